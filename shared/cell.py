@@ -1,0 +1,280 @@
+"""One description of the cell: cameras, robots, pads, targets and frames, read from one YAML file.
+
+A user with another robot, mesh, camera or skin edits only that file. It is validated on load; a fault is told with its line.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from shared import geometry
+from shared.classes import Label
+
+BUILT_IN = Path(__file__).parent / "cells"
+
+Vector3 = Annotated[tuple[float, float, float], Field(description="metres or radians")]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+
+
+class CellError(ValueError):
+    """A cell file that cannot be used; the text names the file, the line, what was expected and what came."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, ignored_types=(cached_property,))
+
+
+class Placement(_Model):
+    """A pose in a parent frame: position [m] and roll, pitch, yaw [rad] about the parent's fixed axes."""
+
+    position: Vector3 = (0.0, 0.0, 0.0)
+    rpy: Vector3 = (0.0, 0.0, 0.0)
+
+    @cached_property
+    def transform(self) -> geometry.Array:
+        """T_parent_this, 4 x 4."""
+        return geometry.from_rpy(self.position, self.rpy)
+
+
+class Camera(_Model):
+    """A pinhole camera: size and intrinsics in pixels, rate, and where it stands: `position` with `look_at` or `rpy`
+    (of the optical frame: x right, y down, z forward)."""
+
+    width: Annotated[int, Field(ge=16, le=8192)]
+    height: Annotated[int, Field(ge=16, le=8192)]
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    rate_hz: Positive = 20.0
+    position: Vector3
+    look_at: Vector3 | None = None
+    rpy: Vector3 | None = None
+
+    @model_validator(mode="after")
+    def _one_direction(self) -> Camera:
+        if (self.look_at is None) == (self.rpy is None):
+            raise ValueError("give either look_at or rpy, not both and not neither")
+        return self
+
+    @cached_property
+    def T_world_camera(self) -> geometry.Array:
+        if self.look_at is not None:
+            return geometry.look_at(self.position, self.look_at)
+        return geometry.from_rpy(self.position, self.rpy or (0.0, 0.0, 0.0))
+
+    @cached_property
+    def K(self) -> geometry.Array:
+        """The 3 x 3 intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+class Robot(_Model):
+    """A robot: its URDF (a path beside the cell file, or `pybullet:PATH` in pybullet's data), base and moving joints."""
+
+    urdf: str
+    base: Placement = Placement()
+    joints: tuple[str, ...]
+
+
+class Electrode(_Model):
+    """One measurement electrode: centroid [m] in the pad's frame (x right, y up, z out of the pad) and its relative gain."""
+
+    centroid: tuple[float, float]
+    gain: Positive = 1.0
+
+
+class Law(_Model):
+    """The paper's response law (eq. sensor_approx) v = a3 + polarity * a1 / (1 + a2 d^2), d the gap to the skin [m];
+    noise [V^2] is a variance."""
+
+    a1: Positive
+    a2: Positive
+    a3: NotNegative
+    polarity: Literal[-1, 1] = 1
+    noise: NotNegative
+    adc_bits: Annotated[int, Field(ge=1, le=24)] = 12
+    adc_reference: Positive = 3.3
+
+
+class PadType(_Model):
+    electrodes: Annotated[dict[Name, Electrode], Field(min_length=1)]
+    law: Law
+    range: Positive = 0.15
+
+
+class Pad(_Model):
+    """A pad on `link` (`world`, or ROBOT/LINK), its frame's z axis pointing out of the skin."""
+
+    type: str
+    link: str = "world"
+    position: Vector3
+    rpy: Vector3 = (0.0, 0.0, 0.0)
+
+    @cached_property
+    def T_link_pad(self) -> geometry.Array:
+        return geometry.from_rpy(self.position, self.rpy)
+
+
+class Spread(_Model):
+    """Standard deviations of a pose: position [m], rotation [rad]."""
+
+    position: Positive
+    rotation: Positive
+
+
+class Target(_Model):
+    """What is tracked. `mesh`: `body:forearm` (the parametric forearm with hand) or a mesh file beside the cell file, in
+    metres, its x axis along the limb. `labels`: the mask classes that show it. `home`: where it is expected before anything
+    is known, with its spread."""
+
+    mesh: str
+    labels: tuple[Literal["robot", "torso", "upper_arm", "forearm", "hand", "occluder"], ...]
+    home: Placement
+    home_spread: Spread = Spread(position=0.15, rotation=0.4)
+
+    @cached_property
+    def label_values(self) -> tuple[int, ...]:
+        return tuple(int(Label[name.upper()]) for name in self.labels)
+
+
+class Body(_Model):
+    """The person's measures [m]; defaults: 50th percentile of men, ANSUR II (Gordon et al. 2014)."""
+
+    forearm_length: Positive = 0.267
+    hand_length: Positive = 0.193
+    hand_breadth: Positive = 0.088
+    forearm_circumference: Positive = 0.308
+    wrist_circumference: Positive = 0.176
+    upper_arm_length: Positive = 0.336
+    upper_arm_circumference: Positive = 0.358
+    chest_breadth: Positive = 0.289
+    chest_depth: Positive = 0.254
+    shoulder_height: Positive = 0.58
+
+
+class Motion(_Model):
+    """The region in which the emulator moves the target: bounds of position [m] and roll, pitch, yaw [rad]."""
+
+    low: Vector3
+    high: Vector3
+    rpy_low: Vector3
+    rpy_high: Vector3
+    speed: Positive = 0.25
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Motion:
+        for low, high, what in ((self.low, self.high, "low/high"), (self.rpy_low, self.rpy_high, "rpy_low/rpy_high")):
+            if any(a > b for a, b in zip(low, high, strict=True)):
+                raise ValueError(f"{what}: every lower bound must not exceed its upper bound, got {low} and {high}")
+        return self
+
+
+class Sim(_Model):
+    """What only the emulator needs."""
+
+    motion: Motion
+    shoulder: Vector3
+    joints_low: tuple[float, ...] = ()
+    joints_high: tuple[float, ...] = ()
+    table: tuple[float, float] | None = None
+
+
+class Cell(_Model):
+    name: Name
+    frame: Name = "world"
+    cameras: dict[Name, Camera] = {}
+    robots: dict[Name, Robot] = {}
+    pad_types: dict[Name, PadType] = {}
+    pads: dict[Name, Pad] = {}
+    targets: Annotated[dict[Name, Target], Field(min_length=1)]
+    body: Body = Body()
+    sim: Sim | None = None
+    folder: Path = Path(".")
+
+    @model_validator(mode="after")
+    def _references(self) -> Cell:
+        links = {"world"} | {f"{name}/" for name in self.robots}
+        for name, pad in self.pads.items():
+            if pad.type not in self.pad_types:
+                raise ValueError(f"pads.{name}.type: one of {sorted(self.pad_types)} expected, got {pad.type!r}")
+            robot, slash, _ = pad.link.partition("/")
+            if robot + slash not in links:
+                raise ValueError(f"pads.{name}.link: world or ROBOT/LINK with ROBOT one of {sorted(self.robots)} expected, got {pad.link!r}")
+        for name, target in self.targets.items():
+            if not target.mesh.startswith("body:") and not (self.folder / target.mesh).is_file():
+                raise ValueError(f"targets.{name}.mesh: no file {self.folder / target.mesh}: give body:forearm or a mesh file beside the cell file")
+        for name, robot_model in self.robots.items():
+            if not robot_model.urdf.startswith("pybullet:") and not (self.folder / robot_model.urdf).is_file():
+                raise ValueError(f"robots.{name}.urdf: no file {self.folder / robot_model.urdf}: give pybullet:PATH or a URDF beside the cell file")
+        return self
+
+    def one(self, kind: Literal["cameras", "robots", "pads", "targets"], name: str | None) -> str:
+        """The name of a camera, robot, pad or target, checked; None means the first one. Raises CellError."""
+        known = getattr(self, kind)
+        if name is None and known:
+            return str(next(iter(known)))
+        if name not in known:
+            raise CellError(f"cell {self.name} has no {kind[:-1]} {name!r}: it has {', '.join(known) or 'none'}")
+        return str(name)
+
+
+def load(cell: str | Path) -> Cell:
+    """The cell of a built-in name (`table`, `arm`) or of a YAML file. Raises CellError with file, line and reason."""
+    path = BUILT_IN / f"{cell}.yaml"
+    if not path.is_file():
+        path = Path(cell)
+    if not path.is_file():
+        built_in = ", ".join(sorted(p.stem for p in BUILT_IN.glob("*.yaml")))
+        raise CellError(f"no cell {str(cell)!r}: give one of {built_in}, or the path of a YAML file")
+    text = path.read_text()
+    try:
+        data = yaml.safe_load(text)
+        tree = yaml.compose(text, yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        raise CellError(f"{path}: not YAML: {error}") from None
+    if not isinstance(data, dict):
+        raise CellError(f"{path}:1: a map with name, cameras, pads and targets expected, a {type(data).__name__} came")
+    try:
+        return Cell.model_validate({**data, "folder": path.parent})
+    except ValidationError as error:
+        raise CellError("\n".join(_explain(path, tree, e) for e in error.errors())) from None
+
+
+def _explain(path: Path, tree: yaml.Node | None, error: Any) -> str:
+    location = [str(part) for part in error["loc"]]
+    reason = error["msg"].removeprefix("Value error, ")
+    if not location and ": " in reason:  # a fault between parts names its place itself
+        location = reason.partition(": ")[0].split(".")
+        reason = reason.partition(": ")[2]
+    got = error.get("input")
+    if isinstance(got, str | int | float | bool) and "got" not in reason:
+        reason += f", got {got!r}"
+    return f"{path}:{_line(tree, location)}: {'.'.join(location)}: {reason}"
+
+
+def _line(node: yaml.Node | None, location: list[str]) -> int:
+    """The line of the deepest node on the way to `location`."""
+    if node is None:
+        return 1
+    line = node.start_mark.line + 1
+    for part in location:
+        if isinstance(node, yaml.MappingNode):
+            match = next(((k, v) for k, v in node.value if k.value == part), None)
+            if match is None:
+                break
+            line, node = match[0].start_mark.line + 1, match[1]
+        elif isinstance(node, yaml.SequenceNode) and part.isdigit() and int(part) < len(node.value):
+            node = node.value[int(part)]
+            line = node.start_mark.line + 1
+        else:
+            break
+    return line

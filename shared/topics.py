@@ -1,0 +1,71 @@
+"""The one table of topics. The bus, `penumbra topics`, the health check and the recorder all read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from shared import messages
+
+
+class QoS(Enum):
+    """Why a topic is sent as it is."""
+
+    LATEST_WINS = "a new sample makes the old one worthless: never wait for a slow reader"
+    NEVER_DROP = "every message counts: wait for the reader"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """`key` with its {names} to fill in; nominal `rate_hz`; `depth`: samples that a reader keeps while busy;
+    `stale_s`: the age after which a reader calls the topic stale; `publisher`: the service that may publish it."""
+
+    name: str
+    key: str
+    message: type[messages.Message]
+    rate_hz: float
+    depth: int
+    stale_s: float
+    publisher: str
+    about: str
+    qos: QoS = QoS.LATEST_WINS
+
+    def at(self, **names: str) -> str:
+        """The key expression; a name that is not given becomes the wildcard `*`."""
+        wanted = {"cell", "camera", "robot", "pad", "target"}
+        return self.key.format(**{name: names.get(name, "*") for name in wanted})
+
+
+FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, "emulator", "one RGB image")
+JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 200, 16, 0.1, "emulator", "joint angles [rad]")
+VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 200, 64, 0.1, "emulator",
+                 "electrode amplitudes [V], 1 kHz in batches")  # fmt: skip
+TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 200, 16, 0.2, "emulator", "what the emulator knows")
+MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, "segmentation", "class indices of a window of a frame")
+VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, "search",
+               "the camera's pose and covariance")  # fmt: skip
+HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 100, 16, 0.1, "haptics",
+               "the skin's pose and information")  # fmt: skip
+FUSED = Topic("fused", "penumbra/{cell}/target/{target}/pose/fused", messages.FusedPose, 200, 4, 0.1, "fusion", "the one pose")
+
+TOPICS = (FRAME, JOINTS, VOLTAGES, TRUTH, MASK, VISION, HAPTIC, FUSED)
+
+
+def current_pose(cell: str, target: str) -> str:
+    """Queryable: the current fused pose, MessagePack of FusedPose, or JSON with `?format=json`."""
+    return f"penumbra/{cell}/target/{target}/pose"
+
+
+def control(cell: str) -> str:
+    """Queryable of the emulator: what `penumbra sim` asks, JSON in and out."""
+    return f"penumbra/{cell}/sim/control"
+
+
+def alive(cell: str, service: str = "*", instance: str = "*") -> str:
+    """Liveliness token of one running instance."""
+    return f"penumbra/{cell}/alive/{service}/{instance}"
+
+
+def health(cell: str, service: str = "*", instance: str = "*") -> str:
+    """Queryable: the health and metrics of one running instance, JSON."""
+    return f"penumbra/{cell}/{service}/{instance}/health"
