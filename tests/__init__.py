@@ -1,0 +1,1 @@
+"""Unit, replay, fault and live tests; tests/bench holds the benchmarks."""

@@ -1,0 +1,91 @@
+"""The containers: `docker compose up` gives the same pose as `penumbra up`, and a dead service comes back.
+
+Needs a Docker engine and builds the images, so it runs by `pytest -m containers`.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import time
+
+import pytest
+import zenoh
+
+from shared import topics
+from tests.live import wait_for
+
+pytestmark = pytest.mark.containers
+SERVICES = {"router", "emulator", "segmentation", "search", "haptics", "fusion"}
+
+
+def compose(*arguments: str) -> str:
+    return subprocess.run(["docker", "compose", *arguments], check=True, capture_output=True, text=True).stdout
+
+
+def containers(service: str) -> list[dict]:
+    ids = compose("ps", "-aq", service).split()
+    return json.loads(subprocess.run(["docker", "inspect", *ids], check=True, capture_output=True, text=True).stdout)
+
+
+@pytest.fixture(scope="module")
+def running():
+    compose("up", "--build", "--detach", "--wait", "--wait-timeout", "300")
+    try:
+        yield
+    except BaseException:
+        print(compose("logs", "--tail", "40"))
+        raise
+    finally:
+        compose("down", "--volumes", "--timeout", "5")
+
+
+@pytest.fixture
+def session(running):
+    config = zenoh.Config.from_json5(
+        '{mode: "client", connect: {endpoints: ["tcp/127.0.0.1:7447"]}, scouting: {multicast: {enabled: false}}}'
+    )
+    with zenoh.open(config) as session:
+        yield session
+
+
+def current_pose(session) -> dict | None:
+    for reply in session.get(topics.current_pose("table", "forearm") + "?format=json", timeout=1.0):
+        if reply.ok:
+            return json.loads(reply.ok.payload.to_string())
+    return None
+
+
+def is_tracking_now(session, after_ns: int = 0) -> bool:
+    pose = current_pose(session)
+    return pose is not None and pose["state"] == "tracking" and pose["stamp_ns"] > after_ns
+
+
+def test_every_container_is_healthy_and_the_host_gets_a_tracked_pose(session):
+    assert {c["Config"]["Labels"]["com.docker.compose.service"] for s in SERVICES for c in containers(s)} == SERVICES
+    wait_for(lambda: is_tracking_now(session), 60, "a tracked pose from the containers")
+
+
+def test_no_container_can_write_its_image_or_runs_as_root(running):
+    for service in SERVICES:
+        for container in containers(service):
+            assert container["HostConfig"]["ReadonlyRootfs"], service
+            assert container["Config"]["User"].startswith("10001"), service
+
+
+@pytest.mark.parametrize("service", ["fusion", "segmentation"])
+def test_a_service_that_is_killed_comes_back(session, service):
+    wait_for(lambda: is_tracking_now(session), 60, "a tracked pose before the kill")
+    before = containers(service)[0]["State"]
+    os.kill(before["Pid"], signal.SIGKILL)
+    killed_ns = time.time_ns()
+    wait_for(lambda: containers(service)[0]["State"]["StartedAt"] != before["StartedAt"], 20, f"{service} started again")
+    wait_for(lambda: is_tracking_now(session, killed_ns + 1_000_000_000), 60, "a tracked pose after the kill")
+
+
+def test_a_second_segmentation_stands_by_and_takes_over(session):
+    compose("up", "--detach", "--scale", "segmentation=2", "--no-recreate", "--wait", "--wait-timeout", "120")
+    assert len(containers("segmentation")) == 2
+    tokens = topics.alive("table", "segmentation")
+    wait_for(lambda: sum(1 for reply in session.liveliness().get(tokens, timeout=1.0) if reply.ok) == 2, 30, "two tokens")
+    wait_for(lambda: is_tracking_now(session), 60, "a tracked pose with two")

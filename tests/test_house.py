@@ -1,0 +1,45 @@
+"""The rules of the house, as tests."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_floors_import_only_downwards_and_services_do_not_know_each_other():
+    result = subprocess.run(["lint-imports"], cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize(
+    ("service", "heavy"),
+    [
+        ("fusion", {"torch", "numba", "cv2", "pybullet", "trimesh"}),
+        ("haptics", {"torch", "cv2"}),
+        ("search", {"torch"}),
+        ("segmentation", {"numba", "pybullet", "trimesh"}),
+        ("emulator", {"torch"}),
+    ],
+)
+def test_a_service_imports_only_what_its_own_extra_installs(service, heavy):
+    code = f"import sys, json, services.{service}.service; print(json.dumps([m for m in sys.modules if '.' not in m]))"
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert not heavy & set(json.loads(out.splitlines()[-1]))
+
+
+def test_every_package_says_in_its_init_what_it_is_for():
+    for folder in ("shared", "sim", "services", *(p.parent.relative_to(ROOT) for p in (ROOT / "services").glob("*/__init__.py"))):
+        text = (ROOT / folder / "__init__.py").read_text()
+        assert text.startswith('"""'), f"{folder}/__init__.py has no docstring"
+
+
+def test_every_weight_file_has_a_card_with_its_seed_and_held_out_score():
+    weights = [p for p in ROOT.glob("services/*/weights/*") if p.suffix in {".npz", ".pt"}]
+    assert weights
+    for path in weights:
+        card = json.loads(path.with_suffix(".json").read_text())
+        assert {"seed", "date", "settings", "held_out"} <= card.keys(), f"{path.name}: {sorted(card)}"
