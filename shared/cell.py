@@ -208,13 +208,19 @@ class Cell(_Model):
                 raise ValueError(f"pads.{name}.type: one of {sorted(self.pad_types)} expected, got {pad.type!r}")
             robot, slash, _ = pad.link.partition("/")
             if robot + slash not in links:
-                raise ValueError(f"pads.{name}.link: world or ROBOT/LINK with ROBOT one of {sorted(self.robots)} expected, got {pad.link!r}")
+                raise ValueError(
+                    f"pads.{name}.link: world or ROBOT/LINK with ROBOT one of {sorted(self.robots)} expected, got {pad.link!r}"
+                )
         for name, target in self.targets.items():
             if not target.mesh.startswith("body:") and not (self.folder / target.mesh).is_file():
-                raise ValueError(f"targets.{name}.mesh: no file {self.folder / target.mesh}: give body:forearm or a mesh file beside the cell file")
+                raise ValueError(
+                    f"targets.{name}.mesh: no file {self.folder / target.mesh}: give body:forearm or a mesh beside the cell file"
+                )
         for name, robot_model in self.robots.items():
             if not robot_model.urdf.startswith("pybullet:") and not (self.folder / robot_model.urdf).is_file():
-                raise ValueError(f"robots.{name}.urdf: no file {self.folder / robot_model.urdf}: give pybullet:PATH or a URDF beside the cell file")
+                raise ValueError(
+                    f"robots.{name}.urdf: no file {self.folder / robot_model.urdf}: give pybullet:PATH or a file beside this one"
+                )
         return self
 
     def one(self, kind: Literal["cameras", "robots", "pads", "targets"], name: str | None) -> str:

@@ -212,7 +212,8 @@ def check_stamp(message: Message, now_ns: int) -> None:
         raise BadMessage("past", f"{type(message).__name__}: stamp at most {MAX_PAST_S} s old expected, {age_s:.3f} s came")
     if age_s < -MAX_FUTURE_S:
         raise BadMessage(
-            "future", f"{type(message).__name__}: stamp at most {MAX_FUTURE_S} s ahead expected, {-age_s:.3f} s came: check the clocks"
+            "future",
+            f"{type(message).__name__}: stamp at most {MAX_FUTURE_S} s ahead expected, {-age_s:.3f} s came: check the clocks",
         )
 
 
@@ -248,8 +249,10 @@ def _field(kind: str, name: str, hint: Any, f: dataclasses.Field[Any], value: An
 
 def _source(where: str, value: Any) -> Source:
     numbers = {"age_s", "weight"}
-    if not isinstance(value, dict) or value.keys() != numbers or not all(
-        isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v) for v in value.values()
+    if (
+        not isinstance(value, dict)
+        or value.keys() != numbers
+        or not all(isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v) for v in value.values())
     ):
         raise BadMessage("sources", f"{where}: finite age_s and weight expected, {value!r:.60} came")
     return Source(age_s=float(value["age_s"]), weight=float(value["weight"]))
@@ -273,5 +276,7 @@ def _array_from_wire(where: str, spec: _ArraySpec, value: Any) -> np.ndarray:
         raise BadMessage("array", f"{where}: {expected} bytes for {dtype} {shape} expected, {len(data)} came")
     array = np.frombuffer(data, dtype=dtype).reshape(shape)
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise BadMessage("finite", f"{where}: finite numbers expected, {int((~np.isfinite(array)).sum())} of {array.size} are not")
+        raise BadMessage(
+            "finite", f"{where}: finite numbers expected, {int((~np.isfinite(array)).sum())} of {array.size} are not"
+        )
     return array

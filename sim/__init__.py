@@ -1,1 +1,1 @@
-"""The simulated world: bodies, robot, skin, camera, occluders, motions and data sets. Only the emulator and train.py import it."""
+"""The simulated world: bodies, robot, skin, camera, occluders, motions, data sets. Only the emulator and train.py import it."""
