@@ -1,11 +1,21 @@
-"""Helpers of the tests that start real processes."""
+"""Helpers of the tests and benchmarks that start real processes."""
 
 from __future__ import annotations
 
+import json
 import socket
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
+
+import psutil
+import zenoh
+
+from shared import topics
 
 
 def wait_for(condition: Callable[[], Any], seconds: float, what: str, interval: float = 0.02) -> Any:
@@ -23,3 +33,65 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def connect(port: int = 7447) -> zenoh.Session:
+    """A client session at a router on loopback, as any user of the bus would open it."""
+    return zenoh.open(
+        zenoh.Config.from_json5(
+            f'{{mode: "client", connect: {{endpoints: ["tcp/127.0.0.1:{port}"], timeout_ms: -1, exit_on_failure: false}}, '
+            "scouting: {multicast: {enabled: false}}}"
+        )
+    )
+
+
+@dataclass
+class Running:
+    """`penumbra up` and a session beside it."""
+
+    cell: str
+    port: int
+    launcher: subprocess.Popen
+    session: zenoh.Session
+
+    def pose(self, target: str = "forearm") -> dict | None:
+        """The answer to the pose query, or None where nobody answers."""
+        for reply in self.session.get(topics.current_pose(self.cell, target) + "?format=json", timeout=1.0):
+            if reply.ok:
+                return json.loads(reply.ok.payload.to_string())
+        return None
+
+    def is_tracking(self, after_ns: int = 0) -> bool:
+        pose = self.pose()
+        return pose is not None and pose["state"] == "tracking" and pose["stamp_ns"] > after_ns
+
+    def health(self) -> dict[str, dict]:
+        """The health of every living instance by service."""
+        replies = self.session.get(topics.health(self.cell), timeout=1.0)
+        found = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
+        return {item["service"]: item for item in found}
+
+    def processes(self) -> dict[str, psutil.Process]:
+        """The launcher and its services by name, from their command lines."""
+        launcher = psutil.Process(self.launcher.pid)
+        out = {"launcher": launcher}
+        for child in launcher.children(recursive=True):
+            words = child.cmdline()
+            if "services.cli" in words:
+                name = words[words.index("services.cli") + 1]
+                out[name if name not in out else f"{name}-{child.pid}"] = child
+        return out
+
+
+@contextmanager
+def penumbra_up(cell: str, seed: int, *arguments: str) -> Iterator[Running]:
+    """The whole chain as real processes on a free port, stopped as by Ctrl-C at the end."""
+    port = free_port()
+    command = [sys.executable, "-m", "services.cli", "up", "--cell", cell, "--seed", str(seed), "--port", str(port), *arguments]
+    launcher = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        with connect(port) as session:
+            yield Running(cell, port, launcher, session)
+    finally:
+        launcher.terminate()
+        launcher.wait(10)

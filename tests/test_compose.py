@@ -10,10 +10,9 @@ import subprocess
 import time
 
 import pytest
-import zenoh
 
 from shared import topics
-from tests.live import wait_for
+from tests.live import connect, wait_for
 
 pytestmark = pytest.mark.containers
 SERVICES = {"router", "emulator", "segmentation", "search", "haptics", "fusion"}
@@ -42,10 +41,7 @@ def running():
 
 @pytest.fixture
 def session(running):
-    config = zenoh.Config.from_json5(
-        '{mode: "client", connect: {endpoints: ["tcp/127.0.0.1:7447"]}, scouting: {multicast: {enabled: false}}}'
-    )
-    with zenoh.open(config) as session:
+    with connect() as session:
         yield session
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 import threading
 import time
@@ -25,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from shared import cell as cells
 from shared import messages, topics
-from tests.live import free_port, wait_for
+from tests.live import penumbra_up, wait_for
 
 VISIBLE = 0.33
 """At most this share of the target hidden: visible (the paper's light occlusion)."""
@@ -145,17 +144,6 @@ def cpu_times(processes: dict[str, psutil.Process]) -> dict[str, float]:
     return out
 
 
-def services_of(launcher: psutil.Process) -> dict[str, psutil.Process]:
-    """The launcher and its services by name, from their command lines."""
-    out = {"launcher": launcher}
-    for child in launcher.children(recursive=True):
-        words = child.cmdline()
-        if "services.cli" in words:
-            name = words[words.index("services.cli") + 1]
-            out[name if name not in out else f"{name}-{child.pid}"] = child
-    return out
-
-
 def measure(recording: Recording, reach: float, seconds: float) -> dict[str, Any]:
     """The numbers of the issue from a recording of `seconds`."""
     _, truths = recording.decoded(topics.TRUTH)
@@ -227,36 +215,14 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     cell = cells.load(options.cell)
     target = cell.one("targets", None)
-    port = free_port()
-    command = [
-        sys.executable,
-        "-m",
-        "services.cli",
-        "up",
-        "--cell",
-        options.cell,
-        "--seed",
-        str(options.seed),
-        "--port",
-        str(port),
-    ]
-    launcher = subprocess.Popen([*command, *options.up], stdout=subprocess.DEVNULL)
-    try:
-        config = zenoh.Config.from_json5(
-            f'{{mode: "client", connect: {{endpoints: ["tcp/127.0.0.1:{port}"], timeout_ms: -1, exit_on_failure: false}}, '
-            "scouting: {multicast: {enabled: false}}}"
-        )
-        with zenoh.open(config) as session:
-            wait_for(lambda: is_tracking(session, cell.name, target) or launcher.poll() is not None, 120, "a tracked pose", 0.5)
-            processes = services_of(psutil.Process(launcher.pid))
-            recording = Recording(session, cell.name, target)
-            cpu_before, started = cpu_times(processes), time.monotonic()
-            time.sleep(options.seconds)
-            elapsed, cpu_after = time.monotonic() - started, cpu_times(processes)
-            recording.close()
-    finally:
-        launcher.terminate()
-        launcher.wait(10)
+    with penumbra_up(options.cell, options.seed, *options.up) as running:
+        wait_for(running.is_tracking, 120, "a tracked pose", 0.5)
+        processes = running.processes()
+        recording = Recording(running.session, cell.name, target)
+        cpu_before, started = cpu_times(processes), time.monotonic()
+        time.sleep(options.seconds)
+        elapsed, cpu_after = time.monotonic() - started, cpu_times(processes)
+        recording.close()
     reach = max(cell.pad_types[pad.type].range for pad in cell.pads.values())
     result = {"cell": cell.name, "seed": options.seed, "seconds": options.seconds, **measure(recording, reach, elapsed)}
     result["cpu"] = {name: round((cpu_after[name] - cpu_before[name]) / elapsed, 3) for name in cpu_after}
@@ -264,13 +230,6 @@ def main(argv: list[str] | None = None) -> int:
     if options.json:
         options.json.write_text(json.dumps(result, indent=1))
     return 0
-
-
-def is_tracking(session: zenoh.Session, cell: str, target: str) -> bool:
-    replies = session.get(topics.current_pose(cell, target), timeout=1.0)
-    return any(
-        reply.ok and messages.decode(messages.FusedPose, reply.ok.payload.to_bytes()).state == "tracking" for reply in replies
-    )
 
 
 if __name__ == "__main__":
