@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
+import math
 import typing
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,18 +32,59 @@ class BadMessage(ValueError):
         self.kind = kind
 
 
+LARGEST = 1e12
+"""No quantity of a cell is larger in SI units, and its square is still finite."""
+UNIT_TOLERANCE = 1e-3
+"""How far the norm of a quaternion may be from one."""
+ROUNDING = 1e-6
+"""What shares and matrices may be off by rounding, relative."""
+_STRUCTURE = {"max_array_len": 16, "max_map_len": 32, "max_str_len": 256, "max_ext_len": 0}
+"""What MessagePack may hold: more than any message needs, less than fills a memory."""
+
+
 @dataclass(frozen=True)
 class _ArraySpec:
     dtype: str
     shape: tuple[int | None, ...]  # None: any positive length
+    check: Callable[[np.ndarray], str | None] | None = None  # what else is wrong with the values
 
 
-def _array(dtype: str, *shape: int | None) -> Any:
-    return field(metadata={"array": _ArraySpec(dtype, shape)})
+def _array(dtype: str, *shape: int | None, check: Callable[[np.ndarray], str | None] | None = None) -> Any:
+    return field(metadata={"array": _ArraySpec(dtype, shape, check)})
+
+
+def _quaternion() -> Any:
+    return _array("float64", 4, check=_not_unit)
+
+
+def _covariance() -> Any:
+    """Also an information matrix: symmetric and not negative in any direction."""
+    return _array("float64", 6, 6, check=_not_semidefinite)
+
+
+def _not_unit(value: np.ndarray) -> str | None:
+    norm = float(np.sqrt(value @ value))
+    return None if abs(norm - 1) <= UNIT_TOLERANCE else f"a unit quaternion expected, one of norm {norm:.4g} came"
+
+
+def _not_semidefinite(value: np.ndarray) -> str | None:
+    tolerance = ROUNDING * float(np.abs(value).max())
+    if np.abs(value - value.T).max() > tolerance:
+        return "a symmetric matrix expected, one with different halves came"
+    lowest = float(np.linalg.eigvalsh(value)[0])
+    return None if lowest >= -tolerance else f"a matrix without negative eigenvalues expected, one with {lowest:.4g} came"
 
 
 def _choice(*values: str) -> Any:
     return field(metadata={"choice": values})
+
+
+def _within(low: float, high: float) -> Any:
+    return field(metadata={"within": (low, high)})
+
+
+def _share() -> Any:
+    return _within(-ROUNDING, 1 + ROUNDING)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +110,9 @@ class Mask(Message):
 
     MAX_BYTES: typing.ClassVar[int] = 32_000_000
     labels: np.ndarray = _array("uint8", None, None)
-    x0: int
-    y0: int
-    scale: int
+    x0: int = _within(-8192, 8192)
+    y0: int = _within(-8192, 8192)
+    scale: int = _within(1, 64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +126,7 @@ class Joints(Message):
 class Voltages(Message):
     """Electrode amplitudes [V] of one pad, oldest row first; `stamp_ns` belongs to the last row."""
 
-    period_ns: int
+    period_ns: int = _within(1, 1_000_000_000)
     volts: np.ndarray = _array("float32", None, None)  # (samples, electrodes)
 
 
@@ -95,10 +139,10 @@ class VisionPose(Message):
     camera: str
     frame: str
     position: np.ndarray = _array("float64", 3)
-    orientation: np.ndarray = _array("float64", 4)
-    covariance: np.ndarray = _array("float64", 6, 6)
-    overlap: float
-    hidden: float
+    orientation: np.ndarray = _quaternion()
+    covariance: np.ndarray = _covariance()
+    overlap: float = _share()
+    hidden: float = _share()
     state: str = _choice("tracking", "occluded", "lost")
 
 
@@ -111,9 +155,9 @@ class HapticPose(Message):
     frame: str
     sample_stamp_ns: int
     position: np.ndarray = _array("float64", 3)
-    orientation: np.ndarray = _array("float64", 4)
-    information: np.ndarray = _array("float64", 6, 6)
-    gap: float
+    orientation: np.ndarray = _quaternion()
+    information: np.ndarray = _covariance()
+    gap: float = _within(-LARGEST, LARGEST)
     state: str = _choice("in_range", "out_of_range")
 
 
@@ -133,9 +177,9 @@ class FusedPose(Message):
     target: str
     frame: str
     position: np.ndarray = _array("float64", 3)
-    orientation: np.ndarray = _array("float64", 4)
+    orientation: np.ndarray = _quaternion()
     velocity: np.ndarray = _array("float64", 6)
-    covariance: np.ndarray = _array("float64", 6, 6)
+    covariance: np.ndarray = _covariance()
     state: str = _choice("tracking", "coasting", "lost")
     sources: dict[str, Source]
 
@@ -148,31 +192,36 @@ class Truth(Message):
     target: str
     frame: str
     position: np.ndarray = _array("float64", 3)
-    orientation: np.ndarray = _array("float64", 4)
+    orientation: np.ndarray = _quaternion()
     velocity: np.ndarray = _array("float64", 6)
-    hidden: float
-    gap: float
+    hidden: float = _share()
+    gap: float = _within(-LARGEST, LARGEST)
 
 
 M = typing.TypeVar("M", bound=Message)
+Fields = tuple[tuple[str, Any, typing.Mapping[str, Any]], ...]
 
 
-@functools.cache
-def _fields(kind: type[Message]) -> tuple[tuple[str, Any, dataclasses.Field[Any]], ...]:
+def _read_fields(kind: Any) -> Fields:
+    """Name, type and metadata of each field of a message class."""
     hints = typing.get_type_hints(kind)
-    return tuple((f.name, hints[f.name], f) for f in dataclasses.fields(kind))
+    return tuple((f.name, hints[f.name], f.metadata) for f in dataclasses.fields(kind))
+
+
+_fields = typing.cast(Callable[[type[Message]], Fields], functools.cache(_read_fields))
 
 
 def encode(message: Message) -> bytes:
     """The MessagePack bytes of a message. Raises BadMessage where an array has not the declared dtype and shape."""
     out: dict[str, Any] = {}
-    for name, _, f in _fields(type(message)):
+    for name, _, metadata in _fields(type(message)):
         value = getattr(message, name)
-        spec = f.metadata.get("array")
+        spec = metadata.get("array")
         if spec is not None:
             value = np.ascontiguousarray(value)
-            _check_array(name, spec, value.dtype.name, value.shape)
-            out[name] = [value.dtype.name, value.shape, value.tobytes()]
+            dtype = value.dtype.name
+            _check_array(name, spec, dtype, value.shape)
+            out[name] = [dtype, value.shape, value.data.cast("B")]  # a view: the only copy is MessagePack's
         elif isinstance(value, dict):
             out[name] = {key: dataclasses.asdict(item) for key, item in value.items()}
         elif isinstance(value, np.generic):
@@ -190,19 +239,34 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None) -> M:
     if len(payload) > kind.MAX_BYTES:
         raise BadMessage("size", f"{kind.__name__}: at most {kind.MAX_BYTES} bytes expected, {len(payload)} came")
     try:
-        raw = msgpack.unpackb(payload)
+        raw = _unpack(payload)
     except Exception as error:
-        raise BadMessage("msgpack", f"{kind.__name__}: MessagePack expected, came {payload[:16]!r}… ({error})") from None
+        raise BadMessage("msgpack", f"{kind.__name__}: MessagePack expected, came {payload[:16]!r}… ({error!s:.100})") from None
     if not isinstance(raw, dict):
         raise BadMessage("map", f"{kind.__name__}: a map of fields expected, a {type(raw).__name__} came")
     specs = _fields(kind)
     if raw.keys() != {name for name, _, _ in specs}:
-        raise BadMessage("fields", f"{kind.__name__}: fields {[n for n, _, _ in specs]} expected, {sorted(map(str, raw))} came")
-    values = {name: _field(kind.__name__, name, hint, f, raw[name]) for name, hint, f in specs}
-    message = kind(**values)
+        raise BadMessage(
+            "fields", f"{kind.__name__}: fields {[n for n, _, _ in specs]} expected, {sorted(map(_short, raw))} came"
+        )
+    message = kind(**{name: _field(kind.__name__, name, hint, metadata, raw[name]) for name, hint, metadata in specs})
     if now_ns is not None:
         check_stamp(message, now_ns)
     return message
+
+
+def _unpack(payload: bytes) -> Any:
+    """The objects in a payload. A large one may be full of tiny lists, each many times its size in memory: they are counted."""
+    if len(payload) <= Message.MAX_BYTES:
+        return msgpack.unpackb(payload, **_STRUCTURE)
+    count = itertools.count(1)
+
+    def limited(container: Any) -> Any:
+        if next(count) > 64:
+            raise ValueError("too many lists and maps")
+        return container
+
+    return msgpack.unpackb(payload, list_hook=limited, object_hook=limited, **_STRUCTURE)
 
 
 def check_stamp(message: Message, now_ns: int) -> None:
@@ -224,38 +288,37 @@ def _check_array(where: str, spec: _ArraySpec, dtype: str, shape: tuple[int, ...
         raise BadMessage("array", f"{where}: {spec.dtype} of shape {wanted} expected, {dtype} of shape {tuple(shape)} came")
 
 
-def _field(kind: str, name: str, hint: Any, f: dataclasses.Field[Any], value: Any) -> Any:
+def _field(kind: str, name: str, hint: Any, metadata: typing.Mapping[str, Any], value: Any) -> Any:
     where = f"{kind}.{name}"
-    spec = f.metadata.get("array")
+    spec = metadata.get("array")
     if spec is not None:
         return _array_from_wire(where, spec, value)
-    if hint is float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise BadMessage("number", f"{where}: a finite number expected, {value!r:.60} came")
-        return float(value)
-    if hint is int:
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise BadMessage("integer", f"{where}: an integer expected, {value!r:.60} came")
-        return value
+    if hint is float or hint is int:
+        return _number(where, hint, metadata.get("within", (-LARGEST, LARGEST) if hint is float else None), value)
     if hint is str:
-        choice = f.metadata.get("choice")
+        choice = metadata.get("choice")
         if not isinstance(value, str) or (choice and value not in choice):
-            raise BadMessage("text", f"{where}: {' | '.join(choice) if choice else 'a text'} expected, {value!r:.60} came")
+            raise BadMessage("text", f"{where}: {' | '.join(choice) if choice else 'a text'} expected, {_short(value)} came")
         return value
-    if not isinstance(value, dict):
-        raise BadMessage("sources", f"{where}: a map of sources expected, {value!r:.60} came")
-    return {str(key): _source(f"{where}.{key}", item) for key, item in value.items()}
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise BadMessage("sources", f"{where}: a map of sources expected, {_short(value)} came")
+    return {key: _source(f"{where}.{key}", item) for key, item in value.items()}
+
+
+def _number(where: str, hint: type, within: tuple[float, float] | None, value: Any) -> Any:
+    wanted = "an integer" if hint is int else "a finite number"
+    numeric = isinstance(value, int) or (hint is float and isinstance(value, float))
+    if not numeric or isinstance(value, bool) or not math.isfinite(value):
+        raise BadMessage("number", f"{where}: {wanted} expected, {_short(value)} came")
+    if within is not None and not within[0] <= value <= within[1]:
+        raise BadMessage("range", f"{where}: {wanted} from {within[0]:g} to {within[1]:g} expected, {_short(value)} came")
+    return hint(value)
 
 
 def _source(where: str, value: Any) -> Source:
-    numbers = {"age_s", "weight"}
-    if (
-        not isinstance(value, dict)
-        or value.keys() != numbers
-        or not all(isinstance(v, int | float) and not isinstance(v, bool) and np.isfinite(v) for v in value.values())
-    ):
-        raise BadMessage("sources", f"{where}: finite age_s and weight expected, {value!r:.60} came")
-    return Source(age_s=float(value["age_s"]), weight=float(value["weight"]))
+    if not isinstance(value, dict) or value.keys() != {"age_s", "weight"}:
+        raise BadMessage("sources", f"{where}: age_s and weight expected, {_short(value)} came")
+    return Source(**{name: _number(f"{where}.{name}", float, (-LARGEST, LARGEST), number) for name, number in value.items()})
 
 
 def _array_from_wire(where: str, spec: _ArraySpec, value: Any) -> np.ndarray:
@@ -268,15 +331,27 @@ def _array_from_wire(where: str, spec: _ArraySpec, value: Any) -> np.ndarray:
         and isinstance(value[2], bytes)
     )
     if not well_formed:
-        raise BadMessage("array", f"{where}: [dtype, shape, bytes] expected, {value!r:.60} came")
+        raise BadMessage("array", f"{where}: [dtype, shape, bytes] expected, {_short(value)} came")
     dtype, shape, data = value
     _check_array(where, spec, dtype, tuple(shape))
-    expected = int(np.dtype(dtype).itemsize) * int(np.prod(shape, dtype=object))
+    expected = int(np.dtype(dtype).itemsize) * math.prod(shape)
     if len(data) != expected:
         raise BadMessage("array", f"{where}: {expected} bytes for {dtype} {shape} expected, {len(data)} came")
     array = np.frombuffer(data, dtype=dtype).reshape(shape)
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise BadMessage(
-            "finite", f"{where}: finite numbers expected, {int((~np.isfinite(array)).sum())} of {array.size} are not"
-        )
+    if array.dtype.kind == "f":
+        if not np.abs(array).max() <= LARGEST:  # also where it is NaN
+            count = int((~(np.abs(array) <= LARGEST)).sum())
+            raise BadMessage("finite", f"{where}: finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not")
+    fault = spec.check(array) if spec.check else None
+    if fault:
+        raise BadMessage("values", f"{where}: {fault}")
     return array
+
+
+def _short(value: Any) -> str:
+    """A value in a log line: never more of it than a line holds, however large it is."""
+    if isinstance(value, bytes | str):
+        return repr(value[:40]) + ("…" if len(value) > 40 else "")
+    if isinstance(value, list | dict):
+        return f"a {'list' if isinstance(value, list) else 'map'} of {len(value)}"
+    return f"{value!r:.60}"

@@ -40,8 +40,19 @@ FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 
 JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 200, 16, 0.1, "emulator", "joint angles [rad]")
 VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 200, 64, 0.1, "emulator",
                  "electrode amplitudes [V], 1 kHz in batches")  # fmt: skip
-TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 200, 16, 0.2, "emulator", "what the emulator knows")
-MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, "segmentation", "class indices of a window of a frame")
+TRUTH = Topic(
+    "truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 200, 16, 0.2, "emulator", "what the emulator knows"
+)
+MASK = Topic(
+    "mask",
+    "penumbra/{cell}/camera/{camera}/mask",
+    messages.Mask,
+    20,
+    1,
+    0.3,
+    "segmentation",
+    "class indices of a window of a frame",
+)
 VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, "search",
                "the camera's pose and covariance")  # fmt: skip
 HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 100, 16, 0.1, "haptics",

@@ -1,0 +1,153 @@
+"""The `penumbra` command. Each subcommand imports only what it needs: fusion starts without torch, `pose` in well under a second."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+COMMANDS = {
+    "up": "start every process of a cell with a router, and show what they do",
+    "router": "the meeting point of all processes",
+    "emulator": "a simulated cell: frames, joints, skin and truth",
+    "segmentation": "frames to masks (`segmentation train`: learn the network again)",
+    "search": "masks to the camera's pose",
+    "haptics": "voltages to the skin's pose (`haptics train`: learn the network again)",
+    "fusion": "both poses to the one pose",
+    "pose": "print the current pose",
+    "topics": "list the topics, and with --hz what really arrives",
+    "sim": "steer the emulator: occlude, motion, pause, resume, speed, state",
+    "snapshot": "write a picture of the cell and its pose",
+    "bench": "run a benchmark",
+    "doctor": "check this machine and say how to mend it",
+}
+SERVICES = ("router", "emulator", "segmentation", "search", "haptics", "fusion")
+LEARNED = ("segmentation", "haptics")
+MODULES = {
+    "up": "services.launch",
+    "pose": "services.client",
+    "topics": "services.client",
+    "sim": "services.client",
+    "snapshot": "services.snapshot",
+    "doctor": "services.doctor",
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs `penumbra ARGV...` and returns the exit code: 0 well, 1 failed, 2 asked for something that is not there."""
+    argv = sys.argv[1:] if argv is None else argv
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(_usage())
+        return 0 if argv else 2
+    command, rest = argv[0], argv[1:]
+    if command not in COMMANDS:
+        print(f"penumbra: no command {command!r}: one of {', '.join(COMMANDS)} expected", file=sys.stderr)
+        return 2
+    try:
+        return _run(command, rest)
+    except ImportError as error:
+        return _explain_import(command, error)
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # `penumbra topics | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if not _is_ours(error):
+            raise
+        for line in str(error).splitlines():
+            print(f"penumbra {command}: {line}", file=sys.stderr)
+        return 2
+
+
+def _run(command: str, argv: list[str]) -> int:
+    if command in LEARNED and argv[:1] == ["train"]:
+        return importlib.import_module(f"services.{command}.train").main(argv[1:]) or 0
+    if command in SERVICES:
+        return serve(command, argv)
+    if command == "bench":
+        return _bench(argv)
+    module = importlib.import_module(MODULES[command])
+    run: Callable[[list[str]], int | None] = getattr(module, command, None) or module.main
+    return run(argv) or 0
+
+
+def serve(name: str, argv: list[str]) -> int:
+    """One service until SIGINT or SIGTERM."""
+    _die_with_parent()
+    from services import arguments
+    from shared import bus, cell, logs
+    from shared.service import Node
+
+    module = importlib.import_module(f"services.{name}.service")
+    parser = arguments.parser(name, module.__doc__ or COMMANDS[name])
+    module.arguments(parser)
+    options = parser.parse_args(argv)
+    options.mode = options.mode or getattr(module, "MODE", None)
+    logs.configure(options.log_level, options.log_json)
+    node = Node(module.NAME, cell.load(options.cell), bus.connection(options))
+    module.start(node, options)
+    node.run()
+    if threading.active_count() > 1:  # something hangs in native code: it must not keep the process
+        logging.shutdown()
+        sys.stdout.flush()
+        os._exit(0)
+    return 0
+
+
+def _bench(argv: list[str]) -> int:
+    folder = Path(__file__).parents[1] / "tests" / "bench"
+    names = sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
+    if not argv or argv[0] not in names:
+        print(f"penumbra bench: one of {', '.join(names) or '(none installed)'} expected", file=sys.stderr)
+        return 2
+    return importlib.import_module(f"tests.bench.{argv[0]}").main(argv[1:]) or 0
+
+
+def _usage() -> str:
+    width = max(map(len, COMMANDS))
+    rows = "\n".join(f"  {name:{width}}  {about}" for name, about in COMMANDS.items())
+    return f"usage: penumbra COMMAND [--help] ...\n\nTracks a forearm beside a robot, also while something hides it.\n\n{rows}"
+
+
+def _is_ours(error: Exception) -> bool:
+    """Whether the text of an error already says what was expected, what came and what to do."""
+    from shared.bus import BusError, Refused
+    from shared.cell import CellError
+
+    return isinstance(error, BusError | Refused | CellError)
+
+
+def _explain_import(command: str, error: ImportError) -> int:
+    """Names the extra that installs what is missing; an error in our own code is not explained away."""
+    name = (error.name or "").partition(".")[0]
+    if not name or (name in ("services", "shared", "sim") and error.name != f"services.{command}"):
+        raise error
+    if error.name == f"services.{command}":
+        print(f"penumbra {command}: not part of this installation", file=sys.stderr)
+        return 2
+    extra = command if command in SERVICES else ("test" if command == "bench" else "all")
+    print(f"penumbra {command}: {name} is not installed: pip install -e '.[{extra}]'", file=sys.stderr)
+    return 2
+
+
+def _die_with_parent() -> None:
+    """Ties a service to the launcher that started it: it must not stay behind, even if the launcher is killed with SIGKILL."""
+    parent = os.environ.get("PENUMBRA_PARENT")
+    if parent is None:
+        return
+    if sys.platform == "linux":
+        PR_SET_PDEATHSIG = 1
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != int(parent):  # it died before we asked
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,59 @@
+"""What a control query may ask of the world: JSON in, JSON out."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from sim.world import World
+
+COMMANDS = {
+    "occlude": "a share of the target's pixels to hide from 0 to 1, or auto",
+    "motion": "on or off: target and robot move or stand still",
+    "pause": "everything stands still",
+    "resume": "everything goes on",
+    "speed": "how fast target and robot move: above 0, at most 4, 1 is as in the cell file",
+    "state": "what is in force now",
+}
+"""Every command, and what its value means."""
+
+
+def control(world: World, payload: bytes, time_s: float) -> dict[str, Any]:
+    """Carry out `{"command": NAME, "value": VALUE}` from `time_s` on and answer what is in force then. The value may be a text.
+
+    Raises ValueError with what is possible where the request is none of that.
+    """
+    try:
+        request = json.loads(payload)
+    except ValueError:
+        raise ValueError(_expected(payload[:60].decode(errors="replace"))) from None
+    if not isinstance(request, dict) or not isinstance(request.get("command"), str) or request.keys() - {"command", "value"}:
+        raise ValueError(_expected(payload[:60].decode(errors="replace")))
+    command, value = request["command"], request.get("value")
+    if command == "occlude":
+        world.occlude(None if value == "auto" else _number(command, value), time_s)
+    elif command == "motion":
+        if value not in ("on", "off"):
+            raise ValueError(f"motion: on or off expected, {value!r} came")
+        world.set_motion(value == "on", time_s)
+    elif command == "speed":
+        world.set_speed(_number(command, value), time_s)
+    elif command in ("pause", "resume"):
+        world.set_paused(command == "pause", time_s)
+    elif command != "state":
+        raise ValueError(_expected(command))
+    return world.describe(time_s)
+
+
+def _number(command: str, value: Any) -> float:
+    try:
+        if isinstance(value, bool):
+            raise ValueError
+        return float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{command}: {COMMANDS[command]} expected, {value!r} came") from None
+
+
+def _expected(came: str) -> str:
+    possible = "\n".join(f"  {name:8} {about}" for name, about in COMMANDS.items())
+    return f'{{"command": NAME, "value": VALUE}} expected, {came!r} came. Commands:\n{possible}'

@@ -1,0 +1,67 @@
+"""Wires the simulated world to the bus: control queries in, frames, joints, voltages and the truth out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from functools import partial
+
+from services.emulator.control import control
+from services.emulator.pace import Pacer
+from shared import topics
+from shared.service import Node
+from sim.world import TICK_NS, Sensors, Stream, World
+
+NAME = "emulator"
+
+PLAN_S = 10.0
+"""How far ahead the limb's motion is planned, in the frames' thread: planning must not delay the skin."""
+AHEAD_S = 0.1
+"""A command acts this much later: frames until then may have been rendered already."""
+AGAIN_S = 0.001
+"""A turn waits by itself; this only keeps one that fails from running hot."""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """The service's own flags."""
+    parser.add_argument("--seed", type=int, default=0, help="draws motion, occlusion, colours and noise (default: 0)")
+    parser.add_argument("--occlude", default="auto", metavar="LEVEL|auto", help="share of the target to hide (default: auto)")
+
+
+def start(node: Node, options: argparse.Namespace) -> None:
+    """Every stream has a turn of its own: what is due next is made ready before its instant, as a real sensor would have it."""
+    cell = node.cell
+    world = World(cell, options.seed)
+    world.plan(PLAN_S)
+    sensors = Sensors(world, node.now_ns())
+    for camera in cell.cameras:  # compiles what the first turn would wait for
+        sensors.frame(camera, 0)
+    sensors.tick(1)
+    sensors.epoch_ns = node.now_ns()
+
+    def time_s() -> float:
+        return (node.now_ns() - sensors.epoch_ns) * 1e-9
+
+    def answer(_: dict[str, str], payload: bytes) -> tuple[bytes, str]:
+        return json.dumps(control(world, payload, time_s() + AHEAD_S)).encode(), "application/json"
+
+    def turn(pacer: Pacer, prepare: Callable[[int], Stream]) -> None:
+        k = pacer.next()
+        messages = prepare(k)
+        if not node.stopping.wait(pacer.remaining_s(k)):
+            for topic, names, message in messages:
+                node.publish(topic, message, **names)
+
+    def frame(camera: str, k: int) -> Stream:
+        world.plan(time_s() + PLAN_S)
+        return sensors.frame(camera, k)
+
+    control(world, json.dumps({"command": "occlude", "value": options.occlude}).encode(), 0.0)
+    node.answer(topics.control(cell.name), answer)
+    skin = Pacer(sensors.epoch_ns, TICK_NS, node.now_ns, late_ns=TICK_NS)
+    node.every(AGAIN_S, partial(turn, skin, sensors.tick))
+    for camera, description in cell.cameras.items():
+        period_ns = 1e9 / description.rate_hz
+        pacer = Pacer(sensors.epoch_ns, period_ns, node.now_ns, late_ns=period_ns / 4)
+        node.every(AGAIN_S, partial(turn, pacer, partial(frame, camera)))

@@ -1,0 +1,234 @@
+"""The paper's observer (section "Modified Luenberger Observer" and "Integration of Perception Methods"), kept as `--observer paper`.
+
+What the paper leaves open or what cannot be done as printed, and what is done here:
+- x is position and roll, pitch, yaw. They wrap: innovations are taken modulo 2 pi. They are singular at a pitch of 90 degrees.
+- y^ contains the noise n(t): left out. z is called a vector of 6: y has 12 entries, and so has z.
+- f and u are not given: f(x, u) = u, a constant velocity, and so A = 0. Nothing measures u: it is the rate of x^, smoothed.
+- Q is not given. Here Q = lambda^2 W_v: a fully hidden arm, seen by the camera alone, is followed with a rate of lambda. Table I
+  asks for a fast one: out of the skin's range the fused error there equals the camera's.
+- R_v is zero when nothing is hidden, which believes the camera entirely: a floor of 1 cm and 1.4 degrees, what a camera at 1.5 m
+  can resolve. R_v then grows by W_v = 8 m^2 and 16 pi rad^2, so that a hundredth of the arm hidden gives the camera a standard
+  deviation of 28 cm: whenever the skin is in range it decides nearly alone. That is the paper's weighting, and kept.
+- R_c is a function of the pose found by regression: here the information that the haptic estimator publishes. It is zero along
+  directions that the skin does not observe; R^-1 is used throughout, R never.
+- Continuous time, with measurements that arrive one by one: between two of them y moves on with u, and an old one is dropped.
+  The Riccati equation is integrated by backward Euler in information form, stable for any step; the low-pass exactly.
+- P has no scale of its own, since that of Q and W_v is arbitrary. What is published as covariance is what the senses' own
+  covariances become through the stationary weights of the two, growing with their age.
+- The paper has no gate: every measurement is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from services.fusion import so3
+from services.fusion.estimate import Array, Estimate, Limits, Log, checked
+from shared import geometry
+from shared.messages import Source
+
+STEP_S = 0.01
+
+
+@dataclass(frozen=True)
+class PaperSettings:
+    """Numbers of the paper's observer.
+
+    W_v : noise of a fully hidden arm, position [m^2] and rotation [rad^2] (section "Numerical Simulation").
+    omega_n, zeta : low-pass on the pose [rad/s] and its damping (ibid.).
+    floor : least hidden share: 1.25e-5 of W_v is (1 cm)^2 and (1.4 degrees)^2.
+    rate : lambda [1/s] in Q = lambda^2 W_v: one camera period.
+    velocity_time : smoothing of u [s].
+    hold : for how long a measurement of each sense is used [s]: its delay and two of its periods.
+    acceleration : by which the published covariance grows with age, density [m^2/s^3] and [rad^2/s^3].
+    """
+
+    W_v: tuple[float, ...] = (8.0, 8.0, 8.0, 16 * np.pi, 16 * np.pi, 16 * np.pi)
+    omega_n: float = 120 * np.pi
+    zeta: float = float(np.sqrt(0.5))
+    floor: float = 1.25e-5
+    rate: float = 20.0
+    velocity_time: float = 0.2
+    hold: tuple[tuple[str, float], ...] = (("vision", 0.2), ("haptic", 0.05))
+    acceleration: tuple[float, float] = (0.3, 2.0)
+    limits: Limits = Limits()
+
+
+@dataclass(frozen=True)
+class _Held:
+    """The newest measurement of one sense: y (6,), R^-1 (6, 6) and its covariance (6, 6), zero where it observes nothing."""
+
+    stamp_ns: int
+    y: Array
+    R_inverse: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class _State:
+    """x^ (6,), P (6, 6), u (6,), and the low-pass: its output (6,) and the output's rate (6,)."""
+
+    stamp_ns: int
+    x: Array
+    P: Array
+    u: Array
+    smooth: Array
+    rate: Array
+
+
+class PaperObserver:
+    """The interface of `observer.ErrorStateObserver`, the paper's equations."""
+
+    def __init__(self, home: Array, spread: tuple[float, float], settings: PaperSettings | None = None):
+        self.settings = settings or PaperSettings()
+        self.log = Log()
+        self._home = home
+        self._home_covariance = np.diag(np.repeat(np.square(spread), 3))
+        self._W_v = np.diag(self.settings.W_v)
+        self._Q = self.settings.rate**2 * self._W_v
+        self._hold_ns = {source: int(1e9 * seconds) for source, seconds in self.settings.hold}
+        self._held: dict[str, _Held] = {}
+        self._state: _State | None = None
+        self._covariance = self._home_covariance
+        self._weights: dict[str, float] = {}
+
+    def measure(self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None) -> bool:
+        """Takes a pose T (4, 4) with its information (6, 6). True if it is newer than the one before of this source.
+
+        source : `vision` (R_v from the share `hidden`) or `haptic` (R_c from the information). Raises ValueError on a pose or an
+        information that is none, and on an unknown source.
+        """
+        self.log.heard(source, stamp_ns)
+        T, information = checked(T, information)
+        before = self._held.get(source)
+        if before is not None and stamp_ns <= before.stamp_ns:
+            self.log.counts[source].late += 1
+            return False
+        y = _pose(T)
+        B = _rates(y)
+        information = B.T @ information @ B
+        R_inverse = np.linalg.inv(self.R_v(hidden or 0.0)) if source == "vision" else information
+        held = _Held(stamp_ns, y, R_inverse, np.linalg.pinv(information, rcond=1e-9, hermitian=True))
+        start = self._state
+        if start is None or stamp_ns - self._newest_ns() > self.settings.limits.lost_age * 1e9:
+            # P(t_0) = P_0: nothing known but home; the first step moves x^ to what is measured
+            x = _pose(self._home)
+            start = _State(stamp_ns - int(STEP_S * 1e9), x, self._W_v, np.zeros(6), x, np.zeros(6))
+            self._held = {source: held}
+            state = self._advanced(start, stamp_ns)
+            self._state = replace(state, u=np.zeros(6), smooth=state.x, rate=np.zeros(6))
+        else:
+            self._state = self._advanced(start, max(stamp_ns, start.stamp_ns))
+            self._held[source] = held
+        self._weigh()
+        self.log.counts[source].accepted += 1
+        return True
+
+    def estimate(self, stamp_ns: int) -> Estimate:
+        """The pose at a stamp, not before the newest measurement. Disturbs nothing."""
+        sources = {}
+        for name, since_ns in self.log.heard_ns.items():
+            newest_ns = self._held[name].stamp_ns if name in self._held else since_ns
+            in_use = name in self._held and stamp_ns - newest_ns <= self._hold_ns[name]
+            sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), self._weights.get(name, 0.0) if in_use else 0.0)
+        if self._state is None:
+            return Estimate(self._home, np.zeros(6), self._home_covariance, "lost", sources)
+        state = self._advanced(self._state, stamp_ns)
+        B = _rates(state.smooth)
+        age_s = (stamp_ns - self._newest_ns()) * 1e-9
+        growth = np.repeat(self.settings.acceleration, 3) * max(0.0, age_s) ** 3 / 3.0
+        covariance = B @ self._covariance @ B.T + np.diag(growth)
+        velocity = np.concatenate([state.u[:3], B[3:, 3:] @ state.u[3:]])
+        return Estimate(_transform(state.smooth), velocity, covariance, self.settings.limits.state(age_s, covariance), sources)
+
+    def R_v(self, hidden: float) -> Array:
+        """R_v (6, 6) of a hidden share in [0, 1]: f_v of the paper, with a floor."""
+        return max(hidden, self.settings.floor) * self._W_v
+
+    def _newest_ns(self) -> int:
+        return max(held.stamp_ns for held in self._held.values())
+
+    def _in_use(self, stamp_ns: int) -> dict[str, _Held]:
+        return {name: held for name, held in self._held.items() if stamp_ns - held.stamp_ns <= self._hold_ns[name]}
+
+    def _advanced(self, state: _State, stamp_ns: int) -> _State:
+        """The state at a later stamp, in steps of at most STEP_S; the same state where the stamp is not later."""
+        begin_ns = state.stamp_ns
+        steps = max(0, -(-(stamp_ns - begin_ns) // int(STEP_S * 1e9)))
+        if steps * STEP_S > self.settings.limits.lost_age:  # nobody asked for long: what lies between cannot matter any more
+            return replace(state, stamp_ns=stamp_ns, u=np.zeros(6), smooth=state.x, rate=np.zeros(6))
+        for i in range(1, steps + 1):
+            state = self._step(state, begin_ns + (stamp_ns - begin_ns) * i // steps)
+        return state
+
+    def _step(self, state: _State, stamp_ns: int) -> _State:
+        settings = self.settings
+        h = (stamp_ns - state.stamp_ns) * 1e-9
+        in_use = self._in_use(stamp_ns)
+        x_predicted = state.x + h * state.u  # f(x^, u) = u
+        # C = [I; I] where both are in use, so that C' R^-1 C is the sum of both R^-1
+        information = sum((held.R_inverse for held in in_use.values()), start=np.zeros((6, 6)))
+        # eq. (luenberger_estim): dP/dt = Q - P C' R^-1 C P, and P never beyond that of a sense worse than a fully hidden camera
+        P = np.linalg.inv(state.P + h * self._Q)
+        P = np.linalg.inv(P + h * information + h * np.linalg.inv(1e3 * self._W_v))
+        P = 0.5 * (P + P.T)
+        x = x_predicted
+        for held in in_use.values():
+            y = held.y + (stamp_ns - held.stamp_ns) * 1e-9 * state.u
+            z = _wrapped(y - x_predicted)  # eq. (luenberger_pose): z = y - y^
+            x = x + h * (P @ (held.R_inverse @ z))  # G z with G = K = P C' R^-1
+        share = 1.0 - np.exp(-h / settings.velocity_time)
+        u = state.u + share * ((x - state.x) / h - state.u) if in_use else state.u * (1.0 - share)
+        smooth, rate = self._low_pass(state, x, h)
+        turns = x - _wrapped(x)  # whole turns, taken off the pose and its low-pass alike
+        return _State(stamp_ns, x - turns, P, u, smooth - turns, rate)
+
+    def _low_pass(self, state: _State, x: Array, h: float) -> tuple[Array, Array]:
+        """s'' + 2 zeta omega_n s' + omega_n^2 s = omega_n^2 x over a step h with x held: output (6,) and its rate (6,)."""
+        damping = self.settings.zeta * self.settings.omega_n
+        omega = self.settings.omega_n * np.sqrt(1.0 - self.settings.zeta**2)
+        a = state.smooth - x
+        b = (state.rate + damping * a) / omega
+        c, s = np.exp(-damping * h) * np.array([np.cos(omega * h), np.sin(omega * h)])
+        return x + a * c + b * s, (omega * b - damping * a) * c - (omega * a + damping * b) * s
+
+    def _weigh(self) -> None:
+        """Covariance and weights of the senses in use, by the stationary solution's shares of their R^-1."""
+        in_use = self._in_use(self._newest_ns())
+        nobody = np.linalg.inv(1e3 * self._W_v)
+        gather = np.linalg.inv(sum((held.R_inverse for held in in_use.values()), start=nobody))
+        shares = {name: gather @ held.R_inverse for name, held in in_use.items()}
+        rest = gather @ nobody
+        covariance = rest @ self._home_covariance @ rest.T
+        for name, held in in_use.items():
+            covariance = covariance + shares[name] @ held.covariance @ shares[name].T
+        self._covariance = covariance
+        traces = {name: float(np.trace(share)) for name, share in shares.items()}
+        self._weights = {name: trace / sum(traces.values()) for name, trace in traces.items()}
+
+
+def _pose(T: Array) -> Array:
+    """x (6,) of a transform: position and roll, pitch, yaw about the fixed axes."""
+    R = T[:3, :3]
+    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
+    return np.array([*T[:3, 3], np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
+
+
+def _transform(x: Array) -> Array:
+    return geometry.from_rpy(x[:3], x[3:])
+
+
+def _wrapped(x: Array) -> Array:
+    """x (6,) with its angles within (-pi, pi]."""
+    return np.concatenate([x[:3], np.pi - np.mod(np.pi - x[3:], 2.0 * np.pi)])
+
+
+def _rates(x: Array) -> Array:
+    """B (6, 6): a small change of x as a pose error (translation, rotation vector about fixed axes)."""
+    about_y, about_z = so3.exp(np.array([0.0, x[4], 0.0])), so3.exp(np.array([0.0, 0.0, x[5]]))
+    B = np.eye(6)
+    B[3:, 3] = about_z @ about_y[:, 0]
+    B[3:, 4] = about_z[:, 1]
+    return B

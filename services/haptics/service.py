@@ -1,0 +1,115 @@
+"""Voltages and joint angles in, haptic poses out: one for each window of the skin's own samples, 100 a second."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from services.haptics import network
+from services.haptics.estimator import Estimate, Estimator
+from services.haptics.kinematics import PadPoses
+from services.haptics.window import Collector, Window
+from shared.body import target_mesh
+from shared.geometry import position_orientation
+from shared.messages import HapticPose, Joints, Voltages
+from shared.robot import robot_models
+from shared.service import Node
+from shared.skin import Skin
+from shared.surface import Surface
+from shared.topics import HAPTIC, JOINTS, VOLTAGES
+
+NAME = "haptics"
+WEIGHTS = Path(__file__).parent / "weights"
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    method = "solve: least squares, started by the network; paper: the network alone (default: %(default)s)"
+    parser.add_argument("--method", choices=("solve", "paper"), default="solve", help=method)
+    parser.add_argument("--weights", type=Path, default=WEIGHTS, help="folder of CELL-TARGET.npz (default: the built-in ones)")
+    parser.add_argument("--window-ms", type=float, default=10.0, help="voltages averaged for one pose (default: %(default)s)")
+
+
+def start(node: Node, options: argparse.Namespace) -> None:
+    cell = node.cell
+    skin = Skin(cell)
+    poses = PadPoses(cell, skin, robot_models(cell))
+    collector = Collector(skin, length_ns=int(options.window_ms * 1e6))
+    estimators = {name: _estimator(node, options, skin, name) for name in cell.targets}
+    known: dict[str, str] = {}
+
+    def on_joints(message: Joints, names: dict[str, str]) -> None:
+        poses.add(names["robot"], message.stamp_ns, message.position)
+
+    def on_voltages(message: Voltages, names: dict[str, str]) -> None:
+        window = collector.add(names["pad"], message.stamp_ns, message.period_ns, message.volts.astype(np.float64))
+        if window is not None:
+            on_window(window)
+
+    def on_window(window: Window) -> None:
+        found = poses.at(window.stamp_ns)
+        faults = dict(window.faults)
+        if found is None:
+            faults["joints"] = "no joint angles near the time of the voltages: is the robot's source running?"
+        _tell(node, known, faults)
+        for target, estimator in estimators.items():
+            if not node.owns(f"haptic/{target}"):
+                continue
+            if found is None:
+                estimate = estimator.nothing()
+            else:
+                estimate = estimator.update(window.stamp_ns, window.amplitude, window.samples, window.alive, *found)
+            node.publish(HAPTIC, _message(estimate, window, target, cell.frame), target=target)
+
+    node.subscribe(JOINTS, on_joints)
+    node.subscribe(VOLTAGES, on_voltages)
+
+
+def _estimator(node: Node, options: argparse.Namespace, skin: Skin, target: str) -> Estimator:
+    """Ready to run: weights loaded where they fit the cell, code compiled."""
+    cell = node.cell
+    path = options.weights / f"{cell.name}-{target}.npz"
+    weights = None
+    try:
+        weights = network.load(path, cell, target)
+    except (FileNotFoundError, ValueError) as error:
+        node.log.warning("no network: the solve starts from the target's home instead", target=target, why=str(error))
+    mesh = target_mesh(cell.targets[target], cell)
+    spread = cell.targets[target].home_spread
+    estimator = Estimator(
+        skin,
+        Surface(mesh.vertices, mesh.faces),
+        cell.targets[target].home.transform,
+        np.repeat([spread.position, spread.rotation], 3),
+        weights,
+        options.method,
+    )
+    estimator.warm_up(sum(len(robot.joints) for robot in cell.robots.values()))
+    return estimator
+
+
+def _tell(node: Node, known: dict[str, str], faults: dict[str, str]) -> None:
+    """Log what is left out when that changes."""
+    for name, reason in faults.items():
+        if known.get(name) != reason:
+            node.log.warning("left out", what=name, why=reason)
+    for name in known.keys() - faults.keys():
+        node.log.info("back in use", what=name)
+    known.clear()
+    known.update(faults)
+
+
+def _message(estimate: Estimate, window: Window, target: str, frame: str) -> HapticPose:
+    position, orientation = position_orientation(estimate.T)
+    return HapticPose(
+        stamp_ns=window.stamp_ns,
+        target=target,
+        frame=frame,
+        sample_stamp_ns=window.newest_ns,
+        position=position,
+        orientation=orientation,
+        information=estimate.information,
+        gap=estimate.gap,
+        state="in_range" if estimate.in_range else "out_of_range",
+    )

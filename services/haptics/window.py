@@ -1,0 +1,116 @@
+"""Voltage batches of all pads to one mean per electrode and time window.
+
+Windows do not overlap, so that the noise of one estimate is independent of the next one's, as the observer assumes.
+The clock is the samples' own stamps: a replay gives the same windows at any speed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.skin import Skin
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Window:
+    """stamp_ns: the middle of the samples; newest_ns: the last one; amplitude (n,) [V]: means; samples (n,): how many are
+    in each; alive (p,): pads that may be believed; faults: reason by pad for the others."""
+
+    stamp_ns: int
+    newest_ns: int
+    amplitude: Array
+    samples: NDArray[np.int64]
+    alive: NDArray[np.bool_]
+    faults: dict[str, str]
+
+
+class Collector:
+    """Gathers batches and hands out a window when every living pad has filled it.
+
+    length_ns: window length (one estimate each); patience_ns: a pad this far behind the newest one is called silent and is
+    no longer waited for.
+    """
+
+    def __init__(self, skin: Skin, length_ns: int = 10_000_000, patience_ns: int = 30_000_000):
+        self.skin, self.length_ns, self.patience_ns = skin, length_ns, patience_ns
+        self._index = {name: k for k, name in enumerate(skin.pads)}
+        self._stamps: list[NDArray[np.int64]] = [np.empty(0, np.int64) for _ in skin.pads]
+        self._volts: list[Array] = [np.empty((0, skin.of(k).stop - skin.of(k).start)) for k in range(len(skin.pads))]
+        self._newest = np.full(len(skin.pads), -1, dtype=np.int64)
+        self._done_ns = -1
+
+    def add(self, pad: str, stamp_ns: int, period_ns: int, volts: Array) -> Window | None:
+        """Take a batch (samples, electrodes) whose last row has stamp_ns; returns a window when one is complete.
+
+        Raises ValueError for an unknown pad, another number of electrodes than the cell has, or a period that is not positive.
+        """
+        if pad not in self._index:
+            raise ValueError(f"a pad of {', '.join(self._index)} expected, {pad!r} came: compare the cell files")
+        k = self._index[pad]
+        if volts.ndim != 2 or volts.shape[1] != self._volts[k].shape[1]:
+            raise ValueError(f"pad {pad}: rows of {self._volts[k].shape[1]} electrodes expected, shape {volts.shape} came")
+        if period_ns <= 0:
+            raise ValueError(f"pad {pad}: a positive period_ns expected, {period_ns} came")
+        if stamp_ns <= self._newest[k]:
+            if self._newest[k] - stamp_ns < self.patience_ns:
+                return None  # a repeated or overtaken batch
+            self._forget()  # time jumped back: the source started again
+        stamps = stamp_ns - period_ns * np.arange(len(volts) - 1, -1, -1, dtype=np.int64)
+        fresh = stamps > max(self._newest[k], stamp_ns - 4 * self.length_ns)
+        self._stamps[k] = np.concatenate([self._stamps[k], stamps[fresh]])
+        self._volts[k] = np.concatenate([self._volts[k], volts[fresh]])
+        self._newest[k] = stamp_ns
+        return self._window()
+
+    def _window(self) -> Window | None:
+        heard = self._newest >= self._newest.max() - self.patience_ns
+        end_ns = int(self._newest[heard].min())
+        if self._done_ns < 0:  # the first window begins where the slowest living pad begins
+            self._done_ns = max(int(s[0]) for s, ok in zip(self._stamps, heard, strict=True) if ok) - 1
+        if end_ns - self._done_ns < self.length_ns:
+            return None
+        # After a cut only the newest stretch is used: an old one would say little about now.
+        begin_ns = max(self._done_ns, end_ns - self.length_ns)
+        skin = self.skin
+        amplitude, samples = skin.a3.copy(), np.zeros(len(skin), np.int64)
+        alive, faults, middles = np.zeros(len(skin.pads), bool), {}, []
+        for k, name in enumerate(skin.pads):
+            inside = (self._stamps[k] > begin_ns) & (self._stamps[k] <= end_ns)
+            rows, stamps = self._volts[k][inside], self._stamps[k][inside]
+            keep = self._stamps[k] > end_ns
+            self._volts[k], self._stamps[k] = self._volts[k][keep], self._stamps[k][keep]
+            fault = "silent" if not len(rows) else self._fault(k, rows)
+            if fault:
+                faults[name] = fault
+                continue
+            alive[k] = True
+            amplitude[skin.of(k)], samples[skin.of(k)] = rows.mean(axis=0), len(rows)
+            middles.append(float((stamps - begin_ns).mean()))
+        self._done_ns = end_ns
+        middle = int(np.mean(middles)) if middles else self.length_ns // 2
+        return Window(begin_ns + middle, end_ns, amplitude, samples, alive, faults)
+
+    def _fault(self, k: int, rows: Array) -> str | None:
+        """Why a pad's rows cannot be what its law and its ADC give, or None."""
+        skin, own = self.skin, self.skin.of(k)
+        low, high = rows.min(axis=0), rows.max(axis=0)
+        margin = 6.0 * np.sqrt(skin.noise[own]) + 0.05 * skin.peak[own]  # noise, and what a calibration may be off
+        if (high >= skin.reference[own] - 0.5 * skin.lsb[own]).any() or (low <= 0.5 * skin.lsb[own]).any():
+            return "saturated: an electrode reads the end of its ADC"
+        signal = (rows.mean(axis=0) - skin.a3[own]) * skin.polarity[own]
+        if (signal < -margin).any() or (signal > skin.peak[own] + margin).any():
+            return "out of range: an electrode reads what its response law cannot give"
+        if len(rows) > 1 and (high == low).all() and (skin.noise[own] > 4.0 * skin.lsb[own] ** 2).all():
+            return "stuck: no noise on any electrode"
+        return None
+
+    def _forget(self) -> None:
+        for k in range(len(self.skin.pads)):
+            self._stamps[k], self._volts[k] = self._stamps[k][:0], self._volts[k][:0]
+        self._newest[:] = -1
+        self._done_ns = -1

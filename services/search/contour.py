@@ -1,0 +1,365 @@
+"""The default search: least squares between the mesh's occluding contour and the boundary of the mask.
+
+One pass, from a pose T_camera_target:
+  1. project the mesh; its occluding contour are the edges between a face seen from the front and one seen from behind (`trace`);
+  2. keep the points on the outside of the silhouette and outside everything that covers the target;
+  3. from each, walk along the contour's normal to the mask's boundary: the offset r [px] (`match`);
+  4. solve the weighted normal equations for the pose error and for the mask's dilation b, r = J e + b + noise (`fit`).
+The passes are iteratively reweighted Gauss-Newton with Huber's weights, from coarse to fine, as in SRT3D (Stoiber et al. 2022,
+doi:10.1007/s11263-022-01579-8). What is hidden is dropped and not scored.
+
+The covariance is that of the measurement alone. Neighbouring points of a mask's boundary err together, so the contour counts as
+one independent point per correlation length; the dilation b is a nuisance with a prior of its own and is marginalised, because
+half a pixel around the limb looks like centimetres of depth.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from services.search.evidence import JOINT, Evidence, Intrinsics
+from shared import geometry, raster
+from shared.body import Mesh
+
+Array = NDArray[np.float64]
+
+SPACING_PX = 3.0
+"""Distance of the sampled contour points: closer ones bring no new information."""
+NEAR = 0.05
+"""Edges nearer to the camera than this are left out [m]."""
+CREASE = 0.8
+"""Facets that meet at a larger angle [rad] are a crease of the body and not a sample of a round surface."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How a mask's boundary errs, in pixels of the mask.
+
+    `edge`: standard deviation along the normal; `correlation`: length along the contour over which errors are one error;
+    `dilation`: standard deviation of the whole mask's being too large or small; `joint`: deviation [m] of the border with
+    the limb's next part, which is one error along its whole length. Defaults: a trained network's masks.
+    """
+
+    edge: float = 0.5
+    correlation: float = 14.0
+    dilation: float = 0.3
+    joint: float = 0.015
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Standard deviations of position [m] and rotation [rad] of a direction that the contour does not show: the weak prior
+    that keeps the solve regular, and the largest deviations published."""
+
+    position: float = 0.5
+    rotation: float = 0.5
+
+    @property
+    def covariance(self) -> Array:
+        return np.diag([self.position**2] * 3 + [self.rotation**2] * 3)
+
+    @property
+    def information(self) -> Array:
+        return np.diag([self.position**-2.0] * 3 + [self.rotation**-2.0] * 3)
+
+
+PASSES = ((24.0, 5.0, 4), (8.0, 2.0, 6))
+"""(reach of the walk [px], Huber's threshold [px], passes at most), from coarse to fine."""
+CONVERGED = 5e-4
+"""A pass that moves less than this [m], and four times it [rad], is the last of its reach."""
+MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
+"""Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
+    `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
+    `cost`: chi^2 of contour, dilation and prior together."""
+
+    T: Array
+    covariance: Array
+    T_searched: Array
+    length: float
+    rms: float
+    dilation: float
+    cost: float
+
+
+class Model:
+    """A closed triangle mesh prepared for contours. The edge list holds, per edge, its two vertices, its two faces (-1: none)."""
+
+    def __init__(self, mesh: Mesh):
+        self.vertices = np.ascontiguousarray(mesh.vertices, np.float64)
+        self.faces = np.ascontiguousarray(mesh.faces, np.int32)
+        self.edges = _edges(self.faces)
+
+    def in_camera(self, T: Array) -> Array:
+        """The vertices (n, 3) [m] in the camera's frame."""
+        return geometry.apply(T, self.vertices)
+
+    def silhouette(self, T: Array, k: Intrinsics, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+        """The silhouette (h, w) in a window (x0, y0, w, h) of the image with intrinsics k."""
+        return raster.silhouette(self.in_camera(T), self.faces, (k.fx, k.fy, k.cx, k.cy), window)
+
+
+def _edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    found: dict[tuple[int, int], list[int]] = {}
+    for f, (a, b, c) in enumerate(faces.tolist()):
+        for i, j in ((a, b), (b, c), (c, a)):
+            found.setdefault((min(i, j), max(i, j)), []).append(f)
+    return np.array([(i, j, fs[0], fs[1] if len(fs) > 1 else -1) for (i, j), fs in found.items()], np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _lean(V, edge, N, X, Y, Z):
+    """How far behind (X, Y, Z) of a silhouette edge, along the line of sight, the surface that the mesh stands for is seen edge-on [m].
+
+    A facet's edge turns with the body, the contour of a round limb does not: without this, eighteen flat sides pretend that
+    the whole forearm shows its roll. Between two facets the normal turns evenly; a crease of the body itself stays where it is.
+    """
+    i, j, f, g = edge[0], edge[1], edge[2], edge[3]
+    turn = math.acos(min(1.0, max(-1.0, N[f, 0] * N[g, 0] + N[f, 1] * N[g, 1] + N[f, 2] * N[g, 2])))
+    if turn < 1e-6 or turn > CREASE:
+        return 0.0
+    nx, ny, nz = N[f, 0] + N[g, 0], N[f, 1] + N[g, 1], N[f, 2] + N[g, 2]
+    away = (nx * X + ny * Y + nz * Z) / math.sqrt((nx * nx + ny * ny + nz * nz) * (X * X + Y * Y + Z * Z))
+    ex, ey, ez = V[j, 0] - V[i, 0], V[j, 1] - V[i, 1], V[j, 2] - V[i, 2]
+    width = (N[f, 3] + N[g, 3]) / (2.0 * math.sqrt(ex * ex + ey * ey + ez * ez))  # mean height of the two facets above the edge
+    return -math.asin(away) / turn * width
+
+
+@njit(cache=True, nogil=True)
+def trace(V, faces, edges, fx, fy, cx, cy, silhouette, spacing):
+    """Points of the outer occluding contour: (n, 8) rows of X, Y, Z in the camera's frame [m], u, v, outward normal (2) and
+    the length of contour [px] that the point stands for. V (n, 3) [m]; silhouette (h, w) of the same pose."""
+    h, w = silhouette.shape
+    n_faces, n_vertices = len(faces), len(V)
+    N = np.empty((n_faces, 4))  # unit normal and twice the area
+    front = np.empty(n_faces, np.bool_)
+    for f in range(n_faces):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = V[b, 0] - V[a, 0], V[b, 1] - V[a, 1], V[b, 2] - V[a, 2]
+        vx, vy, vz = V[c, 0] - V[a, 0], V[c, 1] - V[a, 1], V[c, 2] - V[a, 2]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        size = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-30
+        N[f, 0], N[f, 1], N[f, 2], N[f, 3] = nx / size, ny / size, nz / size, size
+        front[f] = nx * V[a, 0] + ny * V[a, 1] + nz * V[a, 2] < 0.0
+    P = np.empty((n_vertices, 2))
+    for i in range(n_vertices):
+        z = max(V[i, 2], 1e-9)
+        P[i, 0] = fx * V[i, 0] / z + cx
+        P[i, 1] = fy * V[i, 1] / z + cy
+    out = np.empty((4096, 8))
+    n = 0
+    for e in range(len(edges)):
+        i, j, f, g = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
+        if (g >= 0 and front[f] == front[g]) or V[i, 2] < NEAR or V[j, 2] < NEAR:
+            continue
+        seen = f if (g < 0 or front[f]) else g
+        dx, dy = P[j, 0] - P[i, 0], P[j, 1] - P[i, 1]
+        length = math.sqrt(dx * dx + dy * dy)
+        if length < 1e-6:
+            continue
+        nx, ny = dy / length, -dx / length
+        k = faces[seen, 0] + faces[seen, 1] + faces[seen, 2] - i - j  # the face's third vertex lies inside
+        if nx * (P[k, 0] - P[i, 0]) + ny * (P[k, 1] - P[i, 1]) > 0.0:
+            nx, ny = -nx, -ny
+        count = max(1, int(length / spacing + 0.5))
+        for m in range(count):
+            s = (m + 0.5) / count
+            u, v = P[i, 0] + s * dx, P[i, 1] + s * dy
+            uo, vo = int(math.floor(u + 1.5 * nx + 0.5)), int(math.floor(v + 1.5 * ny + 0.5))
+            ui, vi = int(math.floor(u - 1.5 * nx + 0.5)), int(math.floor(v - 1.5 * ny + 0.5))
+            if not (0 <= uo < w and 0 <= vo < h and 0 <= ui < w and 0 <= vi < h) or silhouette[vo, uo] or not silhouette[vi, ui]:
+                continue
+            if n == len(out):
+                return out
+            # the point of the edge in space that projects to (u, v): linear in the inverse depth
+            z = 1.0 / ((1.0 - s) / V[i, 2] + s / V[j, 2])
+            x, y = (u - cx) / fx * z, (v - cy) / fy * z
+            if g >= 0:
+                scale = 1.0 + _lean(V, edges[e], N, x, y, z) / math.sqrt(x * x + y * y + z * z)
+                x, y, z = x * scale, y * scale, z * scale
+            out[n, 0], out[n, 1], out[n, 2] = x, y, z
+            out[n, 3], out[n, 4], out[n, 5], out[n, 6], out[n, 7] = u, v, nx, ny, length / count
+            n += 1
+    return out[:n]
+
+
+@njit(cache=True, nogil=True)
+def _bilinear(image, u, v):
+    h, w = image.shape
+    x, y = int(math.floor(u)), int(math.floor(v))
+    if x < 0 or y < 0 or x >= w - 1 or y >= h - 1:
+        return -1.0
+    a, b = u - x, v - y
+    top = image[y, x] * (1.0 - a) + image[y, x + 1] * a
+    bottom = image[y + 1, x] * (1.0 - a) + image[y + 1, x + 1] * a
+    return top * (1.0 - b) + bottom * b
+
+
+@njit(cache=True, nogil=True)
+def _nearest(image, u, v):
+    """The pixel's value; 255 outside."""
+    x, y = int(math.floor(u + 0.5)), int(math.floor(v + 0.5))
+    if x < 0 or y < 0 or x >= image.shape[1] or y >= image.shape[0]:
+        return 255
+    return image[y, x]
+
+
+DROPPED, MEASURED, BOUNDED, AT_JOINT = 0, 1, 2, 3
+"""What became of a contour point. BOUNDED: on the way to the boundary something covers the view, which only says that the contour
+has to move at least that far."""
+
+
+@njit(cache=True, nogil=True)
+def match(points, field, state, guarded, reach):
+    """Offsets r (n,) [px] along the outward normal from each contour point to the mask's boundary, and their kinds (n,)."""
+    n = len(points)
+    r = np.zeros(n)
+    kind = np.zeros(n, np.uint8)
+    for i in range(n):
+        u, v, nx, ny = points[i, 3], points[i, 4], points[i, 5], points[i, 6]
+        before = _bilinear(field, u, v)
+        if before < 0.0 or _nearest(guarded, u, v) != 0:
+            continue
+        way = 1.0 if before >= 0.5 else -1.0  # inside the mask: the boundary lies outwards
+        r[i] = way * reach  # where no boundary is in reach: at least so far
+        kind[i] = BOUNDED
+        for step in range(1, int(reach) + 1):
+            t = way * step
+            pu, pv = u + t * nx, v + t * ny
+            value = _bilinear(field, pu, pv)
+            if value < 0.0 or _nearest(guarded, pu, pv) != 0:
+                r[i] = t
+                if step <= 2:
+                    kind[i] = DROPPED
+                break
+            if (value < 0.5) == (way > 0.0):
+                r[i] = t - way * (value - 0.5) / (value - before)
+                kind[i] = MEASURED
+                if _nearest(state, u + (r[i] + 2.0) * nx, v + (r[i] + 2.0) * ny) == JOINT:
+                    kind[i] = AT_JOINT
+                break
+            before = value
+    return r, kind
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(points, r, kind, origin, fx, fy, edge, correlation, joint, huber, bounded):
+    """Of the pose error along the camera's axes and the dilation: the 7 x 7 information, its right side (7,), the length of
+    contour measured [px], the sum of length times Huber-limited squared offset [px^3], and Huber's cost (chi^2 where all is
+    within `huber`). `origin` (3,): the target's [m]; `bounded`: whether BOUNDED points inform, and not only cost."""
+    H = np.zeros((7, 7))
+    g = np.zeros(7)
+    J = np.empty(7)
+    length, square, cost = 0.0, 0.0, 0.0
+    joint_length = 0.0
+    for i in range(len(points)):
+        if kind[i] == AT_JOINT:
+            joint_length += points[i, 7]
+    for i in range(len(points)):
+        if kind[i] == DROPPED:
+            continue
+        X, Y, Z, nx, ny = points[i, 0], points[i, 1], points[i, 2], points[i, 5], points[i, 6]
+        # motion of the contour along its normal by a motion of its point: n' d(projection)/dX
+        J[0] = nx * fx / Z
+        J[1] = ny * fy / Z
+        J[2] = -(nx * fx * X + ny * fy * Y) / (Z * Z)
+        x, y, z = X - origin[0], Y - origin[1], Z - origin[2]
+        J[3] = J[2] * y - J[1] * z  # rotation vector w moves the point by w x (X - origin)
+        J[4] = J[0] * z - J[2] * x
+        J[5] = J[1] * x - J[0] * y
+        J[6] = 1.0
+        limit, share, sigma = huber, points[i, 7] / correlation, edge
+        if kind[i] == AT_JOINT:
+            sigma = max(edge, joint * fx / Z)
+            limit = max(huber, sigma)
+            share = points[i, 7] / max(joint_length, correlation)
+        elif kind[i] == MEASURED:
+            length += points[i, 7]
+            square += points[i, 7] * min(r[i] * r[i], huber * huber)
+        weight = share / (sigma * sigma)
+        if abs(r[i]) <= limit:
+            cost += weight * r[i] * r[i]
+        else:
+            cost += weight * limit * (2.0 * abs(r[i]) - limit)
+            weight *= limit / abs(r[i])
+        if kind[i] == BOUNDED and not bounded:
+            continue
+        for a in range(7):
+            g[a] += weight * J[a] * r[i]
+            for b in range(7):
+                H[a, b] += weight * J[a] * J[b]
+    return H, g, length, square, cost
+
+
+def fit(
+    model: Model,
+    T_start: Array,
+    evidence: Evidence,
+    T_prior: Array | None = None,
+    prior: Array | None = None,
+    noise: Noise | None = None,
+    limits: Limits | None = None,
+) -> Fit:
+    """The pose T_camera_target whose contour lies on the mask's boundary, searched from T_start (4 x 4).
+
+    `prior` (6, 6) is the information about T_prior (T_start where None) along the camera's axes. It keeps the solve near where
+    the contour says little, and is taken out of the result again: `Fit.T` and `Fit.covariance` are the measurement's alone.
+    """
+    noise, limits = noise or Noise(), limits or Limits()
+    weak = limits.information
+    k = evidence.intrinsics
+    intrinsics = (k.fx, k.fy, k.cx, k.cy)
+    h, w = evidence.state.shape
+    regular = np.zeros((7, 7))
+    regular[:6, :6] = weak if prior is None else prior + weak
+    regular[6, 6] = noise.dilation**-2
+    T, moved = T_start, np.zeros(7)  # pose error from the prior, and the dilation
+    if T_prior is not None:
+        moved[:6] = geometry.pose_error(T_start, T_prior)
+
+    def linearise(reach: float, huber: float, bounded: bool) -> tuple[Array, Array, float, float, float]:
+        V = model.in_camera(T)
+        silhouette = raster.silhouette(V, model.faces, intrinsics, (0, 0, w, h))
+        points = trace(V, model.faces, model.edges, *intrinsics, silhouette, SPACING_PX)
+        r, kind = match(points, evidence.field, evidence.state, evidence.guarded, reach)
+        weights = (noise.edge, noise.correlation, noise.joint, huber, bounded)
+        return normal_equations(points, r - moved[6], kind, T[:3, 3], k.fx, k.fy, *weights)
+
+    for reach, huber, passes in PASSES:
+        for _ in range(passes):
+            H, g, *_ = linearise(reach, huber, True)
+            step = np.linalg.solve(H + regular, g - regular @ moved)
+            step *= min(1.0, float(np.min(MAX_STEP / np.maximum(np.abs(step[:6]), 1e-12))))
+            T = geometry.perturb(T, step[:6])
+            moved += step
+            if np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED:
+                break
+
+    H, g, length, square, cost = linearise(reach, huber, False)  # the pose is final: only what was measured informs
+    rms = math.sqrt(square / length) if length > 0 else math.inf
+    if length > 0 and rms > noise.edge:  # a mask worse than expected: believe its residuals
+        H *= (noise.edge / rms) ** 2
+        g *= (noise.edge / rms) ** 2
+    # the dilation is marginalised (Schur complement), and the prior left out
+    g[6] -= regular[6, 6] * moved[6]
+    gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
+    covariance = np.linalg.inv(H[:6, :6] - np.outer(gain, H[6, :6]) + weak)
+    offset = covariance @ (g[:6] - gain * g[6] - weak @ moved[:6])
+    return Fit(
+        geometry.perturb(T, offset),
+        (covariance + covariance.T) / 2.0,
+        T,
+        length,
+        rms,
+        float(moved[6]),
+        cost + float(np.dot(moved, regular @ moved)),
+    )

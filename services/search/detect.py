@@ -1,0 +1,94 @@
+"""Finds the target in a mask without a prediction: hypotheses from the mask's moments and the mesh's proportions."""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from services.search.contour import Model
+from services.search.evidence import TARGET, Evidence
+
+Array = NDArray[np.float64]
+
+SMALLEST_PX = 150
+"""A region of fewer pixels has no shape to start from."""
+TILTS = (-0.6, -0.3, 0.0, 0.3, 0.6)
+"""Samples of the axis's angle out of the image plane [rad]."""
+ROLLS = (-0.5, 0.0, 0.5, np.pi)
+"""Samples of the roll about the axis, from that at home [rad]: around it, and the limb turned over."""
+SLIDES = (-0.3, -0.15, 0.0, 0.15, 0.3)
+"""Samples of where the visible part's middle is on the limb, in lengths of the limb: one end may be hidden."""
+
+
+def hypotheses(model: Model, evidence: Evidence, T_home: Array) -> list[Array]:
+    """Poses T_camera_target (4 x 4 each) that could have made the mask's largest region; empty where it is too small.
+
+    The region's second moments give the axis in the image, its hand which end is which, its width the depth; rolls are counted
+    from that of `T_home` (T_camera_target where the target is expected).
+    """
+    count, regions, stats, centroids = cv2.connectedComponentsWithStats((evidence.state == TARGET).astype(np.uint8))
+    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])) if count > 1 else 0
+    if largest == 0 or stats[largest, cv2.CC_STAT_AREA] < SMALLEST_PX:
+        return []
+    k = evidence.intrinsics
+    rows, columns = np.nonzero(regions == largest)
+    spread, axes = np.linalg.eigh(np.cov(np.stack([columns, rows])))
+    # a uniform strip of width b has variance b^2 / 12 across; the mesh's own width is measured in the same way
+    depth = float(k.fx * np.std(model.vertices[:, 1]) / np.sqrt(max(spread[0], 0.01)))
+    z_home = float(T_home[2, 3])
+    depths = (z_home, float(np.clip(depth, z_home / 3.0, z_home * 3.0)))
+    u, v = centroids[largest]
+    ray = np.array([(u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0])
+    middle = model.vertices.mean(axis=0)
+    slides = np.array(SLIDES) * np.ptp(model.vertices[:, 0])
+
+    found = []
+    for toward_hand, tilt, roll in itertools.product(_directions(evidence, rows, columns, axes[:, 1]), TILTS, ROLLS):
+        x = np.array([*(np.cos(tilt) * toward_hand), np.sin(tilt)])
+        R = Rotation.from_rotvec(roll * x).as_matrix() @ _shortest_rotation(T_home[:3, 0], x) @ T_home[:3, :3]
+        for z, slide in itertools.product(depths, slides):
+            T = np.eye(4)
+            T[:3, :3] = R
+            T[:3, 3] = ray * z - R @ middle + x * slide
+            found.append(T)
+    return found
+
+
+def mirrored(T: Array) -> list[Array]:
+    """Poses (4 x 4 each) with nearly the silhouette of T_camera_target: the axis tilted the other way out of the image plane,
+    or a roll beside it. A fit that stopped at one of them is started again from the others."""
+    sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
+    x = T[:3, 0]
+    reflected = x - 2.0 * (x @ sight) * sight
+    starts = []
+    for R, roll in ((_shortest_rotation(x, reflected), 0.0), (np.eye(3), 0.6), (np.eye(3), -0.6)):
+        start = T.copy()
+        start[:3, :3] = Rotation.from_rotvec(roll * x).as_matrix() @ R @ T[:3, :3]
+        starts.append(start)
+    return starts
+
+
+def _directions(evidence: Evidence, rows: NDArray[np.intp], columns: NDArray[np.intp], axis: Array) -> list[Array]:
+    """The axis (2,) in the image, pointing to the hand; both ways where the hand is not told apart."""
+    is_hand = evidence.hand[rows, columns] != 0
+    if not 0.02 < is_hand.mean() < 0.98:
+        return [axis, -axis]
+    pixels = np.column_stack([columns, rows])
+    lead = (pixels[is_hand].mean(axis=0) - pixels[~is_hand].mean(axis=0)) @ axis
+    return [axis if lead > 0 else -axis]
+
+
+def _shortest_rotation(a: Array, b: Array) -> Array:
+    """The rotation matrix of the shortest arc from unit vector a (3,) to b (3,); about any perpendicular where they oppose."""
+    axis = np.cross(a, b)
+    if np.linalg.norm(axis) < 1e-9:
+        if a @ b > 0.0:
+            return np.eye(3)
+        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        return Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis)).as_matrix()
+    angle = np.arctan2(np.linalg.norm(axis), a @ b)
+    return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()

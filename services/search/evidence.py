@@ -1,0 +1,113 @@
+"""What each pixel of a mask tells about the target: seen, not there, hidden by something, or another part of the same limb."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.cell import Camera
+from shared.classes import Label
+
+FREE, TARGET, COVERED, JOINT = 0, 1, 2, 3
+"""State of a pixel. COVERED: something stands in front, or nothing is known there. JOINT: a neighbouring part of the limb, whose
+border with the target is anatomy and less sharp than a silhouette."""
+
+SMOOTHING_PX = 1.0
+"""Standard deviation of the blur that makes the boundary of a hard mask sub-pixel: about the stairs' own period."""
+GUARD_PX = 2
+"""Within this distance of a covered pixel a boundary may be the occluder's and not the target's."""
+DEPTH_MARGIN = 0.05
+"""What lies further than this behind the target's furthest point [m] is behind it for certain: half a limb's thickness."""
+
+_LIMB = (Label.UPPER_ARM, Label.FOREARM, Label.HAND)
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole in pixels of a mask, whose first pixel's centre is (0, 0)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @staticmethod
+    def of_window(camera: Camera, x0: int, y0: int, scale: int) -> Intrinsics:
+        """The intrinsics of a window of a camera's image whose pixels cover `scale` x `scale` image pixels."""
+        centre = (scale - 1) / 2.0
+        return Intrinsics(
+            camera.fx / scale, camera.fy / scale, (camera.cx - x0 - centre) / scale, (camera.cy - y0 - centre) / scale
+        )
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """`state` (h, w) uint8; `field` (h, w) float32, the smoothed share of the target in what is known, 0.5 on its boundary;
+    `guarded` (h, w) uint8, 1 where COVERED is near; `hand` (h, w) uint8, 1 on the part of the target that lies towards +x."""
+
+    state: NDArray[np.uint8]
+    field: NDArray[np.float32]
+    guarded: NDArray[np.uint8]
+    hand: NDArray[np.uint8]
+    intrinsics: Intrinsics
+
+    @property
+    def seen_px(self) -> int:
+        """Number of pixels that show the target."""
+        return int(np.count_nonzero(self.state == TARGET))
+
+
+def classify(
+    labels: NDArray[np.uint8],
+    target_labels: Collection[int],
+    robot_depth: NDArray[np.float32] | None = None,
+    reach: tuple[float, float] = (0.0, 0.0),
+) -> NDArray[np.uint8]:
+    """The state (h, w) of every pixel of a mask of class indices (h, w).
+
+    `robot_depth` (h, w) [m], infinite where the robot is not, decides over the mask where given: `reach` being the target's
+    smallest and largest depth [m], the robot covers what it stands in front of, and is background where it stands behind.
+    """
+    table = np.full(256, COVERED, np.uint8)
+    table[[Label.BACKGROUND, Label.TORSO]] = FREE
+    table[list(_LIMB)] = JOINT
+    table[list(target_labels)] = TARGET
+    state = table[labels]
+    if robot_depth is not None:
+        behind = (robot_depth > reach[1] + DEPTH_MARGIN) & np.isfinite(robot_depth)
+        before = robot_depth < reach[0]
+        between = np.isfinite(robot_depth) & ~behind & (state != TARGET)
+        state[behind & (labels == Label.ROBOT)] = FREE
+        state[before | between] = COVERED
+    return state
+
+
+def cover_outside(state: NDArray[np.uint8], x0: int, y0: int, scale: int, camera: Camera) -> None:
+    """Marks in place what a window (first pixel x0, y0) shows beyond the image's border: nothing is known there."""
+    h, w = state.shape
+    left, top = max(0, -(x0 // scale)), max(0, -(y0 // scale))
+    right, bottom = (camera.width - x0) // scale, (camera.height - y0) // scale
+    state[:top], state[:, :left] = COVERED, COVERED
+    state[max(bottom, 0) : h], state[:, max(right, 0) : w] = COVERED, COVERED
+
+
+def gather(state: NDArray[np.uint8], labels: NDArray[np.uint8], intrinsics: Intrinsics) -> Evidence:
+    """The evidence of a mask from its states and labels (h, w)."""
+    target = (state == TARGET).astype(np.float32)
+    covered = (state == COVERED).astype(np.uint8)
+    field = _blur(target)
+    if covered.any():
+        known = _blur((1 - covered).astype(np.float32))
+        field = np.divide(field, known, out=np.zeros_like(field), where=known > 1e-3)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GUARD_PX + 1, 2 * GUARD_PX + 1))
+    guarded = cv2.dilate(covered, disc, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    hand = ((labels == Label.HAND) & (state == TARGET)).astype(np.uint8)
+    return Evidence(state, field, guarded.astype(np.uint8, copy=False), hand, intrinsics)
+
+
+def _blur(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    return cv2.GaussianBlur(image, (0, 0), SMOOTHING_PX, borderType=cv2.BORDER_REPLICATE).astype(np.float32, copy=False)

@@ -1,0 +1,256 @@
+"""The search of one target in the masks of one camera: evidence, fit, judgement, and the way back after a loss."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from services.search import contour, detect, evidence, overlap
+from services.search.contour import Fit, Limits, Noise
+from services.search.evidence import FREE, TARGET, Evidence, Intrinsics
+from services.search.robots import RobotDepth
+from shared import body, geometry
+from shared.cell import Cell
+from shared.messages import Mask
+
+Array = NDArray[np.float64]
+State = Literal["tracking", "occluded", "lost"]
+
+METHODS = ("default", "paper")
+HIDDEN = 0.95
+"""A larger hidden share leaves too little to measure a pose."""
+SHORTEST_PX = 30.0
+"""Least contour measured [px] for a pose: about four independent points."""
+FITS, FITS_WELL = 0.65, 0.85
+"""Overlap below which the target is not where the fit says, and from which no other explanation is tried."""
+GATE = 27.9
+"""Squared Mahalanobis distance, six degrees of freedom, that one in 10^4 right poses exceeds."""
+PRIOR_INFLATION = 2.0
+PRIOR_FLOOR = (0.02, 0.09)
+"""The prediction's standard deviations are doubled, and these [m, rad] added, before the solve leans on it: it shall only keep
+the fit from wandering off."""
+DETECT_FITS = 8
+"""Hypotheses that are fitted, of those that overlap best."""
+HOME_WEIGHT = 0.005
+"""Overlap that one standard deviation from home costs a detection: decides between mirror images, which overlap equally."""
+PAPER_SIGMA = (0.02, 0.09)
+"""The paper gives its search no covariance, but an average error of less than 2 cm [m]; the rotation [rad] is ours."""
+
+
+@dataclass(frozen=True)
+class VisionEstimate:
+    """T_world_target, covariance (6, 6) along the world's axes, overlap and hidden share in [0, 1], state. The pose is the
+    measurement's alone; `T_searched` is the most probable one together with the prediction."""
+
+    T: Array
+    covariance: Array
+    overlap: float
+    hidden: float
+    state: State
+    T_searched: Array
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A fit and its pixel counts from `compare`."""
+
+    fit: Fit
+    both: int
+    either: int
+    free: int
+
+    @property
+    def overlap(self) -> float:
+        return _overlap(self.both, self.either, self.free)
+
+
+def _overlap(both: int, either: int, free: int) -> float:
+    return both / either if either else 0.0
+
+
+class Search:
+    """One target seen by one camera. Raises CellError for a name that the cell does not have."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        camera: str | None = None,
+        target: str | None = None,
+        method: str = "default",
+        noise: Noise | None = None,
+    ):
+        if method not in METHODS:
+            raise ValueError(f"method: one of {', '.join(METHODS)} expected, got {method!r}")
+        self.method = method
+        self._camera = cell.cameras[cell.one("cameras", camera)]
+        self._target = cell.targets[cell.one("targets", target)]
+        self._model = contour.Model(body.target_mesh(self._target, cell))
+        self._noise, self._limits = noise or Noise(), Limits()
+        self._T_camera_world = geometry.inverse(self._camera.T_world_camera)
+        self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])  # covariances: camera axes to world axes
+        self._robots = RobotDepth(cell, self._T_camera_world)
+
+    def update(
+        self,
+        mask: Mask,
+        T_prior: Array | None = None,
+        prior_covariance: Array | None = None,
+        joints: Mapping[str, Array] | None = None,
+    ) -> VisionEstimate:
+        """What a mask says about the target's pose.
+
+        T_prior (4 x 4): the predicted T_world_target, None where nothing is known; `prior_covariance` (6, 6) along the world's
+        axes; `joints` (n,) [rad] by robot, to know exactly what the robots hide.
+
+        Raises ValueError for a mask that cannot be this camera's.
+        """
+        h, w = mask.labels.shape
+        if mask.scale < 1 or h * mask.scale > 2 * self._camera.height or w * mask.scale > 2 * self._camera.width:
+            raise ValueError(
+                f"mask: a window of an image of {self._camera.width} x {self._camera.height} at a scale of at least 1 expected, "
+                f"{w} x {h} at scale {mask.scale} came: check the segmentation's camera"
+            )
+        k = Intrinsics.of_window(self._camera, mask.x0, mask.y0, mask.scale)
+        T_start = self._T_camera_world @ (self._target.home.transform if T_prior is None else T_prior)
+        seen = self._gather(mask, k, T_start, joints)
+        if self.method == "paper":
+            return self._paper(seen, T_start)
+        best = self._detect(seen, T_start) if T_prior is None else self._track(seen, T_start, prior_covariance)
+        return self._lost(T_start) if best is None else self._judge(seen, best)
+
+    def _gather(self, mask: Mask, k: Intrinsics, T: Array, joints: Mapping[str, Array] | None) -> Evidence:
+        depth = self._robots.render(joints, k, mask.labels.shape) if joints else None
+        z = self._model.in_camera(T)[:, 2]
+        state = evidence.classify(mask.labels, self._target.label_values, depth, (float(z.min()), float(z.max())))
+        evidence.cover_outside(state, mask.x0, mask.y0, mask.scale, self._camera)
+        return evidence.gather(state, mask.labels, k)
+
+    def _track(self, seen: Evidence, T_start: Array, prior_covariance: Array | None) -> _Candidate | None:
+        floor = np.diag(np.repeat(np.square(PRIOR_FLOOR), 3))
+        covariance = np.zeros((6, 6)) if prior_covariance is None else self._axes.T @ prior_covariance @ self._axes
+        first = self._with_mirror(seen, T_start, np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64))
+        if first.overlap >= FITS_WELL or seen.seen_px < detect.SMALLEST_PX:
+            return first
+        other = self._detect(seen, T_start)
+        if other is None or other.overlap <= max(first.overlap, FITS):
+            return first
+        # another pose explains the mask better: believed where the prediction allows it, or where the prediction itself fails
+        error = geometry.pose_error(other.fit.T, T_start)
+        possible = error @ np.linalg.solve(covariance + floor + other.fit.covariance, error) < GATE
+        return other if possible or first.overlap < FITS else first
+
+    def _with_mirror(self, seen: Evidence, T_start: Array, prior: Array) -> _Candidate:
+        """The fit from the prediction, and that from its mirror image where both may be right: an axis nearly parallel to the
+        image looks the same tilted either way. They are merged by their likelihoods, so that the covariance covers both."""
+        first = self._candidate(seen, T_start, T_start, prior)
+        T_mirror = detect.mirrored(first.fit.T_searched)[0]
+        away = geometry.pose_error(T_mirror, T_start)
+        if first.overlap < FITS or away @ prior @ away > GATE:
+            return first
+        other = self._candidate(seen, T_mirror, T_start, prior)
+        if other.fit.cost < first.fit.cost:
+            first, other = other, first
+        share = 1.0 / (1.0 + np.exp(0.5 * min(other.fit.cost - first.fit.cost, 100.0)))
+        if share < 0.01:
+            return first
+        apart = geometry.pose_error(other.fit.T, first.fit.T)
+        covariance = (
+            (1.0 - share) * first.fit.covariance + share * other.fit.covariance + share * (1.0 - share) * np.outer(apart, apart)
+        )
+        return replace(first, fit=replace(first.fit, T=geometry.perturb(first.fit.T, share * apart), covariance=covariance))
+
+    def _detect(self, seen: Evidence, T_home: Array) -> _Candidate | None:
+        spread = self._target.home_spread
+        information = np.diag(np.repeat([spread.position**-2.0, spread.rotation**-2.0], 3))
+
+        def score(share: float, T: Array) -> float:
+            angle = np.arccos(np.clip((np.sum(T[:3, :3] * T_home[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+            distance = np.linalg.norm(T[:3, 3] - T_home[:3, 3])
+            return share - HOME_WEIGHT * float(np.hypot(distance / spread.position, angle / spread.rotation))
+
+        def fitted(T: Array) -> tuple[float, _Candidate]:
+            found = self._candidate(seen, T, T_home, information)
+            return score(found.overlap, found.fit.T_searched), found
+
+        starts = detect.hypotheses(self._model, seen, T_home)
+        if not starts:
+            return None
+        ranked = sorted(starts, key=lambda T: -score(_overlap(*self._counts(seen, T)), T))
+        best = max((fitted(T) for T in ranked[:DETECT_FITS]), key=lambda pair: pair[0])
+        for T in detect.mirrored(best[1].fit.T_searched):
+            best = max(best, fitted(T), key=lambda pair: pair[0])
+        return best[1]
+
+    def _candidate(self, seen: Evidence, T: Array, T_prior: Array, prior: Array) -> _Candidate:
+        fit = contour.fit(self._model, T, seen, T_prior, prior, self._noise, self._limits)
+        return _Candidate(fit, *self._counts(seen, fit.T_searched))
+
+    def _counts(self, seen: Evidence, T: Array) -> tuple[int, int, int]:
+        h, w = seen.state.shape
+        return compare(seen.state, self._model.silhouette(T, seen.intrinsics, (0, 0, w, h)))
+
+    def _judge(self, seen: Evidence, best: _Candidate) -> VisionEstimate:
+        fit = best.fit
+        amodal = max(self._amodal_px(fit.T_searched, seen.intrinsics), 1)
+        hidden = float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0))
+        explained = 1.0 - (best.both + best.free) / amodal  # covered, or outside the window
+        if hidden > HIDDEN or fit.length < SHORTEST_PX:
+            state: State = "occluded" if explained > 0.5 else "lost"
+        else:
+            state = "tracking" if best.overlap >= FITS else "lost"
+        covariance = fit.covariance if state == "tracking" else self._limits.covariance
+        return self._estimate(
+            fit.T if state == "tracking" else fit.T_searched, covariance, best.overlap, hidden, state, fit.T_searched
+        )
+
+    def _amodal_px(self, T: Array, k: Intrinsics) -> int:
+        """Pixels of the whole silhouette, whatever covers it and wherever the window ends."""
+        V = self._model.in_camera(T)
+        if V[:, 2].min() < contour.NEAR:
+            return 0
+        u, v = k.fx * V[:, 0] / V[:, 2] + k.cx, k.fy * V[:, 1] / V[:, 2] + k.cy
+        x0, y0 = int(np.floor(u.min())), int(np.floor(v.min()))
+        window = (x0, y0, min(int(np.ceil(u.max())) - x0 + 1, 4096), min(int(np.ceil(v.max())) - y0 + 1, 4096))
+        return int(np.count_nonzero(self._model.silhouette(T, k, window)))
+
+    def _paper(self, seen: Evidence, T_start: Array) -> VisionEstimate:
+        T, value = overlap.ascend(self._model, T_start, seen.state == TARGET, seen.intrinsics)
+        hidden = float(np.clip(1.0 - seen.seen_px / max(self._amodal_px(T, seen.intrinsics), 1), 0.0, 1.0))
+        covariance = np.diag(np.repeat(np.square(PAPER_SIGMA), 3))
+        return self._estimate(T, covariance, (value + 1.0) / 2.0, hidden, "occluded" if hidden > HIDDEN else "tracking", T)
+
+    def _lost(self, T: Array) -> VisionEstimate:
+        return self._estimate(T, self._limits.covariance, 0.0, 1.0, "lost", T)
+
+    def _estimate(
+        self, T: Array, covariance: Array, share: float, hidden: float, state: State, T_searched: Array
+    ) -> VisionEstimate:
+        T_world_camera = self._camera.T_world_camera
+        covariance = self._axes @ covariance @ self._axes.T
+        return VisionEstimate(
+            T_world_camera @ T, (covariance + covariance.T) / 2.0, share, hidden, state, T_world_camera @ T_searched
+        )
+
+
+@njit(cache=True, nogil=True)
+def compare(state, silhouette):
+    """Pixel counts of a mask's states (h, w) and a silhouette (h, w): those in both the target and the silhouette, those in
+    either, and those of the silhouette that are free. What is covered or of a joint is not scored."""
+    both, either, free = 0, 0, 0
+    h, w = state.shape
+    for y in range(h):
+        for x in range(w):
+            s = state[y, x]
+            if s == TARGET:
+                either += 1
+                if silhouette[y, x]:
+                    both += 1
+            elif s == FREE and silhouette[y, x]:
+                either += 1
+                free += 1
+    return both, either, free

@@ -1,0 +1,71 @@
+"""Wires the search to the bus: masks, joints and the fused pose in, the camera's pose out."""
+
+from __future__ import annotations
+
+import argparse
+
+from services.search.prediction import JointHistory, predict
+from services.search.search import METHODS, Search
+from shared import geometry
+from shared.messages import FusedPose, Joints, Mask, VisionPose
+from shared.service import Node
+from shared.topics import FUSED, JOINTS, MASK, VISION
+
+NAME = "search"
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """The service's own flags."""
+    parser.add_argument(
+        "--method", choices=METHODS, default="default", help="default: contour least squares; paper: ascent on f_m"
+    )
+    parser.add_argument("--camera", help="search only the masks of this camera (default: of all)")
+    parser.add_argument("--target", help="search only this target (default: all)")
+
+
+def start(node: Node, options: argparse.Namespace) -> None:
+    """Subscribes; every mask is searched for every target that this replica owns."""
+    cell = node.cell
+    cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
+    targets = [cell.one("targets", options.target)] if options.target else list(cell.targets)
+    searches = {(c, t): Search(cell, c, t, options.method) for c in cameras for t in targets}
+    history = {robot: JointHistory() for robot in cell.robots}
+    fused: dict[str, FusedPose] = {}
+
+    def on_joints(message: Joints, names: dict[str, str]) -> None:
+        robot, expected = names["robot"], len(cell.robots[names["robot"]].joints)
+        if len(message.position) != expected:
+            raise ValueError(f"joints of {robot}: {expected} values expected, {len(message.position)} came")
+        history[robot].add(message.stamp_ns, message.position)
+
+    def on_fused(message: FusedPose, names: dict[str, str]) -> None:
+        fused[names["target"]] = message
+
+    def on_mask(message: Mask, names: dict[str, str]) -> None:
+        joints = {robot: q for robot, h in history.items() if (q := h.at(message.stamp_ns)) is not None}
+        for (camera, target), search in searches.items():
+            if camera != names["camera"] or not node.owns(f"{camera}/{target}"):
+                continue
+            T_prior, covariance = predict(fused.get(target), message.stamp_ns)
+            estimate = search.update(message, T_prior, covariance, joints)
+            position, orientation = geometry.position_orientation(estimate.T)
+            pose = VisionPose(
+                stamp_ns=message.stamp_ns,
+                target=target,
+                camera=camera,
+                frame=cell.frame,
+                position=position,
+                orientation=orientation,
+                covariance=estimate.covariance,
+                overlap=estimate.overlap,
+                hidden=estimate.hidden,
+                state=estimate.state,
+            )
+            node.publish(VISION, pose, target=target)
+
+    for robot in cell.robots:
+        node.subscribe(JOINTS, on_joints, robot=robot)
+    for target in targets:
+        node.subscribe(FUSED, on_fused, target=target)
+    for camera in cameras:
+        node.subscribe(MASK, on_mask, camera=camera)

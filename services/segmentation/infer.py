@@ -1,0 +1,92 @@
+"""Inference: frames and windows in, masks out; the recurrent state kept between them."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+
+from services.segmentation import prednet
+from services.segmentation.crop import Window, shift_state
+from services.segmentation.prednet import PredNet, State
+from shared.classes import Label
+
+WEIGHTS = Path(__file__).parent / "weights" / "prednet.npz"
+MAX_GAP_S = 0.5
+"""After a longer silence the picture has little to do with what the state remembers."""
+TARGET_LABELS = (Label.FOREARM, Label.HAND)
+
+
+class Segmenter:
+    """Masks of one camera's frames, in order. `offset`: added to the logits of forearm and hand, calibrated so that their masks are
+    on average as large as they should be (the search would take a mask too large for an arm too near)."""
+
+    def __init__(self, net: PredNet, offset: float = 0.0, dtype: torch.dtype | None = None):
+        self._dtype = fastest_dtype() if dtype is None else dtype
+        self._net = net.to(self._dtype).eval()
+        self._offset = torch.zeros(1, len(Label), 1, 1)
+        self._offset[:, list(TARGET_LABELS)] = offset
+        self._state: State | None = None
+        self._window: Window | None = None
+        self._stamp_ns = 0
+
+    def __call__(self, image: NDArray[np.uint8], window: Window, stamp_ns: int) -> NDArray[np.uint8]:
+        """Class indices (window.height, window.width) uint8 of a window of an RGB image (h, w, 3) uint8, exposed at `stamp_ns`.
+
+        The state is forgotten where the scale changes, time stands, goes back or jumps by more than MAX_GAP_S.
+        Raises ValueError where the window does not lie in the image.
+        """
+        with torch.inference_mode():
+            picture = cut(image, window).to(self._dtype)
+            logits, _, self._state = self._net(picture, self._remembered(window, stamp_ns))
+            self._window, self._stamp_ns = window, stamp_ns
+            return (logits.float() + self._offset)[0].argmax(0).to(torch.uint8).numpy()
+
+    def _remembered(self, window: Window, stamp_ns: int) -> State:
+        follows = 0 < stamp_ns - self._stamp_ns <= MAX_GAP_S * 1e9
+        if self._state is None or self._window is None or self._window.scale != window.scale or not follows:
+            return self._net.initial_state(1, window.height, window.width)
+        if self._window == window:
+            return self._state
+        return shift_state(self._state, self._net.strides, self._window, window)
+
+
+def cut(image: NDArray[np.uint8], window: Window) -> torch.Tensor:
+    """The window (1, 3, height, width) in [0, 1] of an RGB image (h, w, 3) uint8; at scales above 1 the mean of the pixels covered."""
+    if min(window.x0, window.y0) < 0 or window.bottom > image.shape[0] or window.right > image.shape[1]:
+        raise ValueError(f"a window inside the image of {image.shape[1]} x {image.shape[0]} expected, {window} came")
+    part = np.ascontiguousarray(image[window.y0 : window.bottom, window.x0 : window.right])
+    picture = torch.from_numpy(part).permute(2, 0, 1)[None].float() / 255.0  # channels_last, as the image is
+    return picture if window.scale == 1 else F.avg_pool2d(picture, window.scale)
+
+
+def load_segmenter(path: Path = WEIGHTS, dtype: torch.dtype | None = None) -> Segmenter:
+    """A segmenter of a weights file with its card. Raises FileNotFoundError that says how to make one."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no weights {path}: make them with `penumbra segmentation train --out {path}`")
+    net, card = prednet.load(path)
+    return Segmenter(net, float(card["calibration"]["target_logit_offset"]), dtype)
+
+
+def fastest_dtype() -> torch.dtype:
+    """bfloat16 where the processor computes in it: a third faster and, in the mask, no different. Else float32."""
+    able = torch.cpu.get_capabilities()
+    return torch.bfloat16 if able.get("avx512_bf16") or able.get("amx_bf16") else torch.float32
+
+
+def speed(segmenter: Segmenter, width: int, height: int, frames: int = 30) -> dict[str, Any]:
+    """Milliseconds a frame (median, 90th percentile) of a window of this size on random pixels, on one thread."""
+    image = np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8)
+    window = Window(0, 0, width, height)
+    times = []
+    for i in range(frames + 5):  # the first frames choose kernels and fill caches
+        begin = time.perf_counter()
+        segmenter(image, window, (i + 1) * 50_000_000)
+        times.append((time.perf_counter() - begin) * 1e3)
+    median, slow = np.percentile(times[5:], [50, 90])
+    return {"ms_median": round(float(median), 2), "ms_p90": round(float(slow), 2)}

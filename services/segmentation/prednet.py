@@ -1,0 +1,181 @@
+"""PredNet with hGRU cells: a stack of layers that predict their own input, and a decoder that reads a mask from them.
+
+One time step (section "PredNet Model"):
+
+1. Bottom-up. Layer l predicts its input A_l from its representation R_l of the last step. What the prediction missed is the
+   error E_l, split into what was too little and what too much; convolved and pooled it is the input A_{l+1} of the next layer.
+2. Top-down. From the last layer to the first, R_l is updated by an hGRU cell driven by E_l and R_{l+1}.
+3. The mask is decoded from all R_l but the first: brought to one resolution, summed, convolved.
+
+The picture enters folded: 2 x 2 pixels become 12 channels (space to depth). The first layer therefore works at half resolution
+where the authors' works at full; the pooling that would follow it is this folding, which, unlike it, throws nothing away.
+Together this halves the time of a step. The second layer keeps half resolution, each one above halves it.
+
+References: Lotter, Kreiman, Cox 2017 (arXiv:1605.08104); Linsley, Kim, Veerabadran, Windolf, Serre 2018 (arXiv:1805.08315).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from shared.classes import Label
+
+State = tuple[Tensor, ...]
+"""What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""
+
+FOLD = 2
+"""Pixels a side that one position of the first layer sees."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Size of the network. channels, kernels: of the hGRU cell of each layer. The authors have 64-128-256-512 and kernels of 5;
+    kernels of 5 in the two coarse layers alone cost a tenth of the time of 5 everywhere and reach as far. `delay`: axonal delays."""
+
+    channels: tuple[int, ...] = (16, 16, 32, 64)
+    kernels: tuple[int, ...] = (3, 3, 5, 5)
+    decoder_channels: int = 16
+    delay: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.channels) != len(self.kernels) or len(self.channels) < 2:
+            raise ValueError(f"one kernel for each of at least 2 layers expected, got {self.channels} and {self.kernels}")
+
+
+class HGRU(nn.Module):
+    """Horizontal gated recurrent unit (Linsley et al. 2018, eq. 4-7) without the time-step gains of its endless use here.
+
+    One horizontal kernel W serves both stages: C1 inhibits, C2 excites. Per channel: alpha, mu scale and shift the inhibition,
+    kappa, beta, omega weigh the input, the excitation and their product.
+    """
+
+    def __init__(self, channels: int, kernel: int):
+        super().__init__()
+        self.horizontal = nn.Conv2d(channels, channels, kernel, padding=kernel // 2, bias=False)
+        self.gain_gate = nn.Conv2d(channels, channels, 1)
+        self.mix_gate = nn.Conv2d(channels, channels, 1)
+        for name, value in (("alpha", 0.1), ("mu", 0.0), ("kappa", 0.5), ("beta", 0.5), ("omega", 0.1)):
+            self.register_parameter(name, nn.Parameter(torch.full((channels,), value)))
+        self.register_buffer("_zero", torch.zeros(channels), persistent=False)
+
+    def forward(self, drive: Tensor, state: Tensor) -> Tensor:
+        """The new state (batch, channels, h, w) from the drive and the old state of the same shape."""
+        inhibition = self.horizontal(torch.sigmoid(self.gain_gate(state)) * state)
+        first = torch.tanh(drive - inhibition * _scale(state, self.alpha, self.mu))
+        excitation = self.horizontal(first)
+        mixed = _scale(first, self.kappa, self._zero) + excitation * _scale(first, self.omega, self.beta)
+        gate = torch.sigmoid(self.mix_gate(first))
+        return state + (torch.tanh(mixed) - state) * gate
+
+
+def _scale(x: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
+    """gain * x + offset per channel. As a 1 x 1 convolution: with the channels innermost in memory broadcasting is 4 times slower."""
+    return F.conv2d(x, torch.diag(gain)[:, :, None, None], offset)
+
+
+class PredNet(nn.Module):
+    """The network of the module's description. Images are (batch, 3, h, w) in [0, 1], h and w multiples of `multiple`."""
+
+    def __init__(self, settings: Settings = Settings()):  # noqa: B008 (immutable)
+        super().__init__()
+        self.settings = settings
+        c, n = settings.channels, len(settings.channels)
+        inputs = [3 * FOLD * FOLD, *c[1:]]  # channels of A_l
+        self.predict = nn.ModuleList(nn.Conv2d(c[i], inputs[i], 3, padding=1) for i in range(n))
+        self.ascend = nn.ModuleList(nn.Conv2d(2 * inputs[i], inputs[i + 1], 3, padding=1) for i in range(n - 1))
+        self.drive = nn.ModuleList(nn.Conv2d(2 * inputs[i], c[i], 3, padding=1) for i in range(n))
+        self.descend = nn.ModuleList(nn.Conv2d(c[i + 1], c[i], 1) for i in range(n - 1))
+        self.cells = nn.ModuleList(HGRU(c[i], settings.kernels[i]) for i in range(n))
+        self.decode = nn.ModuleList(nn.Conv2d(c[i], settings.decoder_channels, 1) for i in range(1, n))
+        self.head = nn.Conv2d(settings.decoder_channels, len(Label) * FOLD * FOLD, 3, padding=1)
+        self.to(memory_format=torch.channels_last)
+
+    @property
+    def layer_strides(self) -> tuple[int, ...]:
+        """Image pixels a side of one position of each layer."""
+        return tuple(FOLD * 2 ** max(i - 1, 0) for i in range(len(self.settings.channels)))
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """The same for each tensor of the state."""
+        return self.layer_strides * (2 if self.settings.delay else 1)
+
+    @property
+    def multiple(self) -> int:
+        """Images have a multiple of this many pixels a side, and the state can be shifted by multiples of it."""
+        return self.layer_strides[-1]
+
+    def initial_state(self, batch: int, height: int, width: int) -> State:
+        """The state that has seen nothing, for images of this size. Raises ValueError where the size does not fit."""
+        if height % self.multiple or width % self.multiple or min(height, width) <= 0:
+            raise ValueError(f"image size: positive multiples of {self.multiple} expected, {width} x {height} came")
+        channels = list(self.settings.channels)
+        if self.settings.delay:
+            channels += [2 * conv.out_channels for conv in self.predict]  # type: ignore[misc]
+        weight = self.head.weight
+        return tuple(
+            torch.zeros(batch, c, height // s, width // s, dtype=weight.dtype, device=weight.device).to(memory_format=torch.channels_last)
+            for c, s in zip(channels, self.strides, strict=True)
+        )
+
+    def forward(self, image: Tensor, state: State) -> tuple[Tensor, list[Tensor], State]:
+        """One time step: (class logits (batch, classes, h, w), mean absolute prediction error of each layer, new state).
+
+        With axonal delays a layer hears its neighbours' activity of the step before: layer l learns of a picture l steps late.
+        """
+        n = len(self.settings.channels)
+        old = state[:n]
+        heard = state[n:]  # with delays: E_l of the step before
+        errors: list[Tensor] = []
+        missed: list[Tensor] = []
+        arriving = F.pixel_unshuffle(image, FOLD)
+        for i in range(n):
+            difference = arriving - self.predict[i](old[i])
+            errors.append(F.relu(torch.cat([difference, -difference], 1)))
+            missed.append(difference.abs().mean())
+            if i + 1 < n:
+                up = self.ascend[i](heard[i] if heard else errors[i])
+                arriving = F.relu(F.max_pool2d(up, 2) if i > 0 else up)  # the folding is the first layer's pooling
+        new: list[Tensor] = []
+        for i in reversed(range(n)):
+            drive = self.drive[i](errors[i])
+            if i + 1 < n:
+                down = self.descend[i](old[i + 1] if heard else new[0])
+                drive = drive + (F.interpolate(down, scale_factor=2, mode="nearest") if i > 0 else down)
+            new.insert(0, self.cells[i](drive, old[i]))
+        return self._decode(new), missed, (*new, *(errors if heard else ()))
+
+    def _decode(self, representations: list[Tensor]) -> Tensor:
+        total = self.decode[0](representations[1])
+        for i in range(2, len(representations)):
+            total = total + F.interpolate(self.decode[i - 1](representations[i]), scale_factor=2 ** (i - 1), mode="bilinear")
+        return F.pixel_shuffle(self.head(F.relu(total)), FOLD)
+
+
+def save(path: Path, net: PredNet, card: dict[str, Any]) -> None:
+    """Write weights (npz, half precision: a third of the mask's noise floor, half the size) and their card beside them."""
+    np.savez(path, **{name: value.detach().float().numpy().astype(np.float16) for name, value in net.state_dict().items()})
+    text = json.dumps({**card, "settings": {**card.get("settings", {}), "network": asdict(net.settings)}}, indent=2)
+    path.with_suffix(".json").write_text(text + "\n")
+
+
+def load(path: Path) -> tuple[PredNet, dict[str, Any]]:
+    """The network of a weights file and its card. Raises ValueError where the two do not fit together."""
+    card = json.loads(path.with_suffix(".json").read_text())
+    network = {key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"]["network"].items()}
+    net = PredNet(Settings(**network))
+    with np.load(path, allow_pickle=False) as stored:
+        weights = {name: torch.from_numpy(stored[name].astype(np.float32)) for name in stored.files}
+    try:
+        net.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ValueError(f"{path}: weights of {network} expected as its card says: {error}") from None
+    return net.eval(), card

@@ -1,0 +1,301 @@
+"""Makes weights/ again: `penumbra segmentation train`.
+
+Sequences are rendered by a second process into a growing data set on disk while the network learns from those already there.
+Step n takes its sequences, patches and colours from a generator seeded by (seed, n), and all schedules are functions of the
+progress, so that a run of --steps interrupted and resumed ends with the same weights as one that was not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import datetime
+import multiprocessing
+import os
+import time
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from services.segmentation import infer, loss, prednet
+from services.segmentation.evaluate import calibrate, held_out
+from services.segmentation.prednet import PredNet, Settings
+from sim import sequences
+
+VALIDATION_SEED = 1_000_000
+"""Added to the seed for held-out data: nothing there was ever trained on."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How training goes. `peak_rate`: of Adam's one cycle; `patches`: (from which progress on, pixels a side, sequences a batch);
+    `reuse`: how often a sequence is visited on average while the data set grows up to `most` sequences; `error_weight`,
+    `focal_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights that are exported."""
+
+    peak_rate: float = 4e-3
+    patches: tuple[tuple[float, int, int], ...] = ((0.0, 64, 16), (0.65, 96, 8))
+    reuse: int = 6
+    most: int = 6000
+    error_weight: float = 0.3
+    focal_weight: float = 5.0
+    clip: float = 1.0
+    averaging: float = 0.995
+
+    def rate(self, progress: float) -> float:
+        """The learning rate of the one-cycle policy (Smith 2018, arXiv:1708.07120) at a progress in [0, 1]."""
+        rise = 0.15
+        if progress < rise:
+            return self.peak_rate * (0.05 + 0.95 * progress / rise)
+        fall = min((progress - rise) / (1.0 - rise), 1.0)
+        return self.peak_rate * (0.005 + 0.995 * 0.5 * (1.0 + float(np.cos(np.pi * fall))))
+
+    def patch(self, progress: float) -> tuple[int, int]:
+        """Pixels a side and sequences a batch at a progress."""
+        return next((size, batch) for start, size, batch in reversed(self.patches) if progress >= start)
+
+
+class DataSet:
+    """Sequences on disk, rendered in order by a process of low priority; `render`: sequences.render or alike."""
+
+    def __init__(self, folder: Path, seed: int, most: int):
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder, self._seed, self._most = folder, seed, most
+        self._asked = 0
+        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=os.nice, initargs=(10,))
+        self._pending: list[Future[None]] = []
+        self._arrays: list[NDArray[np.uint8]] = []
+
+    def ensure(self, count: int, ahead: int = 64) -> int:
+        """Wait until `count` sequences (at most `most`) are there, ask for some more; returns how many may be used."""
+        count = min(count, self._most)
+        for index in range(self._asked, min(count + ahead, self._most)):
+            self._pending.append(self._pool.submit(_render_to, self._path(index), self._seed, index))
+            self._asked = index + 1
+        while len(self._arrays) < count:
+            self._pending[len(self._arrays)].result()
+            self._arrays.append(np.load(self._path(len(self._arrays)), mmap_mode="r"))
+        return count
+
+    def __getitem__(self, index: int) -> NDArray[np.uint8]:
+        """Red, green, blue and class (frames, h, w, 4) of a sequence that is there."""
+        return self._arrays[index]
+
+    def close(self) -> None:
+        """Render no more."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _path(self, index: int) -> Path:
+        return self._folder / f"{self._seed}-{index:06d}.npy"
+
+
+def _render_to(path: Path, seed: int, index: int) -> None:
+    if path.is_file():
+        return
+    sequence = sequences.render(seed, index)
+    part = path.with_suffix(".part.npy")
+    np.save(part, np.concatenate([sequence.images, sequence.labels[..., None]], axis=-1))
+    part.replace(path)  # a file is there wholly or not at all
+
+
+class Trainer:
+    """A network being trained, its optimiser and how far it has come."""
+
+    def __init__(self, settings: Settings, schedule: Schedule, seed: int):
+        torch.manual_seed(seed)
+        self.settings, self.schedule, self.seed = settings, schedule, seed
+        self.net = PredNet(settings)
+        self.average = copy.deepcopy(self.net)
+        self.optimizer = torch.optim.Adam(self.net.parameters(), betas=(0.9, 0.98))
+        self.step, self.minutes = 0, 0.0
+        self._half = infer.fastest_dtype() is torch.bfloat16
+
+    def train_step(self, data: DataSet, progress: float) -> dict[str, float]:
+        """One step of gradient descent; returns the parts of the loss."""
+        size, batch = self.schedule.patch(progress)
+        rng = np.random.default_rng([self.seed, 1, self.step])
+        count = data.ensure(8 * batch + self.step * batch // self.schedule.reuse)
+        images, labels = draw_batch([data[i] for i in rng.integers(count, size=batch)], size, rng)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.schedule.rate(progress)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
+            parts = self._losses(images, labels, old_state=rng.random() < 0.4)
+        total = parts["dice"] + self.schedule.focal_weight * parts["focal"] + self.schedule.error_weight * parts["error"]
+        self.optimizer.zero_grad()
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), self.schedule.clip)
+        self.optimizer.step()
+        self.step += 1
+        keep = min(self.schedule.averaging, self.step / (self.step + 10.0))
+        with torch.no_grad():
+            for mean, value in zip(self.average.parameters(), self.net.parameters(), strict=True):
+                mean.lerp_(value, 1.0 - keep)
+        return {name: float(value) for name, value in parts.items()} | {"total": float(total)}
+
+    def _losses(self, images: torch.Tensor, labels: torch.Tensor, old_state: bool) -> dict[str, torch.Tensor]:
+        """images (batch, frames, 3, h, w) in [0, 1], labels (batch, frames, h, w). `old_state`: first play the sequence backwards
+        without learning, so that the network is also trained with a state that has seen much, as it is in use."""
+        frames = images.shape[1]
+        state = self.net.initial_state(images.shape[0], *images.shape[-2:])
+        if old_state:
+            with torch.no_grad():
+                for t in reversed(range(1, frames)):
+                    _, _, state = self.net(images[:, t], state)
+        logits, errors = [], []
+        for t in range(frames):
+            out, missed, state = self.net(images[:, t], state)
+            logits.append(out.float())
+            if t > 0 or old_state:  # nothing can be predicted from nothing
+                errors.append(loss.prediction_error([m.float() for m in missed]))
+        all_logits, all_labels = torch.cat(logits), labels.transpose(0, 1).flatten(0, 1)
+        return {
+            "dice": loss.dice(all_logits, all_labels),
+            "focal": loss.focal(all_logits, all_labels),
+            "error": torch.stack(errors).mean(),
+        }
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint from which `restore` goes on."""
+        part = path.with_suffix(".part")
+        content = {"net": self.net.state_dict(), "average": self.average.state_dict(), "optimizer": self.optimizer.state_dict()}
+        torch.save({**content, "step": self.step, "minutes": self.minutes, "settings": asdict(self.settings), "seed": self.seed}, part)
+        part.replace(path)
+
+    @classmethod
+    def restore(cls, path: Path, schedule: Schedule) -> Trainer:
+        """The trainer of a checkpoint; network, delay and seed are the checkpoint's."""
+        content = torch.load(path, weights_only=True)
+        trainer = cls(Settings(**content["settings"]), schedule, content["seed"])
+        trainer.net.load_state_dict(content["net"])
+        trainer.average.load_state_dict(content["average"])
+        trainer.optimizer.load_state_dict(content["optimizer"])
+        trainer.step, trainer.minutes = content["step"], content["minutes"]
+        return trainer
+
+
+def draw_batch(
+    chosen: list[NDArray[np.uint8]], size: int, rng: np.random.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Patches of sequences (frames, h, w, 4): images (batch, frames, 3, size, size) in [0, 1] and labels (batch, frames, size, size).
+
+    Three of four lie around a pixel of the target. Mirrored, played backwards and coloured anew at random (colour jitter of 0.4, as
+    the authors').
+    """
+    images, labels = [], []
+    for sequence in chosen:
+        height, width = sequence.shape[1:3]
+        middle = rng.integers(0, [height, width])
+        if rng.random() < 0.75:
+            target = np.argwhere(np.isin(sequence[rng.integers(len(sequence)), ..., 3], infer.TARGET_LABELS))
+            if len(target):
+                middle = target[rng.integers(len(target))] + rng.integers(-size // 3, size // 3 + 1, size=2)
+        y, x = np.clip(middle - size // 2, 0, [height - size, width - size])
+        patch = sequence[:, y : y + size, x : x + size]
+        if rng.random() < 0.5:
+            patch = patch[:, :, ::-1]
+        if rng.random() < 0.5:
+            patch = patch[::-1]
+        picture = jitter(patch[..., :3].astype(np.float32) / 255.0, rng)
+        images.append(torch.from_numpy(picture).movedim(-1, 1))
+        labels.append(torch.from_numpy(patch[..., 3].astype(np.int64)))
+    return torch.stack(images), torch.stack(labels)
+
+
+def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float = 0.4) -> NDArray[np.float32]:
+    """Brightness, contrast, saturation and tint of a picture (..., 3) in [0, 1], changed at random by up to `amount`."""
+    brightness, contrast, saturation = 1.0 + amount * rng.uniform(-1.0, 1.0, 3)
+    tint = 1.0 + 0.25 * amount * rng.uniform(-1.0, 1.0, 3)
+    grey = picture.mean(axis=-1, keepdims=True)
+    picture = grey + saturation * (picture - grey)
+    mean = picture.mean()
+    return np.clip((mean + contrast * (picture - mean)) * brightness * tint, 0.0, 1.0, dtype=np.float32)
+
+
+def export(trainer: Trainer, out: Path, sequences_each: int) -> dict[str, Any]:
+    """Calibrate and score the averaged weights on held-out sequences, write them with their card; returns the card."""
+    seed = VALIDATION_SEED + trainer.seed
+    offset, calibrated = calibrate(trainer.average, seed, sequences_each)
+    card = {
+        "seed": trainer.seed,
+        "date": datetime.date.today().isoformat(),
+        "settings": {
+            "schedule": asdict(trainer.schedule),
+            "steps": trainer.step,
+            "minutes": round(trainer.minutes, 1),
+        },
+        "parameters": sum(p.numel() for p in trainer.net.parameters()),
+        "calibration": {"seed": seed, "target_logit_offset": offset, **calibrated},
+        "held_out": {"seed": seed + 1, **held_out(trainer.average, offset, seed + 1, sequences_each)},
+    }
+    out.parent.mkdir(parents=True, exist_ok=True)
+    prednet.save(out, trainer.average, card)
+    return card
+
+
+def arguments() -> argparse.ArgumentParser:
+    """The flags of `penumbra segmentation train`."""
+    parser = argparse.ArgumentParser(prog="penumbra segmentation train", description="Train the segmentation network on simulated sequences.")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--minutes", type=float, default=60.0, help="train for so long (default: 60)")
+    length.add_argument("--steps", type=int, help="train for so many steps instead: the same result on every run of one machine")
+    parser.add_argument("--seed", type=int, default=0, help="of data, initial weights and batches")
+    parser.add_argument("--size", type=int, nargs="+", help="channels of each layer (default: 16 16 32 64)")
+    parser.add_argument("--delay", action=argparse.BooleanOptionalAction, default=False, help="axonal delays between the layers")
+    parser.add_argument("--checkpoint", type=Path, default=Path("segmentation.checkpoint"), help="written every few minutes")
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if there is one")
+    parser.add_argument("--data", type=Path, default=Path("segmentation-data"), help="folder of the rendered sequences (some GB)")
+    parser.add_argument("--out", type=Path, default=infer.WEIGHTS, help="the weights; the card is written beside them")
+    parser.add_argument("--held-out", type=int, default=60, help="sequences for calibration, and as many for the score")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Train, then write weights and card."""
+    options = arguments().parse_args(argv)
+    torch.set_num_threads(1)
+    schedule = Schedule()
+    if options.resume and options.checkpoint.is_file():
+        trainer = Trainer.restore(options.checkpoint, schedule)
+    else:
+        channels = tuple(options.size or Settings.channels)
+        kernels = (*(3 for _ in channels[:-2]), 5, 5)
+        trainer = Trainer(Settings(channels, kernels, delay=options.delay), schedule, options.seed)
+    data = DataSet(options.data, trainer.seed, schedule.most)
+    try:
+        run(trainer, data, options.steps, options.minutes, options.checkpoint)
+    except KeyboardInterrupt:
+        trainer.save(options.checkpoint)
+        print(f"stopped at step {trainer.step}: go on with --resume --checkpoint {options.checkpoint}")
+        return 130
+    finally:
+        data.close()
+    card = export(trainer, options.out, options.held_out)
+    print(f"{options.out}: {card['held_out']}")
+    return 0
+
+
+def run(trainer: Trainer, data: DataSet, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0) -> None:
+    """Train up to so many steps, or minutes (over all runs); shows a progress bar."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    total = steps if steps is not None else int(minutes * 60)
+    saved = last = time.monotonic()
+    smooth: dict[str, float] = {}
+    with Progress(*columns) as bar:
+        task = bar.add_task("steps" if steps is not None else "seconds", total=total)
+        while (progress := trainer.step / steps if steps is not None else trainer.minutes / minutes if minutes else 1.0) < 1.0:
+            for name, value in trainer.train_step(data, progress).items():
+                smooth[name] = value if name not in smooth else smooth[name] + 0.02 * (value - smooth[name])
+            now = time.monotonic()
+            trainer.minutes += (now - last) / 60.0
+            last = now
+            text = "  ".join(f"{name} {value:.3f}" for name, value in smooth.items())
+            bar.update(task, completed=int(progress * total), description=f"step {trainer.step}  {text}")
+            if now - saved > save_every_s:
+                trainer.save(checkpoint)
+                saved = now
+    trainer.save(checkpoint)

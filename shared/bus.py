@@ -1,0 +1,314 @@
+"""The bus: one Zenoh session per process, readers that never stall one another, and what they count.
+
+Sensor streams are read from a ring per subscription by a thread of its own. A Python callback or the default channel would let
+one slow reader hold up every other subscriber of the session.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from shared.messages import BadMessage, Message, decode
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+RATE_WINDOW_S = 3.0
+ATTEMPT_MS = 500
+"""How long one attempt to reach the router may block inside Zenoh, where no signal is heard."""
+
+
+class BusError(RuntimeError):
+    """The bus cannot be used as asked; the text says what to do."""
+
+
+class Refused(ValueError):
+    """A query was answered with an error; the text is the answerer's."""
+
+
+@dataclass(frozen=True)
+class Connection:
+    """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
+    tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise."""
+
+    mode: str | None = None
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    config: Path | None = None
+
+    @property
+    def where(self) -> str:
+        """The endpoints in words."""
+        return ", ".join(self.connect) or (f"the endpoints of {self.config}" if self.config else DEFAULT_ENDPOINT)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The Zenoh flags that every process takes."""
+    group = parser.add_argument_group("bus")
+    group.add_argument("-m", "--mode", choices=("client", "peer", "router"), help="Zenoh mode (default: client; router: router)")
+    group.add_argument("-e", "--connect", action="append", default=[], metavar="ENDPOINT",
+                       help=f"router to reach; may be repeated (default: $PENUMBRA_CONNECT or {DEFAULT_ENDPOINT})")  # fmt: skip
+    group.add_argument("-l", "--listen", action="append", default=[], metavar="ENDPOINT", help="endpoint to listen on")
+    group.add_argument("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5)")
+
+
+def connection(options: argparse.Namespace) -> Connection:
+    """The connection that the flags of `add_arguments` and the environment ask for."""
+    connect = tuple(options.connect)
+    if not connect and options.config is None and options.mode in (None, "client"):
+        connect = tuple(os.environ.get("PENUMBRA_CONNECT", "").split())
+    return Connection(options.mode, connect, tuple(options.listen), options.config)
+
+
+def mode(connection: Connection) -> str:
+    """client, peer or router, as the connection or its file says. Raises BusError like `configuration`."""
+    return str(json.loads(configuration(connection).get_json("mode")))
+
+
+def configuration(connection: Connection) -> zenoh.Config:
+    """The Zenoh configuration of a connection. Raises BusError for a file or an endpoint that Zenoh does not take."""
+    try:
+        config = zenoh.Config.from_file(str(connection.config)) if connection.config else zenoh.Config()
+    except zenoh.ZError as error:
+        raise BusError(f"--config {connection.config}: a Zenoh configuration (JSON5) expected: {_short(error)}") from None
+
+    def is_set(key: str) -> bool:
+        return connection.config is not None and config.get_json(key) not in ("null", "[]")
+
+    mode = connection.mode or (json.loads(config.get_json("mode")) if is_set("mode") else "client")
+    settings: dict[str, Any] = {"mode": mode}
+    if connection.connect:
+        settings["connect/endpoints"] = connection.connect
+    elif mode == "client" and not is_set("connect/endpoints"):
+        settings["connect/endpoints"] = [DEFAULT_ENDPOINT]
+    if connection.listen:
+        settings["listen/endpoints"] = connection.listen
+    elif mode == "router" and connection.config is None:
+        settings["listen/endpoints"] = [DEFAULT_ENDPOINT]
+    defaults = {
+        # one attempt is short, because Ctrl-C is not heard inside it; `open_session` repeats it, and later Zenoh itself does
+        "connect/timeout_ms": ATTEMPT_MS,
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        # processes meet at the router and nowhere else: what is not configured is not found by chance
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+    }
+    settings |= {key: value for key, value in defaults.items() if not is_set(key)}
+    if connection.config is None:
+        settings["transport/link/tx/lease"] = 1000  # ms after which a frozen process is no longer alive
+    for key, value in settings.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise BusError(f"{key}: {json.dumps(value)} is nothing that Zenoh takes: {_short(error)}") from None
+    return config
+
+
+def open_session(
+    connection: Connection, stopping: threading.Event, waiting: Callable[[], None], patience_s: float = math.inf
+) -> zenoh.Session:
+    """A session, as soon as the router is there; `waiting` is called once if it is not yet. Once open, the session comes back by
+    itself whenever the router does.
+
+    Raises BusError where the configuration cannot be used, the port is taken, or no router came within `patience_s` or before
+    `stopping` was set.
+    """
+    config = configuration(connection)
+    deadline = time.monotonic() + patience_s
+    told = False
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            if "Address already in use" in str(error):
+                raise BusError(
+                    f"the port of {', '.join(connection.listen) or DEFAULT_ENDPOINT} is taken: another router runs there; "
+                    "stop it, or give another port (penumbra up --port 7448; penumbra router --listen tcp/127.0.0.1:7448)"
+                ) from None
+            if "Unable to connect" not in str(error):
+                raise BusError(f"the Zenoh session does not open: {_short(error)}") from None
+        if stopping.is_set() or time.monotonic() > deadline:
+            raise BusError(f"no router at {connection.where}: start `penumbra router` or `penumbra up`, or give --connect")
+        if not told:
+            waiting()
+            told = True
+
+
+def ask(
+    session: zenoh.Session, key: str, parameters: str = "", payload: bytes | None = None, timeout_s: float = 1.0
+) -> list[bytes]:
+    """The payloads of all answers to a query. Raises Refused where the only answers are errors."""
+    selector = f"{key}?{parameters}" if parameters else key
+    answers, errors = [], []
+    # every answerer counts, also where several processes answer on the same key
+    for reply in session.get(
+        selector,
+        payload=payload,
+        timeout=timeout_s,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+    ):
+        if reply.ok is not None:
+            answers.append(reply.ok.payload.to_bytes())
+        elif reply.err is not None:
+            errors.append(reply.err.payload.to_bytes().decode(errors="replace"))
+    if errors and not answers:
+        raise Refused(errors[0])
+    return answers
+
+
+class Rate:
+    """Events per second over about the last RATE_WINDOW_S, at a constant cost per event: an exponentially weighted count,
+    divided by the weight that the time since the first event can have."""
+
+    def __init__(self) -> None:
+        self._first = self._last = math.nan
+        self._weight = 0.0
+
+    def add(self, now_s: float) -> None:
+        if math.isnan(self._first):
+            self._first = self._last = now_s  # one event has no rate: it only starts the clock
+            return
+        self._weight = self._weight * math.exp((self._last - now_s) / RATE_WINDOW_S) + 1.0
+        self._last = now_s
+
+    def hz(self, now_s: float) -> float:
+        elapsed = now_s - self._first
+        if not elapsed > 0:
+            return 0.0
+        weight = self._weight * math.exp((self._last - now_s) / RATE_WINDOW_S)
+        return weight / (RATE_WINDOW_S * -math.expm1(-elapsed / RATE_WINDOW_S))
+
+
+@dataclass
+class Traffic:
+    """What came (or went) on one key. `bad`: refused messages by kind; `dropped`: gaps in the publishers' own count, None for
+    what cannot be known; `delay_s`: from the measurement to here, of the last message."""
+
+    stale_s: float
+    count: int = 0
+    bad: dict[str, int] = field(default_factory=dict)
+    dropped: int | None = None
+    stamp_ns: int | None = None
+    delay_s: float = math.nan
+    rate: Rate = field(default_factory=Rate)
+    _source: Any = None
+    _number: int = 0
+
+    def took(self, stamp_ns: int, now_ns: int) -> None:
+        """Counts a good message."""
+        self.count += 1
+        self.stamp_ns = stamp_ns
+        self.delay_s = (now_ns - stamp_ns) * 1e-9
+        self.rate.add(time.monotonic())
+
+    def follow(self, info: zenoh.SourceInfo | None) -> None:
+        """Counts what is missing since the last message of the same publisher."""
+        if info is None:
+            return
+        source, number = info.source_id, info.source_sn
+        if source == self._source and number > self._number:
+            self.dropped = (self.dropped or 0) + number - self._number - 1
+        elif self.dropped is None:
+            self.dropped = 0
+        self._source, self._number = source, number
+
+    def age_s(self, now_ns: int) -> float | None:
+        """Seconds since the newest measurement; None where none ever came."""
+        return None if self.stamp_ns is None else (now_ns - self.stamp_ns) * 1e-9
+
+    def is_stale(self, now_ns: int) -> bool:
+        age = self.age_s(now_ns)
+        return math.isfinite(self.stale_s) and (age is None or age > self.stale_s)
+
+    def report(self, now_ns: int) -> dict[str, Any]:
+        """The counters as JSON."""
+        age = self.age_s(now_ns)
+        return {
+            "count": self.count,
+            "rate_hz": round(self.rate.hz(time.monotonic()), 2),
+            "age_s": None if age is None else round(age, 4),
+            "delay_s": None if math.isnan(self.delay_s) else round(self.delay_s, 5),
+            "dropped": self.dropped,
+            "bad": dict(self.bad),
+            "stale": self.is_stale(now_ns),
+        }
+
+
+class Reader:
+    """One subscription: a ring of `depth` samples and a thread that decodes them and hands them on.
+
+    keys: every concrete key that the cell knows, with its names and counters; a sample on any other key is refused, so that
+    nobody can grow the table. `refused` is told of the first bad message of each kind on a key, `failed` of every exception of
+    the handler.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        expression: str,
+        depth: int,
+        kind: type[Message],
+        keys: dict[str, tuple[dict[str, str], Traffic]],
+        strangers: Traffic,
+        handler: Callable[[Any, dict[str, str]], None],
+        now_ns: Callable[[], int],
+        refused: Callable[[str, BadMessage], None],
+        failed: Callable[[str, Exception], None],
+    ):
+        self._kind, self._keys, self._strangers = kind, keys, strangers
+        self._handler, self._now_ns, self._refused, self._failed = handler, now_ns, refused, failed
+        self._subscriber = session.declare_subscriber(expression, zenoh.handlers.RingChannel(depth))
+        self.thread = threading.Thread(target=self._run, name=f"read {expression}", daemon=True)
+        self.thread.start()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                sample = self._subscriber.recv()
+            except zenoh.ZError:  # the session was closed
+                return
+            self._take(sample)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        names, traffic = self._keys.get(key, (None, self._strangers))
+        try:
+            if names is None:
+                raise BadMessage("key", f"one of the cell's {len(self._keys)} keys expected, {key!r:.120} came")
+            traffic.follow(sample.source_info)
+            message = self._decode(sample)
+        except BadMessage as error:
+            traffic.bad[error.kind] = traffic.bad.get(error.kind, 0) + 1
+            if traffic.bad[error.kind] == 1:
+                self._refused(key, error)
+            return
+        traffic.took(message.stamp_ns, self._now_ns())
+        try:
+            self._handler(message, names)
+        except Exception as error:
+            self._failed(f"reader of {key}", error)
+
+    def _decode(self, sample: zenoh.Sample) -> Message:
+        if sample.kind is zenoh.SampleKind.DELETE:
+            raise BadMessage("delete", f"a {self._kind.__name__} expected, a deletion came")
+        if len(sample.payload) > self._kind.MAX_BYTES:  # before it is copied
+            raise BadMessage(
+                "size", f"{self._kind.__name__}: at most {self._kind.MAX_BYTES} bytes expected, {len(sample.payload)} came"
+            )
+        return decode(self._kind, sample.payload.to_bytes(), self._now_ns())
+
+
+def _short(error: Exception) -> str:
+    """The first line of Zenoh's text, without the place in its sources."""
+    return str(error).partition(" at /")[0].strip().replace("\n", " ")[:300]

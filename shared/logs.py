@@ -1,0 +1,66 @@
+"""Structured logs: a sentence and its fields, as key=value text or as one JSON object a line, on standard error."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import MutableMapping
+from datetime import UTC, datetime
+from typing import Any
+
+LEVELS = ("debug", "info", "warning", "error")
+
+
+class Log(logging.LoggerAdapter):
+    """A standard logger that also takes fields: `log.info("calibrated", pad="p0", gain=1.02)`."""
+
+    def process(self, msg: Any, kwargs: MutableMapping[str, Any]) -> tuple[Any, MutableMapping[str, Any]]:
+        known = {name: kwargs[name] for name in ("exc_info", "stack_info", "stacklevel") if name in kwargs}
+        fields = {
+            **(self.extra or {}),
+            **{name: value for name, value in kwargs.items() if name not in known and name != "extra"},
+        }
+        return msg, {**known, "extra": {"fields": fields}}
+
+
+def get(service: str, **fields: Any) -> Log:
+    """The log of a service; `fields` go with every line."""
+    return Log(logging.getLogger(f"penumbra.{service}"), fields)
+
+
+def configure(level: str = "info", as_json: bool = False) -> None:
+    """Sends the logs of Penumbra to standard error, from `level` on."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Json() if as_json else _Text())
+    logger = logging.getLogger("penumbra")
+    logger.handlers[:] = [handler]
+    logger.setLevel(level.upper())
+    logger.propagate = False
+
+
+def _common(record: logging.LogRecord) -> tuple[str, str, str]:
+    time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").removesuffix("+00:00") + "Z"
+    return time, record.levelname.lower(), record.name.removeprefix("penumbra.")
+
+
+class _Text(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        time, level, service = _common(record)
+        words = "".join(f" {name}={_value(value)}" for name, value in getattr(record, "fields", {}).items() if name != "instance")
+        trace = "\n" + self.formatException(record.exc_info) if record.exc_info else ""
+        return f"{time} {level:7} {service}: {record.getMessage()}{words}{trace}"
+
+
+class _Json(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        time, level, service = _common(record)
+        line = {"time": time, "level": level, "service": service, "text": record.getMessage(), **getattr(record, "fields", {})}
+        if record.exc_info:
+            line["trace"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+def _value(value: Any) -> str:
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return json.dumps(text) if not text or any(c.isspace() or c in '"=' for c in text) else text

@@ -1,0 +1,371 @@
+"""The runtime that every service is built on: a Node wires functions to topics, and keeps count of what they do.
+
+def start(node, options):                     # wires; nothing is received before the node runs
+    node.subscribe(FRAME, on_frame, camera="front")
+    node.every(0.005, publish_pose)
+
+node.run()                                    # until SIGINT or SIGTERM
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import re
+import secrets
+import signal
+import socket
+import string
+import threading
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from hashlib import blake2b
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, cast
+
+import psutil
+import zenoh
+
+from shared import bus, cell, logs, topics
+from shared.messages import BadMessage, Message, encode
+from shared.topics import QoS, Topic
+
+CLOSE_S = 0.8
+"""Closing a session on a bad network may take much longer; a process that ends does not wait for that."""
+QUERY_DEPTH = 32
+
+Answer = Callable[[dict[str, str], bytes], "bytes | tuple[bytes, str]"]
+
+
+class Node:
+    """One service instance: a session, its subscriptions, timers and queryables, their counters, and a log.
+
+    Whatever is declared before `open` (which `run` calls) is declared on the bus when it opens; what is published before that is
+    dropped, as it is where nobody listens. Use `with` where the node does not `run`.
+
+    service: name of the service. cell: the cell. connection: how to reach the others.
+    """
+
+    def __init__(self, service: str, cell: cell.Cell, connection: bus.Connection = bus.Connection()):  # noqa: B008 (frozen)
+        self.service, self.cell, self.connection = service, cell, connection
+        self._needs_router = bus.mode(connection) == "client"  # refuses a bad configuration before anything else is done
+        self.instance = f"{_safe(socket.gethostname())}-{os.getpid()}-{secrets.token_hex(2)}"
+        self.log = logs.get(service, instance=self.instance)
+        self.stopping = threading.Event()
+        self.session: zenoh.Session | None = None
+        self._pending: list[Callable[[], None]] = []
+        self._threads: list[threading.Thread] = []
+        self._received: dict[str, bus.Traffic] = {}
+        self._published: dict[str, bus.Traffic] = {}
+        self._publishers: dict[tuple[str, ...], tuple[zenoh.Publisher, bus.Traffic, zenoh.EntityGlobalId, itertools.count]] = {}
+        self._faults: dict[str, int] = {}
+        self._replicas = frozenset({self.instance})
+        self._owned: dict[str, bool] = {}
+        self._process = psutil.Process()
+        self._cpu = 0.0
+        self._started = time.monotonic()
+        self._reachable = False
+
+    # ---- life
+
+    def open(self, patience_s: float = float("inf")) -> Node:
+        """Opens the session, waiting for the router, and declares what was asked for. Raises bus.BusError."""
+        self.session = bus.open_session(self.connection, self.stopping, self._tell_waiting, patience_s)
+        self._reachable = True
+        self._watch_replicas()
+        self.answer(topics.health(self.cell.name, self.service, self.instance), lambda _, __: json.dumps(self.health()).encode())
+        for declare in self._pending:
+            declare()
+        self._pending.clear()
+        # the last step: who is alive can be asked and is listening
+        self._token = self.session.liveliness().declare_token(topics.alive(self.cell.name, self.service, self.instance))
+        self._process.cpu_percent()
+        self.every(1.0, self._keep_house)
+        self.log.debug("on the bus", zid=str(self.session.zid()))
+        return self
+
+    def run(self) -> None:
+        """Opens, and serves until SIGINT or SIGTERM; a second signal ends the process at once."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+        try:
+            self.open()
+        except bus.BusError:
+            if not self.stopping.is_set():
+                raise
+            return
+        self.stopping.wait()
+        self.close()
+
+    def close(self) -> None:
+        """Leaves the bus and ends the node's threads, within about CLOSE_S."""
+        self.stopping.set()
+        if self.session is None:
+            return
+        session, self.session = self.session, None
+        deadline = time.monotonic() + CLOSE_S
+        closing = threading.Thread(target=session.close, name="close", daemon=True)
+        closing.start()
+        for thread in (closing, *self._threads):
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, deadline - time.monotonic()))
+
+    def __enter__(self) -> Node:
+        return self if self.session else self.open()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def _on_signal(self, number: int, _: Any) -> None:
+        if self.stopping.is_set():
+            os._exit(128 + number)
+        self.stopping.set()
+
+    # ---- messages
+
+    def now_ns(self) -> int:
+        """Nanoseconds since the epoch."""
+        return time.time_ns()
+
+    def publish(self, topic: Topic, message: Message, **names: str) -> None:
+        """Sends a message. names: every {name} of the topic's key, e.g. camera="front". Raises CellError for a name that the cell
+        does not have, BadMessage for an array of the wrong dtype or shape."""
+        session = self.session
+        if session is None:
+            return
+        identity = (topic.name, *names.values())
+        found = self._publishers.get(identity)
+        if found is None:
+            found = self._publishers.setdefault(identity, self._declare_publisher(session, topic, names))
+        publisher, traffic, source, numbers = found
+        payload = encode(message)
+        try:
+            publisher.put(payload, source_info=zenoh.SourceInfo(source, next(numbers) & 0xFFFFFFFF))
+        except zenoh.ZError:
+            if self.session is not None:  # else: closed meanwhile
+                raise
+            return
+        traffic.took(message.stamp_ns, self.now_ns())
+
+    def _declare_publisher(self, session: zenoh.Session, topic: Topic, names: dict[str, str]) -> Any:
+        missing = [name for name in _names(topic) if name not in names]
+        if missing:
+            raise ValueError(f"publishing {topic.name} needs {', '.join(f'{name}=' for name in missing)}")
+        (key,) = self._keys(topic, names)
+        publisher = session.declare_publisher(
+            key,
+            congestion_control=zenoh.CongestionControl.BLOCK if topic.qos is QoS.NEVER_DROP else zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_HIGH if topic.qos is QoS.NEVER_DROP else zenoh.Priority.DATA,
+        )
+        traffic = self._published.setdefault(key, bus.Traffic(topic.stale_s))
+        return publisher, traffic, publisher.id, itertools.count()
+
+    def subscribe(self, topic: Topic, handler: Callable[[Any, dict[str, str]], None], **names: str) -> None:
+        """Calls `handler(message, names)` for every good message, in a thread of this subscription.
+
+        names: fix some of the topic's {names}; the others take every value that the cell has. While the handler is busy the
+        newest `topic.depth` messages per key are kept. Bad messages are counted and logged once per kind; so are exceptions of
+        the handler. Raises CellError for a name that the cell does not have.
+        """
+        keys = self._keys(topic, names)
+        if not keys:
+            self.log.info("nothing to read: the cell has no such part", topic=topic.name)
+            return
+        expression = next(iter(keys)) if len(keys) == 1 else topic.at(cell=self.cell.name, **names)
+        traffic = {key: self._received.setdefault(key, bus.Traffic(topic.stale_s)) for key in keys}
+        table = {key: (found, traffic[key]) for key, found in keys.items()}
+        strangers = (
+            bus.Traffic(float("inf")) if len(keys) == 1 else self._received.setdefault(expression, bus.Traffic(float("inf")))
+        )
+
+        def declare() -> None:
+            reader = bus.Reader(
+                cast(zenoh.Session, self.session),
+                expression,
+                topic.depth * len(keys),
+                topic.message,
+                table,
+                strangers,
+                handler,
+                self.now_ns,
+                self._refused,
+                self.fault,
+            )
+            self._threads.append(reader.thread)
+
+        self._declare(declare)
+
+    def _count(self, key: str, stale_s: float) -> bus.Traffic:
+        """Counters for one more reader of a key."""
+        readers = sum(1 for known in self._received if known.partition(" #")[0] == key)
+        traffic = bus.Traffic(stale_s)
+        self._received[key if not readers else f"{key} #{readers + 1}"] = traffic
+        return traffic
+
+    def _keys(self, topic: Topic, names: dict[str, str]) -> dict[str, dict[str, str]]:
+        """Every concrete key of a topic in this cell with its names, some of them fixed."""
+        values: list[Sequence[str]] = []
+        for name in _names(topic):
+            kind = cast(Literal["cameras", "robots", "pads", "targets"], f"{name}s")
+            values.append([self.cell.one(kind, names[name])] if name in names else list(getattr(self.cell, kind)))
+        unknown = names.keys() - set(_names(topic))
+        if unknown:
+            raise ValueError(f"topic {topic.name} has the names {', '.join(_names(topic))}, not {', '.join(sorted(unknown))}")
+        combinations = (dict(zip(_names(topic), choice, strict=True)) for choice in itertools.product(*values))
+        return {topic.at(cell=self.cell.name, **found): found for found in combinations}
+
+    # ---- queries
+
+    def answer(self, key: str, function: Answer) -> None:
+        """Answers queries on `key` with `function(parameters, payload)`: bytes, or bytes and their encoding. A ValueError becomes
+        an error reply with its text."""
+
+        def serve(queryable: Any) -> None:
+            while True:
+                try:
+                    query = queryable.recv()
+                except zenoh.ZError:
+                    return
+                with query:
+                    self._reply(key, query, function)
+
+        def declare() -> None:
+            queryable = cast(zenoh.Session, self.session).declare_queryable(key, zenoh.handlers.RingChannel(QUERY_DEPTH))
+            self._spawn(lambda: serve(queryable), f"answer {key}")
+
+        self._declare(declare)
+
+    def _reply(self, key: str, query: zenoh.Query, function: Answer) -> None:
+        parameters = dict(cast(Any, query.parameters))
+        try:
+            result = function(parameters, query.payload.to_bytes() if query.payload is not None else b"")
+        except ValueError as error:
+            query.reply_err(str(error).encode())
+        except Exception as error:
+            self.fault(f"answer on {key}", error)
+            query.reply_err(f"{self.service} failed: {type(error).__name__}: {error}".encode())
+        else:
+            payload, encoding = result if isinstance(result, tuple) else (result, None)
+            query.reply(key, payload, encoding=encoding)
+
+    def query(self, key: str, parameters: str = "", payload: bytes | None = None, timeout_s: float = 1.0) -> list[bytes]:
+        """The payloads of all answers; none where nobody answers. Raises bus.Refused where the only answers are errors."""
+        return bus.ask(self.session, key, parameters, payload, timeout_s) if self.session else []
+
+    # ---- time, replicas, health
+
+    def every(self, period_s: float, function: Callable[[], None]) -> None:
+        """Calls `function` every `period_s` in a thread of its own; turns that are missed are left out, not made up for."""
+
+        def loop() -> None:
+            due = time.monotonic()
+            while not self.stopping.wait(max(0.0, due - time.monotonic())):
+                try:
+                    function()
+                except Exception as error:
+                    self.fault(f"timer {getattr(function, '__name__', '')} of {period_s} s", error)
+                due = max(due + period_s, time.monotonic() - period_s)
+
+        self._declare(lambda: self._spawn(loop, f"every {period_s} s"))
+
+    def owns(self, stream: str) -> bool:
+        """Whether this replica is the one of the living replicas of its service that handles `stream`. Rendezvous hashing
+        (Thaler and Ravishankar 1998, doi:10.1109/90.663936): a replica that goes away moves only its own streams. While the
+        news of a replica's coming or going is under way two may own a stream, or none."""
+        owned = self._owned.get(stream)
+        if owned is None:
+            owned = self.instance == max(self._replicas, key=lambda replica: blake2b(f"{replica} {stream}".encode()).digest())
+            self._owned[stream] = owned
+        return owned
+
+    def _watch_replicas(self) -> None:
+        session = cast(zenoh.Session, self.session)
+        expression = topics.alive(self.cell.name, self.service, "*")
+        tokens = session.liveliness().declare_subscriber(expression, zenoh.handlers.FifoChannel(256), history=True)
+
+        def watch() -> None:
+            living: set[str] = set()
+            while True:
+                try:
+                    sample = tokens.recv()
+                except zenoh.ZError:
+                    return
+                instance = str(sample.key_expr).rpartition("/")[2]
+                (living.discard if sample.kind is zenoh.SampleKind.DELETE else living.add)(instance)
+                self._replicas = frozenset(living | {self.instance})
+                self._owned = {}
+
+        self._spawn(watch, "replicas")
+
+    def health(self) -> dict[str, Any]:
+        """What this instance is and how it fares, as JSON: CPU in cores, memory in MB, counters of every topic."""
+        now = self.now_ns()
+        return {
+            "service": self.service,
+            "instance": self.instance,
+            "pid": os.getpid(),
+            "cell": self.cell.name,
+            "uptime_s": round(time.monotonic() - self._started, 1),
+            "cpu": round(self._cpu, 3),
+            "memory_mb": round(self._process.memory_info().rss / 1e6, 1),
+            "replicas": len(self._replicas),
+            "topics": {key: traffic.report(now) for key, traffic in sorted(self._received.items())},
+            "published": {key: traffic.report(now) for key, traffic in sorted(self._published.items())},
+            "stale": sorted(key for key, traffic in self._received.items() if traffic.is_stale(now)),
+            "faults": dict(self._faults),
+        }
+
+    def fault(self, where: str, error: Exception) -> None:
+        """Counts an exception; the first of its kind and place is logged with its trace."""
+        frames = traceback.extract_tb(error.__traceback__)
+        place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "?"
+        kind = f"{type(error).__name__} at {place}"
+        self._faults[kind] = self._faults.get(kind, 0) + 1
+        if self._faults[kind] == 1:
+            self.log.error(f"{type(error).__name__}: {error}", where=where, at=place, exc_info=error)
+
+    def _refused(self, key: str, error: BadMessage) -> None:
+        self.log.warning("message refused; more of this kind are only counted", key=key, kind=error.kind, why=str(error))
+
+    def _tell_waiting(self) -> None:
+        self.log.warning(f"waiting for the router at {self.connection.where}: start `penumbra router` or `penumbra up`")
+
+    def _keep_house(self) -> None:
+        """Once a second: CPU, the state of the link, and the heartbeat file that a container's health check reads."""
+        self._cpu = self._process.cpu_percent() / 100
+        session = self.session
+        if session is None:
+            return
+        reachable = not self._needs_router or bool(session.info.routers_zid())
+        if reachable != self._reachable:
+            self._reachable = reachable
+            if reachable:
+                self.log.info("the router is back")
+            else:
+                self._tell_waiting()
+        heartbeat = os.environ.get("PENUMBRA_HEARTBEAT")
+        if heartbeat and reachable:
+            Path(heartbeat).touch()
+
+    def _declare(self, declare: Callable[[], None]) -> None:
+        if self.session is None:
+            self._pending.append(declare)
+        else:
+            declare()
+
+    def _spawn(self, function: Callable[[], None], name: str) -> None:
+        thread = threading.Thread(target=function, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+
+def _names(topic: Topic) -> tuple[str, ...]:
+    """The {names} of a topic's key, without the cell's."""
+    return tuple(name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell")
+
+
+def _safe(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]", "-", text)

@@ -1,0 +1,153 @@
+"""How things look: colours and textures of bodies, light, background and sensor, drawn from a random generator."""
+
+from __future__ import annotations
+
+import colorsys
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.classes import Label
+
+PLAIN, BLOTCHES, STRIPES, CHECKS, WOOD = range(5)
+TEXTURE_FIELDS = 20
+NO_CUFF = -1e9
+
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Two linear RGB colours mixed by a pattern of `period` [m], by at most `contrast`."""
+
+    colour: Colour
+    accent: Colour
+    pattern: int = PLAIN
+    period: float = 0.1
+    contrast: float = 1.0
+
+    def fields(self) -> tuple[float, ...]:
+        return (self.pattern, self.period, self.contrast, *self.colour, *self.accent)
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """A body's texture, what it wears below `cuff` along its x axis [m] (a sleeve), its gloss and whether it casts a shadow."""
+
+    texture: Texture
+    sleeve: Texture | None = None
+    cuff: float = NO_CUFF
+    gloss: float = 0.0
+    casts_shadow: bool = True
+
+    def row(self) -> NDArray[np.float32]:
+        """The TEXTURE_FIELDS numbers that the shading pass reads."""
+        sleeve = self.sleeve or self.texture
+        return np.array([*self.texture.fields(), *sleeve.fields(), self.cuff, self.gloss], np.float32)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is common to a picture: lamp position [m] and colours (linear RGB), background at infinity, and the sensor's blur
+    [px], noise (share of full scale) and white balance."""
+
+    lamp: tuple[float, float, float]
+    lamp_colour: Colour
+    ambient: Colour
+    background: Appearance
+    blur_px: float = 0.6
+    noise: float = 0.012
+    gain: Colour = (1.0, 1.0, 1.0)
+
+
+@functools.cache
+def noise_volume() -> NDArray[np.float32]:
+    """Lattice values (32, 32, 32) in [0, 1] of the value noise."""
+    return np.random.default_rng(7).random((32, 32, 32), dtype=np.float32)
+
+
+def hsv(hue: float, saturation: float, value: float) -> Colour:
+    """Linear RGB of a colour named as artists do; `value` is the display's, so it is squared."""
+    r, g, b = colorsys.hsv_to_rgb(hue % 1.0, min(max(saturation, 0.0), 1.0), min(max(value, 0.0), 1.0))
+    return r * r, g * g, b * b
+
+
+def skin(rng: np.random.Generator) -> Texture:
+    """Human skin, from very light to very dark, slightly blotched."""
+    depth = rng.uniform()
+    hue = rng.uniform(0.035, 0.075)
+    saturation = 0.25 + 0.35 * depth + rng.uniform(-0.05, 0.05)
+    value = 0.95 - 0.6 * depth + rng.uniform(-0.03, 0.03)
+    return Texture(hsv(hue, saturation, value), hsv(hue - 0.015, saturation + 0.1, value * 0.85), BLOTCHES, rng.uniform(0.015, 0.05), 0.6)
+
+
+def cloth(rng: np.random.Generator) -> Texture:
+    return _any(rng, saturation=0.8, value=(0.1, 0.95), period=(0.006, 0.06), patterns=(PLAIN, PLAIN, BLOTCHES, STRIPES, CHECKS))
+
+
+def _any(rng, saturation: float, value: tuple[float, float], period: tuple[float, float], patterns: tuple[int, ...]) -> Texture:
+    hue, low = rng.uniform(), rng.uniform(*value)
+    first = hsv(hue, rng.uniform(0, saturation), low)
+    second = hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0, saturation), np.clip(low + rng.uniform(-0.35, 0.35), 0.05, 1.0))
+    return Texture(first, second, int(rng.choice(patterns)), float(np.exp(rng.uniform(*np.log(period)))), rng.uniform(0.3, 1.0))
+
+
+def metal(rng: np.random.Generator) -> Texture:
+    """A robot's paint: white, grey, sometimes orange, blue or yellow."""
+    if rng.uniform() < 0.7:
+        return Texture(hsv(rng.uniform(), 0.05, rng.uniform(0.35, 1.0)), hsv(0.0, 0.0, 0.3), BLOTCHES, 0.2, 0.15)
+    return Texture(hsv(rng.choice([0.06, 0.13, 0.6, 0.0]), rng.uniform(0.6, 0.95), rng.uniform(0.6, 1.0)), hsv(0, 0, 0.2), BLOTCHES, 0.2, 0.15)
+
+
+def tabletop(rng: np.random.Generator) -> Texture:
+    if rng.uniform() < 0.45:
+        hue, value = rng.uniform(0.06, 0.1), rng.uniform(0.35, 0.85)
+        return Texture(hsv(hue, 0.5, value), hsv(hue - 0.01, 0.6, value * 0.75), WOOD, rng.uniform(0.05, 0.15), rng.uniform(0.3, 1.0))
+    return _any(rng, saturation=0.25, value=(0.2, 0.95), period=(0.02, 0.3), patterns=(PLAIN, BLOTCHES, BLOTCHES, CHECKS))
+
+
+def occluder(rng: np.random.Generator) -> Texture:
+    """Any colour and pattern; now and then the colour of skin."""
+    if rng.uniform() < 0.08:
+        return skin(rng)
+    return _any(rng, saturation=0.95, value=(0.1, 1.0), period=(0.01, 0.2), patterns=(PLAIN, BLOTCHES, STRIPES, CHECKS, WOOD))
+
+
+def person(rng: np.random.Generator) -> dict[Label, Appearance]:
+    """Skin, and clothes: a sleeve of any length on the forearm, the same cloth on upper arm and torso."""
+    bare, shirt = skin(rng), cloth(rng)
+    gloss = rng.uniform(0.0, 0.06)
+    length = rng.uniform()
+    if length < 0.45:  # short sleeves
+        forearm, upper_arm = Appearance(bare, gloss=gloss), Appearance(bare, shirt, rng.uniform(0.1, 0.32), gloss)
+    elif length < 0.6:  # rolled up somewhere on the forearm
+        forearm, upper_arm = Appearance(bare, shirt, rng.uniform(-0.12, 0.1), gloss), Appearance(shirt)
+    else:
+        forearm, upper_arm = Appearance(bare, shirt, rng.uniform(0.1, 0.15), gloss), Appearance(shirt)
+    return {Label.FOREARM: forearm, Label.UPPER_ARM: upper_arm, Label.TORSO: Appearance(shirt)}
+
+
+def background(rng: np.random.Generator) -> Appearance:
+    """Walls and what stands before them, far away."""
+    texture = _any(rng, saturation=0.5, value=(0.15, 0.95), period=(0.15, 2.0), patterns=(PLAIN, BLOTCHES, BLOTCHES, STRIPES, CHECKS, WOOD))
+    return Appearance(texture, casts_shadow=False)
+
+
+def look(rng: np.random.Generator, around: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Look:
+    """A lamp somewhere above `around` [m], ambient light, a background and a sensor."""
+    angle = rng.uniform(0, 2 * np.pi)
+    distance, height = rng.uniform(0.2, 1.8), rng.uniform(1.4, 2.4)
+    lamp = (around[0] + distance * np.cos(angle), around[1] + distance * np.sin(angle), around[2] + height)
+    warmth, strength, fill = rng.uniform(-0.12, 0.12), rng.uniform(0.45, 1.0), rng.uniform(0.2, 0.6)
+    tint = np.array([1 + warmth, 1.0, 1 - warmth])
+    return Look(
+        lamp=lamp,
+        lamp_colour=tuple(strength * tint),
+        ambient=tuple(fill * np.ones(3)),
+        background=background(rng),
+        blur_px=rng.uniform(0.4, 0.9),
+        noise=rng.uniform(0.004, 0.025),
+        gain=tuple(rng.uniform(0.8, 1.15) * (1 + rng.uniform(-0.06, 0.06, 3))),
+    )

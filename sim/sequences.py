@@ -1,0 +1,213 @@
+"""Image sequences with class labels for training the segmentation: `render(seed, index)` is a function of its arguments.
+
+Scenes are drawn around those of the built-in cells: their cameras, motions, persons, robots and tables, each varied, with things
+that come between and leave, clutter, and all appearances that `sim.camera` draws. A sequence is seen through a window that stands
+still, at scales from those of a far arm or a coarse whole frame to those of a near one.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from shared import cell as cells
+from shared import geometry
+from shared.body import Mesh
+from shared.classes import Label
+from shared.geometry import Array
+from shared.robot import RobotModel, robot_models
+from sim.occluder import Panel, box
+from sim.person import Person, frame
+
+CELLS = ("table", "arm")
+PERIOD_S = 0.05
+FORGOTTEN = 0.15
+"""Share of sequences whose window lies anywhere in the frame."""
+
+
+@dataclass(frozen=True)
+class Variety:
+    """What is drawn. frames; size [px] of the window; scale: bounds of the focal length relative to the cell's camera; speed [m/s]
+    and turn [rad/s]: the target's largest; jitter [m]: how far the window's middle is off the target's."""
+
+    frames: int = 8
+    size: int = 160
+    scale: tuple[float, float] = (0.4, 1.5)
+    speed: float = 0.5
+    turn: float = 1.2
+    jitter: float = 0.06
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """images (frames, h, w, 3) uint8 RGB, labels (frames, h, w) uint8, hidden (frames,): share of the target's pixels in the window
+    that something covers."""
+
+    images: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+    hidden: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Thing:
+    """A mesh and its poses T_world_mesh (frames, 4, 4)."""
+
+    name: str
+    mesh: Mesh
+    T: Array
+
+
+def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells.Camera, list[Thing]]:  # noqa: B008 (frozen)
+    """A camera and the things in front of it, the target first."""
+    cell = _cell(CELLS[rng.integers(len(CELLS))])
+    assert cell.sim is not None
+    times = PERIOD_S * (np.arange(variety.frames) - variety.frames / 2)
+    measures = {name: value * rng.uniform(0.9, 1.1) for name, value in cell.body.model_dump().items()}
+    varied = cell.model_copy(update={"body": cells.Body(**measures)})
+    shoulder = np.asarray(cell.sim.shoulder) + rng.normal(0.0, 0.06, 3)
+    target = next(iter(cell.targets.values()))
+    person = Person(varied, cell.sim.model_copy(update={"shoulder": tuple(shoulder)}), target)
+    T_target = _path(cell.sim.motion, variety, times, rng)
+    names = ("target", "upper_arm", "torso")
+    things = [Thing(name, mesh, T) for name, mesh, T in zip(names, person.meshes, person.poses(T_target), strict=True)]
+    middle = T_target[len(times) // 2]
+    camera = _camera(next(iter(cell.cameras.values())), middle[:3, 3], variety, rng)
+    things += _robot(cell, times, rng)
+    things += _furniture(cell.sim.table or (1.2, 0.8), len(times), rng)
+    if rng.random() < 0.75:
+        things.append(_between(camera, person.meshes[0], T_target, times, rng))
+    return camera, things
+
+
+@functools.cache
+def _cell(name: str) -> cells.Cell:
+    return cells.load(name)
+
+
+@functools.cache
+def _robots(name: str) -> dict[str, RobotModel]:
+    return robot_models(_cell(name))
+
+
+def _path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.Generator) -> Array:
+    """Poses (frames, 4, 4) of the target at a constant twist; one sequence of seven stands still."""
+    position = rng.uniform(np.subtract(motion.low, 0.06), np.add(motion.high, 0.06))
+    rpy = 1.4 * rng.uniform(motion.rpy_low, motion.rpy_high)
+    if rng.random() < 0.25:
+        rpy += rng.normal(0.0, (1.2, 0.3, 0.5))
+    twist = np.concatenate([_direction(rng) * variety.speed, _direction(rng) * variety.turn]) * rng.random() ** 1.5
+    if rng.random() < 1.0 / 7.0:
+        twist[:] = 0.0
+    middle = geometry.from_rpy(position, rpy)
+    return np.stack([geometry.perturb(middle, twist * t) for t in times])
+
+
+def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.random.Generator) -> cells.Camera:
+    """A camera near the cell's or, once in four, anywhere around the target; its resolution scaled."""
+    position = np.asarray(camera.position) + rng.normal(0.0, 0.1, 3)
+    look_at = np.asarray(camera.look_at or target) + rng.normal(0.0, 0.08, 3)
+    if rng.random() < 0.25:
+        azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.1, 1.3)
+        away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+        position, look_at = target + rng.uniform(1.1, 2.2) * away, target + rng.normal(0.0, 0.1, 3)
+    low, high = variety.scale
+    choice = rng.random()  # around 1: the crop at native resolution; around 0.5: the whole frame at scale 2
+    scale = rng.uniform(0.85, 1.15) if choice < 0.5 else rng.uniform(0.45, 0.6) if choice < 0.7 else rng.uniform(low, high)
+    scale = float(np.clip(scale, low, high))
+    width, height = (max(round(scale * n), variety.size) for n in (camera.width, camera.height))
+    return camera.model_copy(
+        update={
+            "width": width,
+            "height": height,
+            "fx": camera.fx * scale,
+            "fy": camera.fy * scale,
+            "cx": (width - 1) / 2.0,
+            "cy": (height - 1) / 2.0,
+            "position": tuple(position),
+            "look_at": tuple(look_at),
+            "rpy": None,
+        }
+    )
+
+
+def _robot(cell: cells.Cell, times: Array, rng: np.random.Generator) -> list[Thing]:
+    """The cell's robots, somewhere in and around their joint bounds and moving; the table cell borrows the other's once in four."""
+    if not cell.robots:
+        if rng.random() < 0.75:
+            return []
+        cell = _cell("arm")
+    assert cell.sim is not None
+    things = []
+    offset = np.eye(4)
+    offset[:3, 3] = rng.normal(0.0, 0.06, 3)
+    for name, model in _robots(cell.name).items():
+        low, high = np.asarray(cell.sim.joints_low), np.asarray(cell.sim.joints_high)
+        q = rng.uniform(low - 0.3, high + 0.3) + times[:, None] * rng.normal(0.0, 0.3, len(low))
+        links = model.link_transforms(q)
+        things += [Thing(f"{name}/{link}", mesh, offset @ links[link]) for link, mesh in model.meshes.items()]
+        for pad in cell.pads.values():
+            plate = box((0.09, 0.09, 0.003), (0.0, 0.0, -0.0015), Label.ROBOT)
+            things.append(Thing("pad", plate, offset @ links[pad.link.partition("/")[2]] @ pad.T_link_pad))
+    return things
+
+
+def _furniture(table: tuple[float, float], frames: int, rng: np.random.Generator) -> list[Thing]:
+    """A table, plates in it and clutter on it: all of it background."""
+    things = []
+    if rng.random() < 0.9:
+        size = np.array(table) * rng.uniform(0.8, 1.4, 2)
+        things.append(_standing("table", box((*size, 0.03), (0.0, 0.0, -0.017), Label.BACKGROUND), np.eye(4), frames))
+        if rng.random() < 0.6:
+            rows, columns, pitch = rng.integers(1, 4), rng.integers(2, 6), rng.uniform(0.06, 0.1)
+            side = pitch * rng.uniform(0.7, 1.1)
+            for i in range(rows):
+                for k in range(columns):
+                    at = ((k - (columns - 1) / 2) * pitch, (i - (rows - 1) / 2) * pitch, -0.0015)
+                    things.append(_standing("pad", box((side, side, 0.003), at, Label.BACKGROUND), np.eye(4), frames))
+    for _ in range(rng.integers(0, 4) if rng.random() < 0.4 else 0):
+        size = rng.uniform(0.03, 0.25, 3)
+        T = geometry.from_rpy([*rng.uniform(-0.6, 0.6, 2), size[2] / 2], [0.0, 0.0, rng.uniform(0.0, np.pi)])
+        things.append(_standing("clutter", box(size, (0.0, 0.0, 0.0), Label.BACKGROUND), T, frames))
+    return things
+
+
+def _standing(name: str, mesh: Mesh, T: Array, frames: int) -> Thing:
+    return Thing(name, mesh, np.broadcast_to(T, (frames, 4, 4)))
+
+
+def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, rng: np.random.Generator) -> Thing:
+    """Something that covers a part of the target from the camera, and slides or stands: the emulator's panel, or a thing of
+    another shape somewhere on the line of sight."""
+    frames = len(times)
+    if rng.random() < 0.4:
+        panel = Panel(int(rng.integers(2**31)))
+        level = rng.uniform(-0.5, 1.0) + times * rng.choice([0.0, rng.normal(0.0, 2.5)])
+        poses = [panel.pose(float(np.clip(a, -0.99, 1.0)), camera, target, T) for a, T in zip(level, T_target, strict=True)]
+        return Thing("occluder", panel.mesh, np.stack([T for T in poses if T is not None]))
+    mesh = _shape(rng)
+    hidden = geometry.apply(T_target[frames // 2], target.vertices[rng.integers(len(target.vertices))])
+    eye = np.asarray(camera.position)
+    share = rng.uniform(0.35, 0.92)
+    middle = eye + share * (hidden - eye) + rng.normal(0.0, 0.05, 3)
+    rotation = geometry.from_rpy(middle, rng.uniform(-np.pi, np.pi, 3))
+    velocity = _direction(rng) * rng.uniform(0.0, 0.6) * share if rng.random() < 0.7 else np.zeros(3)
+    return Thing("occluder", mesh, frame(rotation[:3, :3], middle + times[:, None] * velocity))
+
+
+def _shape(rng: np.random.Generator) -> Mesh:
+    kind = rng.integers(3)
+    if kind == 0:
+        return box(rng.uniform(0.04, 0.3, 3), (0.0, 0.0, 0.0), Label.OCCLUDER)
+    if kind == 1:
+        return box((*rng.uniform(0.1, 0.45, 2), 0.005), (0.0, 0.0, 0.0), Label.OCCLUDER)
+    tube = trimesh.creation.cylinder(radius=rng.uniform(0.01, 0.09), height=rng.uniform(0.15, 0.8), sections=20)
+    return Mesh(np.asarray(tube.vertices), tube.faces.astype(np.int32), np.full(len(tube.faces), Label.OCCLUDER, np.uint8))
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    v = rng.normal(size=3)
+    return v / np.linalg.norm(v)

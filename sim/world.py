@@ -1,0 +1,269 @@
+"""The simulated cell: where everything is at a time, what the cameras see and what the skin feels.
+
+`World(cell, seed).state(t)` is a function of time, seed and the commands given (occlude, motion, pause, speed). The target
+moves by reaches that never touch robot, pads or table; upper arm and torso follow it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from shared import cell as cells
+from shared import geometry
+from shared.body import Mesh
+from shared.classes import Label
+from shared.geometry import Array
+from shared.messages import Frame, Joints, Message, Truth, Voltages
+from shared.robot import robot_models
+from shared.skin import electrode_positions, link_names
+from shared.topics import FRAME, JOINTS, TRUTH, VOLTAGES, Topic
+from sim.clearance import Clearance
+from sim.motion import Clock, LimbMotion, angular_velocity, joint_motions
+from sim.occluder import OcclusionSchedule, Panel, box
+from sim.person import Person
+from sim.skin import SkinModel
+
+FAR = 10.0
+"""What the truth calls the gap [m] where the cell has no pads."""
+PLATE, PLATE_MARGIN, TABLE_THICK = 0.003, 0.02, 0.03
+"""Thickness of a pad, how much wider it is than its electrodes, thickness of the table top [m]."""
+MAX_SPEED = 4.0
+"""Fastest scene: more would leave the cameras and the planner behind."""
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """Where everything is. time_s: real time; T_world_target (4, 4), the same as pose (6,): x, y, z [m], roll, pitch, yaw [rad];
+    velocity (6,): linear [m/s] and angular [rad/s] along the world's axes; joints by robot (n,); links: T_world_link by robot and
+    link."""
+
+    time_s: float
+    T_world_target: Array
+    pose: Array
+    velocity: Array
+    joints: dict[str, Array]
+    links: dict[str, dict[str, Array]]
+
+
+class World:
+    """The cell in motion. Times are real seconds from the start, >= 0; commands act from `time_s` on.
+
+    Raises CellError where the cell lacks what the emulator needs, or its region cannot be moved in.
+    """
+
+    def __init__(self, cell: cells.Cell, seed: int = 0):
+        if cell.sim is None:
+            raise cells.CellError(f"cell {cell.name} has no `sim`: the emulator needs its motion, shoulder and joint bounds")
+        if len(cell.targets) != 1:
+            raise cells.CellError(
+                f"cell {cell.name}: the emulator moves one target, {len(cell.targets)} came: {', '.join(cell.targets)}"
+            )
+        self.cell, self.sim, self.seed = cell, cell.sim, seed
+        self.target_name, self.target = next(iter(cell.targets.items()))
+        self.person = Person(cell, cell.sim, self.target)
+        self.robots = robot_models(cell)
+        self.skin = SkinModel(cell) if cell.pads else None
+        self._things = _things(cell, cell.sim)
+        self.clock, self.occlusion_clock = Clock(), Clock()
+        self.occlusion = OcclusionSchedule(seed)
+        self.panel = Panel(seed)
+        self._motion, self._paused, self._speed = True, False, 1.0
+        self._joint_motions = joint_motions(cell, cell.sim, seed)
+        clearance = Clearance(
+            self.person, self.robots, self._joint_motions, self.skin and self.skin.skin, cell.sim.table is not None
+        )
+        self._limb = LimbMotion(cell.sim.motion, seed, clearance)
+
+    def state(self, time_s: float) -> WorldState:
+        """Where everything is at a time."""
+        scene_s = self.clock.at(time_s)
+        pose, rate = self._limb.at(scene_s)
+        joints = {name: motion.at(scene_s) for name, motion in self._joint_motions.items()}
+        return WorldState(
+            time_s=time_s,
+            T_world_target=geometry.from_rpy(pose[:3], pose[3:]),
+            pose=pose,
+            velocity=self.clock.rate(time_s) * np.concatenate([rate[:3], angular_velocity(pose[3:], rate[3:])]),
+            joints=joints,
+            links={name: self.robots[name].link_transforms(q) for name, q in joints.items()},
+        )
+
+    def plan(self, until_s: float) -> None:
+        """Plan the limb's motion up to a time at the present speed, so that `state` answers at once."""
+        self._limb.plan(self.clock.at(until_s))
+
+    def electrodes(self, state: WorldState) -> Array:
+        """Electrode centroids (n, 3) [m] in the world, in the order of `shared.skin.Skin`."""
+        assert self.skin is not None
+        return self.skin.skin.positions(self.skin.skin.T_world_pads(link_names(state.links)))
+
+    def gaps(self, state: WorldState) -> Array:
+        """Distance [m] (n,) from every electrode to the target's skin; empty where the cell has no pads."""
+        if self.skin is None:
+            return np.empty(0)
+        return self.skin.gaps(self.electrodes(state), [(self.person.meshes[0], state.T_world_target)])
+
+    def bodies(self, camera: str, state: WorldState) -> dict[str, tuple[Mesh, Array]]:
+        """Everything that a camera may see by name, with its T_world_mesh: target, upper_arm, torso, ROBOT/LINK, pads, table and
+        occluder."""
+        links = {"world": np.eye(4), **link_names(state.links)}
+        person = zip(("target", "upper_arm", "torso"), self.person.meshes, self.person.poses(state.T_world_target), strict=False)
+        out = {name: (mesh, T) for name, mesh, T in person}
+        out |= {
+            f"{robot}/{link}": (mesh, state.links[robot][link])
+            for robot, model in self.robots.items()
+            for link, mesh in model.meshes.items()
+        }
+        out |= {name: (mesh, links[link]) for name, (mesh, link) in self._things.items()}
+        T_world_panel = self.occluder(camera, state)
+        return out if T_world_panel is None else {**out, "occluder": (self.panel.mesh, T_world_panel)}
+
+    def occluder(self, camera: str, state: WorldState) -> Array | None:
+        """T_world_panel (4, 4) before a camera, None where it is away."""
+        level = self.occlusion.at(self.occlusion_clock.at(state.time_s))
+        return self.panel.pose(level, self.cell.cameras[camera], self.person.meshes[0], state.T_world_target)
+
+    # Commands
+
+    def occlude(self, level: float | None, time_s: float) -> None:
+        """Hide a share [0, 1] of the target's pixels from the first camera (above 0.95: all), or follow the schedule (None)."""
+        if level is not None and not 0.0 <= level <= 1.0:
+            raise ValueError(f"occlude: a share from 0 to 1 or auto expected, {level} came")
+        self.occlusion.command(self.occlusion_clock.at(time_s), level)
+
+    def set_motion(self, on: bool, time_s: float) -> None:
+        """Let target and robot move, or hold them still."""
+        self._motion = on
+        self._set_rates(time_s)
+
+    def set_paused(self, paused: bool, time_s: float) -> None:
+        """Hold everything, the occluder too, or go on."""
+        self._paused = paused
+        self._set_rates(time_s)
+
+    def set_speed(self, speed: float, time_s: float) -> None:
+        """Scene seconds per second of target and robot."""
+        if not 0.0 < speed <= MAX_SPEED:
+            raise ValueError(f"speed: a factor above 0 and at most {MAX_SPEED:g} expected, {speed:g} came")
+        self._speed = speed
+        self._set_rates(time_s)
+
+    def describe(self, time_s: float) -> dict[str, Any]:
+        """The commands in force, for people and programs."""
+        occlusion = self.occlusion.commanded
+        return {
+            "occlusion": "auto" if occlusion is None else occlusion,
+            "occlusion_now": max(0.0, self.occlusion.at(self.occlusion_clock.at(time_s))),
+            "motion": "on" if self._motion else "off",
+            "paused": self._paused,
+            "speed": self._speed,
+            "scene_s": self.clock.at(time_s),
+            "seed": self.seed,
+        }
+
+    def _set_rates(self, time_s: float) -> None:
+        self.clock.set_rate(time_s, self._speed if self._motion and not self._paused else 0.0)
+        self.occlusion_clock.set_rate(time_s, 0.0 if self._paused else 1.0)
+
+
+def _things(cell: cells.Cell, sim: cells.Sim) -> dict[str, tuple[Mesh, str]]:
+    """What the cell holds beside people and robots, with the link that carries it: pads as plates a little larger than their
+    electrodes' circle, and the table."""
+    out = {}
+    for name, pad in cell.pads.items():
+        radius = np.linalg.norm(electrode_positions(cell.pad_types[pad.type]), axis=1).max()
+        side = 2.0 * radius + PLATE_MARGIN
+        label = Label.BACKGROUND if pad.link == "world" else Label.ROBOT
+        plate = box((side, side, PLATE), (0.0, 0.0, -PLATE / 2.0), label)
+        out[f"pad {name}"] = (dataclasses.replace(plate, vertices=geometry.apply(pad.T_link_pad, plate.vertices)), pad.link)
+    if sim.table is not None:  # its top lies a hair below the pads, so that these are seen
+        out["table"] = (box((*sim.table, TABLE_THICK), (0.0, 0.0, -PLATE / 2.0 - TABLE_THICK / 2.0), Label.BACKGROUND), "world")
+    return out
+
+
+BATCH = 5
+"""Samples of a voltage message."""
+SAMPLE_NS = 1_000_000
+"""Time between two samples of an electrode."""
+TICK_NS = BATCH * SAMPLE_NS
+
+Stream = list[tuple[Topic, dict[str, str], Message]]
+"""Messages with their topic and the names that fill its key."""
+
+
+class Sensors:
+    """The messages that a world gives off. Time zero of the world is `epoch_ns`; tick k of the skin ends at epoch + k TICK_NS,
+    frame k is exposed at epoch + k periods of its camera. Ticks and frames may be left out; what is left has the same values."""
+
+    def __init__(self, world: World, epoch_ns: int):
+        self.world, self.epoch_ns = world, epoch_ns
+        self._gaps: tuple[int, Array] | None = None  # tick and its gaps, for the samples up to the next
+        self._hidden: deque[tuple[int, float]] = deque([(epoch_ns, 0.0)], maxlen=4)  # stamp of a frame and what was hidden in it
+
+    def frame_stamp_ns(self, camera: str, k: int) -> int:
+        """When frame k of a camera is exposed."""
+        return self.epoch_ns + round(k * 1e9 / self.world.cell.cameras[camera].rate_hz)
+
+    def frame(self, camera: str, k: int) -> Stream:
+        """Frame k of a camera."""
+        stamp_ns = self.frame_stamp_ns(camera, k)
+        view = self.world.view(camera, (stamp_ns - self.epoch_ns) * 1e-9)
+        if camera == next(iter(self.world.cell.cameras)):
+            self._hidden.append((stamp_ns, view.hidden))
+        return [(FRAME, {"camera": camera}, Frame(stamp_ns=stamp_ns, image=view.image))]
+
+    def tick(self, k: int) -> Stream:
+        """Voltages of every pad, joints of every robot and the truth at tick k >= 1."""
+        world, cell = self.world, self.world.cell
+        stamp_ns = self.epoch_ns + k * TICK_NS
+        state = world.state(k * TICK_NS * 1e-9)
+        gaps = world.gaps(state)
+        out: Stream = []
+        if world.skin is not None:
+            if self._gaps is None or self._gaps[0] != k - 1:
+                self._gaps = (k - 1, world.gaps(world.state((k - 1) * TICK_NS * 1e-9)))
+            ratio = np.arange(1, BATCH + 1)[:, None] / BATCH
+            rng = np.random.default_rng([world.seed, 5, k])
+            volts = world.skin.volts(self._gaps[1] + ratio * (gaps - self._gaps[1]), rng).astype(np.float32)
+            for i, pad in enumerate(cell.pads):
+                samples = volts[:, world.skin.skin.of(i)]
+                out.append((VOLTAGES, {"pad": pad}, Voltages(stamp_ns=stamp_ns, period_ns=SAMPLE_NS, volts=samples)))
+            self._gaps = (k, gaps)
+        out += [(JOINTS, {"robot": name}, Joints(stamp_ns=stamp_ns, position=q)) for name, q in state.joints.items()]
+        truth = Truth(
+            stamp_ns=stamp_ns,
+            target=world.target_name,
+            frame=cell.frame,
+            position=state.pose[:3],
+            orientation=Rotation.from_euler("xyz", state.pose[3:]).as_quat(canonical=True),
+            velocity=state.velocity,
+            hidden=next((hidden for stamp, hidden in reversed(self._hidden) if stamp <= stamp_ns), 0.0),
+            gap=float(gaps.min(initial=FAR)),
+        )
+        return [*out, (TRUTH, {"target": world.target_name}, truth)]
+
+
+def record(
+    cell: cells.Cell, seed: int, seconds: float, frames: bool = True, epoch_ns: int = 10**18
+) -> Iterator[tuple[Topic, dict[str, str], Message]]:
+    """All messages of a run in the order of their stamps, as the emulator would publish them: (topic, names, message).
+
+    frames: without them nothing is rendered (a hundred times faster), and the truth says that nothing is hidden.
+    """
+    world = World(cell, seed)
+    sensors = Sensors(world, epoch_ns)
+    ends_ns = epoch_ns + round(seconds * 1e9)
+    counts = dict.fromkeys(cell.cameras if frames else (), 0)
+    for k in range(1, (ends_ns - epoch_ns) // TICK_NS + 1):
+        for camera in counts:
+            while sensors.frame_stamp_ns(camera, counts[camera]) <= epoch_ns + k * TICK_NS:
+                yield from sensors.frame(camera, counts[camera])
+                counts[camera] += 1
+        yield from sensors.tick(k)
