@@ -27,7 +27,9 @@ def parser(command: str, about: str) -> Parser:
 
 def add_cell(out: argparse.ArgumentParser) -> None:
     default = os.environ.get("PENUMBRA_CELL", "table")
-    out.add_argument("--cell", default=default, metavar="CELL", help="table, arm or a YAML file (default: $PENUMBRA_CELL or table)")
+    out.add_argument(
+        "--cell", default=default, metavar="CELL", help="table, arm or a YAML file (default: $PENUMBRA_CELL or table)"
+    )
 
 
 def add_log(out: argparse.ArgumentParser) -> None:

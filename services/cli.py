@@ -1,4 +1,4 @@
-"""The `penumbra` command. Each subcommand imports only what it needs: fusion starts without torch, `pose` in well under a second."""
+"""The `penumbra` command. Each subcommand imports only what it needs: fusion starts without torch, `pose` at once."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ COMMANDS = {
 }
 SERVICES = ("router", "emulator", "segmentation", "search", "haptics", "fusion")
 LEARNED = ("segmentation", "haptics")
-MODULES = {
-    "up": "services.launch",
-    "pose": "services.client",
-    "topics": "services.client",
-    "sim": "services.client",
-    "snapshot": "services.snapshot",
-    "doctor": "services.doctor",
+FUNCTIONS = {
+    "up": "services.launch:main",
+    "pose": "services.client:pose",
+    "topics": "services.client:list_topics",
+    "sim": "services.client:sim",
+    "snapshot": "services.snapshot:main",
+    "doctor": "services.doctor:main",
 }
 
 
@@ -73,8 +73,8 @@ def _run(command: str, argv: list[str]) -> int:
         return serve(command, argv)
     if command == "bench":
         return _bench(argv)
-    module = importlib.import_module(MODULES[command])
-    run: Callable[[list[str]], int | None] = getattr(module, command, None) or module.main
+    module, _, function = FUNCTIONS[command].partition(":")
+    run: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
     return run(argv) or 0
 
 

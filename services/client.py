@@ -44,11 +44,16 @@ def pose(argv: list[str]) -> int:
         print(text, flush=True)
 
     with _session(bus.connection(options)) as session:
-        show(session)
-        while options.watch:
+        while True:
+            try:
+                show(session)
+            except bus.BusError as error:
+                if not options.watch:
+                    raise
+                print(error, file=sys.stderr)
+            if not options.watch:
+                return 0
             time.sleep(WATCH_S)
-            show(session)
-    return 0
 
 
 def _describe(pose: dict[str, Any]) -> str:
@@ -56,7 +61,8 @@ def _describe(pose: dict[str, Any]) -> str:
     spread = [math.sqrt(max(0.0, pose["covariance"][i][i])) for i in range(6)]
     age_ms = (time.time_ns() - pose["stamp_ns"]) * 1e-6
     senses = [
-        f"{name} {100 * sense['weight']:.0f} % ({1e3 * sense['age_s']:.0f} ms old)" for name, sense in sorted(pose["sources"].items())
+        f"{name} {100 * sense['weight']:.0f} % ({1e3 * sense['age_s']:.0f} ms old)"
+        for name, sense in sorted(pose["sources"].items())
     ]
     rows = {
         pose["target"]: f"{pose['state']}, in frame {pose['frame']}, {age_ms:.0f} ms old",
@@ -73,7 +79,7 @@ def _row(values: list[float], scale: float, spec: str, unit: str, spread: float 
     return f"{text} {unit}" + ("" if spread is None else f"  +- {spread * scale:.2g} {unit}")
 
 
-def topics_(argv: list[str]) -> int:
+def list_topics(argv: list[str]) -> int:
     """`penumbra topics [--hz]`"""
     from rich.console import Console
     from rich.table import Table
@@ -95,11 +101,13 @@ def topics_(argv: list[str]) -> int:
     report = listen(cell, bus.connection(options), options.seconds)
     table = Table("key", "Hz", "expected", "delay ms", "dropped", "bad", box=None)
     for key, row in report.items():
-        topic = topics.find(key)
+        expected = bus.topic_of(key)
         if row["count"] or row["bad"] or "*" not in key:
             delay = "-" if row["delay_s"] is None else f"{1e3 * row['delay_s']:.1f}"
             bad = ", ".join(f"{n} {kind}" for kind, n in row["bad"].items()) or "0"
-            table.add_row(key, f"{row['rate_hz']:.1f}", f"{topic.rate_hz:g}" if topic else "", delay, str(row["dropped"] or 0), bad)
+            table.add_row(
+                key, f"{row['rate_hz']:.1f}", f"{expected.rate_hz:g}" if expected else "", delay, str(row["dropped"] or 0), bad
+            )
     console.print(table)
     return 0
 
@@ -118,7 +126,9 @@ def listen(cell: cells.Cell, connection: bus.Connection, seconds: float) -> dict
 
 def sim(argv: list[str]) -> int:
     """`penumbra sim COMMAND [VALUE]`: what is possible is the emulator's to say."""
-    parser = arguments.parser("sim", "Steers the emulator: occlude LEVEL|auto, motion on|off, pause, resume, speed FACTOR, state.")
+    parser = arguments.parser(
+        "sim", "Steers the emulator: occlude LEVEL|auto, motion on|off, pause, resume, speed FACTOR, state."
+    )
     parser.add_argument("command", help="occlude, motion, pause, resume, speed or state")
     parser.add_argument("value", nargs="?", help="of occlude, motion and speed")
     options = parser.parse_args(argv)
@@ -135,6 +145,3 @@ def sim(argv: list[str]) -> int:
 def _session(connection: bus.Connection) -> zenoh.Session:
     nothing: Callable[[], None] = lambda: None  # noqa: E731
     return bus.open_session(connection, threading.Event(), nothing, PATIENCE_S)
-
-
-COMMANDS = {"pose": pose, "topics": topics_, "sim": sim}

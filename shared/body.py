@@ -67,7 +67,10 @@ def forearm_mesh(body: cells.Body) -> Mesh:
     length = body.forearm_length
     # The muscle's belly lies a quarter of the way from the elbow, the wrist is flatter than the belly.
     at = np.array([0.0, 0.06, 0.25, 0.45, 0.65, 0.85, 1.0])
-    around = np.interp(at, [0.0, 0.06, 0.25, 0.45, 0.65, 0.85, 1.0], [0.78, 0.92, 1.0, 0.93, 0.76, 0.6, 0.0]) * body.forearm_circumference
+    around = (
+        np.interp(at, [0.0, 0.06, 0.25, 0.45, 0.65, 0.85, 1.0], [0.78, 0.92, 1.0, 0.93, 0.76, 0.6, 0.0])
+        * body.forearm_circumference
+    )
     around[-1] = body.wrist_circumference
     wide, thin = half_axes(around, np.interp(at, [0, 0.25, 1.0], [0.95, 0.92, 0.68]))
     forearm = loft(_along_x((at - 0.5) * length, 0.0, 0.0), wide, thin, 18)
@@ -122,7 +125,7 @@ def target_mesh(target: cells.Target, cell: cells.Cell) -> Mesh:
     except Exception as error:
         raise cells.CellError(f"{path}: a triangle mesh that trimesh reads expected (STL, OBJ, PLY, GLB): {error}") from None
     if not len(getattr(mesh, "faces", ())):
-        raise cells.CellError(f"{path}: a mesh with triangles expected, this one has none")
+        raise cells.CellError(f"{path}: a triangle mesh expected, this one has no triangles")
     extent = float(max(mesh.extents))
     if not 0.02 < extent < 3.0:
         raise cells.CellError(f"{path}: a limb in metres expected, this mesh is {extent:.3g} long: scale it to metres")

@@ -20,6 +20,7 @@ from typing import Any
 import zenoh
 
 from shared.messages import BadMessage, Message, decode
+from shared.topics import TOPICS, Topic
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 RATE_WINDOW_S = 3.0
@@ -165,6 +166,11 @@ def ask(
     if errors and not answers:
         raise Refused(errors[0])
     return answers
+
+
+def topic_of(key: str) -> Topic | None:
+    """The topic that a key (or a key expression) belongs to."""
+    return next((topic for topic in TOPICS if zenoh.KeyExpr(topic.at()).includes(key)), None)
 
 
 class Rate:

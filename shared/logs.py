@@ -31,12 +31,22 @@ def get(service: str, **fields: Any) -> Log:
 
 def configure(level: str = "info", as_json: bool = False) -> None:
     """Sends the logs of Penumbra to standard error, from `level` on."""
-    handler = logging.StreamHandler(sys.stderr)
+    handler = _ToStandardError()
     handler.setFormatter(_Json() if as_json else _Text())
     logger = logging.getLogger("penumbra")
     logger.handlers[:] = [handler]
     logger.setLevel(level.upper())
     logger.propagate = False
+
+
+class _ToStandardError(logging.Handler):
+    """Writes to what sys.stderr is now: a live table puts itself in its place."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            sys.stderr.write(self.format(record) + "\n")
+        except Exception:
+            self.handleError(record)
 
 
 def _common(record: logging.LogRecord) -> tuple[str, str, str]:

@@ -338,10 +338,9 @@ def _array_from_wire(where: str, spec: _ArraySpec, value: Any) -> np.ndarray:
     if len(data) != expected:
         raise BadMessage("array", f"{where}: {expected} bytes for {dtype} {shape} expected, {len(data)} came")
     array = np.frombuffer(data, dtype=dtype).reshape(shape)
-    if array.dtype.kind == "f":
-        if not np.abs(array).max() <= LARGEST:  # also where it is NaN
-            count = int((~(np.abs(array) <= LARGEST)).sum())
-            raise BadMessage("finite", f"{where}: finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not")
+    if array.dtype.kind == "f" and not np.abs(array).max() <= LARGEST:  # also where it is NaN
+        count = int((~(np.abs(array) <= LARGEST)).sum())
+        raise BadMessage("finite", f"{where}: finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not")
     fault = spec.check(array) if spec.check else None
     if fault:
         raise BadMessage("values", f"{where}: {fault}")

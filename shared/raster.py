@@ -159,11 +159,15 @@ def _draw(V, faces, fx, fy, cx, cy, ids, start, depth, out_ids, out_triangles):
         for k in range(3):
             triangle[k] = V[faces[f, k]]
         if triangle[0, 2] >= NEAR and triangle[1, 2] >= NEAR and triangle[2, 2] >= NEAR:
-            _draw_triangle(triangle[0], triangle[1], triangle[2], fx, fy, cx, cy, ids[f], start + f, depth, out_ids, out_triangles)
+            _draw_triangle(
+                triangle[0], triangle[1], triangle[2], fx, fy, cx, cy, ids[f], start + f, depth, out_ids, out_triangles
+            )
             continue
         m = _clip(triangle, clipped)
         for c in range(2, m):
-            _draw_triangle(clipped[0], clipped[c - 1], clipped[c], fx, fy, cx, cy, ids[f], start + f, depth, out_ids, out_triangles)
+            _draw_triangle(
+                clipped[0], clipped[c - 1], clipped[c], fx, fy, cx, cy, ids[f], start + f, depth, out_ids, out_triangles
+            )
 
 
 @njit(cache=True, nogil=True)

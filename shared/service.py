@@ -20,7 +20,8 @@ import string
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
 from types import TracebackType
@@ -88,17 +89,25 @@ class Node:
         return self
 
     def run(self) -> None:
-        """Opens, and serves until SIGINT or SIGTERM; a second signal ends the process at once."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
+        """Opens, and serves until SIGINT or SIGTERM; a second signal ends the process at once. Raises bus.BusError."""
+        with self.until_signal():
+            try:
+                self.open()
+            except bus.BusError:
+                if not self.stopping.is_set():  # else: told to stop before the router came
+                    raise
+            self.stopping.wait()
+
+    @contextmanager
+    def until_signal(self) -> Iterator[None]:
+        """Within it SIGINT and SIGTERM set `stopping`; at its end the node is closed."""
+        previous = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            self.open()
-        except bus.BusError:
-            if not self.stopping.is_set():
-                raise
-            return
-        self.stopping.wait()
-        self.close()
+            yield
+        finally:
+            self.close()
+            for number, handler in previous.items():
+                signal.signal(number, handler)
 
     def close(self) -> None:
         """Leaves the bus and ends the node's threads, within about CLOSE_S."""

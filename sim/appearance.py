@@ -13,6 +13,8 @@ from shared.classes import Label
 
 PLAIN, BLOTCHES, STRIPES, CHECKS, WOOD = range(5)
 TEXTURE_FIELDS = 20
+CUFF, GLOSS = 18, 19
+"""A row of a body's texture: two of Texture.fields (nine numbers each: its own and its sleeve's), cuff, gloss."""
 NO_CUFF = -1e9
 
 Colour = tuple[float, float, float]
@@ -80,7 +82,9 @@ def skin(rng: np.random.Generator) -> Texture:
     hue = rng.uniform(0.035, 0.075)
     saturation = 0.25 + 0.35 * depth + rng.uniform(-0.05, 0.05)
     value = 0.95 - 0.6 * depth + rng.uniform(-0.03, 0.03)
-    return Texture(hsv(hue, saturation, value), hsv(hue - 0.015, saturation + 0.1, value * 0.85), BLOTCHES, rng.uniform(0.015, 0.05), 0.6)
+    return Texture(
+        hsv(hue, saturation, value), hsv(hue - 0.015, saturation + 0.1, value * 0.85), BLOTCHES, rng.uniform(0.015, 0.05), 0.6
+    )
 
 
 def cloth(rng: np.random.Generator) -> Texture:
@@ -98,13 +102,21 @@ def metal(rng: np.random.Generator) -> Texture:
     """A robot's paint: white, grey, sometimes orange, blue or yellow."""
     if rng.uniform() < 0.7:
         return Texture(hsv(rng.uniform(), 0.05, rng.uniform(0.35, 1.0)), hsv(0.0, 0.0, 0.3), BLOTCHES, 0.2, 0.15)
-    return Texture(hsv(rng.choice([0.06, 0.13, 0.6, 0.0]), rng.uniform(0.6, 0.95), rng.uniform(0.6, 1.0)), hsv(0, 0, 0.2), BLOTCHES, 0.2, 0.15)
+    return Texture(
+        hsv(rng.choice([0.06, 0.13, 0.6, 0.0]), rng.uniform(0.6, 0.95), rng.uniform(0.6, 1.0)),
+        hsv(0, 0, 0.2),
+        BLOTCHES,
+        0.2,
+        0.15,
+    )
 
 
 def tabletop(rng: np.random.Generator) -> Texture:
     if rng.uniform() < 0.45:
         hue, value = rng.uniform(0.06, 0.1), rng.uniform(0.35, 0.85)
-        return Texture(hsv(hue, 0.5, value), hsv(hue - 0.01, 0.6, value * 0.75), WOOD, rng.uniform(0.05, 0.15), rng.uniform(0.3, 1.0))
+        return Texture(
+            hsv(hue, 0.5, value), hsv(hue - 0.01, 0.6, value * 0.75), WOOD, rng.uniform(0.05, 0.15), rng.uniform(0.3, 1.0)
+        )
     return _any(rng, saturation=0.25, value=(0.2, 0.95), period=(0.02, 0.3), patterns=(PLAIN, BLOTCHES, BLOTCHES, CHECKS))
 
 
@@ -131,7 +143,9 @@ def person(rng: np.random.Generator) -> dict[Label, Appearance]:
 
 def background(rng: np.random.Generator) -> Appearance:
     """Walls and what stands before them, far away."""
-    texture = _any(rng, saturation=0.5, value=(0.15, 0.95), period=(0.15, 2.0), patterns=(PLAIN, BLOTCHES, BLOTCHES, STRIPES, CHECKS, WOOD))
+    texture = _any(
+        rng, saturation=0.5, value=(0.15, 0.95), period=(0.15, 2.0), patterns=(PLAIN, BLOTCHES, BLOTCHES, STRIPES, CHECKS, WOOD)
+    )
     return Appearance(texture, casts_shadow=False)
 
 

@@ -18,7 +18,7 @@ from shared import cell as cells
 from shared import geometry, raster
 from shared.body import Mesh
 from shared.geometry import Array
-from sim.appearance import TEXTURE_FIELDS, Appearance, Look, noise_volume
+from sim.appearance import CUFF, GLOSS, TEXTURE_FIELDS, Appearance, Look, noise_volume
 
 SHADOW_PX = 256
 CREASE = math.cos(math.radians(50.0))
@@ -44,7 +44,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Body:
-    """One thing in the scene. `appearance` may be told apart by face: `parts` (m,) indexes `appearances`."""
+    """One thing in the scene."""
 
     shape: Shape
     T_world_body: Array
@@ -76,7 +76,7 @@ class Renderer:
         self._shadow = raster.Raster(SHADOW_PX, SHADOW_PX)
 
     def render(self, bodies: list[Body], look: Look, rng: np.random.Generator) -> Picture:
-        """The picture of `bodies` (at most 254) under the light, background and sensor of `look`; `rng` draws the sensor's noise."""
+        """The picture of `bodies` (at most 254) under the light and sensor of `look`; `rng` draws the noise."""
         view = self._raster
         view.clear()
         tables = _Tables(bodies)
@@ -96,7 +96,6 @@ class Renderer:
             np.array(self._k),
             T_world_camera,
             tables.T_body_world,
-            tables.offsets,
             tables.corners,
             tables.normals,
             tables.labels,
@@ -108,7 +107,7 @@ class Renderer:
             T_lamp_world,
             lamp_f,
             self._shadow.depth,
-            look.background.row(),
+            look.background.row()[None],
             image,
             labels,
         )
@@ -146,8 +145,9 @@ class _Tables:
     def __init__(self, bodies: list[Body]):
         meshes = [body.shape.mesh for body in bodies]
         self.T_body_world = np.array([geometry.inverse(body.T_world_body) for body in bodies]).reshape(-1, 4, 4)
-        self.offsets = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)])
-        self.corners = np.concatenate([mesh.vertices[mesh.faces].astype(np.float32) for mesh in meshes] or [np.zeros((0, 3, 3), np.float32)])
+        self.corners = np.concatenate(
+            [mesh.vertices[mesh.faces].astype(np.float32) for mesh in meshes] or [np.zeros((0, 3, 3), np.float32)]
+        )
         self.normals = np.concatenate([body.shape.normals for body in bodies] or [np.zeros((0, 3, 3), np.float32)])
         self.labels = np.concatenate([mesh.labels for mesh in meshes] or [np.zeros(0, np.uint8)])
         self.textures = np.array([body.appearance.row() for body in bodies], np.float32).reshape(-1, TEXTURE_FIELDS)
@@ -219,25 +219,29 @@ def _corner_normals(vertices, flat, area, crease):
 
 @njit(cache=True, nogil=True)
 def _noise(volume, x, y, z):
-    """Trilinear value noise in [0, 1] with period 1 in its own units."""
-    n = volume.shape[0]
+    """Trilinear value noise in [0, 1] with a lattice of pitch 1, whose size is a power of two."""
+    wrap = volume.shape[0] - 1
     fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
     a, b, c = np.float32(x - fx), np.float32(y - fy), np.float32(z - fz)
-    i, j, k = int(fx) % n, int(fy) % n, int(fz) % n
-    i1, j1, k1 = (i + 1) % n, (j + 1) % n, (k + 1) % n
+    i, j, k = int(fx) & wrap, int(fy) & wrap, int(fz) & wrap
+    i1, j1, k1 = (i + 1) & wrap, (j + 1) & wrap, (k + 1) & wrap
     one = np.float32(1.0)
-    low = (volume[i, j, k] * (one - a) + volume[i1, j, k] * a) * (one - b) + (volume[i, j1, k] * (one - a) + volume[i1, j1, k] * a) * b
-    high = (volume[i, j, k1] * (one - a) + volume[i1, j, k1] * a) * (one - b) + (volume[i, j1, k1] * (one - a) + volume[i1, j1, k1] * a) * b
+    low = (volume[i, j, k] * (one - a) + volume[i1, j, k] * a) * (one - b) + (
+        volume[i, j1, k] * (one - a) + volume[i1, j1, k] * a
+    ) * b
+    high = (volume[i, j, k1] * (one - a) + volume[i1, j, k1] * a) * (one - b) + (
+        volume[i, j1, k1] * (one - a) + volume[i1, j1, k1] * a
+    ) * b
     return low * (one - c) + high * c
 
 
 @njit(cache=True, nogil=True)
-def _texture(row, x, y, z, volume, out):
-    """Albedo (3,) of a texture row (Appearance.row) at body coordinates."""
+def _texture(textures, row, x, y, z, volume, out):
+    """Albedo (3,) of a row of textures (Appearance.row) at body coordinates."""
     base = 0
-    if row[18] > -1e8 and x < row[18]:  # below the cuff: the sleeve's colours
+    if x < textures[row, CUFF]:  # below the cuff: the sleeve's colours
         base = 9
-    pattern, period = int(row[base]), row[base + 1]
+    pattern, period = int(textures[row, base]), textures[row, base + 1]
     u, v, w = x / period, y / period, z / period
     if pattern == 0:
         mix = np.float32(0.0)
@@ -250,22 +254,21 @@ def _texture(row, x, y, z, volume, out):
     else:  # wood: stretched noise, in rings
         ring = 4.0 * _noise(volume, 0.15 * u, v, w) + 0.6 * _noise(volume, u, 5.0 * v, 5.0 * w)
         mix = np.float32(ring - math.floor(ring))
-    mix *= row[base + 2]
+    mix *= textures[row, base + 2]
     for c in range(3):
-        out[c] = row[base + 3 + c] * (np.float32(1.0) - mix) + row[base + 6 + c] * mix
+        out[c] = textures[row, base + 3 + c] * (np.float32(1.0) - mix) + textures[row, base + 6 + c] * mix
 
 
 @njit(cache=True, nogil=True)
 def _shade(
-    depth, ids, triangles, k, T_world_camera, T_body_world, offsets, corners, normals, face_labels, textures, volume,
+    depth, ids, triangles, k, R, T, corners, normals, face_labels, textures, volume,
     lamp, lamp_colour, ambient, T_lamp_world, lamp_f, shadow, background, image, labels,
 ):  # fmt: skip
     h, w = ids.shape
     albedo = np.empty(3, np.float32)
     size = shadow.shape[0]
     centre = size / 2 - 0.5
-    ex, ey, ez = T_world_camera[0, 3], T_world_camera[1, 3], T_world_camera[2, 3]
-    R = T_world_camera
+    ex, ey, ez = R[0, 3], R[1, 3], R[2, 3]
     for row in range(h):
         dy = (row - k[3]) / k[1]
         for column in range(w):
@@ -276,24 +279,23 @@ def _shade(
             rz = R[2, 0] * dx + R[2, 1] * dy + R[2, 2]
             body = ids[row, column]
             if body == 255:
-                _texture(background, 3.0 * rx, 3.0 * ry, 3.0 * rz, volume, albedo)
+                _texture(background, 0, 3.0 * rx, 3.0 * ry, 3.0 * rz, volume, albedo)
                 for c in range(3):
                     image[row, column, c] = albedo[c] * (ambient[c] + np.float32(0.5) * lamp_colour[c])
                 labels[row, column] = 0
                 continue
             z = depth[row, column]
             px, py, pz = ex + z * rx, ey + z * ry, ez + z * rz
-            T = T_body_world[body]
-            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            q = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            x = T[body, 0, 0] * px + T[body, 0, 1] * py + T[body, 0, 2] * pz + T[body, 0, 3]
+            y = T[body, 1, 0] * px + T[body, 1, 1] * py + T[body, 1, 2] * pz + T[body, 1, 3]
+            q = T[body, 2, 0] * px + T[body, 2, 1] * py + T[body, 2, 2] * pz + T[body, 2, 3]
             t = triangles[row, column]
             labels[row, column] = face_labels[t]
             # barycentric weights of the point in its triangle
-            a, b, c3 = corners[t, 0], corners[t, 1], corners[t, 2]
-            ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-            vx, vy, vz = c3[0] - a[0], c3[1] - a[1], c3[2] - a[2]
-            wx, wy, wz = x - a[0], y - a[1], q - a[2]
+            ax, ay, az = corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]
+            ux, uy, uz = corners[t, 1, 0] - ax, corners[t, 1, 1] - ay, corners[t, 1, 2] - az
+            vx, vy, vz = corners[t, 2, 0] - ax, corners[t, 2, 1] - ay, corners[t, 2, 2] - az
+            wx, wy, wz = x - ax, y - ay, q - az
             uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
             wu, wv = wx * ux + wy * uy + wz * uz, wx * vx + wy * vy + wz * vz
             det = uu * vv - uv * uv
@@ -302,14 +304,13 @@ def _shade(
             else:
                 s1, s2 = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
             s0 = 1.0 - s1 - s2
-            n = normals[t]
-            mx = s0 * n[0, 0] + s1 * n[1, 0] + s2 * n[2, 0]
-            my = s0 * n[0, 1] + s1 * n[1, 1] + s2 * n[2, 1]
-            mz = s0 * n[0, 2] + s1 * n[1, 2] + s2 * n[2, 2]
-            # normal in the world: the transpose of T's rotation
-            nx = T[0, 0] * mx + T[1, 0] * my + T[2, 0] * mz
-            ny = T[0, 1] * mx + T[1, 1] * my + T[2, 1] * mz
-            nz = T[0, 2] * mx + T[1, 2] * my + T[2, 2] * mz
+            mx = s0 * normals[t, 0, 0] + s1 * normals[t, 1, 0] + s2 * normals[t, 2, 0]
+            my = s0 * normals[t, 0, 1] + s1 * normals[t, 1, 1] + s2 * normals[t, 2, 1]
+            mz = s0 * normals[t, 0, 2] + s1 * normals[t, 1, 2] + s2 * normals[t, 2, 2]
+            # its normal in the world: the transpose of T's rotation
+            nx = T[body, 0, 0] * mx + T[body, 1, 0] * my + T[body, 2, 0] * mz
+            ny = T[body, 0, 1] * mx + T[body, 1, 1] * my + T[body, 2, 1] * mz
+            nz = T[body, 0, 2] * mx + T[body, 1, 2] * my + T[body, 2, 2] * mz
             length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
             nx, ny, nz = nx / length, ny / length, nz / length
             lx, ly, lz = lamp[0] - px, lamp[1] - py, lamp[2] - pz
@@ -328,17 +329,15 @@ def _shade(
                     if 0 <= i < size - 1 and 0 <= j < size - 1:
                         fu, fv = su - i, sv - j
                         edge = sz - 0.012 - 0.02 * (1.0 - diffuse)
-                        lit = (
-                            ((1 - fu) * (shadow[j, i] > edge) + fu * (shadow[j, i + 1] > edge)) * (1 - fv)
-                            + ((1 - fu) * (shadow[j + 1, i] > edge) + fu * (shadow[j + 1, i + 1] > edge)) * fv
-                        )
+                        lit = ((1 - fu) * (shadow[j, i] > edge) + fu * (shadow[j, i + 1] > edge)) * (1 - fv) + (
+                            (1 - fu) * (shadow[j + 1, i] > edge) + fu * (shadow[j + 1, i + 1] > edge)
+                        ) * fv
                 diffuse *= lit
             else:
                 diffuse = 0.0
-            texture = textures[body]
-            _texture(texture, x, y, q, volume, albedo)
+            _texture(textures, body, x, y, q, volume, albedo)
             shine = 0.0
-            if texture[19] > 0.0 and lit > 0.0:
+            if textures[body, GLOSS] > 0.0 and lit > 0.0:
                 length = math.sqrt(rx * rx + ry * ry + rz * rz)
                 hx, hy, hz = lx - rx / length, ly - ry / length, lz - rz / length
                 length = math.sqrt(hx * hx + hy * hy + hz * hz) + 1e-9
@@ -346,7 +345,7 @@ def _shade(
                 cosine *= cosine
                 cosine *= cosine
                 cosine *= cosine
-                shine = texture[19] * lit * cosine * cosine
+                shine = textures[body, GLOSS] * lit * cosine * cosine
             sky = 0.75 + 0.25 * nz
             for c in range(3):
                 image[row, column, c] = albedo[c] * (ambient[c] * sky + lamp_colour[c] * diffuse) + lamp_colour[c] * shine

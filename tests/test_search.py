@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from services.search import detect, evidence, overlap
-from services.search.contour import Model, Noise
+from services.search.contour import Model
+from services.search.fit import Noise
 from services.search.prediction import JointHistory, predict
 from services.search.robots import RobotDepth
 from services.search.search import Search, VisionEstimate

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shared import geometry
 from shared.messages import Source
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 SOURCES = ("vision", "haptic")
 
@@ -19,7 +21,7 @@ class Estimate:
     """The target at one moment. `T` (4, 4); `velocity` (6,): linear [m/s], angular [rad/s]; `covariance` (6, 6) of the pose error
     (`shared.geometry`); `state`: tracking, coasting or lost; `sources`: the senses heard so far."""
 
-    T: Array
+    T: geometry.Array
     velocity: Array
     covariance: Array
     state: str

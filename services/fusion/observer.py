@@ -10,6 +10,7 @@ import numpy as np
 from services.fusion.estimate import Array, Estimate, Log, checked
 from services.fusion.filter import MOTION, POSE, Filter, Measurement, Settings, State
 from services.fusion.history import History
+from shared import geometry
 from shared.messages import Source
 
 
@@ -19,7 +20,7 @@ class ErrorStateObserver:
     home : expected pose (4, 4) before anything is known, with standard deviations `spread` (position [m], rotation [rad]).
     """
 
-    def __init__(self, home: Array, spread: tuple[float, float], settings: Settings | None = None):
+    def __init__(self, home: geometry.Array, spread: tuple[float, float], settings: Settings | None = None):
         self.settings = settings or Settings()
         self.log = Log()
         self._home = home

@@ -1,4 +1,4 @@
-"""The paper's observer (section "Modified Luenberger Observer" and "Integration of Perception Methods"), kept as `--observer paper`.
+"""The paper's observer ("Modified Luenberger Observer" and "Integration of Perception Methods"), kept as `--observer paper`.
 
 What the paper leaves open or what cannot be done as printed, and what is done here:
 - x is position and roll, pitch, yaw. They wrap: innovations are taken modulo 2 pi. They are singular at a pitch of 90 degrees.
@@ -81,16 +81,17 @@ class _State:
 class PaperObserver:
     """The interface of `observer.ErrorStateObserver`, the paper's equations."""
 
-    def __init__(self, home: Array, spread: tuple[float, float], settings: PaperSettings | None = None):
+    def __init__(self, home: geometry.Array, spread: tuple[float, float], settings: PaperSettings | None = None):
         self.settings = settings or PaperSettings()
         self.log = Log()
         self._home = home
         self._home_covariance = np.diag(np.repeat(np.square(spread), 3))
         self._W_v = np.diag(self.settings.W_v)
         self._Q = self.settings.rate**2 * self._W_v
+        self._nobody = np.linalg.inv(1e3 * self._W_v)  # R^-1 of a sense that says next to nothing
         self._hold_ns = {source: int(1e9 * seconds) for source, seconds in self.settings.hold}
         self._held: dict[str, _Held] = {}
-        self._state: _State | None = None
+        self._ahead: list[_State] = []  # the state at the newest measurement, and as far ahead as somebody asked
         self._covariance = self._home_covariance
         self._weights: dict[str, float] = {}
 
@@ -108,20 +109,20 @@ class PaperObserver:
             return False
         y = _pose(T)
         B = _rates(y)
-        information = B.T @ information @ B
-        R_inverse = np.linalg.inv(self.R_v(hidden or 0.0)) if source == "vision" else information
-        held = _Held(stamp_ns, y, R_inverse, np.linalg.pinv(information, rcond=1e-9, hermitian=True))
-        start = self._state
-        if start is None or stamp_ns - self._newest_ns() > self.settings.limits.lost_age * 1e9:
+        R_c_inverse = B.T @ information @ B
+        R_inverse = np.linalg.inv(self.R_v(hidden or 0.0)) if source == "vision" else R_c_inverse
+        held = _Held(stamp_ns, y, R_inverse, np.linalg.pinv(R_c_inverse, rcond=1e-9, hermitian=True))
+        if not self._ahead or stamp_ns - self._newest_ns() > self.settings.limits.lost_age * 1e9:
             # P(t_0) = P_0: nothing known but home; the first step moves x^ to what is measured
             x = _pose(self._home)
-            start = _State(stamp_ns - int(STEP_S * 1e9), x, self._W_v, np.zeros(6), x, np.zeros(6))
             self._held = {source: held}
-            state = self._advanced(start, stamp_ns)
-            self._state = replace(state, u=np.zeros(6), smooth=state.x, rate=np.zeros(6))
+            self._ahead = [_State(stamp_ns - int(STEP_S * 1e9), x, self._W_v, np.zeros(6), x, np.zeros(6))]
+            state = self._advanced(stamp_ns)
+            state = replace(state, u=np.zeros(6), smooth=state.x, rate=np.zeros(6))
         else:
-            self._state = self._advanced(start, max(stamp_ns, start.stamp_ns))
+            state = self._advanced(stamp_ns)
             self._held[source] = held
+        self._ahead = [state]
         self._weigh()
         self.log.counts[source].accepted += 1
         return True
@@ -133,9 +134,9 @@ class PaperObserver:
             newest_ns = self._held[name].stamp_ns if name in self._held else since_ns
             in_use = name in self._held and stamp_ns - newest_ns <= self._hold_ns[name]
             sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), self._weights.get(name, 0.0) if in_use else 0.0)
-        if self._state is None:
+        if not self._ahead:
             return Estimate(self._home, np.zeros(6), self._home_covariance, "lost", sources)
-        state = self._advanced(self._state, stamp_ns)
+        state = self._advanced(stamp_ns)
         B = _rates(state.smooth)
         age_s = (stamp_ns - self._newest_ns()) * 1e-9
         growth = np.repeat(self.settings.acceleration, 3) * max(0.0, age_s) ** 3 / 3.0
@@ -153,34 +154,44 @@ class PaperObserver:
     def _in_use(self, stamp_ns: int) -> dict[str, _Held]:
         return {name: held for name, held in self._held.items() if stamp_ns - held.stamp_ns <= self._hold_ns[name]}
 
-    def _advanced(self, state: _State, stamp_ns: int) -> _State:
-        """The state at a later stamp, in steps of at most STEP_S; the same state where the stamp is not later."""
-        begin_ns = state.stamp_ns
-        steps = max(0, -(-(stamp_ns - begin_ns) // int(STEP_S * 1e9)))
-        if steps * STEP_S > self.settings.limits.lost_age:  # nobody asked for long: what lies between cannot matter any more
-            return replace(state, stamp_ns=stamp_ns, u=np.zeros(6), smooth=state.x, rate=np.zeros(6))
-        for i in range(1, steps + 1):
-            state = self._step(state, begin_ns + (stamp_ns - begin_ns) * i // steps)
-        return state
+    def _advanced(self, stamp_ns: int) -> _State:
+        """The state at a stamp, in steps of STEP_S while a measurement is in use; the newest state where the stamp is not later."""
+        begin_ns, step_ns = self._ahead[0].stamp_ns, int(STEP_S * 1e9)
+        end_ns = min(stamp_ns, max(held.stamp_ns + self._hold_ns[name] for name, held in self._held.items()))
+        while self._ahead[-1].stamp_ns + step_ns <= end_ns:
+            self._ahead.append(self._step(self._ahead[-1], self._ahead[-1].stamp_ns + step_ns))
+        state = self._ahead[max(0, end_ns - begin_ns) // step_ns]
+        if end_ns > state.stamp_ns:
+            state = self._step(state, end_ns)
+        if stamp_ns <= state.stamp_ns:
+            return state
+        h = (stamp_ns - state.stamp_ns) * 1e-9  # nothing to correct with: u takes x^ on while it is forgotten
+        decay = float(np.exp(-h / self.settings.velocity_time))
+        x = state.x + self.settings.velocity_time * (1.0 - decay) * state.u
+        smooth, rate = self._low_pass(state, x, h)
+        return _State(stamp_ns, x, self._riccati(state.P, h, np.zeros((6, 6))), decay * state.u, smooth, rate)
+
+    def _riccati(self, P: Array, h: float, information: Array) -> Array:
+        """P after a step h; `information` (6, 6) is C' R^-1 C. A sense that says next to nothing keeps P bounded."""
+        P = np.linalg.inv(P + h * self._Q)  # eq. (luenberger_estim): dP/dt = Q - P C' R^-1 C P
+        P = np.linalg.inv(P + h * information + h * self._nobody)
+        return 0.5 * (P + P.T)
 
     def _step(self, state: _State, stamp_ns: int) -> _State:
         settings = self.settings
         h = (stamp_ns - state.stamp_ns) * 1e-9
         in_use = self._in_use(stamp_ns)
         x_predicted = state.x + h * state.u  # f(x^, u) = u
-        # C = [I; I] where both are in use, so that C' R^-1 C is the sum of both R^-1
+        # C = [I; I], of which the rows of what is not in use are left out
         information = sum((held.R_inverse for held in in_use.values()), start=np.zeros((6, 6)))
-        # eq. (luenberger_estim): dP/dt = Q - P C' R^-1 C P, and P never beyond that of a sense worse than a fully hidden camera
-        P = np.linalg.inv(state.P + h * self._Q)
-        P = np.linalg.inv(P + h * information + h * np.linalg.inv(1e3 * self._W_v))
-        P = 0.5 * (P + P.T)
+        P = self._riccati(state.P, h, information)
         x = x_predicted
         for held in in_use.values():
             y = held.y + (stamp_ns - held.stamp_ns) * 1e-9 * state.u
             z = _wrapped(y - x_predicted)  # eq. (luenberger_pose): z = y - y^
             x = x + h * (P @ (held.R_inverse @ z))  # G z with G = K = P C' R^-1
         share = 1.0 - np.exp(-h / settings.velocity_time)
-        u = state.u + share * ((x - state.x) / h - state.u) if in_use else state.u * (1.0 - share)
+        u = state.u + share * ((x - state.x) / h - state.u)
         smooth, rate = self._low_pass(state, x, h)
         turns = x - _wrapped(x)  # whole turns, taken off the pose and its low-pass alike
         return _State(stamp_ns, x - turns, P, u, smooth - turns, rate)
@@ -197,10 +208,9 @@ class PaperObserver:
     def _weigh(self) -> None:
         """Covariance and weights of the senses in use, by the stationary solution's shares of their R^-1."""
         in_use = self._in_use(self._newest_ns())
-        nobody = np.linalg.inv(1e3 * self._W_v)
-        gather = np.linalg.inv(sum((held.R_inverse for held in in_use.values()), start=nobody))
+        gather = np.linalg.inv(sum((held.R_inverse for held in in_use.values()), start=self._nobody))
         shares = {name: gather @ held.R_inverse for name, held in in_use.items()}
-        rest = gather @ nobody
+        rest = gather @ self._nobody
         covariance = rest @ self._home_covariance @ rest.T
         for name, held in in_use.items():
             covariance = covariance + shares[name] @ held.covariance @ shares[name].T
@@ -216,7 +226,7 @@ def _pose(T: Array) -> Array:
     return np.array([*T[:3, 3], np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
 
 
-def _transform(x: Array) -> Array:
+def _transform(x: Array) -> geometry.Array:
     return geometry.from_rpy(x[:3], x[3:])
 
 

@@ -7,11 +7,12 @@ state estimation in robotics" (2018), arXiv:1812.01537, appendix B.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 
 def hat(r: Array) -> Array:
@@ -40,14 +41,17 @@ def exp(r: Array) -> Array:
 
 def log(R: Array) -> Array:
     """The rotation vector of a rotation matrix, its angle in [0, pi]."""
-    w, x, y, z = _quaternion(R)
+    x, y, z, w = quaternion(R)
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, w) / sine
     return np.array([scale * x, scale * y, scale * z])
 
 
-def _quaternion(R: Array) -> tuple[float, float, float, float]:
-    """(w, x, y, z) with w >= 0, from the largest of the four components (Shepperd): no loss of digits near an angle of pi."""
+def quaternion(R: Array) -> tuple[float, float, float, float]:
+    """(x, y, z, w) with w >= 0 of a rotation matrix.
+
+    Computed from the largest of the four (Shepperd 1978): no loss of digits near an angle of pi.
+    """
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     if a + e + i > 0.0:
         q = (1.0 + a + e + i, h - f, c - g, d - b)
@@ -58,7 +62,7 @@ def _quaternion(R: Array) -> tuple[float, float, float, float]:
     else:
         q = (d - b, c + g, f + h, 1.0 + i - a - e)
     scale = math.copysign(1.0 / math.sqrt(sum(v * v for v in q)), q[0])
-    return q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
+    return q[1] * scale, q[2] * scale, q[3] * scale, q[0] * scale
 
 
 def left_jacobian_inverse(r: Array) -> Array:

@@ -1,28 +1,14 @@
-"""The default search: least squares between the mesh's occluding contour and the boundary of the mask.
-
-One pass, from a pose T_camera_target:
-  1. project the mesh; its occluding contour are the edges between a face seen from the front and one seen from behind (`trace`);
-  2. keep the points on the outside of the silhouette and outside everything that covers the target;
-  3. from each, walk along the contour's normal to the mask's boundary: the offset r [px] (`match`);
-  4. solve the weighted normal equations for the pose error and for the mask's dilation b, r = J e + b + noise (`fit`).
-The passes are iteratively reweighted Gauss-Newton with Huber's weights, from coarse to fine, as in SRT3D (Stoiber et al. 2022,
-doi:10.1007/s11263-022-01579-8). What is hidden is dropped and not scored.
-
-The covariance is that of the measurement alone. Neighbouring points of a mask's boundary err together, so the contour counts as
-one independent point per correlation length; the dilation b is a nuisance with a prior of its own and is marginalised, because
-half a pixel around the limb looks like centimetres of depth.
-"""
+"""The mesh's occluding contour, its distance to the boundary of a mask, and how that changes with the pose."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from services.search.evidence import JOINT, Evidence, Intrinsics
+from services.search.evidence import JOINT, Intrinsics
 from shared import geometry, raster
 from shared.body import Mesh
 
@@ -34,61 +20,6 @@ NEAR = 0.05
 """Edges nearer to the camera than this are left out [m]."""
 CREASE = 0.8
 """Facets that meet at a larger angle [rad] are a crease of the body and not a sample of a round surface."""
-
-
-@dataclass(frozen=True)
-class Noise:
-    """How a mask's boundary errs, in pixels of the mask.
-
-    `edge`: standard deviation along the normal; `correlation`: length along the contour over which errors are one error;
-    `dilation`: standard deviation of the whole mask's being too large or small; `joint`: deviation [m] of the border with
-    the limb's next part, which is one error along its whole length. Defaults: a trained network's masks.
-    """
-
-    edge: float = 0.5
-    correlation: float = 14.0
-    dilation: float = 0.3
-    joint: float = 0.015
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Standard deviations of position [m] and rotation [rad] of a direction that the contour does not show: the weak prior
-    that keeps the solve regular, and the largest deviations published."""
-
-    position: float = 0.5
-    rotation: float = 0.5
-
-    @property
-    def covariance(self) -> Array:
-        return np.diag([self.position**2] * 3 + [self.rotation**2] * 3)
-
-    @property
-    def information(self) -> Array:
-        return np.diag([self.position**-2.0] * 3 + [self.rotation**-2.0] * 3)
-
-
-PASSES = ((24.0, 5.0, 4), (8.0, 2.0, 6))
-"""(reach of the walk [px], Huber's threshold [px], passes at most), from coarse to fine."""
-CONVERGED = 5e-4
-"""A pass that moves less than this [m], and four times it [rad], is the last of its reach."""
-MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
-"""Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
-
-
-@dataclass(frozen=True)
-class Fit:
-    """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
-    `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
-    `cost`: chi^2 of contour, dilation and prior together."""
-
-    T: Array
-    covariance: Array
-    T_searched: Array
-    length: float
-    rms: float
-    dilation: float
-    cost: float
 
 
 class Model:
@@ -298,68 +229,3 @@ def normal_equations(points, r, kind, origin, fx, fy, edge, correlation, joint, 
             for b in range(7):
                 H[a, b] += weight * J[a] * J[b]
     return H, g, length, square, cost
-
-
-def fit(
-    model: Model,
-    T_start: Array,
-    evidence: Evidence,
-    T_prior: Array | None = None,
-    prior: Array | None = None,
-    noise: Noise | None = None,
-    limits: Limits | None = None,
-) -> Fit:
-    """The pose T_camera_target whose contour lies on the mask's boundary, searched from T_start (4 x 4).
-
-    `prior` (6, 6) is the information about T_prior (T_start where None) along the camera's axes. It keeps the solve near where
-    the contour says little, and is taken out of the result again: `Fit.T` and `Fit.covariance` are the measurement's alone.
-    """
-    noise, limits = noise or Noise(), limits or Limits()
-    weak = limits.information
-    k = evidence.intrinsics
-    intrinsics = (k.fx, k.fy, k.cx, k.cy)
-    h, w = evidence.state.shape
-    regular = np.zeros((7, 7))
-    regular[:6, :6] = weak if prior is None else prior + weak
-    regular[6, 6] = noise.dilation**-2
-    T, moved = T_start, np.zeros(7)  # pose error from the prior, and the dilation
-    if T_prior is not None:
-        moved[:6] = geometry.pose_error(T_start, T_prior)
-
-    def linearise(reach: float, huber: float, bounded: bool) -> tuple[Array, Array, float, float, float]:
-        V = model.in_camera(T)
-        silhouette = raster.silhouette(V, model.faces, intrinsics, (0, 0, w, h))
-        points = trace(V, model.faces, model.edges, *intrinsics, silhouette, SPACING_PX)
-        r, kind = match(points, evidence.field, evidence.state, evidence.guarded, reach)
-        weights = (noise.edge, noise.correlation, noise.joint, huber, bounded)
-        return normal_equations(points, r - moved[6], kind, T[:3, 3], k.fx, k.fy, *weights)
-
-    for reach, huber, passes in PASSES:
-        for _ in range(passes):
-            H, g, *_ = linearise(reach, huber, True)
-            step = np.linalg.solve(H + regular, g - regular @ moved)
-            step *= min(1.0, float(np.min(MAX_STEP / np.maximum(np.abs(step[:6]), 1e-12))))
-            T = geometry.perturb(T, step[:6])
-            moved += step
-            if np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED:
-                break
-
-    H, g, length, square, cost = linearise(reach, huber, False)  # the pose is final: only what was measured informs
-    rms = math.sqrt(square / length) if length > 0 else math.inf
-    if length > 0 and rms > noise.edge:  # a mask worse than expected: believe its residuals
-        H *= (noise.edge / rms) ** 2
-        g *= (noise.edge / rms) ** 2
-    # the dilation is marginalised (Schur complement), and the prior left out
-    g[6] -= regular[6, 6] * moved[6]
-    gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
-    covariance = np.linalg.inv(H[:6, :6] - np.outer(gain, H[6, :6]) + weak)
-    offset = covariance @ (g[:6] - gain * g[6] - weak @ moved[:6])
-    return Fit(
-        geometry.perturb(T, offset),
-        (covariance + covariance.T) / 2.0,
-        T,
-        length,
-        rms,
-        float(moved[6]),
-        cost + float(np.dot(moved, regular @ moved)),
-    )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from shared.cell import Camera
@@ -111,3 +112,22 @@ def gather(state: NDArray[np.uint8], labels: NDArray[np.uint8], intrinsics: Intr
 
 def _blur(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return cv2.GaussianBlur(image, (0, 0), SMOOTHING_PX, borderType=cv2.BORDER_REPLICATE).astype(np.float32, copy=False)
+
+
+@njit(cache=True, nogil=True)
+def compare(state, silhouette):
+    """Pixel counts of a mask's states (h, w) and a silhouette (h, w): those in both the target and the silhouette, those in
+    either, and those of the silhouette that are free. What is covered or of a joint is not scored."""
+    both, either, free = 0, 0, 0
+    h, w = state.shape
+    for y in range(h):
+        for x in range(w):
+            s = state[y, x]
+            if s == TARGET:
+                either += 1
+                if silhouette[y, x]:
+                    both += 1
+            elif s == FREE and silhouette[y, x]:
+                either += 1
+                free += 1
+    return both, either, free

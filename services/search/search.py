@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from services.search import contour, detect, evidence, overlap
-from services.search.contour import Fit, Limits, Noise
-from services.search.evidence import FREE, TARGET, Evidence, Intrinsics
+from services.search.evidence import TARGET, Evidence, Intrinsics
+from services.search.fit import Fit, Limits, Noise, fit
 from services.search.robots import RobotDepth
 from shared import body, geometry
 from shared.cell import Cell
@@ -53,24 +52,6 @@ class VisionEstimate:
     hidden: float
     state: State
     T_searched: Array
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """A fit and its pixel counts from `compare`."""
-
-    fit: Fit
-    both: int
-    either: int
-    free: int
-
-    @property
-    def overlap(self) -> float:
-        return _overlap(self.both, self.either, self.free)
-
-
-def _overlap(both: int, either: int, free: int) -> float:
-    return both / either if either else 0.0
 
 
 class Search:
@@ -130,7 +111,7 @@ class Search:
         evidence.cover_outside(state, mask.x0, mask.y0, mask.scale, self._camera)
         return evidence.gather(state, mask.labels, k)
 
-    def _track(self, seen: Evidence, T_start: Array, prior_covariance: Array | None) -> _Candidate | None:
+    def _track(self, seen: Evidence, T_start: Array, prior_covariance: Array | None) -> Fit | None:
         floor = np.diag(np.repeat(np.square(PRIOR_FLOOR), 3))
         covariance = np.zeros((6, 6)) if prior_covariance is None else self._axes.T @ prior_covariance @ self._axes
         first = self._with_mirror(seen, T_start, np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64))
@@ -140,31 +121,29 @@ class Search:
         if other is None or other.overlap <= max(first.overlap, FITS):
             return first
         # another pose explains the mask better: believed where the prediction allows it, or where the prediction itself fails
-        error = geometry.pose_error(other.fit.T, T_start)
-        possible = error @ np.linalg.solve(covariance + floor + other.fit.covariance, error) < GATE
+        error = geometry.pose_error(other.T, T_start)
+        possible = error @ np.linalg.solve(covariance + floor + other.covariance, error) < GATE
         return other if possible or first.overlap < FITS else first
 
-    def _with_mirror(self, seen: Evidence, T_start: Array, prior: Array) -> _Candidate:
+    def _with_mirror(self, seen: Evidence, T_start: Array, prior: Array) -> Fit:
         """The fit from the prediction, and that from its mirror image where both may be right: an axis nearly parallel to the
         image looks the same tilted either way. They are merged by their likelihoods, so that the covariance covers both."""
-        first = self._candidate(seen, T_start, T_start, prior)
-        T_mirror = detect.mirrored(first.fit.T_searched)[0]
+        first = self._fit(seen, T_start, T_start, prior)
+        T_mirror = detect.mirrored(first.T_searched)[0]
         away = geometry.pose_error(T_mirror, T_start)
         if first.overlap < FITS or away @ prior @ away > GATE:
             return first
-        other = self._candidate(seen, T_mirror, T_start, prior)
-        if other.fit.cost < first.fit.cost:
+        other = self._fit(seen, T_mirror, T_start, prior)
+        if other.cost < first.cost:
             first, other = other, first
-        share = 1.0 / (1.0 + np.exp(0.5 * min(other.fit.cost - first.fit.cost, 100.0)))
+        share = 1.0 / (1.0 + np.exp(0.5 * min(other.cost - first.cost, 100.0)))
         if share < 0.01:
             return first
-        apart = geometry.pose_error(other.fit.T, first.fit.T)
-        covariance = (
-            (1.0 - share) * first.fit.covariance + share * other.fit.covariance + share * (1.0 - share) * np.outer(apart, apart)
-        )
-        return replace(first, fit=replace(first.fit, T=geometry.perturb(first.fit.T, share * apart), covariance=covariance))
+        apart = geometry.pose_error(other.T, first.T)
+        covariance = (1.0 - share) * first.covariance + share * other.covariance + share * (1.0 - share) * np.outer(apart, apart)
+        return replace(first, T=geometry.perturb(first.T, share * apart), covariance=covariance)
 
-    def _detect(self, seen: Evidence, T_home: Array) -> _Candidate | None:
+    def _detect(self, seen: Evidence, T_home: Array) -> Fit | None:
         spread = self._target.home_spread
         information = np.diag(np.repeat([spread.position**-2.0, spread.rotation**-2.0], 3))
 
@@ -173,40 +152,38 @@ class Search:
             distance = np.linalg.norm(T[:3, 3] - T_home[:3, 3])
             return share - HOME_WEIGHT * float(np.hypot(distance / spread.position, angle / spread.rotation))
 
-        def fitted(T: Array) -> tuple[float, _Candidate]:
-            found = self._candidate(seen, T, T_home, information)
-            return score(found.overlap, found.fit.T_searched), found
+        def fitted(T: Array) -> tuple[float, Fit]:
+            found = self._fit(seen, T, T_home, information)
+            return score(found.overlap, found.T_searched), found
 
         starts = detect.hypotheses(self._model, seen, T_home)
         if not starts:
             return None
-        ranked = sorted(starts, key=lambda T: -score(_overlap(*self._counts(seen, T)), T))
+        ranked = sorted(starts, key=lambda T: -score(self._overlap(seen, T), T))
         best = max((fitted(T) for T in ranked[:DETECT_FITS]), key=lambda pair: pair[0])
-        for T in detect.mirrored(best[1].fit.T_searched):
+        for T in detect.mirrored(best[1].T_searched):
             best = max(best, fitted(T), key=lambda pair: pair[0])
         return best[1]
 
-    def _candidate(self, seen: Evidence, T: Array, T_prior: Array, prior: Array) -> _Candidate:
-        fit = contour.fit(self._model, T, seen, T_prior, prior, self._noise, self._limits)
-        return _Candidate(fit, *self._counts(seen, fit.T_searched))
+    def _fit(self, seen: Evidence, T_start: Array, T_prior: Array, prior: Array) -> Fit:
+        return fit(self._model, T_start, seen, T_prior, prior, self._noise, self._limits)
 
-    def _counts(self, seen: Evidence, T: Array) -> tuple[int, int, int]:
+    def _overlap(self, seen: Evidence, T: Array) -> float:
         h, w = seen.state.shape
-        return compare(seen.state, self._model.silhouette(T, seen.intrinsics, (0, 0, w, h)))
+        both, either, _ = evidence.compare(seen.state, self._model.silhouette(T, seen.intrinsics, (0, 0, w, h)))
+        return both / either if either else 0.0
 
-    def _judge(self, seen: Evidence, best: _Candidate) -> VisionEstimate:
-        fit = best.fit
-        amodal = max(self._amodal_px(fit.T_searched, seen.intrinsics), 1)
+    def _judge(self, seen: Evidence, best: Fit) -> VisionEstimate:
+        amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
         hidden = float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0))
         explained = 1.0 - (best.both + best.free) / amodal  # covered, or outside the window
-        if hidden > HIDDEN or fit.length < SHORTEST_PX:
+        if hidden > HIDDEN or best.length < SHORTEST_PX:
             state: State = "occluded" if explained > 0.5 else "lost"
         else:
             state = "tracking" if best.overlap >= FITS else "lost"
-        covariance = fit.covariance if state == "tracking" else self._limits.covariance
-        return self._estimate(
-            fit.T if state == "tracking" else fit.T_searched, covariance, best.overlap, hidden, state, fit.T_searched
-        )
+        if state == "tracking":
+            return self._estimate(best.T, best.covariance, best.overlap, hidden, state, best.T_searched)
+        return self._estimate(best.T_searched, self._limits.covariance, best.overlap, hidden, state, best.T_searched)
 
     def _amodal_px(self, T: Array, k: Intrinsics) -> int:
         """Pixels of the whole silhouette, whatever covers it and wherever the window ends."""
@@ -235,22 +212,3 @@ class Search:
         return VisionEstimate(
             T_world_camera @ T, (covariance + covariance.T) / 2.0, share, hidden, state, T_world_camera @ T_searched
         )
-
-
-@njit(cache=True, nogil=True)
-def compare(state, silhouette):
-    """Pixel counts of a mask's states (h, w) and a silhouette (h, w): those in both the target and the silhouette, those in
-    either, and those of the silhouette that are free. What is covered or of a joint is not scored."""
-    both, either, free = 0, 0, 0
-    h, w = state.shape
-    for y in range(h):
-        for x in range(w):
-            s = state[y, x]
-            if s == TARGET:
-                either += 1
-                if silhouette[y, x]:
-                    both += 1
-            elif s == FREE and silhouette[y, x]:
-                either += 1
-                free += 1
-    return both, either, free
