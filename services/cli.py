@@ -29,6 +29,8 @@ COMMANDS = {
 }
 SERVICES = ("router", "emulator", "segmentation", "search", "haptics", "fusion")
 LEARNED = ("segmentation", "haptics")
+SWITCH_S = 0.0005
+"""A reader thread waits at most this long for a computing one; Python's 5 ms would be half of the skin's period."""
 FUNCTIONS = {
     "up": "services.launch:main",
     "pose": "services.client:pose",
@@ -81,6 +83,7 @@ def _run(command: str, argv: list[str]) -> int:
 def serve(name: str, argv: list[str]) -> int:
     """One service until SIGINT or SIGTERM."""
     _die_with_parent()
+    sys.setswitchinterval(SWITCH_S)
     from services import arguments
     from shared import bus, cell, logs
     from shared.service import Node
@@ -121,7 +124,7 @@ def _is_ours(error: Exception) -> bool:
     from shared.bus import BusError, Refused
     from shared.cell import CellError
 
-    return isinstance(error, BusError | Refused | CellError)
+    return isinstance(error, BusError | Refused | CellError | FileNotFoundError)
 
 
 def _explain_import(command: str, error: ImportError) -> int:

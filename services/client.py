@@ -43,7 +43,7 @@ def pose(argv: list[str]) -> int:
                 text = "\x1b[H\x1b[J" + text
         print(text, flush=True)
 
-    with _session(bus.connection(options)) as session:
+    with open_session(bus.connection(options)) as session:
         while True:
             try:
                 show(session)
@@ -82,6 +82,7 @@ def _row(values: list[float], scale: float, spec: str, unit: str, spread: float 
 def list_topics(argv: list[str]) -> int:
     """`penumbra topics [--hz]`"""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     parser = arguments.parser("topics", "Lists the table of topics, and with --hz what really arrives.")
@@ -89,13 +90,13 @@ def list_topics(argv: list[str]) -> int:
     parser.add_argument("--seconds", type=float, default=3.0, help="how long to listen (default: %(default)s)")
     options = parser.parse_args(argv)
     cell = cells.load(options.cell)
-    console = Console(width=None if sys.stdout.isatty() else 160)
+    console = Console(width=None if sys.stdout.isatty() else 200)
     if not options.hz:
         table = Table("topic", "key", "message", "Hz", "quality of service", "stale after", "from", "what", box=None)
         for topic in topics.TOPICS:
             key = topic.key.replace("{cell}", cell.name)
             table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", topic.qos.name.lower().replace("_", " "),
-                          f"{topic.stale_s:g} s", topic.publisher, topic.about)  # fmt: skip
+                          f"{topic.stale_s:g} s", topic.publisher, escape(topic.about))  # fmt: skip
         console.print(table)
         return 0
     report = listen(cell, bus.connection(options), options.seconds)
@@ -134,7 +135,7 @@ def sim(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     cell = cells.load(options.cell)
     request = {"command": options.command} | ({} if options.value is None else {"value": options.value})
-    with _session(bus.connection(options)) as session:
+    with open_session(bus.connection(options)) as session:
         answers = bus.ask(session, topics.control(cell.name), payload=json.dumps(request).encode())
     if not answers:
         raise bus.BusError(f"no emulator in cell {cell.name}: start `penumbra emulator` or `penumbra up`")
@@ -142,6 +143,6 @@ def sim(argv: list[str]) -> int:
     return 0
 
 
-def _session(connection: bus.Connection) -> zenoh.Session:
+def open_session(connection: bus.Connection) -> zenoh.Session:
     nothing: Callable[[], None] = lambda: None  # noqa: E731
     return bus.open_session(connection, threading.Event(), nothing, PATIENCE_S)

@@ -100,13 +100,13 @@ class Watch:
 
     def topic_rows(self) -> list[TopicRow]:
         """The traffic of the cell: rates as published, delays and losses as received."""
-        rows = {topic.name: TopicRow(topic.name) for topic in topics.TOPICS}
+        rows = {topic.name: TopicRow(topic.name) for topic in topics.TOPICS if self._node.keys(topic, {})}
         for report in self.health.values():
             for key, traffic in report["published"].items():
-                if (topic := bus.topic_of(key)) is not None:
+                if (topic := bus.topic_of(key)) is not None and topic.name in rows:
                     rows[topic.name].rates.append(traffic["rate_hz"])
             for key, traffic in report["topics"].items():
-                if (topic := bus.topic_of(key.partition(" #")[0])) is not None:
+                if (topic := bus.topic_of(key.partition(" #")[0])) is not None and topic.name in rows:
                     row = rows[topic.name]
                     row.delays_s += [traffic["delay_s"]] if traffic["delay_s"] is not None else []
                     row.dropped += traffic["dropped"] or 0
@@ -127,7 +127,7 @@ def accuracy(pose: FusedPose, truths: Iterable[Truth]) -> Accuracy:
 
 def table(title: str, processes: list[ProcessRow], watch: Watch) -> Group:
     """Everything at one look."""
-    left = Table("process", "state", "pid", "CPU %", "MB", "restarts", "", box=None, title=title, title_justify="left")
+    left = Table("process", "state", "pid", "CPU %", "MB", "restarts", "", box=None)
     for row in processes:
         state = Text(row.state, STYLES.get(row.state, "red"))
         numbers = (f"{100 * row.cpu:.0f}", f"{row.memory_mb:.0f}") if row.pid else ("", "")
@@ -137,7 +137,7 @@ def table(title: str, processes: list[ProcessRow], watch: Watch) -> Group:
         expected = next(topic.rate_hz for topic in topics.TOPICS if topic.name == line.name)
         delay = f"{1e3 * max(line.delays_s):.1f}" if line.delays_s else "-"
         right.add_row(line.name, f"{line.rate_hz:.1f}", f"{expected:g}", delay, str(line.dropped), str(line.bad))
-    return Group(left, Text(), right, Text(), Text(pose_line(watch.accuracy)))
+    return Group(Text(title), left, Text(), right, Text(), Text(pose_line(watch.accuracy)))
 
 
 def pose_line(accuracy: Accuracy | None) -> str:

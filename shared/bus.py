@@ -23,6 +23,7 @@ from shared.messages import BadMessage, Message, decode
 from shared.topics import TOPICS, Topic
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 RATE_WINDOW_S = 3.0
 ATTEMPT_MS = 500
 """How long one attempt to reach the router may block inside Zenoh, where no signal is heard."""
@@ -103,10 +104,16 @@ def configuration(connection: Connection) -> zenoh.Config:
         # processes meet at the router and nowhere else: what is not configured is not found by chance
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "scouting/delay": 0,  # nor waited for
     }
     settings |= {key: value for key, value in defaults.items() if not is_set(key)}
     if connection.config is None:
         settings["transport/link/tx/lease"] = 1000  # ms after which a frozen process is no longer alive
+    for endpoint in (*connection.connect, *connection.listen):
+        if endpoint.partition("/")[0] not in PROTOCOLS:  # Zenoh would try it for ever
+            raise BusError(
+                f"endpoint {endpoint!r}: PROTOCOL/ADDRESS expected, as in {DEFAULT_ENDPOINT}; protocols: {', '.join(PROTOCOLS)}"
+            )
     for key, value in settings.items():
         try:
             config.insert_json5(key, json.dumps(value))
@@ -222,7 +229,7 @@ class Traffic:
         """Counts what is missing since the last message of the same publisher."""
         if info is None:
             return
-        source, number = info.source_id, info.source_sn
+        source, number = (info.source_id.zid, info.source_id.eid), info.source_sn
         if source == self._source and number > self._number:
             self.dropped = (self.dropped or 0) + number - self._number - 1
         elif self.dropped is None:
@@ -306,7 +313,7 @@ class Reader:
             self._failed(f"reader of {key}", error)
 
     def _decode(self, sample: zenoh.Sample) -> Message:
-        if sample.kind is zenoh.SampleKind.DELETE:
+        if sample.kind == zenoh.SampleKind.DELETE:
             raise BadMessage("delete", f"a {self._kind.__name__} expected, a deletion came")
         if len(sample.payload) > self._kind.MAX_BYTES:  # before it is copied
             raise BadMessage(

@@ -179,13 +179,16 @@ class Motion(_Model):
 
 
 class Sim(_Model):
-    """What only the emulator needs."""
+    """What only the emulator needs. `shoulder`: where the person's right shoulder would be [m] if the arm were long enough;
+    `joints_low`, `joints_high`: the bounds of all robots' joints, one after the other; `table`: length and breadth [m] of a table
+    whose top is z = 0, around `table_middle`."""
 
     motion: Motion
     shoulder: Vector3
     joints_low: tuple[float, ...] = ()
     joints_high: tuple[float, ...] = ()
     table: tuple[float, float] | None = None
+    table_middle: tuple[float, float] = (0.0, 0.0)
 
 
 class Cell(_Model):

@@ -50,7 +50,9 @@ class RobotModel:
             flags = pybullet.URDF_USE_IMPLICIT_CYLINDER
             body = pybullet.loadURDF(str(path), useFixedBase=True, flags=flags, physicsClientId=client)
         except pybullet.error as error:
-            raise cells.CellError(f"{path}: not a URDF that pybullet can load: {error}") from None
+            raise cells.CellError(
+                f"{path}: a URDF expected that pybullet can load, and all its meshes: {error} It says more on stdout."
+            ) from None
         infos = [pybullet.getJointInfo(body, i, physicsClientId=client) for i in range(pybullet.getNumJoints(body, client))]
         base = pybullet.getBodyInfo(body, client)[0].decode()
         self.links = (base, *(info[12].decode() for info in infos))
@@ -160,9 +162,10 @@ def _collision_mesh(body: int, link: int, client: int) -> Mesh | None:
         parts.append(part.apply_transform(T_link_inertial @ geometry.transform(position, orientation)))
     if not parts:
         return None
-    whole = trimesh.util.concatenate(parts)
-    faces = np.array(whole.faces, dtype=np.int32)
-    return Mesh(np.array(whole.vertices, dtype=np.float64), faces, np.full(len(faces), Label.ROBOT, np.uint8))
+    counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + first for part, first in zip(parts, counts, strict=False)]).astype(np.int32)
+    return Mesh(vertices, faces, np.full(len(faces), Label.ROBOT, np.uint8))
 
 
 def _shape(kind: int, dimensions: tuple[float, float, float], file: str) -> trimesh.Trimesh:

@@ -85,7 +85,7 @@ class Node:
         self._token = self.session.liveliness().declare_token(topics.alive(self.cell.name, self.service, self.instance))
         self._process.cpu_percent()
         self.every(1.0, self._keep_house)
-        self.log.debug("on the bus", zid=str(self.session.zid()))
+        self.log.info("on the bus", at=", ".join(self.connection.listen) or self.connection.where)
         return self
 
     def run(self) -> None:
@@ -163,7 +163,7 @@ class Node:
         missing = [name for name in _names(topic) if name not in names]
         if missing:
             raise ValueError(f"publishing {topic.name} needs {', '.join(f'{name}=' for name in missing)}")
-        (key,) = self._keys(topic, names)
+        (key,) = self.keys(topic, names)
         publisher = session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK if topic.qos is QoS.NEVER_DROP else zenoh.CongestionControl.DROP,
@@ -179,7 +179,7 @@ class Node:
         newest `topic.depth` messages per key are kept. Bad messages are counted and logged once per kind; so are exceptions of
         the handler. Raises CellError for a name that the cell does not have.
         """
-        keys = self._keys(topic, names)
+        keys = self.keys(topic, names)
         if not keys:
             self.log.info("nothing to read: the cell has no such part", topic=topic.name)
             return
@@ -214,8 +214,9 @@ class Node:
         self._received[key if not readers else f"{key} #{readers + 1}"] = traffic
         return traffic
 
-    def _keys(self, topic: Topic, names: dict[str, str]) -> dict[str, dict[str, str]]:
-        """Every concrete key of a topic in this cell with its names, some of them fixed."""
+    def keys(self, topic: Topic, names: dict[str, str]) -> dict[str, dict[str, str]]:
+        """Every concrete key of a topic in this cell with its names, some of them fixed; none where the cell has no such part.
+        Raises CellError for a name that the cell does not have."""
         values: list[Sequence[str]] = []
         for name in _names(topic):
             kind = cast(Literal["cameras", "robots", "pads", "targets"], f"{name}s")
@@ -303,7 +304,7 @@ class Node:
                 except zenoh.ZError:
                     return
                 instance = str(sample.key_expr).rpartition("/")[2]
-                (living.discard if sample.kind is zenoh.SampleKind.DELETE else living.add)(instance)
+                (living.discard if sample.kind == zenoh.SampleKind.DELETE else living.add)(instance)
                 self._replicas = frozenset(living | {self.instance})
                 self._owned = {}
 

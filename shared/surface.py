@@ -36,8 +36,7 @@ class Surface:
         solid = area > 1e-14
         self.vertices, self.faces = vertices, faces[solid]
         self._corners = np.ascontiguousarray(corners[solid])
-        centers = self._corners.mean(axis=1)
-        self._radii = np.linalg.norm(self._corners - centers[:, None], axis=2).max(axis=1)
+        centers, self._radii = _enclosing_circles(self._corners)
         self._centers = np.ascontiguousarray(centers.T)
         self._normals = _pseudonormals(vertices, self.faces)
 
@@ -53,6 +52,23 @@ class Surface:
     def arrays(self) -> tuple[Array, Array, Array, Array]:
         """Corners (m, 3, 3), centres (3, m), radii (m,) and pseudonormals (m, 7, 3): what compiled code needs."""
         return self._corners, self._centers, self._radii, self._normals
+
+
+def _enclosing_circles(corners: Array) -> tuple[Array, Array]:
+    """Centres (m, 3) and radii (m,) of the smallest circles around triangles (m, 3, 3): the circumcircle, or for an obtuse
+    triangle the circle on its longest edge. Each centre lies on its triangle."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    # barycentric weights of the circumcentre, from the squared edges; a negative one is opposite to an obtuse corner
+    squares = np.stack([np.sum((p - q) ** 2, axis=1) for p, q in ((b, c), (c, a), (a, b))], axis=1)
+    weights = squares * (squares.sum(axis=1, keepdims=True) - 2.0 * squares)
+    weights = np.maximum(weights / np.abs(weights).sum(axis=1, keepdims=True), 0.0)
+    obtuse = (weights == 0.0).any(axis=1)
+    longest = np.argmax(squares, axis=1)
+    weights[obtuse] = 0.5
+    weights[obtuse, longest[obtuse]] = 0.0
+    weights /= weights.sum(axis=1, keepdims=True)
+    centers = np.einsum("mk,mki->mi", weights, corners)
+    return centers, np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
 
 
 def _pseudonormals(vertices: Array, faces: NDArray[np.int64]) -> Array:
@@ -123,34 +139,40 @@ def nearest_points(points, corners, centers, radii, normals, distance, nearest, 
         for j in range(m):  # kept apart from the search for the smallest, so that it compiles to vector instructions
             x, y, z = p[0] - centers[0, j], p[1] - centers[1, j], p[2] - centers[2, j]
             to_center[j] = x * x + y * y + z * z
-        first = np.argmin(to_center)
-        # A centre lies on the surface: the nearest one bounds the distance, and few triangles reach below that bound.
+        first = int(np.argmin(to_center))
+        # A centre lies on the surface: the nearest one bounds the distance, its triangle bounds it closely (and is therefore
+        # looked at first), and few other triangles reach below that bound.
         bound = np.sqrt(to_center[first]) * (1.0 + 1e-9) + 1e-12
         best = bound * bound
-        for j in range(m):
+        face, feature = first, 0
+        for k in range(-1, m):
+            j = first if k < 0 else k
             reach = bound + radii[j]
             if to_center[j] > reach * reach:
                 continue
             # Sharper than the ball is the disc around the triangle: its height below p, and how far aside its rim stays.
-            n = normals[j, 0]
-            height = (p[0] - centers[0, j]) * n[0] + (p[1] - centers[1, j]) * n[1] + (p[2] - centers[2, j]) * n[2]
+            height = (
+                (p[0] - centers[0, j]) * normals[j, 0, 0]
+                + (p[1] - centers[1, j]) * normals[j, 0, 1]
+                + (p[2] - centers[2, j]) * normals[j, 0, 2]
+            )
             aside = max(np.sqrt(max(to_center[j] - height * height, 0.0)) - radii[j], 0.0)
-            if height * height + aside * aside > bound * bound:
+            if height * height + aside * aside > best:
                 continue
             a, b, c = corners[j, 0], corners[j, 1], corners[j, 2]
             v, w, part = _closest(p, a, b, c)
             u = 1.0 - v - w
             qx, qy, qz = u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2]
             square = (p[0] - qx) ** 2 + (p[1] - qy) ** 2 + (p[2] - qz) ** 2
-            if square <= best:
-                best = square
-                bound = np.sqrt(square)
+            if square < best:
+                best, bound = square, np.sqrt(square)
                 nearest[i, 0], nearest[i, 1], nearest[i, 2] = qx, qy, qz
-                n = normals[j, part]
-                side = (p[0] - qx) * n[0] + (p[1] - qy) * n[1] + (p[2] - qz) * n[2]
-                sign = 1.0 if side >= 0.0 else -1.0
-                distance[i] = sign * bound
-                if bound > 1e-9:
-                    gradient[i] = sign * (p - nearest[i]) / bound
-                else:
-                    gradient[i] = n / np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+                face, feature = j, part
+        x, y, z = p[0] - nearest[i, 0], p[1] - nearest[i, 1], p[2] - nearest[i, 2]
+        n = normals[face, feature]
+        sign = 1.0 if x * n[0] + y * n[1] + z * n[2] >= 0.0 else -1.0
+        distance[i] = sign * bound
+        scale = sign / max(bound, 1e-12)
+        if bound < 1e-9:  # on the surface: its normal
+            x, y, z, scale = n[0], n[1], n[2], 1.0 / np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+        gradient[i, 0], gradient[i, 1], gradient[i, 2] = scale * x, scale * y, scale * z

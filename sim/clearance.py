@@ -20,7 +20,7 @@ ROBOT_CLEARANCE = 0.022
 """Demanded distance [m] to the robot at the planned instants; between them it shrinks by less than 7 mm."""
 TABLE_CLEARANCE = 0.025
 """Demanded distance [m] to the table and to pads in it; between the planned instants it shrinks by less than 5 mm."""
-SAMPLE = 0.015
+SAMPLE = 0.02
 """Distance [m] between the points that stand for a hull."""
 
 
@@ -54,7 +54,7 @@ class BodyPart:
         self._surface = Surface(mesh.vertices, mesh.faces)
         self._low, self._high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
 
-    def clearance(self, obstacle: Obstacle, T_world_obstacle: Array, T_world_part: Array, enough: float = 0.05) -> float:
+    def clearance(self, obstacle: Obstacle, T_world_obstacle: Array, T_world_part: Array, enough: float = 0.01) -> float:
         """How much more than demanded [m] lies between this part and an obstacle, at poses (k, 4, 4) of both: the least of all,
         at most `enough` (farther points are not measured)."""
         R = T_world_part[:, :3, :3]
@@ -104,7 +104,7 @@ class Clearance:
             )
 
     def __call__(self, times: Array, poses: Array) -> float:
-        """The least of what is left over [m] at times (k,) [s of the scene] and poses of the target (k, 6); at most 5 cm."""
+        """The least of what is left over [m] at times (k,) [s of the scene] and poses of the target (k, 6); at most 1 cm."""
         T_target = frame(Rotation.from_euler("xyz", poses[:, 3:]).as_matrix(), poses[:, :3])
         placed = list(zip(self._parts, self._person.poses(T_target), strict=True))
         least = np.inf

@@ -67,7 +67,8 @@ class LimbMotion:
         start = next((pose for pose, free in drawn if free >= 0.0), None)
         if start is None:
             raise cells.CellError(
-                f"sim.motion: no pose of the region {region.low} to {region.high} keeps clear of the robot and the table: move the region"
+                f"sim.motion: no pose of the region {region.low} to {region.high} keeps clear of the robot and the table: "
+                "move the region"
             )
         self._reaches = [Reach(0.0, 0.5, 0.5, start, start)]
         self._ends = [0.5]
@@ -114,7 +115,7 @@ class LimbMotion:
 
 
 class JointMotion:
-    """A slow sway of the robot's joints around the middle of their bounds: three sines for each joint, of periods from 9 to 30 s."""
+    """A slow sway of the robot's joints around the middle of their bounds: three sines a joint, of periods from 9 to 30 s."""
 
     def __init__(self, low: ArrayLike, high: ArrayLike, seed: int):
         low, high = np.asarray(low, float), np.asarray(high, float)
@@ -172,7 +173,8 @@ def joint_motions(cell: cells.Cell, sim: cells.Sim, seed: int) -> dict[str, Join
     total = sum(len(robot.joints) for robot in cell.robots.values())
     if not len(sim.joints_low) == len(sim.joints_high) == total:
         raise cells.CellError(
-            f"sim.joints_low and sim.joints_high: {total} values expected, one for each joint of {', '.join(cell.robots) or 'no robot'}; "
+            f"sim.joints_low and sim.joints_high: {total} values expected, "
+            f"one for each joint of {', '.join(cell.robots) or 'no robot'}; "
             f"{len(sim.joints_low)} and {len(sim.joints_high)} came"
         )
     motions, first = {}, 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import threading
 
 import numpy as np
 import trimesh
@@ -29,6 +30,7 @@ class OcclusionSchedule:
 
     def __init__(self, seed: int):
         self._rng = np.random.default_rng([seed, 3])
+        self._lock = threading.Lock()
         self._ends, self._levels = [float(self._rng.uniform(3.0, 5.0))], [AWAY]
         self._commands: list[tuple[float, float | None, float]] = [(0.0, None, AWAY)]  # from when, level or automatic, level then
 
@@ -51,12 +53,13 @@ class OcclusionSchedule:
         return before + float(np.clip(automatic - before, *_reach(self.SLOPE * (time_s - begin))))
 
     def _automatic(self, time_s: float) -> float:
-        while self._ends[-1] <= time_s:
-            hide = self._levels[-1] == AWAY
-            level = (1.0 if self._rng.random() < 0.6 else float(self._rng.uniform(0.5, 0.95))) if hide else AWAY
-            hold = self._rng.uniform(2.5, 5.0) if hide else self._rng.uniform(2.5, 6.0)
-            self._levels.append(level)
-            self._ends.append(self._ends[-1] + 2.0 / self.SLOPE + float(hold))
+        with self._lock:
+            while self._ends[-1] <= time_s:
+                hide = self._levels[-1] == AWAY
+                level = (1.0 if self._rng.random() < 0.6 else float(self._rng.uniform(0.5, 0.95))) if hide else AWAY
+                hold = self._rng.uniform(2.5, 5.0) if hide else self._rng.uniform(2.5, 6.0)
+                self._levels.append(level)
+                self._ends.append(self._ends[-1] + 2.0 / self.SLOPE + float(hold))
         i = bisect.bisect_right(self._ends, time_s)
         if i == 0:
             return self._levels[0]
@@ -133,4 +136,6 @@ def _upper_quantile(across: Array, area: Array, share: float) -> float:
 def box(size: ArrayLike, middle: ArrayLike, label: Label) -> Mesh:
     """A box with edges `size` (3,) [m] along its frame's axes around `middle` (3,)."""
     shape = trimesh.creation.box(extents=size)
-    return Mesh(np.asarray(shape.vertices) + middle, shape.faces.astype(np.int32), np.full(12, label, np.uint8))
+    return Mesh(
+        np.asarray(shape.vertices, np.float64) + np.asarray(middle), shape.faces.astype(np.int32), np.full(12, label, np.uint8)
+    )

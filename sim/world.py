@@ -6,7 +6,6 @@ moves by reaches that never touch robot, pads or table; upper arm and torso foll
 
 from __future__ import annotations
 
-import dataclasses
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,22 +17,20 @@ from scipy.spatial.transform import Rotation
 from shared import cell as cells
 from shared import geometry
 from shared.body import Mesh
-from shared.classes import Label
 from shared.geometry import Array
 from shared.messages import Frame, Joints, Message, Truth, Voltages
 from shared.robot import robot_models
-from shared.skin import electrode_positions, link_names
+from shared.skin import link_names
 from shared.topics import FRAME, JOINTS, TRUTH, VOLTAGES, Topic
 from sim.clearance import Clearance
 from sim.motion import Clock, LimbMotion, angular_velocity, joint_motions
-from sim.occluder import OcclusionSchedule, Panel, box
+from sim.occluder import OcclusionSchedule, Panel
 from sim.person import Person
+from sim.scene import Cameras, View, furniture
 from sim.skin import SkinModel
 
 FAR = 10.0
 """What the truth calls the gap [m] where the cell has no pads."""
-PLATE, PLATE_MARGIN, TABLE_THICK = 0.003, 0.02, 0.03
-"""Thickness of a pad, how much wider it is than its electrodes, thickness of the table top [m]."""
 MAX_SPEED = 4.0
 """Fastest scene: more would leave the cameras and the planner behind."""
 
@@ -70,14 +67,15 @@ class World:
         self.person = Person(cell, cell.sim, self.target)
         self.robots = robot_models(cell)
         self.skin = SkinModel(cell) if cell.pads else None
-        self._things = _things(cell, cell.sim)
+        self._furniture = furniture(cell, cell.sim)
+        self._cameras = Cameras(cell, seed)
         self.clock, self.occlusion_clock = Clock(), Clock()
         self.occlusion = OcclusionSchedule(seed)
         self.panel = Panel(seed)
         self._motion, self._paused, self._speed = True, False, 1.0
         self._joint_motions = joint_motions(cell, cell.sim, seed)
         clearance = Clearance(
-            self.person, self.robots, self._joint_motions, self.skin and self.skin.skin, cell.sim.table is not None
+            self.person, self.robots, self._joint_motions, self.skin.skin if self.skin else None, cell.sim.table is not None
         )
         self._limb = LimbMotion(cell.sim.motion, seed, clearance)
 
@@ -110,6 +108,10 @@ class World:
             return np.empty(0)
         return self.skin.gaps(self.electrodes(state), [(self.person.meshes[0], state.T_world_target)])
 
+    def view(self, camera: str, time_s: float) -> View:
+        """What a camera sees at a time."""
+        return self._cameras.view(camera, self.bodies(camera, self.state(time_s)), time_s)
+
     def bodies(self, camera: str, state: WorldState) -> dict[str, tuple[Mesh, Array]]:
         """Everything that a camera may see by name, with its T_world_mesh: target, upper_arm, torso, ROBOT/LINK, pads, table and
         occluder."""
@@ -121,7 +123,7 @@ class World:
             for robot, model in self.robots.items()
             for link, mesh in model.meshes.items()
         }
-        out |= {name: (mesh, links[link]) for name, (mesh, link) in self._things.items()}
+        out |= {name: (mesh, links[link]) for name, (mesh, link) in self._furniture.items()}
         T_world_panel = self.occluder(camera, state)
         return out if T_world_panel is None else {**out, "occluder": (self.panel.mesh, T_world_panel)}
 
@@ -171,21 +173,6 @@ class World:
     def _set_rates(self, time_s: float) -> None:
         self.clock.set_rate(time_s, self._speed if self._motion and not self._paused else 0.0)
         self.occlusion_clock.set_rate(time_s, 0.0 if self._paused else 1.0)
-
-
-def _things(cell: cells.Cell, sim: cells.Sim) -> dict[str, tuple[Mesh, str]]:
-    """What the cell holds beside people and robots, with the link that carries it: pads as plates a little larger than their
-    electrodes' circle, and the table."""
-    out = {}
-    for name, pad in cell.pads.items():
-        radius = np.linalg.norm(electrode_positions(cell.pad_types[pad.type]), axis=1).max()
-        side = 2.0 * radius + PLATE_MARGIN
-        label = Label.BACKGROUND if pad.link == "world" else Label.ROBOT
-        plate = box((side, side, PLATE), (0.0, 0.0, -PLATE / 2.0), label)
-        out[f"pad {name}"] = (dataclasses.replace(plate, vertices=geometry.apply(pad.T_link_pad, plate.vertices)), pad.link)
-    if sim.table is not None:  # its top lies a hair below the pads, so that these are seen
-        out["table"] = (box((*sim.table, TABLE_THICK), (0.0, 0.0, -PLATE / 2.0 - TABLE_THICK / 2.0), Label.BACKGROUND), "world")
-    return out
 
 
 BATCH = 5

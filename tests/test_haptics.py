@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import threading
 import time
 from pathlib import Path
 
@@ -12,18 +14,21 @@ import torch
 import trimesh
 
 from services.haptics import network as networks
-from services.haptics import train
+from services.haptics import service, train
 from services.haptics.estimator import Estimator
 from services.haptics.kinematics import PadPoses
 from services.haptics.nearest import nearest_points
 from services.haptics.solve import MODEL_ERROR, peak, solve
-from services.haptics.window import Collector
+from services.haptics.window import Backlog, Collector
+from shared import bus, geometry, messages, topics
 from shared import cell as cells
-from shared import geometry
 from shared.body import target_mesh
 from shared.robot import robot_models
+from shared.service import Node
 from shared.skin import Skin
 from shared.surface import Surface
+from sim.world import TICK_NS, Sensors, World
+from tests.live import free_port, wait_for
 
 MS = 1_000_000
 WEIGHTS = Path(train.__file__).parent / "weights"
@@ -48,7 +53,7 @@ def forearm(table: cells.Cell) -> Surface:
 @pytest.fixture(scope="module")
 def limb() -> Surface:
     """A forearm as a long capsule: its roll is not felt, nor, above the pads, where along itself it lies."""
-    shape = trimesh.creation.capsule(height=1.2, radius=0.045, count=[16, 64])
+    shape = trimesh.creation.capsule(height=1.2, radius=0.045, count=[64, 64])
     shape.apply_transform(geometry.from_rpy((0, 0, 0), (0, np.pi / 2, 0)))
     return Surface(np.array(shape.vertices), np.array(shape.faces))
 
@@ -144,7 +149,7 @@ def test_a_window_is_complete_with_the_last_pads_batch_and_not_before(skin: Skin
 def test_a_silent_pad_is_waited_for_a_little_and_then_left_out(skin: Skin) -> None:
     windows = play(Collector(skin), skin, [5 * MS * i for i in range(1, 61)], silent={"p3": 100 * MS})
     assert windows[-1].faults == {"p3": "silent"} and not windows[-1].alive[3]
-    assert windows[-1].alive.sum() == 7 and windows[-1].newest_ns == 300 * MS
+    assert windows[-1].alive.sum() == 7 and windows[-1].newest_ns >= 290 * MS
     assert np.diff([w.newest_ns for w in windows]).max() <= 40 * MS
 
 
@@ -182,6 +187,14 @@ def test_repeated_and_overtaken_batches_are_ignored(skin: Skin) -> None:
     windows = play(Collector(skin), skin, [5 * MS, 5 * MS, 10 * MS, 5 * MS, 15 * MS, 20 * MS])
     assert [w.newest_ns for w in windows] == [10 * MS, 20 * MS]
     assert all(set(w.samples) == {10} for w in windows)
+
+
+def test_a_reader_that_fell_behind_leaves_windows_out_until_it_has_caught_up() -> None:
+    backlog = Backlog()
+    offset = 300 * MS  # the other clock is that much behind
+    delays = [2, 3, 2, 50, 40, 20, 3]
+    late = [backlog.is_late(10 * MS * i, 10 * MS * i + offset + delay * MS) for i, delay in enumerate(delays)]
+    assert late == [False, False, False, True, True, False, False]
 
 
 def test_other_rates_give_windows_too(skin: Skin) -> None:
@@ -232,10 +245,9 @@ def test_what_a_long_round_limb_does_not_show_is_published_as_unknown(skin: Skin
     which = Estimator(skin, limb, T, np.repeat([0.12, 0.4], 3), None)
     estimate = update(which, skin, 1, feel(skin, limb, T, np.random.default_rng(0)))
     values, directions = np.linalg.eigh(estimate.information)
-    unknown = directions[:, values < 1e-6 * values[-1]]
-    assert unknown.shape[1] == 2
-    # along itself (x), and about itself (rotation x)
-    np.testing.assert_allclose(np.abs(unknown[[0, 3]]).max(axis=1), 1.0, atol=0.02)
+    # nothing along itself; about itself only what the facets of the mesh show, worse than 0.1 rad
+    assert values[0] < 1e-6 * values[-1] and values[1] < 100.0 < values[2]
+    np.testing.assert_allclose(np.abs(directions[[0, 3], [0, 1]]), 1.0, atol=0.02)
 
 
 def test_the_peak_of_a_quadratic_is_found_only_along_known_directions() -> None:
@@ -394,12 +406,28 @@ def test_the_committed_weights_reach_what_their_card_says(name: str) -> None:
             assert got[1] < 2.0 * promised[1] + 2.0
 
 
-def test_training_can_be_interrupted_goes_on_and_writes_weights_with_a_card(tmp_path: Path) -> None:
-    common = ["--cell", "table", "--out", str(tmp_path / "w.npz"), "--checkpoint", str(tmp_path / "c.pt"), "--scenes", "300"]
-    train.main([*common, "--steps", "6"])
+def test_training_can_be_interrupted_goes_on_and_writes_weights_with_a_card(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--cell", "table", "--out", str(tmp_path / "w.npz"), "--checkpoint", str(tmp_path / "c.pt"), "--scenes", "100"]
+    steps = []
+
+    def interrupted(out: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
+        steps.append(1)
+        if len(steps) == 4:
+            raise KeyboardInterrupt  # Ctrl-C in the fourth step
+        return loss(out, label)
+
+    loss = train.loss
+    monkeypatch.setattr(train, "loss", interrupted)
+    with pytest.raises(SystemExit, match="run the same command again"):
+        train.main([*flags, "--steps", "6"])
+    train.main([*flags, "--steps", "6"])
+    assert "resumed" in capsys.readouterr().out and len(steps) == 4 + 3
     card = json.loads((tmp_path / "w.json").read_text())
-    assert card["network"]["steps"] == 6 and card["data"]["seed"] == 1
+    assert card["settings"]["network"]["steps"] == 6 and card["seed"] == 1
     assert networks.load(tmp_path / "w.npz", cells.load("table"), "forearm").weights[0].shape[1] == 256
+    assert not (tmp_path / "c.pt").exists()
 
 
 # ---- kinematics
@@ -428,3 +456,52 @@ def test_pads_on_a_robot_move_with_its_joints_between_two_messages() -> None:
 def test_fixed_pads_need_no_joint_angles(table: cells.Cell, skin: Skin) -> None:
     found = PadPoses(table, skin, {}).at(123)
     assert found is not None and found[1].shape == (0,)
+
+
+# ---- the service
+
+
+def test_the_service_answers_every_window_within_milliseconds_and_goes_on_without_a_silent_pad(table: cells.Cell) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    world = World(table, seed=3)
+    world.plan(3.0)
+    poses: list[tuple[int, messages.HapticPose]] = []
+    options = argparse.Namespace(method="solve", weights=WEIGHTS, window_ms=10.0)
+    haptics = Node("haptics", table, bus.Connection(connect=(endpoint,)))
+    service.start(haptics, options)
+    reader = Node("reader", table, bus.Connection(connect=(endpoint,)))
+    reader.subscribe(topics.HAPTIC, lambda message, names: poses.append((reader.now_ns(), message)))
+    truths = {}
+    with (
+        Node("router", table, bus.Connection("router", listen=(endpoint,))),
+        haptics,
+        reader,
+        Node("emulator", table, bus.Connection(connect=(endpoint,))) as emulator,
+    ):
+        epoch_ns, k, silent_ns = emulator.now_ns(), 0, 1 << 62
+        sensors = Sensors(world, epoch_ns)
+
+        def tick() -> None:
+            nonlocal k
+            k += 1
+            for topic, names, message in sensors.tick(k):
+                if isinstance(message, messages.Truth):
+                    truths[message.stamp_ns] = message
+                elif names.get("pad") != "p5" or message.stamp_ns < silent_ns:
+                    emulator.publish(topic, message, **names)
+            threading.Event().wait(max(0.0, (epoch_ns + (k + 1) * TICK_NS - emulator.now_ns()) * 1e-9))
+
+        def played(count: int) -> None:
+            before = len(poses)
+            wait_for(lambda: tick() or len(poses) >= before + count, 15, f"{count} poses", interval=0.0)
+
+        played(60)
+        silent_ns = emulator.now_ns()
+        played(60)
+    ages_ms = [(came_ns - pose.sample_stamp_ns) * 1e-6 for came_ns, pose in poses]
+    assert np.median(ages_ms) < 25  # two cores shared with other tests; a few milliseconds on an idle machine
+    assert np.median(np.diff([pose.stamp_ns for _, pose in poses])) == pytest.approx(10e6)
+    last = poses[-1][1]
+    truth = truths[last.sample_stamp_ns]
+    assert last.state == ("in_range" if truth.gap < 0.15 else last.state)
+    assert last.gap == pytest.approx(truth.gap, abs=0.03 + 0.3 * truth.gap)

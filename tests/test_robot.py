@@ -28,7 +28,8 @@ ODD = """<robot name="odd">
   <axis xyz="0.6 0 0.8"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
  <link name="one"><inertial><origin xyz="0.3 0.2 0.3" rpy="0.9 0.2 0.4"/><mass value="1"/>
    <inertia ixx="1" iyy="2" izz="1" ixy="0.1" ixz="0" iyz="0"/></inertial>
-  <collision><origin xyz="0 0.2 0.1" rpy="0.5 0 0.5"/><geometry><cylinder radius="0.1" length="0.4"/></geometry></collision></link>
+  <collision><origin xyz="0 0.2 0.1" rpy="0.5 0 0.5"/><geometry><cylinder radius="0.1" length="0.4"/></geometry>
+  </collision></link>
  <joint name="slide" type="prismatic"><parent link="one"/><child link="two"/><origin xyz="0 0.1 0.4" rpy="0.4 0.1 0.2"/>
   <axis xyz="0 1 0"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint>
  <link name="two"><inertial><mass value="1"/><inertia ixx="1" iyy="2" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -50,7 +51,9 @@ def panda():
 def odd(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robot")
     (folder / "odd.urdf").write_text(ODD)
-    robot = cells.Robot(urdf="odd.urdf", joints=("spin", "turn", "slide"), base=cells.Placement(position=(1, 2, 3), rpy=(0.1, 0.2, 0.3)))
+    robot = cells.Robot(
+        urdf="odd.urdf", joints=("spin", "turn", "slide"), base=cells.Placement(position=(1, 2, 3), rpy=(0.1, 0.2, 0.3))
+    )
     return RobotModel(robot, folder), folder / "odd.urdf"
 
 
@@ -141,13 +144,14 @@ def test_an_unknown_joint_is_told_with_the_joints_that_there_are():
 
 
 def test_a_missing_urdf_is_told():
-    with pytest.raises(cells.CellError, match="no file .*panda/none.urdf: give pybullet:PATH"):
+    with pytest.raises(cells.CellError, match=r"no file .*panda/none.urdf: give pybullet:PATH"):
         RobotModel(PANDA.model_copy(update={"urdf": "pybullet:panda/none.urdf"}))
 
 
-def test_a_broken_urdf_is_told(tmp_path):
-    (tmp_path / "broken.urdf").write_text("<robot><link")
-    with pytest.raises(cells.CellError, match=r"broken.urdf: not a URDF that pybullet can load"):
+@pytest.mark.parametrize("text", ["<robot><link", ODD.replace('box size="0.2 0.1 0.4"', 'mesh filename="none.stl"')])
+def test_a_broken_urdf_or_a_missing_mesh_is_told(tmp_path, text):
+    (tmp_path / "broken.urdf").write_text(text)
+    with pytest.raises(cells.CellError, match=r"broken.urdf: a URDF expected that pybullet can load, and all its meshes"):
         RobotModel(cells.Robot(urdf="broken.urdf", joints=()), tmp_path)
 
 

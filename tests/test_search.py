@@ -58,7 +58,10 @@ def scene(seed: int, hidden: float = 0.0, noisy: bool = False, size: int = 192, 
         return distance - np.sign(distance) / 2 + 0.5 * wobble / wobble.std() + rng.normal(0.0, 0.25) > 0
 
     silhouette = draw(MESH.faces)
-    hand = draw(np.ascontiguousarray(MESH.faces[MESH.labels == Label.HAND]))
+    forearm = draw(np.ascontiguousarray(MESH.faces[MESH.labels == Label.FOREARM]))
+    hand = (
+        cv2.dilate(draw(np.ascontiguousarray(MESH.faces[MESH.labels == Label.HAND])).astype(np.uint8), np.ones((7, 7))) & ~forearm
+    )
     angle = rng.uniform(0.0, 2.0 * np.pi)
     rows, columns = np.mgrid[:size, :size]
     side = columns * np.cos(angle) + rows * np.sin(angle)
@@ -66,7 +69,7 @@ def scene(seed: int, hidden: float = 0.0, noisy: bool = False, size: int = 192, 
     share = 1.0 - np.count_nonzero(silhouette & ~occluder) / np.count_nonzero(silhouette)
     target, labels = spoiled(silhouette), np.zeros((size, size), np.uint8)
     labels[target] = Label.FOREARM
-    labels[target & hand] = Label.HAND
+    labels[target & (hand != 0)] = Label.HAND
     labels[spoiled(occluder)] = Label.OCCLUDER
     error = rng.normal(size=6) * np.sqrt(np.diag(PRIOR))
     return Scene(T, geometry.perturb(T, error), Mask(stamp_ns=0, labels=labels, x0=x0, y0=y0, scale=1), share)

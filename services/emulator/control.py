@@ -30,11 +30,13 @@ def control(world: World, payload: bytes, time_s: float) -> dict[str, Any]:
     if not isinstance(request, dict) or not isinstance(request.get("command"), str) or request.keys() - {"command", "value"}:
         raise ValueError(_expected(payload[:60].decode(errors="replace")))
     command, value = request["command"], request.get("value")
+    if command in ("pause", "resume", "state") and value is not None:
+        raise ValueError(f"{command} takes no value, {value!r} came")
     if command == "occlude":
         world.occlude(None if value == "auto" else _number(command, value), time_s)
     elif command == "motion":
         if value not in ("on", "off"):
-            raise ValueError(f"motion: on or off expected, {value!r} came")
+            raise ValueError(f"motion: {COMMANDS[command]} expected, {value!r} came")
         world.set_motion(value == "on", time_s)
     elif command == "speed":
         world.set_speed(_number(command, value), time_s)

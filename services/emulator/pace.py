@@ -5,19 +5,29 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+SMOOTHING = 0.25
+"""Weight of the newest turn in the mean of how long preparing takes: one that was held up must not thin out the next ones."""
+
 
 class Pacer:
-    """Counts the ticks of a stream: tick k is due at epoch_ns + k * period_ns by the clock now_ns(). After a delay the ticks that
-    are more than `late_ns` overdue are dropped, none is queued, and the rhythm stays."""
+    """Counts the ticks of a stream: tick k is due at epoch_ns + k * period_ns by the clock now_ns().
+
+    Ticks that could only be ready more than `late_ns` after their instant, as preparing takes lately, are dropped: on a busy
+    machine the stream becomes thinner, not later, and nothing queues.
+    """
 
     def __init__(self, epoch_ns: int, period_ns: float, now_ns: Callable[[], int], late_ns: float):
         self._epoch_ns, self._period_ns, self._now_ns, self._late_ns = epoch_ns, period_ns, now_ns, late_ns
         self._last: int | None = None
+        self._begun_ns = 0
+        self._takes_ns = 0.0
         self.dropped = 0
 
     def next(self) -> int:
-        """The tick to prepare now, at least 1: the one after the last, or the first that is not too late."""
-        in_time = max(1, math.ceil((self._now_ns() - self._late_ns - self._epoch_ns) / self._period_ns))
+        """The tick to prepare now, at least 1: the one after the last, or the first that can be ready in time."""
+        self._begun_ns = self._now_ns()
+        ready_ns = self._begun_ns + self._takes_ns - self._late_ns
+        in_time = max(1, math.ceil((ready_ns - self._epoch_ns) / self._period_ns))
         if self._last is None:
             self._last = in_time
         else:
@@ -25,6 +35,8 @@ class Pacer:
             self._last = max(self._last + 1, in_time)
         return self._last
 
-    def remaining_s(self, k: int) -> float:
-        """Seconds until tick k is due, zero where it is past."""
-        return max(0.0, (self._epoch_ns + k * self._period_ns - self._now_ns()) * 1e-9)
+    def ready(self) -> float:
+        """Seconds until the tick is due that was prepared since `next`, zero where it is overdue."""
+        now_ns = self._now_ns()
+        self._takes_ns += SMOOTHING * (now_ns - self._begun_ns - self._takes_ns)
+        return max(0.0, (self._epoch_ns + (self._last or 0) * self._period_ns - now_ns) * 1e-9)

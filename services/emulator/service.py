@@ -49,7 +49,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
     def turn(pacer: Pacer, prepare: Callable[[int], Stream]) -> None:
         k = pacer.next()
         messages = prepare(k)
-        if not node.stopping.wait(pacer.remaining_s(k)):
+        if not node.stopping.wait(pacer.ready()):
             for topic, names, message in messages:
                 node.publish(topic, message, **names)
 
@@ -63,5 +63,5 @@ def start(node: Node, options: argparse.Namespace) -> None:
     node.every(AGAIN_S, partial(turn, skin, sensors.tick))
     for camera, description in cell.cameras.items():
         period_ns = 1e9 / description.rate_hz
-        pacer = Pacer(sensors.epoch_ns, period_ns, node.now_ns, late_ns=period_ns / 4)
+        pacer = Pacer(sensors.epoch_ns, period_ns, node.now_ns, late_ns=period_ns / 10)
         node.every(AGAIN_S, partial(turn, pacer, partial(frame, camera)))

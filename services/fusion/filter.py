@@ -80,7 +80,7 @@ class Settings:
     patience: float = 0.5
     source_patience: float = 1.0
     refusals: int = 5
-    unobserved: float = 10.0
+    unobserved: float = 2.0
     horizon: float = 1.0
     weight_time: float = 0.5
     limits: Limits = Limits()
@@ -94,6 +94,8 @@ class Measurement:
     T : the pose (4, 4).
     directions : their unit vectors (6, k), in UNITS.
     basis : (k, 6); `basis @ error` has independent entries with standard deviations `sigma` (k,).
+    axis : the axis (3,) about which a rotation is not observed (the limb's, where the sense does not see its roll), or None.
+    slides : whether a translation is not observed (along the limb, where the sense sees neither of its ends).
     """
 
     key: tuple[int, str]
@@ -101,6 +103,8 @@ class Measurement:
     directions: Array
     basis: Array
     sigma: Array
+    axis: Array | None
+    slides: bool
 
     @property
     def rank(self) -> int:
@@ -168,7 +172,10 @@ class Filter:
         observed = eigenvalues > max(self.settings.unobserved**-2, 1e-9 * eigenvalues[-1])
         directions = vectors[:, observed]
         sigma = np.sqrt(1.0 / eigenvalues[observed] + self.settings.senses[source].floor ** 2)
-        return Measurement((stamp_ns, source), T, directions, directions.T / UNITS, sigma)
+        weakest, axes = np.linalg.eigh(directions[3:] @ directions[3:].T)
+        axis = axes[:, 0] if weakest[0] < 1e-3 else None
+        slides = bool(np.linalg.eigvalsh(directions[:3] @ directions[:3].T)[0] < 1e-3)
+        return Measurement((stamp_ns, source), T, directions, directions.T / UNITS, sigma, axis, slides)
 
     def step(self, state: State | None, m: Measurement) -> State:
         """The state after a measurement: predicted to its stamp, and updated unless the gate refuses it."""
@@ -207,8 +214,8 @@ class Filter:
         """A new state from one measurement; along what it does not observe, from the pose T (4, 4) with its covariance (6, 6)."""
         p, R = T[:3, 3].copy(), T[:3, :3].copy()
         for _ in range(5):  # Gauss-Newton on the observed directions; one step does where all are observed
-            e = np.concatenate([p - m.T[:3, 3], so3.log(R @ m.T[:3, :3].T)])
-            correction = UNITS * (m.directions @ (m.basis @ e))
+            value, _ = self.error(p, R, m)
+            correction = UNITS * (m.directions @ value)
             p, R = p - correction[:3], so3.exp(-correction[3:]) @ R
         wide = np.eye(POSE) + 9.0 * (UNITS[:, None] * m.directions) @ m.basis  # where it observes, the measurement decides
         P = np.eye(self.size)
@@ -264,22 +271,39 @@ class Filter:
         senses = {name: replace(record, gain=fade * record.gain) for name, record in state.senses.items()}
         return replace(state, stamp_ns=stamp_ns, p=p, R=R, velocity=velocity, bias=keep * state.bias, P=P, senses=senses)
 
+    def error(self, p: Array, R: Array, m: Measurement) -> tuple[Array, Array]:
+        """The error of a pose p (3,), R (3, 3) along the directions of a measurement (k,), and its derivative (k, 6) by the pose.
+
+        What is not observed belongs to the limb and turns with it: the roll about its axis, the way along it. Were the directions
+        those at the measured pose, their noise would let information leak into what nobody observes; so they are turned to the
+        pose in question. A roll that is made up, however large, says nothing (swing-twist decomposition).
+        """
+        turn = R @ m.T[:3, :3].T
+        if m.axis is None:
+            rotation = so3.log(turn)
+            jacobian = so3.left_jacobian_inverse(rotation)
+        else:
+            rotation = so3.swing(m.axis, turn @ m.axis)
+            jacobian = so3.exp(-rotation)
+        derivative = m.basis.copy()
+        derivative[:, 3:] = m.basis[:, 3:] @ jacobian
+        if m.slides:
+            derivative[:, :3] = m.basis[:, :3] @ so3.exp(-rotation)
+        return derivative[:, :3] @ (p - m.T[:3, 3]) + m.basis[:, 3:] @ rotation, derivative
+
     def linearised(self, state: State, m: Measurement) -> tuple[Array, Array]:
         """Innovation z (k,) and its derivative H (k, n) by the state, the white noise left out.
 
-        A measurement says: the error e with `perturb(T_measured, e) == T_true` is noise along its directions. What a
-        rank-deficient one says along the others is made up and may be far off; the Jacobian at e keeps that out of the rest.
+        A measurement says: the error e with `perturb(T_measured, e) == T_true` is noise along its directions.
         """
         source = m.key[1]
-        e = np.concatenate([state.p - m.T[:3, 3], so3.log(state.R @ m.T[:3, :3].T)])
         lasting = self._doubt(state, source) * self.settings.senses[source].lasting
         bias = np.sqrt(lasting) * m.sigma[:, None] * m.directions.T
         H = np.zeros((m.rank, self.size))
-        H[:, :3] = m.basis[:, :3]
-        H[:, 3:6] = m.basis[:, 3:] @ so3.left_jacobian_inverse(e[3:])
+        value, H[:, :POSE] = self.error(state.p, state.R, m)
         H[:, self.bias_of[source]] = bias
         offset = self.bias_of[source].start - MOTION
-        return -(m.basis @ e) - bias @ state.bias[offset : offset + POSE], H
+        return -value - bias @ state.bias[offset : offset + POSE], H
 
     def innovation(self, state: State, z: Array, H: Array, m: Measurement) -> tuple[Array, Array, Array]:
         """P H' (n, k), the inverse of the innovation's covariance (k, k), and the innovation (6,) in units of its standard
@@ -317,6 +341,11 @@ class Filter:
         K = PHt @ S_inverse
         dx = K @ z
         P = state.P - K @ PHt.T
+        turn = so3.exp(dx[3:6])
+        if m.rank < POSE:  # what is not observed turns with the limb: see `error`
+            for axes in (slice(3, 6), slice(9, 12)):
+                P[axes] = turn @ P[axes]
+                P[:, axes] = P[:, axes] @ turn.T
         P = 0.5 * (P + P.T)
         volume = np.linalg.slogdet(state.P[:POSE, :POSE])[1] - np.linalg.slogdet(P[:POSE, :POSE])[1]
         record = state.senses[source]
@@ -324,7 +353,7 @@ class Filter:
         return replace(
             state,
             p=state.p + dx[:3],
-            R=so3.orthonormal(so3.exp(dx[3:6]) @ state.R),
+            R=so3.orthonormal(turn @ state.R),
             velocity=state.velocity + dx[POSE:MOTION],
             bias=state.bias + dx[MOTION:],
             P=P,

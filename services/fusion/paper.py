@@ -155,7 +155,7 @@ class PaperObserver:
         return {name: held for name, held in self._held.items() if stamp_ns - held.stamp_ns <= self._hold_ns[name]}
 
     def _advanced(self, stamp_ns: int) -> _State:
-        """The state at a stamp, in steps of STEP_S while a measurement is in use; the newest state where the stamp is not later."""
+        """The state at a stamp, in steps of STEP_S while a measurement is in use; not before the newest measurement."""
         begin_ns, step_ns = self._ahead[0].stamp_ns, int(STEP_S * 1e9)
         end_ns = min(stamp_ns, max(held.stamp_ns + self._hold_ns[name] for name, held in self._held.items()))
         while self._ahead[-1].stamp_ns + step_ns <= end_ns:

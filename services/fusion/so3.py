@@ -77,6 +77,18 @@ def left_jacobian_inverse(r: Array) -> Array:
     return np.eye(3) - 0.5 * K + c * (K @ K)
 
 
+def swing(a: Array, b: Array) -> Array:
+    """The rotation vector of the shortest turn that takes the unit vector a (3,) to b (3,)."""
+    cross = hat(a) @ b
+    sine, cosine = math.sqrt(float(cross @ cross)), float(a @ b)
+    if sine > 1e-9:
+        return math.atan2(sine, cosine) / sine * cross
+    if cosine > 0.0:
+        return cross
+    across = hat(a) @ np.eye(3)[np.argmin(np.abs(a))]  # opposite: half a turn about any axis across
+    return math.pi / math.sqrt(float(across @ across)) * across
+
+
 def orthonormal(R: Array) -> Array:
     """R after one Newton step towards the nearest rotation: keeps rounding from piling up over a long run."""
     return 1.5 * R - 0.5 * (R @ R.T @ R)

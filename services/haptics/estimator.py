@@ -5,8 +5,9 @@ independent noise. Earlier windows enter only as the point and spread where the 
 
 1. predict: the last pose drifts back to its home as an Ornstein-Uhlenbeck process, so its spread never exceeds home's
 2. solve from there (`solve.py`); close to the pads from three rolls, because a hand that is turned either way can be felt alike
-3. if that does not explain the voltages, nothing is tracked, or some time has passed, solve from scratch: from the network's
-   pose, home and the track, with home's spread; this replaces the track where it explains the voltages clearly better
+3. if that does not explain the voltages, nothing is tracked, or some time has passed, solve from scratch: from the
+   network's pose with three rolls and from the track, with home's spread; this replaces the track where it explains the
+   voltages clearly better
 4. merge what fits about equally well into one Gaussian, and take the prior's share out again
 """
 
@@ -30,8 +31,9 @@ MISFIT = 2.5
 """Mean squared residual above which the voltages are not explained, and the solve starts afresh."""
 CHECK_EVERY = 10
 """Windows between solves from scratch beside the track: a limb can be felt alike at two places along it."""
-CONVINCING = 4.0
-"""A solve from scratch replaces the track where it makes the voltages e to this power more probable."""
+CONVINCING = 12.0
+"""A solve from scratch replaces the track where it makes the voltages e to this power more probable. Its wider prior alone lets
+it follow the noise of six directions, which is worth 3 on average and 11 once in a thousand windows."""
 ROLL_GAP = 0.10
 """Nearer than this [m] the roll can be felt, and has several solutions."""
 ROLL_MEMORY_S = 0.1
@@ -127,8 +129,9 @@ class Estimator:
             self._T, self._covariance = self.home, self._home_covariance
             starts = [kept[0], self.home]
             if self.network is not None:
-                starts.append(self.network.posterior(self._features(amplitude, variance, alive, T_world_pads, joints)))
-            found = self._solutions(electrodes, amplitude, variance, starts, coarse=4, fine=3)
+                starts[1] = self.network.posterior(self._features(amplitude, variance, alive, T_world_pads, joints))
+            starts += [_turned(starts[1], roll - self._roll(starts[1])) for roll in ROLLS]
+            found = self._solutions(electrodes, amplitude, variance, starts, coarse=3, fine=3)
             if tracked and tracked[0].evidence < found[0].evidence + CONVINCING:
                 found, (self._T, self._covariance) = tracked, kept
         T, information, gradient = self._merge(found)
@@ -215,5 +218,5 @@ def _turned(T: Array, roll: float) -> Array:
     return T @ from_rpy((0.0, 0.0, 0.0), (roll, 0.0, 0.0))
 
 
-def _log_det(covariance: Array) -> float:
+def _log_det(covariance: NDArray[np.floating]) -> float:
     return float(np.linalg.slogdet(covariance)[1])

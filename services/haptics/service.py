@@ -10,7 +10,7 @@ import numpy as np
 from services.haptics import network
 from services.haptics.estimator import Estimate, Estimator
 from services.haptics.kinematics import PadPoses
-from services.haptics.window import Collector, Window
+from services.haptics.window import Backlog, Collector, Window
 from shared.body import target_mesh
 from shared.geometry import position_orientation
 from shared.messages import HapticPose, Joints, Voltages
@@ -37,6 +37,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
     poses = PadPoses(cell, skin, robot_models(cell))
     collector = Collector(skin, length_ns=int(options.window_ms * 1e6))
     estimators = {name: _estimator(node, options, skin, name) for name in cell.targets}
+    backlog = Backlog()
     known: dict[str, str] = {}
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
@@ -44,7 +45,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
 
     def on_voltages(message: Voltages, names: dict[str, str]) -> None:
         window = collector.add(names["pad"], message.stamp_ns, message.period_ns, message.volts.astype(np.float64))
-        if window is not None:
+        if window is not None and not backlog.is_late(window.newest_ns, node.now_ns()):
             on_window(window)
 
     def on_window(window: Window) -> None:

@@ -38,6 +38,9 @@ WORTHLESS = 0.15
 """A direction known no better than this [m, or rad times LEVER] is published as unknown: beyond, the linearisation that a
 covariance stands for has no meaning."""
 
+TOO_FAR = 0.1
+"""The same for a direction along which the likelihood peaks this far [m, or rad times LEVER] from where it was linearised."""
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -61,12 +64,13 @@ class Solution:
 
 def peak(T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
     """The pose where a quadratic log-likelihood with this information (6, 6) and gradient (6,) at T is largest, and its
-    information; negative and worthless directions (see WORTHLESS) carry none and are left as they are in T."""
+    information; negative and worthless directions (see WORTHLESS, TOO_FAR) carry none and are left as they are in T."""
     scale = np.array([1.0, 1.0, 1.0, 1.0 / LEVER, 1.0 / LEVER, 1.0 / LEVER])
     eigenvalues, directions = np.linalg.eigh(information * np.outer(scale, scale))
-    known = eigenvalues > 1.0 / WORTHLESS**2
+    steps = (directions.T @ (scale * gradient)) / np.maximum(eigenvalues, 1e-12)
+    known = (eigenvalues > 1.0 / WORTHLESS**2) & (np.abs(steps) < TOO_FAR)
     directions = directions[:, known]
-    step = scale * (directions @ ((directions.T @ (scale * gradient)) / eigenvalues[known]))
+    step = scale * (directions @ steps[known])
     kept = (directions * eigenvalues[known]) @ directions.T / np.outer(scale, scale)
     return perturb(T, step), kept
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -43,8 +44,9 @@ PERSONS = 8
 """Places of the shoulder among which scenes are drawn."""
 DEAD = 0.02
 """Share of pads that are dead in training."""
-BATCH, FRESH, START, POOL = 1024, 128, 30_000, 400_000
+BATCH, FRESH, START, POOL = 1024, 128, 4000, 400_000
 """Scenes in a step; of these, drawn anew (the others come from a pool that they join); in the pool at first and at most."""
+CHECKPOINT_S = 20.0
 BANDS = (0.0, 0.04, 0.075, 0.125, 0.175)
 """Limits of the gap bands [m] of the held-out errors."""
 
@@ -71,18 +73,18 @@ class Scenes:
         self.surface, *self._others = [Surface(mesh.vertices, mesh.faces) for mesh in self._persons[0].meshes]
         self.models = robot_models(cell)
 
-    def draw(self, rng: np.random.Generator, count: int, motion: bool = False) -> dict[str, Array]:
+    def draw(self, rng: np.random.Generator, count: int, motion: bool = False) -> dict[str, Any]:
         """`count` scenes, from the training's Gaussian, or uniformly from the region of the cell's motion.
 
         T (count, 4, 4), joints (count, j), pads (count, p, 4, 4), gap (count,) to the target, amplitude (count, n), alive
         (count, p).
         """
-        kept: list[dict[str, Array]] = []
+        kept: list[dict[str, Any]] = []
         while sum(len(k["gap"]) for k in kept) < count:
             kept.append(self._draw(rng, count, motion))
         return {name: np.concatenate([k[name] for k in kept])[:count] for name in kept[0]}
 
-    def inputs(self, scene: dict[str, Array]) -> NDArray[np.float32]:
+    def inputs(self, scene: dict[str, Any]) -> NDArray[np.float32]:
         """The network's input for scenes: as `estimator.py` forms it."""
         skin = self.skin
         variance = skin.noise / SAMPLES + (MODEL_ERROR * np.maximum(skin.signal(scene["amplitude"]), 0.0)) ** 2
@@ -94,7 +96,7 @@ class Scenes:
         error = np.concatenate([scene["T"][:, :3, 3] - self.home[:3, 3], rotation], axis=1)
         return (error / self.spread).astype(np.float32)
 
-    def _draw(self, rng: np.random.Generator, count: int, motion: bool) -> dict[str, Array]:
+    def _draw(self, rng: np.random.Generator, count: int, motion: bool) -> dict[str, Any]:
         skin = self.skin
         T = np.tile(np.eye(4), (count, 1, 1))
         if motion:
@@ -253,15 +255,20 @@ def main(argv: list[str] | None = None) -> None:
     model, mean, scale, steps, seconds = _train(scenes, fingerprint(cell, target), options, checkpoint)
     network = to_numpy(model, mean, scale, scenes.home, scenes.spread)
     save(network, out, fingerprint(cell, target))
+    schedule = f"--minutes {options.minutes:g}" if options.minutes else f"--steps {options.steps}"
     card = {
-        "made_by": f"penumbra haptics train --cell {options.cell} --target {target} --seed {options.seed}",
+        "made_by": f"penumbra haptics train --cell {options.cell} --target {target} --seed {options.seed} {schedule}",
         "date": time.strftime("%Y-%m-%d"),
-        "data": {"seed": options.seed, "held_out_seed": options.seed + 1_000_000, "samples_per_window": SAMPLES,
-                 "model_error": MODEL_ERROR, "dead_pads": DEAD, "closest_m": CLOSEST},
-        "network": {"hidden": HIDDEN, "steps": steps, "batch": BATCH, "minutes": round(seconds / 60, 1)},
-        "fingerprint": fingerprint(cell, target),
+        "seed": options.seed,
+        "settings": {
+            "network": {"hidden": HIDDEN, "steps": steps, "batch": BATCH, "minutes": round(seconds / 60, 1)},
+            "data": {"samples_per_window": SAMPLES, "model_error": MODEL_ERROR, "dead_pads": DEAD, "closest_m": CLOSEST},
+            "prior": {"home": scenes.home.round(6).tolist(), "spread": scenes.spread.round(6).tolist()},
+            "fingerprint": fingerprint(cell, target),
+        },
+        "held_out_seed": options.seed + 1_000_000,
         "held_out": evaluate(scenes, network, options.seed + 1_000_000, options.scenes),
-    }  # fmt: skip
+    }
     out.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n")
     print(f"{out} and its card: {json.dumps(card['held_out'], indent=1)}")
     checkpoint.unlink(missing_ok=True)
@@ -270,7 +277,7 @@ def main(argv: list[str] | None = None) -> None:
 def _train(
     scenes: Scenes, key: str, options: argparse.Namespace, checkpoint: Path
 ) -> tuple[torch.nn.Sequential, Array, Array, int, float]:
-    """The trained model, mean and scale of its inputs, steps and seconds. Interrupted, it goes on from the checkpoint."""
+    """The trained model, mean and scale of its inputs, steps and seconds; goes on from the checkpoint of an interrupted run."""
     torch.manual_seed(options.seed)
     rng = np.random.default_rng(options.seed)
     first = scenes.draw(rng, START)
@@ -289,36 +296,44 @@ def _train(
             step, before = state["step"], state["seconds"]
             rng = np.random.default_rng([options.seed, step])
             print(f"resumed {checkpoint} at step {step}")
-    began, saved = time.monotonic(), time.monotonic()
+    began = saved = time.monotonic()
+
+    def save_checkpoint() -> None:
+        checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        state = {"key": key, "seed": options.seed, "step": step, "seconds": before + time.monotonic() - began}
+        torch.save({**state, "model": model.state_dict(), "optimizer": optimizer.state_dict()}, checkpoint)
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
         total = int(60 * options.minutes) if options.minutes else options.steps
         bar = progress.add_task("training", total=total)
-        while True:
-            seconds = before + time.monotonic() - began
-            done = seconds / (60 * options.minutes) if options.minutes else step / options.steps
-            if done >= 1.0:
-                return model, mean, scale, step, seconds
-            fresh = scenes.draw(rng, FRESH)
-            place = np.arange(filled, filled + FRESH) % POOL
-            pool_x[place], pool_y[place], filled = scenes.inputs(fresh), scenes.labels(fresh), filled + FRESH
-            rows = rng.integers(min(filled, POOL), size=BATCH)
-            x_batch = torch.from_numpy(((pool_x[rows] - mean) / scale).astype(np.float32))
-            for group in optimizer.param_groups:
-                group["lr"] = 1e-3 * min(1.0, (step + 1) / 200) * (0.5 * (1 + np.cos(np.pi * done)) + 0.002)
-            value = loss(model(x_batch), torch.from_numpy(pool_y[rows]))
-            optimizer.zero_grad()
-            value.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 20.0)
-            optimizer.step()
-            step += 1
-            if step % 20 == 0:
-                progress.update(bar, completed=int(done * total), description=f"training, loss {value.item():.2f}")
-            if time.monotonic() - saved > 20.0:
-                saved = time.monotonic()
-                checkpoint.parent.mkdir(parents=True, exist_ok=True)
-                state = {"key": key, "seed": options.seed, "step": step, "seconds": seconds}
-                torch.save({**state, "model": model.state_dict(), "optimizer": optimizer.state_dict()}, checkpoint)
+        try:
+            while True:
+                seconds = before + time.monotonic() - began
+                done = seconds / (60 * options.minutes) if options.minutes else step / options.steps
+                if done >= 1.0:
+                    return model, mean, scale, step, seconds
+                fresh = scenes.draw(rng, FRESH)
+                place = np.arange(filled, filled + FRESH) % POOL
+                pool_x[place], pool_y[place], filled = scenes.inputs(fresh), scenes.labels(fresh), filled + FRESH
+                rows = rng.integers(min(filled, POOL), size=BATCH)
+                x_batch = torch.from_numpy(((pool_x[rows] - mean) / scale).astype(np.float32))
+                for group in optimizer.param_groups:
+                    group["lr"] = 1e-3 * min(1.0, (step + 1) / 200) * (0.5 * (1 + math.cos(math.pi * done)) + 0.002)
+                value = loss(model(x_batch), torch.from_numpy(pool_y[rows]))
+                optimizer.zero_grad()
+                value.backward()
+                torch.nn.utils.clip_grad_norm_(model.parameters(), 20.0)
+                optimizer.step()
+                step += 1
+                if step % 20 == 0:
+                    progress.update(bar, completed=int(done * total), description=f"training, loss {value.item():.2f}")
+                if time.monotonic() - saved > CHECKPOINT_S:
+                    saved = time.monotonic()
+                    save_checkpoint()
+        except KeyboardInterrupt:
+            save_checkpoint()
+            raise SystemExit(f"interrupted at step {step}; run the same command again to go on from {checkpoint}") from None
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ The clock is the samples' own stamps: a replay gives the same windows at any spe
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from shared.skin import Skin
 
 Array = NDArray[np.float64]
+
+NEVER = -(1 << 62)
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,22 @@ class Window:
     faults: dict[str, str]
 
 
+class Backlog:
+    """Tells when a reader has fallen behind its samples, so that it can leave out what is overtaken already.
+
+    Clocks may differ and the way here takes time: late is what comes much later than the quickest of the last windows.
+    """
+
+    def __init__(self, patience_ns: int = 30_000_000, memory: int = 200):
+        self.patience_ns = patience_ns
+        self._lags: deque[int] = deque(maxlen=memory)
+
+    def is_late(self, newest_ns: int, now_ns: int) -> bool:
+        """Whether a window whose last sample has newest_ns comes too late at now_ns."""
+        self._lags.append(now_ns - newest_ns)
+        return self._lags[-1] > min(self._lags) + self.patience_ns
+
+
 class Collector:
     """Gathers batches and hands out a window when every living pad has filled it.
 
@@ -41,8 +60,8 @@ class Collector:
         self._index = {name: k for k, name in enumerate(skin.pads)}
         self._stamps: list[NDArray[np.int64]] = [np.empty(0, np.int64) for _ in skin.pads]
         self._volts: list[Array] = [np.empty((0, skin.of(k).stop - skin.of(k).start)) for k in range(len(skin.pads))]
-        self._newest = np.full(len(skin.pads), -1, dtype=np.int64)
-        self._done_ns = -1
+        self._newest = np.full(len(skin.pads), NEVER, dtype=np.int64)
+        self._done_ns = NEVER
 
     def add(self, pad: str, stamp_ns: int, period_ns: int, volts: Array) -> Window | None:
         """Take a batch (samples, electrodes) whose last row has stamp_ns; returns a window when one is complete.
@@ -65,13 +84,13 @@ class Collector:
         self._stamps[k] = np.concatenate([self._stamps[k], stamps[fresh]])
         self._volts[k] = np.concatenate([self._volts[k], volts[fresh]])
         self._newest[k] = stamp_ns
-        return self._window()
+        return self._window(period_ns)
 
-    def _window(self) -> Window | None:
+    def _window(self, period_ns: int) -> Window | None:
         heard = self._newest >= self._newest.max() - self.patience_ns
         end_ns = int(self._newest[heard].min())
-        if self._done_ns < 0:  # the first window begins where the slowest living pad begins
-            self._done_ns = max(int(s[0]) for s, ok in zip(self._stamps, heard, strict=True) if ok) - 1
+        if self._done_ns == NEVER:  # the first window begins where the slowest living pad begins
+            self._done_ns = max(int(s[0]) for s, ok in zip(self._stamps, heard, strict=True) if ok) - period_ns
         if end_ns - self._done_ns < self.length_ns:
             return None
         # After a cut only the newest stretch is used: an old one would say little about now.
@@ -112,5 +131,5 @@ class Collector:
     def _forget(self) -> None:
         for k in range(len(self.skin.pads)):
             self._stamps[k], self._volts[k] = self._stamps[k][:0], self._volts[k][:0]
-        self._newest[:] = -1
-        self._done_ns = -1
+        self._newest[:] = NEVER
+        self._done_ns = NEVER

@@ -15,5 +15,4 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: Node, options: argparse.Namespace) -> None:
-    """Says where it can be reached."""
-    node.log.info("routing", listen=" ".join(node.connection.listen) or node.connection.where)
+    """Nothing: the session itself is the router."""

@@ -18,17 +18,24 @@ SPACING_PX = 3.0
 """Distance of the sampled contour points: closer ones bring no new information."""
 NEAR = 0.05
 """Edges nearer to the camera than this are left out [m]."""
+BESIDE = 4.0
+"""Contours of two parts that are nearer than this [px] are told apart by nothing."""
+COLUMN = 8
+"""Width of the columns [px] in which they are looked for, at least BESIDE."""
+APART = 0.01
+"""Two points of the contour whose depths differ by more than this [m] belong to two parts."""
 CREASE = 0.8
-"""Facets that meet at a larger angle [rad] are a crease of the body and not a sample of a round surface."""
+"""Facets that meet at a larger angle [rad] are a crease of the body, and not a sample of a round surface."""
 
 
 class Model:
-    """A closed triangle mesh prepared for contours. The edge list holds, per edge, its two vertices, its two faces (-1: none)."""
+    """A triangle mesh prepared for contours. `edges` (n, 4): two vertices and two faces (-1: none) each."""
 
     def __init__(self, mesh: Mesh):
         self.vertices = np.ascontiguousarray(mesh.vertices, np.float64)
         self.faces = np.ascontiguousarray(mesh.faces, np.int32)
         self.edges = _edges(self.faces)
+        self.closed = bool((self.edges[:, 3] >= 0).all())
 
     def in_camera(self, T: Array) -> Array:
         """The vertices (n, 3) [m] in the camera's frame."""
@@ -36,7 +43,12 @@ class Model:
 
     def silhouette(self, T: Array, k: Intrinsics, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
         """The silhouette (h, w) in a window (x0, y0, w, h) of the image with intrinsics k."""
-        return raster.silhouette(self.in_camera(T), self.faces, (k.fx, k.fy, k.cx, k.cy), window)
+        return self.silhouette_of(self.in_camera(T), k, window)
+
+    def silhouette_of(self, V: Array, k: Intrinsics, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+        """The same of vertices (n, 3) [m] that are in the camera's frame already."""
+        faces = _front(V, self.faces) if self.closed else self.faces  # the far side of a closed mesh adds nothing
+        return raster.silhouette(V, faces, (k.fx, k.fy, k.cx, k.cy), window)
 
 
 def _edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -48,8 +60,23 @@ def _edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 @njit(cache=True, nogil=True)
+def _front(V, faces):
+    """The faces (n, 3) that turn their outside to the camera."""
+    out = np.empty_like(faces)
+    n = 0
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = V[b, 0] - V[a, 0], V[b, 1] - V[a, 1], V[b, 2] - V[a, 2]
+        vx, vy, vz = V[c, 0] - V[a, 0], V[c, 1] - V[a, 1], V[c, 2] - V[a, 2]
+        if (uy * vz - uz * vy) * V[a, 0] + (uz * vx - ux * vz) * V[a, 1] + (ux * vy - uy * vx) * V[a, 2] < 0.0:
+            out[n] = faces[f]
+            n += 1
+    return out[:n]
+
+
+@njit(cache=True, nogil=True)
 def _lean(V, edge, N, X, Y, Z):
-    """How far behind (X, Y, Z) of a silhouette edge, along the line of sight, the surface that the mesh stands for is seen edge-on [m].
+    """How far behind (X, Y, Z) of a silhouette edge, along the line of sight, the round surface is seen edge-on [m].
 
     A facet's edge turns with the body, the contour of a round limb does not: without this, eighteen flat sides pretend that
     the whole forearm shows its roll. Between two facets the normal turns evenly; a crease of the body itself stays where it is.
@@ -68,7 +95,11 @@ def _lean(V, edge, N, X, Y, Z):
 @njit(cache=True, nogil=True)
 def trace(V, faces, edges, fx, fy, cx, cy, silhouette, spacing):
     """Points of the outer occluding contour: (n, 8) rows of X, Y, Z in the camera's frame [m], u, v, outward normal (2) and
-    the length of contour [px] that the point stands for. V (n, 3) [m]; silhouette (h, w) of the same pose."""
+    the length of contour [px] that the point stands for. V (n, 3) [m]; silhouette (h, w) of the same pose.
+
+    Where two parts (thumb and palm) end within BESIDE of one another, the points are left out: the smallest motion decides which
+    of the two is the contour, so that neither predicts how it moves.
+    """
     h, w = silhouette.shape
     n_faces, n_vertices = len(faces), len(V)
     N = np.empty((n_faces, 4))  # unit normal and twice the area
@@ -87,6 +118,7 @@ def trace(V, faces, edges, fx, fy, cx, cy, silhouette, spacing):
         P[i, 0] = fx * V[i, 0] / z + cx
         P[i, 1] = fy * V[i, 1] / z + cy
     out = np.empty((4096, 8))
+    outer = np.empty(4096, np.bool_)
     n = 0
     for e in range(len(edges)):
         i, j, f, g = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
@@ -107,10 +139,9 @@ def trace(V, faces, edges, fx, fy, cx, cy, silhouette, spacing):
             u, v = P[i, 0] + s * dx, P[i, 1] + s * dy
             uo, vo = int(math.floor(u + 1.5 * nx + 0.5)), int(math.floor(v + 1.5 * ny + 0.5))
             ui, vi = int(math.floor(u - 1.5 * nx + 0.5)), int(math.floor(v - 1.5 * ny + 0.5))
-            if not (0 <= uo < w and 0 <= vo < h and 0 <= ui < w and 0 <= vi < h) or silhouette[vo, uo] or not silhouette[vi, ui]:
+            if not (0 <= uo < w and 0 <= vo < h and 0 <= ui < w and 0 <= vi < h) or n == len(out):
                 continue
-            if n == len(out):
-                return out
+            outer[n] = not silhouette[vo, uo] and silhouette[vi, ui]
             # the point of the edge in space that projects to (u, v): linear in the inverse depth
             z = 1.0 / ((1.0 - s) / V[i, 2] + s / V[j, 2])
             x, y = (u - cx) / fx * z, (v - cy) / fy * z
@@ -120,7 +151,34 @@ def trace(V, faces, edges, fx, fy, cx, cy, silhouette, spacing):
             out[n, 0], out[n, 1], out[n, 2] = x, y, z
             out[n, 3], out[n, 4], out[n, 5], out[n, 6], out[n, 7] = u, v, nx, ny, length / count
             n += 1
-    return out[:n]
+    # chains of points by column, so that each is compared with its neighbours only
+    columns = w // COLUMN + 1
+    last, previous = np.full(columns, -1), np.empty(n, np.int64)
+    for i in range(n):
+        c = min(max(int(out[i, 3]) // COLUMN, 0), columns - 1)
+        previous[i], last[c] = last[c], i
+    kept = 0
+    points = np.empty((n, 8))
+    for i in range(n):
+        if outer[i] and not _beside(out, i, last, previous):
+            points[kept] = out[i]
+            kept += 1
+    return points[:kept]
+
+
+@njit(cache=True, nogil=True)
+def _beside(points, i, last, previous):
+    """Whether another part's contour runs along point i."""
+    u, v, nx, ny, z = points[i, 3], points[i, 4], points[i, 5], points[i, 6], points[i, 2]
+    column = min(max(int(u) // COLUMN, 0), len(last) - 1)
+    for c in range(max(column - 1, 0), min(column + 2, len(last))):
+        k = last[c]
+        while k >= 0:
+            du, dv = points[k, 3] - u, points[k, 4] - v
+            if abs(points[k, 2] - z) >= APART and max(abs(du), abs(dv)) <= BESIDE and points[k, 5] * nx + points[k, 6] * ny > 0.5:
+                return True
+            k = previous[k]
+    return False
 
 
 @njit(cache=True, nogil=True)
@@ -185,12 +243,12 @@ def match(points, field, state, guarded, reach):
 @njit(cache=True, nogil=True)
 def normal_equations(points, r, kind, origin, fx, fy, edge, correlation, joint, huber, bounded):
     """Of the pose error along the camera's axes and the dilation: the 7 x 7 information, its right side (7,), the length of
-    contour measured [px], the sum of length times Huber-limited squared offset [px^3], and Huber's cost (chi^2 where all is
-    within `huber`). `origin` (3,): the target's [m]; `bounded`: whether BOUNDED points inform, and not only cost."""
+    contour measured [px], the sum of length times Huber-limited squared offset [px^3], the length that costs, and Huber's cost
+    (chi^2 where all is within `huber`). `origin` (3,): the target's [m]; `bounded`: whether BOUNDED points inform."""
     H = np.zeros((7, 7))
     g = np.zeros(7)
     J = np.empty(7)
-    length, square, cost = 0.0, 0.0, 0.0
+    length, square, counted, cost = 0.0, 0.0, 0.0, 0.0
     joint_length = 0.0
     for i in range(len(points)):
         if kind[i] == AT_JOINT:
@@ -217,6 +275,7 @@ def normal_equations(points, r, kind, origin, fx, fy, edge, correlation, joint, 
             length += points[i, 7]
             square += points[i, 7] * min(r[i] * r[i], huber * huber)
         weight = share / (sigma * sigma)
+        counted += points[i, 7]
         if abs(r[i]) <= limit:
             cost += weight * r[i] * r[i]
         else:
@@ -228,4 +287,4 @@ def normal_equations(points, r, kind, origin, fx, fy, edge, correlation, joint, 
             g[a] += weight * J[a] * r[i]
             for b in range(7):
                 H[a, b] += weight * J[a] * J[b]
-    return H, g, length, square, cost
+    return H, g, length, square, counted, cost

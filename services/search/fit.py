@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from services.search.contour import Model, match, normal_equations, trace
 from services.search.evidence import Evidence, compare
-from shared import geometry, raster
+from shared import geometry
 
 Array = NDArray[np.float64]
 
@@ -62,21 +62,25 @@ class Limits:
         return np.diag([self.position**-2.0] * 3 + [self.rotation**-2.0] * 3)
 
 
-STAGES = ((24.0, 5.0, 5), (8.0, 2.0, 7))
-"""(reach of the walk [px], Huber's threshold [px], passes at most), from coarse to fine."""
-CONVERGED = 5e-4
+COARSE, FINE = (24.0, 5.0, 4), (8.0, 2.0, 7)
+"""Reach of the walk [px], Huber's threshold [px], passes at most. The coarse passes take every step, as the contour points that
+are matched change with each; the fine ones only what lowers the cost."""
+CONVERGED = 1e-3
 """A pass that moves less than this [m], and four times it [rad], is the last of its stage."""
 MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
 """Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
 DAMPING = (1e-3, 10.0, 1e2)
 """Marquardt's factor at the start, its change after a pass that gained or lost, and where the search gives up."""
+MISFIT = 3.0
+"""A larger `Fit.misfit` has one fit of a hundred that are right, and most that are wrong."""
 
 
 @dataclass(frozen=True)
 class Fit:
     """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
     `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
-    `cost`: chi^2 of contour, dilation and prior together; `both`, `either`, `free`: see `compare`."""
+    `cost`: chi^2 of contour, dilation and prior together; `misfit`: the same per measurement, 1 to 3 where the pose
+    is right; `both`, `either`, `free`: see `compare`."""
 
     T: Array
     covariance: Array
@@ -85,6 +89,7 @@ class Fit:
     rms: float
     dilation: float
     cost: float
+    misfit: float
     both: int
     either: int
     free: int
@@ -97,16 +102,52 @@ class Fit:
 
 @dataclass(frozen=True)
 class _Pass:
-    """One pose (as pose error from the prior, and dilation) and the normal equations of the contour there."""
+    """The contour at one pose, which is `moved` (7,) from the prior: pose error and dilation."""
 
     T: Array
     moved: Array
+    points: Array
+    r: Array
+    kind: NDArray[np.uint8]
     H: Array
     g: Array
-    length: float
-    square: float
     cost: float
     counts: tuple[int, int, int]
+
+
+class _Problem:
+    def __init__(self, model: Model, evidence: Evidence, noise: Noise, regular: Array):
+        self.model, self.evidence, self.noise, self.regular = model, evidence, noise, regular
+
+    def at(self, T: Array, moved: Array, reach: float, huber: float) -> _Pass:
+        evidence, k = self.evidence, self.evidence.intrinsics
+        intrinsics = (k.fx, k.fy, k.cx, k.cy)
+        V = self.model.in_camera(T)
+        silhouette = self.model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1]))
+        points = trace(V, self.model.faces, self.model.edges, *intrinsics, silhouette, SPACING_PX)
+        offsets, kind = match(points, evidence.field, evidence.state, evidence.guarded, reach)
+        r = offsets - moved[6]
+        H, g, _, _, counted, cost = self.normal_equations(T, points, r, kind, huber, True)
+        both, free = compare(evidence.state, silhouette)
+        # parts of the mask that no contour is near pull at nothing, but must not look cheap; nor may points pay by dropping out
+        unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
+        cost = cost * evidence.boundary_px / max(counted, 1.0) + unexplained + float(np.dot(moved, self.regular @ moved))
+        return _Pass(T, moved, points, r, kind, H, g, cost, (both, evidence.seen_px + free, free))
+
+    def normal_equations(
+        self, T: Array, points: Array, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
+    ) -> tuple[Array, Array, float, float, float, float]:
+        noise, k = self.noise, self.evidence.intrinsics
+        return normal_equations(points, r, kind, T[:3, 3], k.fx, k.fy, noise.edge, noise.correlation, noise.joint, huber, bounded)
+
+    def step(self, here: _Pass, damping: float) -> Array:
+        information = here.H + self.regular
+        information[_DIAGONAL] *= 1.0 + damping
+        step = np.linalg.solve(information, here.g - self.regular @ here.moved)
+        return np.asarray(step / max(1.0, float(np.max(np.abs(step[:6]) / MAX_STEP))), np.float64)
+
+
+_DIAGONAL = np.diag_indices(7)
 
 
 def fit(
@@ -128,47 +169,49 @@ def fit(
     regular = np.zeros((7, 7))
     regular[:6, :6] = weak if prior is None else prior + weak
     regular[6, 6] = noise.dilation**-2
+    problem = _Problem(model, evidence, noise, regular)
 
-    def at(T: Array, moved: Array, reach: float, huber: float, bounded: bool) -> _Pass:
-        k = evidence.intrinsics
-        intrinsics = (k.fx, k.fy, k.cx, k.cy)
-        V = model.in_camera(T)
-        silhouette = raster.silhouette(V, model.faces, intrinsics, (0, 0, *evidence.state.shape[::-1]))
-        points = trace(V, model.faces, model.edges, *intrinsics, silhouette, SPACING_PX)
-        r, kind = match(points, evidence.field, evidence.state, evidence.guarded, reach)
-        weights = (noise.edge, noise.correlation, noise.joint, huber, bounded)
-        H, g, length, square, cost = normal_equations(points, r - moved[6], kind, T[:3, 3], k.fx, k.fy, *weights)
-        counts = compare(evidence.state, silhouette)
-        # parts of the mask that no contour is near pull at nothing, but must not look cheap
-        unexplained = (counts[1] - counts[2] - counts[0]) / (noise.correlation * noise.edge)
-        return _Pass(T, moved, H, g, length, square, cost + unexplained + float(np.dot(moved, regular @ moved)), counts)
-
-    T, moved = T_start, np.zeros(7)
+    start = np.zeros(7)
     if T_prior is not None:
-        moved[:6] = geometry.pose_error(T_start, T_prior)
-    for reach, huber, passes in STAGES:
-        here, damping = at(T, moved, reach, huber, True), DAMPING[0]
-        for _ in range(passes):
-            information = here.H + regular
-            step = np.linalg.solve(information + damping * np.diag(np.diag(information)), here.g - regular @ here.moved)
-            step *= min(1.0, float(np.min(MAX_STEP / np.maximum(np.abs(step[:6]), 1e-12))))
-            there = at(geometry.perturb(here.T, step[:6]), here.moved + step, reach, huber, True)
-            if there.cost < here.cost:
-                here, damping = there, damping / DAMPING[1]
-            else:
-                damping *= DAMPING[1]
-            if (np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED) or damping > DAMPING[2]:
-                break
-        T, moved = here.T, here.moved
+        start[:6] = geometry.pose_error(T_start, T_prior)
+    T, moved = T_start, start
+    reach, huber, passes = COARSE
+    for _ in range(passes):
+        step = problem.step(problem.at(T, moved, reach, huber), 0.0)
+        T, moved = geometry.perturb(T, step[:6]), moved + step
+        if _small(step):
+            break
+    reach, huber, passes = FINE
+    here = problem.at(T, moved, reach, huber)
+    if here.cost > MISFIT * evidence.measurements(noise.correlation):  # the coarse passes may have left a good start
+        here = min(here, problem.at(T_start, start, reach, huber), key=lambda one: one.cost)
+    damping = DAMPING[0]
+    for _ in range(passes):
+        step = problem.step(here, damping)
+        there = problem.at(geometry.perturb(here.T, step[:6]), here.moved + step, reach, huber)
+        if there.cost < here.cost:
+            here, damping = there, damping / DAMPING[1]
+        else:
+            damping *= DAMPING[1]
+        if _small(step) or damping > DAMPING[2]:
+            break
 
-    last = at(T, moved, reach, huber, False)  # the pose is final: only what was measured informs
-    H, g = last.H, last.g
-    rms = math.sqrt(last.square / last.length) if last.length > 0 else math.inf
-    if last.length > 0 and rms > noise.edge:  # a mask worse than expected: believe its residuals
-        H, g = H * (noise.edge / rms) ** 2, g * (noise.edge / rms) ** 2
+    # the pose is final: only what was measured informs
+    moved = here.moved
+    H, g, length, square, _, _ = problem.normal_equations(here.T, here.points, here.r, here.kind, huber, False)
+    rms = math.sqrt(square / length) if length > 0 else math.inf
+    misfit = here.cost / evidence.measurements(noise.correlation)
+    # a mask or a fit worse than expected: believe the residuals
+    trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
+    H, g = H * trust, g * trust
     # the dilation is marginalised (Schur complement), and the prior left out
     gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
     covariance = np.linalg.inv(H[:6, :6] - np.outer(gain, H[6, :6]) + weak)
     offset = covariance @ (g[:6] - gain * (g[6] - regular[6, 6] * moved[6]) - weak @ moved[:6])
     covariance = (covariance + covariance.T) / 2.0
-    return Fit(geometry.perturb(T, offset), covariance, T, last.length, rms, float(moved[6]), last.cost, *last.counts)
+    T = geometry.perturb(here.T, offset)
+    return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
+
+
+def _small(step: Array) -> bool:
+    return bool(np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from services.search import contour, detect, evidence, overlap
 from services.search.evidence import TARGET, Evidence, Intrinsics
-from services.search.fit import Fit, Limits, Noise, fit
+from services.search.fit import MISFIT, Fit, Limits, Noise, fit
 from services.search.robots import RobotDepth
 from shared import body, geometry
 from shared.cell import Cell
@@ -114,8 +114,14 @@ class Search:
     def _track(self, seen: Evidence, T_start: Array, prior_covariance: Array | None) -> Fit | None:
         floor = np.diag(np.repeat(np.square(PRIOR_FLOOR), 3))
         covariance = np.zeros((6, 6)) if prior_covariance is None else self._axes.T @ prior_covariance @ self._axes
-        first = self._with_mirror(seen, T_start, np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64))
-        if first.overlap >= FITS_WELL or seen.seen_px < detect.SMALLEST_PX:
+        prior = np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64)
+        first = self._with_mirror(seen, T_start, prior)
+        if seen.seen_px < detect.SMALLEST_PX:
+            return first
+        if first.misfit > MISFIT:  # beside the right pose, mostly in roll
+            beside = [self._fit(seen, T, T_start, prior) for T in detect.mirrored(first.T_searched)]
+            first = min((first, *beside), key=lambda found: found.cost)
+        if first.overlap >= FITS_WELL:
             return first
         other = self._detect(seen, T_start)
         if other is None or other.overlap <= max(first.overlap, FITS):
@@ -170,8 +176,8 @@ class Search:
 
     def _overlap(self, seen: Evidence, T: Array) -> float:
         h, w = seen.state.shape
-        both, either, _ = evidence.compare(seen.state, self._model.silhouette(T, seen.intrinsics, (0, 0, w, h)))
-        return both / either if either else 0.0
+        both, free = evidence.compare(seen.state, self._model.silhouette(T, seen.intrinsics, (0, 0, w, h)))
+        return both / max(seen.seen_px + free, 1)
 
     def _judge(self, seen: Evidence, best: Fit) -> VisionEstimate:
         amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)

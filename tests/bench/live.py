@@ -144,22 +144,11 @@ def cpu_times(processes: dict[str, psutil.Process]) -> dict[str, float]:
     return out
 
 
-def measure(recording: Recording, reach: float, seconds: float) -> dict[str, Any]:
-    """The numbers of the issue from a recording of `seconds`."""
-    _, truths = recording.decoded(topics.TRUTH)
+def accuracy(truths: list[messages.Truth], estimates: dict[str, list[Any]], reach: float, seconds: float) -> dict[str, Any]:
+    """Errors of each sense's estimates in each situation, how long the situations lasted, and the fused states."""
     truth = TruthTrack.of(truths)
     situations = truth.situations(reach)
-    received, estimates = {}, {}
-    for sense, topic in SENSES.items():
-        received[sense], estimates[sense] = recording.decoded(topic)
-
-    result: dict[str, Any] = {
-        "frames_per_s": round(len(estimates["vision"]) / seconds, 2),
-        "fused_hz": round(len(estimates["fused"]) / seconds, 2),
-        "age_ms": percentiles(fused_ages_s(estimates["vision"], estimates["fused"]), 1e3),
-    }
-    haptic_age = received["haptic"] - np.array([h.sample_stamp_ns for h in estimates["haptic"]], dtype=np.int64)
-    result["haptic_age_ms"] = percentiles(haptic_age, 1e-6)
+    result: dict[str, Any] = {}
     for key in ("error_cm", "error_p95_cm", "axis_deg", "samples"):
         result[key] = {sight: {skin: {} for skin in ("in_range", "out_of_range")} for sight in ("visible", "occluded")}
     for sense, found in estimates.items():
@@ -182,6 +171,26 @@ def measure(recording: Recording, reach: float, seconds: float) -> dict[str, Any
     return result
 
 
+def measure(recording: Recording, reach: float, seconds: float) -> dict[str, Any]:
+    """The numbers of a recording of `seconds`: rates, ages and accuracy."""
+    received, estimates = {}, {}
+    for sense, topic in SENSES.items():
+        received[sense], estimates[sense] = recording.decoded(topic)
+    haptic_age = received["haptic"] - np.array([h.sample_stamp_ns for h in estimates["haptic"]], dtype=np.int64)
+    return {
+        "frames_per_s": round(len(estimates["vision"]) / seconds, 2),
+        "fused_hz": round(len(estimates["fused"]) / seconds, 2),
+        "age_ms": percentiles(fused_ages_s(estimates["vision"], estimates["fused"]), 1e3),
+        "haptic_age_ms": percentiles(haptic_age, 1e-6),
+        **accuracy(recording.decoded(topics.TRUTH)[1], estimates, reach, seconds),
+    }
+
+
+def reach_of(cell: cells.Cell) -> float:
+    """The longest range of the cell's pads [m]."""
+    return max(cell.pad_types[pad.type].range for pad in cell.pads.values())
+
+
 def show(result: dict[str, Any], console: Console) -> None:
     table = Table("", "measured", "goal", title=f"cell {result['cell']}, seed {result['seed']}, {result['seconds']} s")
     table.add_row("frames used per second", f"{result['frames_per_s']:.1f}", ">= 15")
@@ -191,9 +200,12 @@ def show(result: dict[str, Any], console: Console) -> None:
     for name, share in result["cpu"].items():
         table.add_row(f"CPU of {name}", f"{share:.2f} cores", "")
     console.print(table)
-    errors = Table(
-        "situation", "s", "vision", "haptic", "fused", "goal", title="position error cm median (p95), limb axis deg median"
-    )
+    show_errors(result, console)
+
+
+def show_errors(result: dict[str, Any], console: Console) -> None:
+    title = f"cell {result['cell']}, seed {result['seed']}: position error cm, median (p95); limb axis deg, median"
+    table = Table("situation", "s", *SENSES, "goal", title=title)
     for sight in ("visible", "occluded"):
         for skin in ("in_range", "out_of_range"):
             columns = []
@@ -201,8 +213,8 @@ def show(result: dict[str, Any], console: Console) -> None:
                 median, p95, axis = (result[key][sight][skin][sense] for key in ("error_cm", "error_p95_cm", "axis_deg"))
                 columns.append("-" if median is None else f"{median:.2f} ({p95:.2f})  {axis:.1f}")
             goal = {"visible": "fused <= 2.0", "occluded": "fused <= 2.5" if skin == "in_range" else ""}[sight]
-            errors.add_row(f"{sight}, {skin}", str(result["situation_s"][sight][skin]), *columns, goal)
-    console.print(errors)
+            table.add_row(f"{sight}, {skin}", str(result["situation_s"][sight][skin]), *columns, goal)
+    console.print(table)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -223,8 +235,7 @@ def main(argv: list[str] | None = None) -> int:
         time.sleep(options.seconds)
         elapsed, cpu_after = time.monotonic() - started, cpu_times(processes)
         recording.close()
-    reach = max(cell.pad_types[pad.type].range for pad in cell.pads.values())
-    result = {"cell": cell.name, "seed": options.seed, "seconds": options.seconds, **measure(recording, reach, elapsed)}
+    result = {"cell": cell.name, "seed": options.seed, "seconds": options.seconds, **measure(recording, reach_of(cell), elapsed)}
     result["cpu"] = {name: round((cpu_after[name] - cpu_before[name]) / elapsed, 3) for name in cpu_after}
     show(result, Console())
     if options.json:

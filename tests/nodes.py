@@ -1,0 +1,72 @@
+"""A small real service for the tests of the runtime: `python -m tests.nodes SERVICE --connect ENDPOINT`.
+
+It publishes the fused pose of the table's forearm at 100 Hz (where it owns it), answers the pose query, and counts frames.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import numpy as np
+
+from services import arguments
+from shared import bus, logs, messages, topics
+from shared import cell as cells
+from shared.service import Node
+
+
+def pose(stamp_ns: int | None = None, x: float = 0.0) -> messages.FusedPose:
+    return messages.FusedPose(
+        stamp_ns=time.time_ns() if stamp_ns is None else stamp_ns,
+        target="forearm",
+        frame="world",
+        position=np.array([x, 0.0, 0.2]),
+        orientation=np.array([0.0, 0.0, 0.0, 1.0]),
+        velocity=np.zeros(6),
+        covariance=1e-4 * np.eye(6),
+        state="tracking",
+        sources={"vision": messages.Source(age_s=0.05, weight=0.7), "haptic": messages.Source(age_s=0.01, weight=0.3)},
+    )
+
+
+def pose_json(target: str = "forearm") -> bytes:
+    """What fusion answers with ?format=json."""
+    now = pose()
+    return json.dumps(
+        {
+            "target": target,
+            "frame": now.frame,
+            "stamp_ns": now.stamp_ns,
+            "position": now.position.tolist(),
+            "orientation": now.orientation.tolist(),
+            "rpy": [0.0, 0.0, 0.0],
+            "velocity": now.velocity.tolist(),
+            "covariance": now.covariance.tolist(),
+            "state": now.state,
+            "sources": {name: vars(source) for name, source in now.sources.items()},
+        }
+    ).encode()
+
+
+def start(node: Node) -> None:
+    def publish() -> None:
+        if node.owns("pose/forearm"):
+            node.publish(topics.FUSED, pose(), target="forearm")
+
+    node.every(0.01, publish)
+    node.subscribe(topics.FRAME, lambda message, names: None)
+    node.answer(topics.current_pose(node.cell.name, "forearm"), lambda parameters, payload: (pose_json(), "application/json"))
+
+
+def main() -> None:
+    options = arguments.parser(sys.argv[1], __doc__ or "").parse_args(sys.argv[2:])
+    logs.configure(options.log_level, options.log_json)
+    node = Node(sys.argv[1], cells.load(options.cell), bus.connection(options))
+    start(node)
+    node.run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""The emulator as a process: what control queries say, how turns keep time, and what really arrives on the bus."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.emulator.control import COMMANDS, control
+from services.emulator.pace import Pacer
+from shared import bus, topics
+from shared import cell as cells
+from shared.service import Node
+from sim.world import World
+from tests.live import free_port, wait_for
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def world():
+    return World(cells.load("table"), 1)
+
+
+def ask(world, command, value=None, time_s=1.0):
+    return control(world, json.dumps({"command": command} | ({} if value is None else {"value": value})).encode(), time_s)
+
+
+def test_every_command_answers_with_what_is_in_force(world):
+    assert ask(world, "state") | {"scene_s": 0} == {
+        "occlusion": "auto", "occlusion_now": 0.0, "motion": "on", "paused": False, "speed": 1.0, "scene_s": 0, "seed": 1,
+    }  # fmt: skip
+    assert ask(world, "occlude", "0.8")["occlusion"] == 0.8
+    assert ask(world, "occlude", 0)["occlusion"] == 0.0
+    assert ask(world, "occlude", "auto")["occlusion"] == "auto"
+    assert ask(world, "motion", "off")["motion"] == "off"
+    assert ask(world, "motion", "on")["motion"] == "on"
+    assert ask(world, "pause")["paused"] is True
+    assert ask(world, "resume")["paused"] is False
+    assert ask(world, "speed", "2.5")["speed"] == 2.5
+    assert world.clock.rate(5.0) == 2.5
+
+
+@pytest.mark.parametrize(
+    ("payload", "text"),
+    [
+        (b"", r'\{"command": NAME, "value": VALUE\} expected, \'\' came'),
+        (b"\xff\xfe", "expected, .* came. Commands:"),
+        (b"[]", "NAME"),
+        (b"nan", "NAME"),
+        (b'{"command": 3}', "NAME"),
+        (b'{"command": "state", "colour": "red"}', "colour"),
+        (b'{"command": "fly"}', "'fly' came. Commands:\n  occlude"),
+        (b'{"command": "occlude"}', "occlude: a share .*from 0 to 1, or auto expected, None came"),
+        (b'{"command": "occlude", "value": "most"}', "occlude: .* or auto expected, 'most' came"),
+        (b'{"command": "occlude", "value": 1.5}', "occlude: a share from 0 to 1 or auto expected, 1.5 came"),
+        (b'{"command": "occlude", "value": NaN}', "occlude: a share from 0 to 1 or auto expected, nan came"),
+        (b'{"command": "occlude", "value": true}', "or auto expected, True came"),
+        (b'{"command": "motion", "value": "fast"}', "motion: on or off.* expected, 'fast' came"),
+        (b'{"command": "motion", "value": [1]}', "motion: on or off"),
+        (b'{"command": "speed", "value": -1}', "speed: a factor above 0 and at most 4 expected, -1 came"),
+        (b'{"command": "pause", "value": 3}', "pause takes no value, 3 came"),
+    ],
+)
+def test_a_bad_command_is_refused_with_what_is_possible_and_changes_nothing(world, payload, text):
+    before = ask(world, "state")
+    with pytest.raises(ValueError, match=text):
+        control(world, payload, 1.0)
+    assert ask(world, "state") == before
+
+
+def test_the_list_of_commands_is_told_whole(world):
+    with pytest.raises(ValueError) as error:
+        ask(world, "help")
+    assert all(f"  {name} " in str(error.value) for name in COMMANDS)
+
+
+def test_a_pacer_gives_every_tick_once_while_turns_are_in_time():
+    now = 1000
+    pacer = Pacer(epoch_ns=1000, period_ns=10.0, now_ns=lambda: now, late_ns=0.0)
+    for expected in range(1, 6):
+        assert pacer.next() == expected
+        now += 6  # prepared
+        assert pacer.ready() == pytest.approx((1000 + 10 * expected - now) * 1e-9)
+        now = 1000 + 10 * expected + 2  # sent, a little late
+    assert pacer.dropped == 0
+
+
+def test_a_pacer_drops_what_is_overdue_and_keeps_the_rhythm():
+    now = 1000
+    pacer = Pacer(epoch_ns=1000, period_ns=10.0, now_ns=lambda: now, late_ns=5.0)
+    assert pacer.next() == 1
+    assert pacer.ready() == pytest.approx(10e-9)
+    now = 1047  # something held the process up: ticks 2, 3 and 4 are overdue, 4 by 7
+    assert pacer.next() == 5 and pacer.dropped == 3
+    assert pacer.next() == 6 and pacer.ready() == pytest.approx(13e-9)
+
+
+def test_a_stream_that_takes_longer_than_its_period_becomes_thinner_and_not_later():
+    now = 0
+    pacer = Pacer(epoch_ns=0, period_ns=50.0, now_ns=lambda: now, late_ns=5.0)
+    late, ticks = [], []
+    for _ in range(40):
+        ticks.append(pacer.next())
+        now += 70
+        wait = pacer.ready() * 1e9
+        now += round(wait)
+        late.append(now - 50 * ticks[-1])
+    assert max(late[10:]) <= 5 and ticks[-1] <= 2 * 40  # every second frame, each in time
+
+
+@pytest.fixture(scope="module")
+def emulator():
+    """A router in this process, a real emulator beside it, and a node that hears it: (node, what it heard)."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)
+    command = [sys.executable, "-m", "services.cli", "emulator", "--cell", "arm", "--seed", "2", "--connect", endpoint]
+    process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    node, heard = Node("listener", cells.load("arm"), bus.Connection("client", (endpoint,))), {}
+    for topic in (topics.FRAME, topics.JOINTS, topics.VOLTAGES, topics.TRUTH):
+        node.subscribe(
+            topic, lambda m, names, t=topic: heard.setdefault((t.name, *names.values()), []).append((node.now_ns(), m))
+        )
+    try:
+        with node:
+            yield node, heard
+    finally:
+        process.terminate()
+        code = process.wait(5)
+        router.close()
+    assert code == 0
+
+
+def test_the_emulator_publishes_every_stream_of_the_cell_at_its_rate_and_in_time(emulator):
+    _, heard = emulator
+    streams = {("frame", "side"), ("joints", "panda"), ("truth", "forearm"), *(("voltages", f"p{i}") for i in range(8))}
+    wait_for(lambda: set(heard) == streams, 60.0, "all streams")  # the first run compiles
+    heard.clear()
+    wait_for(lambda: len(heard.get(("frame", "side"), ())) >= 30, 10.0, "30 frames")
+    for stream in streams:
+        received, messages = zip(*heard[stream], strict=True)
+        stamps = np.array([m.stamp_ns for m in messages])
+        periods = np.diff(stamps) / (50e6 if stream[0] == "frame" else 5e6)
+        np.testing.assert_allclose(periods, np.maximum(np.round(periods), 1), atol=1e-6)  # a busy machine may leave some out
+        age_ms = (np.array(received) - stamps) / 1e6
+        # a reading is sent at its instant, not after it; the margin is for machines that do other things as well
+        assert age_ms.min() > 0.0 and np.median(age_ms) < (25.0 if stream[0] == "frame" else 10.0), (stream, np.median(age_ms))
+
+
+def test_the_emulator_obeys_control_queries_and_refuses_others(emulator):
+    node, heard = emulator
+    wait_for(lambda: len(heard.get(("truth", "forearm"), ())) > 0, 60.0, "the truth")
+    key = topics.control("arm")
+
+    def ask(command, value=None):
+        return json.loads(node.query(key, payload=json.dumps({"command": command, "value": value}).encode())[0])
+
+    assert ask("occlude", 1)["occlusion"] == 1.0
+    wait_for(lambda: heard[("truth", "forearm")][-1][1].hidden == 1.0, 5.0, "the arm to be hidden")
+    assert ask("pause")["paused"] is True
+    wait_for(lambda: not heard[("truth", "forearm")][-1][1].velocity.any(), 5.0, "stillness")
+    with pytest.raises(bus.Refused, match=r"'dance' came. Commands:"):
+        ask("dance")
+    assert ask("resume")["paused"] is False
+    wait_for(lambda: heard[("truth", "forearm")][-1][1].velocity.any(), 5.0, "motion")

@@ -1,0 +1,240 @@
+"""Nodes as whole processes: replicas, health, logs, and how they end."""
+
+import itertools
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from shared import bus, logs, topics
+from shared import cell as cells
+from shared.service import CLOSE_S, Node
+from tests.live import free_port, wait_for
+
+CELL = cells.load("table")
+STREAMS = [f"stream/{k}" for k in range(60)]
+
+
+@pytest.fixture
+def router():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with Node("router", CELL, bus.Connection("router", listen=(endpoint,))) as node:
+        yield node
+
+
+@pytest.fixture
+def replica(router):
+    """Opens replicas of one service in this process."""
+    nodes = []
+
+    def make():
+        nodes.append(Node("worker", CELL, bus.Connection(connect=router.connection.listen)).open())
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.close()
+
+
+@pytest.fixture
+def process(router):
+    """Starts the small service of tests.nodes as a process of its own."""
+    started = []
+
+    def make(service="worker", *arguments, **environment):
+        command = [sys.executable, "-m", "tests.nodes", service, "--connect", router.connection.listen[0], *arguments]
+        started.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **environment}))
+        return started[-1]
+
+    yield make
+    for each in started:
+        each.kill()
+        each.communicate()
+
+
+def living(node, service="worker"):
+    replies = node.session.liveliness().get(topics.alive("table", service), timeout=1.0)
+    return {str(reply.ok.key_expr).rpartition("/")[2] for reply in replies if reply.ok}
+
+
+def health(node, service="worker"):
+    return [json.loads(answer) for answer in node.query(topics.health("table", service))]
+
+
+def owners(nodes):
+    """The owner of each stream, once all agree on exactly one; None before."""
+    found = [[node for node in nodes if node.owns(stream)] for stream in STREAMS]
+    return [each[0] for each in found] if all(len(each) == 1 for each in found) else None
+
+
+def test_every_stream_has_one_owner_and_only_the_dead_ones_streams_move(replica):
+    nodes = [replica() for _ in range(3)]
+    before = wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    assert {id(owner) for owner in before} == {id(node) for node in nodes}, "every replica has some of sixty streams"
+    nodes[1].close()
+    survivors = [nodes[0], nodes[2]]
+    after = wait_for(lambda: owners(survivors), 5, "one owner for every stream after a death")
+    assert all(new is old for old, new in zip(before, after, strict=True) if old is not nodes[1])
+
+
+def test_a_replica_that_runs_alone_owns_everything_even_before_it_is_on_the_bus():
+    node = Node("worker", CELL)
+    assert all(node.owns(stream) for stream in STREAMS)
+
+
+def test_the_streams_of_a_frozen_process_move_to_the_living_one(replica, process):
+    frozen = process()
+    node = replica()
+    wait_for(lambda: not all(map(node.owns, STREAMS)), 10, "the other process to own some streams")
+    frozen.send_signal(signal.SIGSTOP)
+    stopped = time.monotonic()
+    wait_for(lambda: all(map(node.owns, STREAMS)), 3, "its streams")
+    assert time.monotonic() - stopped < 2.0
+    frozen.send_signal(signal.SIGCONT)
+    wait_for(lambda: not all(map(node.owns, STREAMS)), 5, "it to own some again after it thawed")
+
+
+def test_health_of_all_instances_is_one_wildcard_query(router, process):
+    process("worker"), process("helper")
+    wait_for(lambda: len(living(router, "*")) >= 3, 10, "both processes")
+    found = {report["service"]: report for report in map(json.loads, router.query(topics.health("table")))}
+    assert found.keys() == {"router", "worker", "helper"}
+    published = wait_for(lambda: health(router)[0]["published"], 5, "a published topic")
+    assert published.keys() == {"penumbra/table/target/forearm/pose/fused"}
+    key = "penumbra/table/camera/front/frame"
+    assert found["worker"]["topics"][key]["count"] == 0
+    assert found["worker"]["stale"] == [key], "a topic that never came is stale"
+
+
+def test_health_tells_rate_age_cpu_and_memory_of_a_steady_publisher(router, process):
+    reader = Node("reader", CELL, bus.Connection(connect=router.connection.listen))
+    reader.subscribe(topics.FUSED, lambda message, names: None)
+    with reader:
+        worker = process()
+        key = topics.FUSED.at(cell="table", target="forearm")
+        row = wait_for(lambda: (r := reader.health()["topics"][key])["count"] >= 150 and r, 10, "150 poses")
+        assert row["rate_hz"] == pytest.approx(100, rel=0.2)
+        assert row["age_s"] < topics.FUSED.stale_s
+        assert row["delay_s"] < 0.05
+        assert row["dropped"] == 0
+        assert not row["stale"]
+        (report,) = health(router)
+        assert report["pid"] == worker.pid
+        assert 0 < report["cpu"] < 1
+        assert 20 < report["memory_mb"] < 500
+        worker.kill()
+        wait_for(lambda: reader.health()["topics"][key]["stale"], 2, "the topic to be stale after its publisher died")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_a_process_within_a_second_with_exit_code_zero(router, process, number):
+    worker = process()
+    wait_for(lambda: living(router), 10, "the process")
+    started = time.monotonic()
+    worker.send_signal(number)
+    assert worker.wait(5) == 0
+    assert time.monotonic() - started < 1.0
+    assert not living(router)
+
+
+def test_a_process_that_waits_for_its_router_ends_on_a_signal():
+    command = [sys.executable, "-m", "tests.nodes", "worker", "--connect", f"tcp/127.0.0.1:{free_port()}"]
+    worker = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        assert "waiting for the router" in worker.stderr.readline()
+        worker.terminate()
+        assert worker.wait(2) == 0
+    finally:
+        worker.kill()
+        worker.communicate()
+
+
+def test_a_handler_that_hangs_does_not_keep_the_node_from_closing(router):
+    node = Node("worker", CELL, bus.Connection(connect=router.connection.listen)).open()
+    node.every(0.01, lambda: time.sleep(30))
+    started = time.monotonic()
+    node.close()
+    assert time.monotonic() - started < CLOSE_S + 0.5
+
+
+def test_a_heartbeat_file_is_written_while_the_router_can_be_reached(router, process, tmp_path):
+    path = tmp_path / "heartbeat"
+    process(PENUMBRA_HEARTBEAT=str(path))
+    wait_for(path.exists, 10, "the heartbeat")
+    written = path.stat().st_mtime_ns
+    wait_for(lambda: path.stat().st_mtime_ns > written, 3, "the next heartbeat")
+    router.close()
+    wait_for(lambda: time.time() - path.stat().st_mtime > 2.5, 6, "no heartbeat without a router")
+
+
+def test_a_timer_keeps_its_rhythm_and_goes_on_after_an_exception(replica):
+    calls = []
+
+    def tick():
+        calls.append(time.monotonic())
+        if len(calls) == 3:
+            raise RuntimeError("third")
+
+    node = replica()
+    node.every(0.01, tick)
+    wait_for(lambda: len(calls) >= 100, 5, "a hundred turns")
+    assert (calls[99] - calls[4]) / 95 == pytest.approx(0.01, rel=0.1)
+    assert list(node.health()["faults"].values()) == [1]
+
+
+def test_turns_that_a_timer_misses_are_not_made_up_for(replica):
+    calls = []
+
+    def tick():
+        calls.append(time.monotonic())
+        if len(calls) == 1:
+            wait_for(lambda: time.monotonic() - calls[0] > 0.3, 1, "a long turn")
+
+    replica().every(0.02, tick)
+    wait_for(lambda: len(calls) >= 6, 5, "six turns")
+    gaps = [b - a for a, b in itertools.pairwise(calls[1:])]
+    assert sum(gap < 0.01 for gap in gaps) <= 1
+
+
+def record(message, *values, **fields):
+    out = logging.makeLogRecord(
+        {"name": "penumbra.fusion", "levelname": "WARNING", "msg": message, "args": values, "fields": fields}
+    )
+    out.created = 0.0
+    return out
+
+
+def test_a_log_line_is_a_sentence_and_its_fields():
+    text = logs._Text().format(record("lost %d", 3, target="forearm", why="no sense", gain=0.123456789, instance="host-1"))
+    assert text == '1970-01-01T00:00:00.000Z warning fusion: lost 3 target=forearm why="no sense" gain=0.123457'
+
+
+def test_a_json_log_line_is_an_object_with_every_field():
+    line = json.loads(logs._Json().format(record("lost", gain=0.5, instance="host-1")))
+    assert line == {
+        "time": "1970-01-01T00:00:00.000Z",
+        "level": "warning",
+        "service": "fusion",
+        "text": "lost",
+        "gain": 0.5,
+        "instance": "host-1",
+    }
+
+
+def test_a_process_logs_json_when_asked_to():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = [sys.executable, "-m", "tests.nodes", "worker", "--connect", endpoint, "--log-json"]
+    worker = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        line = json.loads(worker.stderr.readline())
+    finally:
+        worker.kill()
+        worker.communicate()
+    assert line["level"] == "warning"
+    assert endpoint in line["text"]
+    assert str(worker.pid) in line["instance"]
