@@ -11,6 +11,10 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from shared.service import Node
 
 COMMANDS = {
     "up": "start every process of a cell with a router, and show what they do",
@@ -96,8 +100,13 @@ def serve(name: str, argv: list[str]) -> int:
     logs.configure(options.log_level, options.log_json)
     node = Node(module.NAME, cell.load(options.cell), bus.connection(options))
     module.start(node, options)
+    return run(node)
+
+
+def run(node: Node) -> int:
+    """Serves until SIGINT or SIGTERM, and lets the process end."""
     node.run()
-    if threading.active_count() > 1:  # something hangs in native code: it must not keep the process
+    if threading.active_count() > 1:  # something hangs: it must not keep the process, even if Zenoh cannot clean /dev/shm then
         logging.shutdown()
         sys.stdout.flush()
         os._exit(0)

@@ -61,7 +61,7 @@ STABLE_S = 10.0
 CRASH_LOOP = 3
 SILENT_S = 10.0
 """A process that answered before and does not for this long hangs: it is killed and started again."""
-TERMINATE_S = 2.0
+TERMINATE_S = 1.5
 ASKED_FOR_NOTHING = 2
 """Exit code of a process whose flags, cell or installation cannot work: starting it again changes nothing."""
 POLL_S = 0.05

@@ -78,7 +78,7 @@ def look_at(eye: ArrayLike, point: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -
     """T_world_camera of a camera at `eye` that looks at `point` (OpenCV axes: x right, y down, z forward)."""
     eye, point = np.asarray(eye, float), np.asarray(point, float)
     z = (point - eye) / np.linalg.norm(point - eye)
-    x = np.cross(z, up)
+    x = np.cross(z, np.asarray(up, float))
     x /= np.linalg.norm(x)
     T = np.eye(4)
     T[:3, :3] = np.column_stack([x, np.cross(z, x), z])

@@ -88,43 +88,46 @@ def skin(rng: np.random.Generator) -> Texture:
 
 
 def cloth(rng: np.random.Generator) -> Texture:
-    return _any(rng, saturation=0.8, value=(0.1, 0.95), period=(0.006, 0.06), patterns=(PLAIN, PLAIN, BLOTCHES, STRIPES, CHECKS))
+    """Work clothes: any hue, mostly plain; seldom the colour of skin."""
+    hue = rng.uniform(0.15, 0.97)
+    colour = hsv(hue, rng.uniform(0.05, 0.8), rng.uniform(0.15, 0.9))
+    accent = hsv(hue + rng.uniform(-0.1, 0.1), rng.uniform(0.05, 0.8), rng.uniform(0.15, 0.9))
+    pattern = int(rng.choice([PLAIN, BLOTCHES, STRIPES, CHECKS], p=[0.45, 0.35, 0.1, 0.1]))
+    return Texture(colour, accent, pattern, _period(rng, 0.01, 0.06), rng.uniform(0.1, 0.5))
 
 
-def _any(rng, saturation: float, value: tuple[float, float], period: tuple[float, float], patterns: tuple[int, ...]) -> Texture:
-    hue, low = rng.uniform(), rng.uniform(*value)
-    first = hsv(hue, rng.uniform(0, saturation), low)
-    second = hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0, saturation), np.clip(low + rng.uniform(-0.35, 0.35), 0.05, 1.0))
-    return Texture(first, second, int(rng.choice(patterns)), float(np.exp(rng.uniform(*np.log(period)))), rng.uniform(0.3, 1.0))
+def _period(rng: np.random.Generator, low: float, high: float) -> float:
+    """A length between bounds [m], small ones as likely as large ones."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 def metal(rng: np.random.Generator) -> Texture:
-    """A robot's paint: white, grey, sometimes orange, blue or yellow."""
-    if rng.uniform() < 0.7:
-        return Texture(hsv(rng.uniform(), 0.05, rng.uniform(0.35, 1.0)), hsv(0.0, 0.0, 0.3), BLOTCHES, 0.2, 0.15)
-    return Texture(
-        hsv(rng.choice([0.06, 0.13, 0.6, 0.0]), rng.uniform(0.6, 0.95), rng.uniform(0.6, 1.0)),
-        hsv(0, 0, 0.2),
-        BLOTCHES,
-        0.2,
-        0.15,
-    )
+    """A robot's paint: white or grey, now and then orange, yellow or blue."""
+    if rng.uniform() < 0.85:
+        return Texture(hsv(rng.uniform(), 0.05, rng.uniform(0.45, 1.0)), hsv(0.0, 0.0, 0.3), BLOTCHES, 0.2, 0.15)
+    hue = rng.choice([0.06, 0.13, 0.6])
+    return Texture(hsv(hue, rng.uniform(0.75, 0.95), rng.uniform(0.7, 1.0)), hsv(0.0, 0.0, 0.2), BLOTCHES, 0.2, 0.15)
 
 
 def tabletop(rng: np.random.Generator) -> Texture:
-    if rng.uniform() < 0.45:
-        hue, value = rng.uniform(0.06, 0.1), rng.uniform(0.35, 0.85)
+    """Wood, or grey to white laminate."""
+    if rng.uniform() < 0.4:
+        hue, value = rng.uniform(0.07, 0.1), rng.uniform(0.4, 0.8)
         return Texture(
-            hsv(hue, 0.5, value), hsv(hue - 0.01, 0.6, value * 0.75), WOOD, rng.uniform(0.05, 0.15), rng.uniform(0.3, 1.0)
+            hsv(hue, 0.55, value), hsv(hue - 0.01, 0.65, value * 0.75), WOOD, rng.uniform(0.05, 0.15), rng.uniform(0.3, 1.0)
         )
-    return _any(rng, saturation=0.25, value=(0.2, 0.95), period=(0.02, 0.3), patterns=(PLAIN, BLOTCHES, BLOTCHES, CHECKS))
+    hue, value = rng.uniform(0.1, 0.7), rng.uniform(0.25, 0.95)
+    return Texture(hsv(hue, 0.06, value), hsv(hue, 0.1, value * 0.85), BLOTCHES, _period(rng, 0.02, 0.3), rng.uniform(0.1, 0.6))
 
 
 def occluder(rng: np.random.Generator) -> Texture:
-    """Any colour and pattern; now and then the colour of skin."""
-    if rng.uniform() < 0.08:
+    """Boards, boxes and tools: strong colours and any pattern; one in fifty has the colour of skin."""
+    if rng.uniform() < 0.02:
         return skin(rng)
-    return _any(rng, saturation=0.95, value=(0.1, 1.0), period=(0.01, 0.2), patterns=(PLAIN, BLOTCHES, STRIPES, CHECKS, WOOD))
+    hue, value = rng.uniform(0.14, 0.95), rng.uniform(0.15, 0.95)
+    accent = hsv(hue + rng.uniform(-0.15, 0.15), rng.uniform(0.2, 0.95), np.clip(value + rng.uniform(-0.4, 0.4), 0.1, 1.0))
+    pattern = int(rng.choice([PLAIN, BLOTCHES, STRIPES, CHECKS], p=[0.4, 0.3, 0.15, 0.15]))
+    return Texture(hsv(hue, rng.uniform(0.35, 0.95), value), accent, pattern, _period(rng, 0.02, 0.2), rng.uniform(0.2, 1.0))
 
 
 def person(rng: np.random.Generator) -> dict[Label, Appearance]:
@@ -132,9 +135,9 @@ def person(rng: np.random.Generator) -> dict[Label, Appearance]:
     bare, shirt = skin(rng), cloth(rng)
     gloss = rng.uniform(0.0, 0.06)
     length = rng.uniform()
-    if length < 0.45:  # short sleeves
+    if length < 0.65:  # short sleeves
         forearm, upper_arm = Appearance(bare, gloss=gloss), Appearance(bare, shirt, rng.uniform(0.1, 0.32), gloss)
-    elif length < 0.6:  # rolled up somewhere on the forearm
+    elif length < 0.8:  # rolled up somewhere on the forearm
         forearm, upper_arm = Appearance(bare, shirt, rng.uniform(-0.12, 0.1), gloss), Appearance(shirt)
     else:
         forearm, upper_arm = Appearance(bare, shirt, rng.uniform(0.1, 0.15), gloss), Appearance(shirt)
@@ -142,11 +145,12 @@ def person(rng: np.random.Generator) -> dict[Label, Appearance]:
 
 
 def background(rng: np.random.Generator) -> Appearance:
-    """Walls and what stands before them, far away."""
-    texture = _any(
-        rng, saturation=0.5, value=(0.15, 0.95), period=(0.15, 2.0), patterns=(PLAIN, BLOTCHES, BLOTCHES, STRIPES, CHECKS, WOOD)
-    )
-    return Appearance(texture, casts_shadow=False)
+    """Walls and what stands before them, far away: light and rather grey, with blotches or edges of low contrast."""
+    hue, value = rng.uniform(), rng.uniform(0.35, 0.95)
+    colour = hsv(hue, rng.uniform(0.0, 0.2), value)
+    accent = hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0.0, 0.3), np.clip(value + rng.uniform(-0.3, 0.2), 0.1, 1.0))
+    pattern = int(rng.choice([PLAIN, BLOTCHES, STRIPES, CHECKS], p=[0.2, 0.5, 0.15, 0.15]))
+    return Appearance(Texture(colour, accent, pattern, _period(rng, 0.2, 2.0), rng.uniform(0.2, 0.8)), casts_shadow=False)
 
 
 def look(rng: np.random.Generator, around: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Look:
@@ -154,7 +158,7 @@ def look(rng: np.random.Generator, around: tuple[float, float, float] = (0.0, 0.
     angle = rng.uniform(0, 2 * np.pi)
     distance, height = rng.uniform(0.2, 1.8), rng.uniform(1.4, 2.4)
     lamp = (around[0] + distance * np.cos(angle), around[1] + distance * np.sin(angle), around[2] + height)
-    warmth, strength, fill = rng.uniform(-0.12, 0.12), rng.uniform(0.45, 1.0), rng.uniform(0.2, 0.6)
+    warmth, strength, fill = rng.uniform(-0.08, 0.08), rng.uniform(0.5, 0.9), rng.uniform(0.25, 0.5)
     tint = np.array([1 + warmth, 1.0, 1 - warmth])
     return Look(
         lamp=lamp,
@@ -163,5 +167,5 @@ def look(rng: np.random.Generator, around: tuple[float, float, float] = (0.0, 0.
         background=background(rng),
         blur_px=rng.uniform(0.4, 0.9),
         noise=rng.uniform(0.004, 0.025),
-        gain=tuple(rng.uniform(0.8, 1.15) * (1 + rng.uniform(-0.06, 0.06, 3))),
+        gain=tuple(rng.uniform(0.85, 1.1) * (1 + rng.uniform(-0.04, 0.04, 3))),
     )

@@ -1,6 +1,7 @@
 """A small real service for the tests of the runtime: `python -m tests.nodes SERVICE --connect ENDPOINT`.
 
-It publishes the fused pose of the table's forearm at 100 Hz (where it owns it), answers the pose query, and counts frames.
+It publishes the fused pose of the table's forearm at 100 Hz (where it owns it), answers the pose query, and counts frames; as
+`camera` it sends them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import time
 
 import numpy as np
 
-from services import arguments
+from services import arguments, cli
 from shared import bus, logs, messages, topics
 from shared import cell as cells
 from shared.service import Node
@@ -56,7 +57,11 @@ def start(node: Node) -> None:
             node.publish(topics.FUSED, pose(), target="forearm")
 
     node.every(0.01, publish)
-    node.subscribe(topics.FRAME, lambda message, names: None)
+    if node.service == "camera":
+        image = np.zeros((480, 640, 3), np.uint8)
+        node.every(0.05, lambda: node.publish(topics.FRAME, messages.Frame(stamp_ns=time.time_ns(), image=image), camera="front"))
+    else:
+        node.subscribe(topics.FRAME, lambda message, names: None)
     node.answer(topics.current_pose(node.cell.name, "forearm"), lambda parameters, payload: (pose_json(), "application/json"))
 
 
@@ -65,7 +70,7 @@ def main() -> None:
     logs.configure(options.log_level, options.log_json)
     node = Node(sys.argv[1], cells.load(options.cell), bus.connection(options))
     start(node)
-    node.run()
+    sys.exit(cli.run(node))
 
 
 if __name__ == "__main__":

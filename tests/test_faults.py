@@ -109,7 +109,7 @@ def test_a_pose_query_in_an_unknown_format_is_answered_with_the_formats_there_ar
     assert "json" in reply.err.payload.to_string()
 
 
-@pytest.mark.parametrize("command", ["nonsense", "[]", '{"occlude": 7}', '{"fly": true}'])
+@pytest.mark.parametrize("command", ["nonsense", "[]", '{"command": "occlude", "value": 7}', '{"command": "fly"}'])
 def test_a_bad_control_command_is_answered_with_what_is_possible(running, command):
     reply = next(iter(running.session.get(topics.control("table"), payload=command, timeout=2.0)))
     assert reply.ok is None

@@ -1,39 +1,28 @@
-"""The observers: rotations, consistency, late and shuffled data, the gate and its way out, senses whose errors last, the service."""
+"""The observers: rotations, late and shuffled data, the gate and its way out, unobserved directions; and the service."""
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
+import itertools
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from services.fusion import service, so3
 from services.fusion.estimate import information
-from services.fusion.filter import UNITS, Sense, Settings
 from services.fusion.observer import ErrorStateObserver
-from services.fusion.paper import PaperObserver, PaperSettings
+from services.fusion.paper import PaperObserver
 from shared import bus, cell, geometry, messages, topics
 from shared.geometry import Array, perturb, pose_error
 from shared.service import Node
+from tests.fusion_data import HOME, SKIN, SPREAD, VISION, ns, without_roll
 from tests.live import free_port, wait_for
 
-T0_NS = 1_700_000_000_000_000_000
-HOME = geometry.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0])
-SPREAD = (0.12, 0.4)
-VISION = np.diag(1.0 / np.square([0.01, 0.01, 0.01, 0.03, 0.03, 0.03]))
 OBSERVERS = [ErrorStateObserver, PaperObserver]
-NO_ROLL = np.diag([1.0, 1.0, 1.0, 0.0, 1.0, 1.0])
-
-
-def ns(seconds: float) -> int:
-    return T0_NS + round(seconds * 1e9)
 
 
 # ---- rotations
@@ -60,89 +49,6 @@ def test_left_jacobian_inverse_is_the_derivative_of_log(angle: float) -> None:
     step = 1e-6
     columns = [(so3.log(so3.exp(d) @ so3.exp(r)) - so3.log(so3.exp(-d) @ so3.exp(r))) / (2 * step) for d in step * np.eye(3)]
     np.testing.assert_allclose(so3.left_jacobian_inverse(r), np.column_stack(columns), atol=1e-8)
-
-
-# ---- consistency: the truth moves and the senses err as the filter assumes
-
-SENSES = {"vision": Sense(0.8, 1.0, 1e-4), "haptic": Sense(0.8, 1.0, 1e-4)}
-MATCHED = Settings(senses=SENSES, velocity_spread=(0.4, 0.5), acceleration=(0.3, 0.5), learning=(0.0, 0.0))
-SKIN = [0.006, 0.003, 0.002, 1.0, 0.02, 0.03]  # standard deviations of a haptic pose along the limb's axes
-PERIOD = {"vision": 0.05, "haptic": 0.01}
-
-
-class Errors:
-    """A sense's pose errors, a lasting and a white part, none where nothing is observed."""
-
-    def __init__(self, sense: Sense, period: float, rng: np.random.Generator):
-        self._sense, self._rng = sense, rng
-        self._keep = np.exp(-period / sense.time_constant)
-        self._bias = rng.normal(size=6)
-
-    def draw(self, seen: Array) -> Array:
-        """An error (6,) for a measurement of information (6, 6)."""
-        self._bias = self._keep * self._bias + np.sqrt(1 - self._keep**2) * self._rng.normal(size=6)
-        w, V = np.linalg.eigh(seen * np.outer(UNITS, UNITS))
-        root = (V * np.where(w > 1e-6, np.abs(w), np.inf) ** -0.5) @ V.T
-        white = self._rng.normal(size=6)
-        return UNITS * (root @ (np.sqrt(self._sense.lasting) * self._bias + np.sqrt(1 - self._sense.lasting) * white))
-
-
-def without_roll(T: Array, sigma: list[float]) -> Array:
-    """Information (6, 6) of a measurement with these standard deviations along the limb's axes that does not see its roll."""
-    B = np.kron(np.eye(2), T[:3, :3])
-    return B @ NO_ROLL @ np.diag(1.0 / np.square(sigma)) @ B.T
-
-
-def normalised_error(senses: dict[str, tuple[float, float]], settings: Settings, seed: int, seconds: float = 1.0) -> float:
-    """Squared error in units of the covariance (6 degrees of freedom) after a run; senses: name -> from and until when [s]."""
-    rng = np.random.default_rng(seed)
-    spread = (0.05, 0.15)
-    T = perturb(HOME, rng.normal(size=6) * np.repeat(spread, 3))
-    velocity = rng.normal(size=6) * np.repeat(settings.velocity_spread, 3)
-    observer = ErrorStateObserver(HOME, spread, settings)
-    h = 0.01
-    decay = np.exp(-h / settings.velocity_time)
-    kick = np.sqrt(np.repeat(settings.acceleration, 3) * 0.5 * settings.velocity_time * (1 - decay**2))
-    errors = {name: Errors(settings.senses[name], PERIOD[name], rng) for name in senses}
-    for k in range(round(seconds / h) + 1):
-        for name, (begin, end) in senses.items():
-            if not begin <= k * h <= end or k % round(PERIOD[name] / h):
-                continue
-            seen = np.diag(1.0 / np.square([0.01, 0.01, 0.02, 0.03, 0.03, 0.03]))
-            if name == "haptic":
-                seen = without_roll(T, SKIN)
-            measured = perturb(T, -errors[name].draw(seen))
-            if name == "haptic":
-                seen = without_roll(measured, SKIN)
-                measured = measured @ geometry.from_rpy([0, 0, 0], [rng.normal(), 0, 0])  # a roll that is made up
-            observer.measure(name, ns(k * h), measured, seen)
-        if k * h < seconds:
-            before, velocity = velocity, decay * velocity + kick * rng.normal(size=6)
-            T = perturb(T, 0.5 * h * (before + velocity))
-    estimate = observer.estimate(ns(seconds))
-    e = pose_error(T, estimate.T)
-    return float(e @ np.linalg.solve(estimate.covariance, e))
-
-
-@pytest.mark.parametrize(
-    ("senses", "settings"),
-    [
-        pytest.param({"vision": (0.0, 9.0)}, MATCHED, id="visible"),
-        pytest.param({"haptic": (0.0, 9.0)}, MATCHED, id="haptic only"),
-        pytest.param({"vision": (0.0, 0.5), "haptic": (0.4, 9.0)}, MATCHED, id="hand-over"),
-        pytest.param(
-            {"vision": (0.0, 0.5), "haptic": (0.4, 9.0)},
-            dataclasses.replace(MATCHED, learning=(0.1, 5.0)),
-            id="hand-over, learning",
-        ),
-    ],
-)
-def test_errors_are_as_large_as_the_covariance_says(senses: dict[str, tuple[float, float]], settings: Settings) -> None:
-    runs = 30
-    total = sum(normalised_error(senses, settings, seed) for seed in range(runs))
-    # fixed seeds: the band catches a wrong filter, not bad luck
-    low, high = chi2.ppf([0.001, 0.999], 6 * runs)
-    assert low < total < high
 
 
 # ---- what arrives late, twice, wrong, or not at all
@@ -214,13 +120,13 @@ def test_an_outlier_is_refused_and_moves_nothing() -> None:
 
 
 @pytest.mark.parametrize("make", OBSERVERS)
-def test_a_limb_that_jumps_is_found_again_within_a_second(make: type) -> None:
+def test_a_limb_that_jumps_is_found_again_within_three_quarters_of_a_second(make: type) -> None:
     observer = make(HOME, SPREAD)
-    far = perturb(HOME, [0.6, -0.4, 0.1, 0.0, 0.5, 1.5])
+    far = perturb(HOME, [3.0, -2.0, 0.1, 0.0, 0.5, 1.5])
     still(observer, HOME, 0.0, 1.0)
-    still(observer, far, 1.0, 2.0)
-    estimate = observer.estimate(ns(2.0))
-    assert np.abs(pose_error(far, estimate.T)).max() < 0.01
+    still(observer, far, 1.0, 1.75)
+    estimate = observer.estimate(ns(1.75))
+    assert np.abs(pose_error(far, estimate.T)).max() < 0.02
     assert estimate.state == "tracking"
 
 
@@ -241,7 +147,7 @@ def test_without_measurements_the_covariance_grows_and_the_state_goes_from_track
     still(observer, HOME, 0.0, 1.0)
     estimates = [observer.estimate(ns(0.95 + age)) for age in np.arange(0.0, 4.0, 0.01)]
     sigmas = [np.linalg.eigvalsh(e.covariance) for e in estimates]
-    assert all((b > a).all() for a, b in zip(sigmas, sigmas[1:], strict=False))
+    assert all((b > a).all() for a, b in itertools.pairwise(sigmas))
     states = [e.state for e in estimates]
     assert list(dict.fromkeys(states)) == ["tracking", "coasting", "lost"]
     assert states[20] == "tracking" and states[30] == "coasting"
@@ -338,136 +244,6 @@ def test_a_turn_through_pi_is_followed(make: type) -> None:
     assert worst < 0.06  # 3.4 degrees, at 115 degrees a second
 
 
-# ---- senses whose errors last: fused must not be worse than the better one
-
-CAMERA = geometry.look_at([0.35, -1.15, 0.90], [0.05, 0.0, 0.15])[:3, 3]
-
-
-def reaches(rng: np.random.Generator) -> Callable[[float], Array]:
-    """Minimum-jerk reaches of 1.2 s with rests of 0.4 s between random poses above a table; the pose at a time."""
-    low, high = np.array([-0.08, -0.06, 0.07, -0.5, -0.25, -0.35]), np.array([0.08, 0.06, 0.25, 0.5, 0.25, 0.35])
-    goals = rng.uniform(low, high, (40, 6))
-
-    def at(t: float) -> Array:
-        i, s = int(t // 1.6), min(1.0, (t % 1.6) / 1.2)
-        x = goals[i] + (goals[i + 1] - goals[i]) * s**3 * (10 - 15 * s + 6 * s**2)
-        return geometry.from_rpy(x[:3], x[3:])
-
-    return at
-
-
-def seen_by_camera(T: Array) -> Array:
-    """Information of a camera's pose: 12 mm along its ray, 2 mm across."""
-    ray = (T[:3, 3] - CAMERA) / np.linalg.norm(T[:3, 3] - CAMERA)
-    across = np.eye(3) - np.outer(ray, ray)
-    out = np.diag([0.0, 0, 0, 1 / 0.02**2, 1 / 0.02**2, 1 / 0.02**2])
-    out[:3, :3] = across / 0.002**2 + np.outer(ray, ray) / 0.012**2
-    return out
-
-
-def felt_by_skin(T: Array, made_up: Array) -> Array:
-    """Information of a skin's pose `made_up` of a limb at T: from 1 mm close by to 10 mm and more at 15 cm."""
-    gap = np.clip(T[2, 3] - 0.04, 0.02, 0.15)
-    worse = float(np.exp(np.interp(gap, [0.02, 0.15], np.log([1.0, 12.0]))))
-    return without_roll(made_up, [0.002 * worse, 0.001 * worse, 0.0012 * worse, 1.0, 0.006 * worse, 0.01 * worse])
-
-
-@pytest.mark.parametrize("lie", [1.0, 2.0], ids=["honest covariances", "errors twice as large as the senses say"])
-def test_fused_is_never_much_worse_than_the_better_sense_although_their_errors_last(lie: float) -> None:
-    errors: dict[str, dict[str, list[float]]] = {
-        s: {"vision": [], "haptic": [], "fused": []} for s in ("visible", "both", "hidden")
-    }
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        at = reaches(rng)
-        observer = ErrorStateObserver(HOME, SPREAD)
-        draw = {"vision": Errors(Sense(0.95, 4.0), 0.05, rng), "haptic": Errors(Sense(0.6, 0.7), 0.01, rng)}
-        waiting: list[tuple[float, float, str, Array, Array]] = []
-        newest: dict[str, tuple[float, float]] = {}
-        for k in range(1200):
-            t = 0.01 * k
-            T = at(t)
-            situation = ("visible", "both", "hidden")[int(t // 2) % 3]
-            if k % 5 == 0 and situation != "hidden":
-                seen = seen_by_camera(T)
-                waiting.append((t + 0.055, t, "vision", perturb(T, -lie * draw["vision"].draw(seen)), seen))
-            if situation != "visible":
-                measured = perturb(T, -lie * draw["haptic"].draw(felt_by_skin(T, T)))
-                waiting.append((t + 0.003, t, "haptic", measured, felt_by_skin(T, measured)))
-            for message in [m for m in waiting if m[0] <= t]:
-                waiting.remove(message)
-                _, stamp, source, pose, seen = message
-                observer.measure(source, ns(stamp), pose, seen)
-                newest[source] = stamp, float(np.linalg.norm(pose_error(at(stamp), pose)[:3]))
-            if t % 2 < 0.2:  # the situation has just changed
-                continue
-            errors[situation]["fused"].append(float(np.linalg.norm(pose_error(T, observer.estimate(ns(t)).T)[:3])))
-            for source, (stamp, error) in newest.items():
-                if t - stamp < (0.15 if source == "vision" else 0.03):
-                    errors[situation][source].append(error)
-    for situation, found in errors.items():
-        median = {name: float(np.median(values)) for name, values in found.items() if len(values) > 100}
-        print(situation, median)
-        # each sense against the truth at its own stamp, as if it were not late; fused against the truth now
-        assert median.pop("fused") <= 1.1 * min(median.values()), situation
-
-
-# ---- the paper's observer
-
-
-def test_the_papers_noise_of_vision_grows_with_what_is_hidden_and_has_a_floor() -> None:
-    observer = PaperObserver(HOME, SPREAD)
-    np.testing.assert_allclose(np.diag(observer.R_v(0.5)), 0.5 * np.array([8, 8, 8, 16 * np.pi, 16 * np.pi, 16 * np.pi]))
-    sigma = np.sqrt(np.diag(observer.R_v(0.0)))
-    np.testing.assert_allclose(sigma[0], 0.01)
-    np.testing.assert_allclose(np.degrees(sigma[3]), 1.44, atol=0.01)
-
-
-def test_the_papers_observer_converges_on_both_senses_weighted_by_the_inverse_of_their_noise() -> None:
-    observer = PaperObserver(HOME, SPREAD)
-    a, b = perturb(HOME, [0.03, 0, 0, 0, 0.1, 0]), perturb(HOME, [0.05, 0, 0, 0, 0.1, 0])
-    for k in range(100):
-        if k % 5 == 0:
-            observer.measure("vision", ns(0.01 * k), a, VISION, hidden=0.0)
-        observer.measure("haptic", ns(0.01 * k), b, 0.25 * VISION)  # (2 cm)^2, against the floor's (1 cm)^2
-    estimate = observer.estimate(ns(0.995))
-    assert estimate.T[0, 3] == pytest.approx(0.8 * 0.03 + 0.2 * 0.05, abs=1e-3)
-    assert geometry.axis_angle_error(a, estimate.T) < 1e-3
-    assert estimate.state == "tracking"
-    assert estimate.sources["vision"].weight + estimate.sources["haptic"].weight == pytest.approx(1.0)
-    for k in range(100, 120):
-        observer.measure("vision", ns(0.01 * k), a, VISION, hidden=0.9)
-        observer.measure("haptic", ns(0.01 * k), b, 0.25 * VISION)
-    hidden = observer.estimate(ns(1.195))
-    assert hidden.T[0, 3] == pytest.approx(0.05, abs=1e-3)
-    assert hidden.sources["haptic"].weight > 0.99
-
-
-def test_the_papers_riccati_equation_settles_where_its_derivative_is_zero() -> None:
-    settings = PaperSettings()
-    observer = PaperObserver(HOME, SPREAD, settings)
-    Q = settings.rate**2 * np.diag(settings.W_v)
-    R = observer.R_v(0.7)
-    P = np.diag(settings.W_v)
-    for _ in range(20_000):
-        P = observer._riccati(P, 1e-4, np.linalg.inv(R))
-    np.testing.assert_allclose(Q, P @ np.linalg.inv(R) @ P, rtol=0.01, atol=1e-6)
-
-
-def test_the_papers_low_pass_is_the_canonical_second_order_one() -> None:
-    settings = PaperSettings()
-    observer = PaperObserver(HOME, SPREAD, settings)
-    observer.measure("vision", ns(0), HOME, VISION)
-    (state,) = observer._ahead
-    rng = np.random.default_rng(0)
-    state = dataclasses.replace(state, smooth=rng.normal(size=6), rate=rng.normal(size=6))
-    x, h = rng.normal(size=6), 0.007
-    w, z = settings.omega_n, settings.zeta
-    A = np.array([[0, 1, 0], [-w * w, -2 * z * w, w * w], [0, 0, 0]])  # s, its rate, and the input
-    expected = expm(A * h) @ np.stack([state.smooth, state.rate, x])
-    np.testing.assert_allclose(observer._low_pass(state, x, h), expected[:2], rtol=1e-9, atol=1e-9)
-
-
 # ---- the service
 
 
@@ -534,9 +310,8 @@ def test_the_service_publishes_and_answers_in_both_formats(observer: str, table:
 
         wait_for(tracking, 5.0, "the state tracking")
         user.publish(topics.VISION, vision_pose(table, frame="moon", position=np.array([9.0, 9.0, 9.0])), target="forearm")
-        user.publish(topics.VISION, vision_pose(table, orientation=np.zeros(4)), target="forearm")
-        user.publish(topics.VISION, vision_pose(table, covariance=-np.eye(6)), target="forearm")
-        wait_for(lambda: sum(fusion.health()["faults"].values()) == 3, 5.0, "three refused poses")
+        user.publish(topics.VISION, vision_pose(table, covariance=np.zeros((6, 6))), target="forearm")
+        wait_for(lambda: sum(fusion.health()["faults"].values()) == 2, 5.0, "two refused poses")
         user.publish(topics.VISION, vision_pose(table), target="forearm")
         pose = answer()
         np.testing.assert_allclose(pose["position"], [0.01, 0.02, 0.15], atol=1e-3)

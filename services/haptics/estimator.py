@@ -9,6 +9,8 @@ independent noise. Earlier windows enter only as the point and spread where the 
    network's pose with three rolls and from the track, with home's spread; this replaces the track where it explains the
    voltages clearly better
 4. merge what fits about equally well into one Gaussian, and take the prior's share out again
+5. marginalise the roll about the limb's axis: only the hand's flatness shows it, with several solutions that look equally
+   certain, so it is solved for and never published
 """
 
 from __future__ import annotations
@@ -31,9 +33,10 @@ MISFIT = 2.5
 """Mean squared residual above which the voltages are not explained, and the solve starts afresh."""
 CHECK_EVERY = 10
 """Windows between solves from scratch beside the track: a limb can be felt alike at two places along it."""
-CONVINCING = 12.0
-"""A solve from scratch replaces the track where it makes the voltages e to this power more probable. Its wider prior alone lets
-it follow the noise of six directions, which is worth 3 on average and 11 once in a thousand windows."""
+CONVINCING = 4.0
+"""A solve from scratch replaces the track where it is e to this power more probable."""
+DOUBTS = 3
+"""… in so many windows in a row."""
 ROLL_GAP = 0.10
 """Nearer than this [m] the roll can be felt, and has several solutions."""
 ROLL_MEMORY_S = 0.1
@@ -77,7 +80,7 @@ class Estimator:
     def reset(self) -> None:
         """Forget the past."""
         self._T, self._covariance, self._stamp_ns, self._tracking, self._gap = self.home, self._home_covariance, 0, False, np.inf
-        self._since_check = 0
+        self._since_check = self._doubts = 0
 
     def nothing(self) -> Estimate:
         """The estimate when nothing can be felt: home, without information."""
@@ -127,14 +130,22 @@ class Estimator:
             self._since_check = 0
             kept = self._T, self._covariance
             self._T, self._covariance = self.home, self._home_covariance
-            starts = [kept[0], self.home]
+            start = self.home
             if self.network is not None:
-                starts[1] = self.network.posterior(self._features(amplitude, variance, alive, T_world_pads, joints))
-            starts += [_turned(starts[1], roll - self._roll(starts[1])) for roll in ROLLS]
+                start = self.network.posterior(self._features(amplitude, variance, alive, T_world_pads, joints))
+            starts = [start, *(_turned(start, roll - self._roll(start)) for roll in ROLLS)]
             found = self._solutions(electrodes, amplitude, variance, starts, coarse=3, fine=3)
-            if tracked and tracked[0].evidence < found[0].evidence + CONVINCING:
+            # The track is judged with the same freedom: from its pose, but with home's spread.
+            (same,) = self._solutions(electrodes, amplitude, variance, [kept[0]], coarse=0 if tracked else 3, fine=3)
+            beaten = same.misfit > MISFIT or same.cost > found[0].cost + CONVINCING
+            self._doubts = self._doubts + 1 if beaten else 0
+            if tracked and self._doubts < DOUBTS:
                 found, (self._T, self._covariance) = tracked, kept
+                self._since_check = CHECK_EVERY if beaten else 0  # a doubt is settled by the next windows
+            else:
+                found, self._doubts = sorted([*found, same], key=lambda solution: solution.cost), 0
         T, information, gradient = self._merge(found)
+        information, gradient = without_roll(T, information, gradient)
         # Voltages that the model explains badly say less than their noise promises.
         trust = 1.0 / max(1.0, found[0].misfit)
         best, known = peak(T, trust * information, trust * gradient)
@@ -212,6 +223,16 @@ class Estimator:
         strongest = float(np.linalg.eigvalsh(information * np.outer(scale, scale))[-1])
         in_range = gap < REACH * float(self.skin.range.max()) and strongest > 1.0 / WORTH**2
         return Estimate(T, information if in_range else np.zeros((6, 6)), min(gap, FARTHEST), in_range)
+
+
+def without_roll(T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
+    """Information (6, 6) and gradient (6,) of a likelihood at T after its roll about the limb's axis was marginalised."""
+    roll = np.concatenate([np.zeros(3), T[:3, 0]])
+    along = information @ roll
+    strength = float(roll @ along)
+    if strength < 1e-6:
+        return information, gradient
+    return information - np.outer(along, along) / strength, gradient - along * float(roll @ gradient) / strength
 
 
 def _turned(T: Array, roll: float) -> Array:

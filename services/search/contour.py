@@ -24,6 +24,8 @@ COLUMN = 8
 """Width of the columns [px] in which they are looked for, at least BESIDE."""
 APART = 0.01
 """Two points of the contour whose depths differ by more than this [m] belong to two parts."""
+SHAPE = 0.006
+"""How well the mesh's cross-section is known [m]: what an ellipse this far from a circle says about its roll is not believed."""
 CREASE = 0.8
 """Facets that meet at a larger angle [rad] are a crease of the body, and not a sample of a round surface."""
 
@@ -241,14 +243,15 @@ def match(points, field, state, guarded, reach):
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(points, r, kind, origin, fx, fy, edge, correlation, joint, huber, bounded):
+def normal_equations(points, r, kind, origin, axis, fx, fy, edge, correlation, joint, huber, bounded):
     """Of the pose error along the camera's axes and the dilation: the 7 x 7 information, its right side (7,), the length of
-    contour measured [px], the sum of length times Huber-limited squared offset [px^3], the length that costs, and Huber's cost
-    (chi^2 where all is within `huber`). `origin` (3,): the target's [m]; `bounded`: whether BOUNDED points inform."""
+    contour measured [px], the sum of length times Huber-limited squared offset [px^3], the length that costs, Huber's cost (chi^2
+    where all is within `huber`), and the share of the information about the roll that comes from levers longer than SHAPE. `origin` (3,) [m] and `axis` (3,) of the target; `bounded`: whether BOUNDED points inform."""
     H = np.zeros((7, 7))
     g = np.zeros(7)
     J = np.empty(7)
     length, square, counted, cost = 0.0, 0.0, 0.0, 0.0
+    rolls, long_rolls = 1e-12, 0.0
     joint_length = 0.0
     for i in range(len(points)):
         if kind[i] == AT_JOINT:
@@ -283,8 +286,11 @@ def normal_equations(points, r, kind, origin, fx, fy, edge, correlation, joint, 
             weight *= limit / abs(r[i])
         if kind[i] == BOUNDED and not bounded:
             continue
+        roll = abs(J[3] * axis[0] + J[4] * axis[1] + J[5] * axis[2])
+        rolls += weight * roll * roll
+        long_rolls += weight * max(roll - SHAPE * fx / Z, 0.0) ** 2
         for a in range(7):
             g[a] += weight * J[a] * r[i]
             for b in range(7):
                 H[a, b] += weight * J[a] * J[b]
-    return H, g, length, square, counted, cost
+    return H, g, length, square, counted, cost, long_rolls / rolls

@@ -79,7 +79,7 @@ def classify(
     """
     table = np.full(256, COVERED, np.uint8)
     table[[Label.BACKGROUND, Label.TORSO]] = FREE
-    table[list(_LIMB)] = JOINT
+    table[list(_LIMB)] = COVERED
     table[list(target_labels)] = TARGET
     state = table[labels]
     if robot_depth is not None:

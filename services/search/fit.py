@@ -50,8 +50,8 @@ class Limits:
     """Standard deviations of position [m] and rotation [rad] of a direction that the contour does not show: the weak prior
     that keeps the solve regular, and the largest deviations published."""
 
-    position: float = 0.5
-    rotation: float = 0.5
+    position: float = 1.0
+    rotation: float = 1.5
 
     @property
     def covariance(self) -> Array:
@@ -127,7 +127,7 @@ class _Problem:
         points = trace(V, self.model.faces, self.model.edges, *intrinsics, silhouette, SPACING_PX)
         offsets, kind = match(points, evidence.field, evidence.state, evidence.guarded, reach)
         r = offsets - moved[6]
-        H, g, _, _, counted, cost = self.normal_equations(T, points, r, kind, huber, True)
+        H, g, _, _, counted, cost, _ = self.normal_equations(T, points, r, kind, huber, True)
         both, free = compare(evidence.state, silhouette)
         # parts of the mask that no contour is near pull at nothing, but must not look cheap; nor may points pay by dropping out
         unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
@@ -136,9 +136,11 @@ class _Problem:
 
     def normal_equations(
         self, T: Array, points: Array, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
-    ) -> tuple[Array, Array, float, float, float, float]:
+    ) -> tuple[Array, Array, float, float, float, float, float]:
         noise, k = self.noise, self.evidence.intrinsics
-        return normal_equations(points, r, kind, T[:3, 3], k.fx, k.fy, noise.edge, noise.correlation, noise.joint, huber, bounded)
+        return normal_equations(
+            points, r, kind, T[:3, 3], T[:3, 0], k.fx, k.fy, noise.edge, noise.correlation, noise.joint, huber, bounded
+        )
 
     def step(self, here: _Pass, damping: float) -> Array:
         information = here.H + self.regular
@@ -198,7 +200,7 @@ def fit(
 
     # the pose is final: only what was measured informs
     moved = here.moved
-    H, g, length, square, _, _ = problem.normal_equations(here.T, here.points, here.r, here.kind, huber, False)
+    H, g, length, square, _, _, rolls = problem.normal_equations(here.T, here.points, here.r, here.kind, huber, False)
     rms = math.sqrt(square / length) if length > 0 else math.inf
     misfit = here.cost / evidence.measurements(noise.correlation)
     # a mask or a fit worse than expected: believe the residuals
@@ -208,7 +210,11 @@ def fit(
     gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
     covariance = np.linalg.inv(H[:6, :6] - np.outer(gain, H[6, :6]) + weak)
     offset = covariance @ (g[:6] - gain * (g[6] - regular[6, 6] * moved[6]) - weak @ moved[:6])
-    covariance = (covariance + covariance.T) / 2.0
+    # the roll that a nearly round section shows is doubted, and with it all that leans on it
+    c = covariance[:, 3:] @ here.T[:3, 0]
+    roll = float(here.T[:3, 0] @ c[3:])
+    doubt = min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll)
+    covariance = (covariance + covariance.T) / 2.0 + doubt * np.outer(c, c) / roll
     T = geometry.perturb(here.T, offset)
     return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
 

@@ -84,7 +84,7 @@ def _scale(x: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
 class PredNet(nn.Module):
     """The network of the module's description. Images are (batch, 3, h, w) in [0, 1], h and w multiples of `multiple`."""
 
-    def __init__(self, settings: Settings = Settings()):  # noqa: B008 (immutable)
+    def __init__(self, settings: Settings = Settings()):
         super().__init__()
         self.settings = settings
         c, n = settings.channels, len(settings.channels)
@@ -122,7 +122,9 @@ class PredNet(nn.Module):
             channels += [2 * conv.out_channels for conv in self.predict]  # type: ignore[misc]
         weight = self.head.weight
         return tuple(
-            torch.zeros(batch, c, height // s, width // s, dtype=weight.dtype, device=weight.device).to(memory_format=torch.channels_last)
+            torch.zeros(batch, c, height // s, width // s, dtype=weight.dtype, device=weight.device).to(
+                memory_format=torch.channels_last
+            )
             for c, s in zip(channels, self.strides, strict=True)
         )
 

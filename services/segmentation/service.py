@@ -46,7 +46,9 @@ def start(node: Node, options: argparse.Namespace) -> None:
                 return
             if frame.image.shape[:2] != (camera.height, camera.width):
                 came = f"{frame.image.shape[1]} x {frame.image.shape[0]}"
-                raise ValueError(f"camera {name}: frames of {camera.width} x {camera.height} expected (the cell file), {came} came")
+                raise ValueError(
+                    f"camera {name}: frames of {camera.width} x {camera.height} expected (the cell file), {came} came"
+                )
             known = [(predicted(poses.get(target), frame.stamp_ns), box) for target, box in corners.items()]
             around = None
             if all(T is not None for T, _ in known):

@@ -13,6 +13,7 @@ import datetime
 import multiprocessing
 import os
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -34,12 +35,13 @@ VALIDATION_SEED = 1_000_000
 
 @dataclass(frozen=True)
 class Schedule:
-    """How training goes. `peak_rate`: of Adam's one cycle; `patches`: (from which progress on, pixels a side, sequences a batch);
+    """How training goes. `peak_rate`: of Adam's one cycle; `frames`: that a step plays; `patches`: (from which progress on, pixels a side, sequences a batch);
     `reuse`: how often a sequence is visited on average while the data set grows up to `most` sequences; `error_weight`,
     `focal_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights that are exported."""
 
-    peak_rate: float = 4e-3
-    patches: tuple[tuple[float, int, int], ...] = ((0.0, 64, 16), (0.65, 96, 8))
+    peak_rate: float = 3e-3
+    frames: int = 5
+    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.8, 128, 4))
     reuse: int = 6
     most: int = 6000
     error_weight: float = 0.3
@@ -120,11 +122,11 @@ class Trainer:
         size, batch = self.schedule.patch(progress)
         rng = np.random.default_rng([self.seed, 1, self.step])
         count = data.ensure(8 * batch + self.step * batch // self.schedule.reuse)
-        images, labels = draw_batch([data[i] for i in rng.integers(count, size=batch)], size, rng)
+        images, labels = draw_batch([data[i] for i in rng.integers(count, size=batch)], self.schedule.frames, size, rng)
         for group in self.optimizer.param_groups:
             group["lr"] = self.schedule.rate(progress)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
-            parts = self._losses(images, labels, old_state=rng.random() < 0.4)
+            parts = self._losses(images, labels, old_state=rng.random() < 0.3)
         total = parts["dice"] + self.schedule.focal_weight * parts["focal"] + self.schedule.error_weight * parts["error"]
         self.optimizer.zero_grad()
         total.backward()
@@ -163,7 +165,9 @@ class Trainer:
         """Write a checkpoint from which `restore` goes on."""
         part = path.with_suffix(".part")
         content = {"net": self.net.state_dict(), "average": self.average.state_dict(), "optimizer": self.optimizer.state_dict()}
-        torch.save({**content, "step": self.step, "minutes": self.minutes, "settings": asdict(self.settings), "seed": self.seed}, part)
+        torch.save(
+            {**content, "step": self.step, "minutes": self.minutes, "settings": asdict(self.settings), "seed": self.seed}, part
+        )
         part.replace(path)
 
     @classmethod
@@ -179,15 +183,16 @@ class Trainer:
 
 
 def draw_batch(
-    chosen: list[NDArray[np.uint8]], size: int, rng: np.random.Generator
+    chosen: list[NDArray[np.uint8]], frames: int, size: int, rng: np.random.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Patches of sequences (frames, h, w, 4): images (batch, frames, 3, size, size) in [0, 1] and labels (batch, frames, size, size).
-
-    Three of four lie around a pixel of the target. Mirrored, played backwards and coloured anew at random (colour jitter of 0.4, as
-    the authors').
+    """Patches of so many frames of sequences (n, h, w, 4): images (batch, frames, 3, size, size) in [0, 1] and labels
+    (batch, frames, size, size). Three of four lie around a pixel of the target; mirrored, played backwards and coloured anew at
+    random.
     """
     images, labels = [], []
     for sequence in chosen:
+        start = rng.integers(0, len(sequence) - frames + 1)
+        sequence = sequence[start : start + frames]
         height, width = sequence.shape[1:3]
         middle = rng.integers(0, [height, width])
         if rng.random() < 0.75:
@@ -206,8 +211,9 @@ def draw_batch(
     return torch.stack(images), torch.stack(labels)
 
 
-def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float = 0.4) -> NDArray[np.float32]:
-    """Brightness, contrast, saturation and tint of a picture (..., 3) in [0, 1], changed at random by up to `amount`."""
+def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float = 0.2) -> NDArray[np.float32]:
+    """Brightness, contrast, saturation and tint of a picture (..., 3) in [0, 1], changed at random by up to `amount` (the authors':
+    0.4, of photographs; our renderer varies the light itself)."""
     brightness, contrast, saturation = 1.0 + amount * rng.uniform(-1.0, 1.0, 3)
     tint = 1.0 + 0.25 * amount * rng.uniform(-1.0, 1.0, 3)
     grey = picture.mean(axis=-1, keepdims=True)
@@ -219,7 +225,7 @@ def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float
 def export(trainer: Trainer, out: Path, sequences_each: int) -> dict[str, Any]:
     """Calibrate and score the averaged weights on held-out sequences, write them with their card; returns the card."""
     seed = VALIDATION_SEED + trainer.seed
-    offset, calibrated = calibrate(trainer.average, seed, sequences_each)
+    offset, calibrated = calibrate(trainer.average, _rendered(seed, sequences_each))
     card = {
         "seed": trainer.seed,
         "date": datetime.date.today().isoformat(),
@@ -230,16 +236,22 @@ def export(trainer: Trainer, out: Path, sequences_each: int) -> dict[str, Any]:
         },
         "parameters": sum(p.numel() for p in trainer.net.parameters()),
         "calibration": {"seed": seed, "target_logit_offset": offset, **calibrated},
-        "held_out": {"seed": seed + 1, **held_out(trainer.average, offset, seed + 1, sequences_each)},
+        "held_out": {"seed": seed + 1, **held_out(trainer.average, offset, _rendered(seed + 1, sequences_each))},
     }
     out.parent.mkdir(parents=True, exist_ok=True)
     prednet.save(out, trainer.average, card)
     return card
 
 
+def _rendered(seed: int, count: int) -> Iterator[sequences.Sequence]:
+    return (sequences.render(seed, index) for index in range(count))
+
+
 def arguments() -> argparse.ArgumentParser:
     """The flags of `penumbra segmentation train`."""
-    parser = argparse.ArgumentParser(prog="penumbra segmentation train", description="Train the segmentation network on simulated sequences.")
+    parser = argparse.ArgumentParser(
+        prog="penumbra segmentation train", description="Train the segmentation network on simulated sequences."
+    )
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--minutes", type=float, default=60.0, help="train for so long (default: 60)")
     length.add_argument("--steps", type=int, help="train for so many steps instead: the same result on every run of one machine")
@@ -279,7 +291,9 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def run(trainer: Trainer, data: DataSet, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0) -> None:
+def run(
+    trainer: Trainer, data: DataSet, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0
+) -> None:
     """Train up to so many steps, or minutes (over all runs); shows a progress bar."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     total = steps if steps is not None else int(minutes * 60)
