@@ -121,7 +121,7 @@ def target_mesh(target: cells.Target, cell: cells.Cell) -> Mesh:
 
     path = cell.folder / target.mesh
     try:
-        mesh = trimesh.load(path, force="mesh", process=True)
+        mesh = trimesh.load_mesh(path)
     except Exception as error:
         raise cells.CellError(f"{path}: a triangle mesh that trimesh reads expected (STL, OBJ, PLY, GLB): {error}") from None
     if not len(getattr(mesh, "faces", ())):

@@ -156,7 +156,7 @@ class _Tables:
 def _expose(image: NDArray[np.float32], look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
     """The sensor: blur, shot and read noise, gamma of the display, 8 bits."""
     if look.blur_px > 0:
-        image = cv2.GaussianBlur(image, (0, 0), look.blur_px)
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), look.blur_px), np.float32)
     noise = _grain()
     start = int(rng.integers(0, noise.size - 1))
     out = np.empty(image.shape, np.uint8)

@@ -34,8 +34,8 @@ ASTRAY = 0.06
 
 @dataclass(frozen=True)
 class Variety:
-    """What is drawn. frames; size [px] of the window; scale: bounds of the focal length relative to the cell's camera; speed [m/s]
-    and turn [rad/s]: the target's largest; jitter [m]: how far the window's middle is off the target's."""
+    """What is drawn. frames; size [px] of the window; scale: bounds of the focal length relative to the cell's camera; speed
+    [m/s] and turn [rad/s]: the target's largest; jitter [m]: how far the window's middle is off the target's."""
 
     frames: int = 8
     size: int = 160
@@ -47,8 +47,8 @@ class Variety:
 
 @dataclass(frozen=True)
 class Sequence:
-    """images (frames, h, w, 3) uint8 RGB, labels (frames, h, w) uint8, hidden (frames,): share of the target's pixels in the window
-    that something covers."""
+    """images (frames, h, w, 3) uint8 RGB, labels (frames, h, w) uint8, hidden (frames,): share of the target's pixels in the
+    window that something covers."""
 
     images: NDArray[np.uint8]
     labels: NDArray[np.uint8]
@@ -98,7 +98,7 @@ def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells
     """A camera and the things in front of it, the target first."""
     cell = _cell(CELLS[rng.integers(len(CELLS))])
     assert cell.sim is not None
-    times = PERIOD_S * (np.arange(variety.frames) - variety.frames / 2)
+    times: Array = np.arange(variety.frames, dtype=float) * PERIOD_S - variety.frames * PERIOD_S / 2
     measures = {name: value * rng.uniform(0.9, 1.1) for name, value in cell.body.model_dump().items()}
     varied = cell.model_copy(update={"body": cells.Body(**measures)})
     shoulder = np.asarray(cell.sim.shoulder) + rng.normal(0.0, 0.06, 3)

@@ -33,10 +33,11 @@ MISFIT = 2.5
 """Mean squared residual above which the voltages are not explained, and the solve starts afresh."""
 CHECK_EVERY = 10
 """Windows between solves from scratch beside the track: a limb can be felt alike at two places along it."""
-CONVINCING = 4.0
-"""A solve from scratch replaces the track where it is e to this power more probable."""
-DOUBTS = 3
-"""… in so many windows in a row."""
+CONVINCING = 8.0
+"""A solve from scratch replaces the track when doubt has summed up to this: the log of how much more probable it is, less one,
+window after window, never below zero (Page's cumulative sum, DOI 10.2307/2333009) …"""
+CLEAR = 4.0
+"""… of which one window can give no more than this, lest one burst of noise carries the track away."""
 ROLL_GAP = 0.10
 """Nearer than this [m] the roll can be felt, and has several solutions."""
 ROLL_MEMORY_S = 0.1
@@ -80,7 +81,7 @@ class Estimator:
     def reset(self) -> None:
         """Forget the past."""
         self._T, self._covariance, self._stamp_ns, self._tracking, self._gap = self.home, self._home_covariance, 0, False, np.inf
-        self._since_check = self._doubts = 0
+        self._since_check, self._doubt = 0, 0.0
 
     def nothing(self) -> Estimate:
         """The estimate when nothing can be felt: home, without information."""
@@ -137,13 +138,13 @@ class Estimator:
             found = self._solutions(electrodes, amplitude, variance, starts, coarse=3, fine=3)
             # The track is judged with the same freedom: from its pose, but with home's spread.
             (same,) = self._solutions(electrodes, amplitude, variance, [kept[0]], coarse=0 if tracked else 3, fine=3)
-            beaten = same.misfit > MISFIT or same.cost > found[0].cost + CONVINCING
-            self._doubts = self._doubts + 1 if beaten else 0
-            if tracked and self._doubts < DOUBTS:
+            advantage = CLEAR if same.misfit > MISFIT else same.cost - found[0].cost
+            self._doubt = max(0.0, self._doubt + min(advantage, CLEAR) - 1.0)
+            if tracked and self._doubt < CONVINCING:
                 found, (self._T, self._covariance) = tracked, kept
-                self._since_check = CHECK_EVERY if beaten else 0  # a doubt is settled by the next windows
+                self._since_check = CHECK_EVERY if self._doubt else 0  # a doubt is settled by the next windows
             else:
-                found, self._doubts = sorted([*found, same], key=lambda solution: solution.cost), 0
+                found, self._doubt = sorted([*found, same], key=lambda solution: solution.cost), 0.0
         T, information, gradient = self._merge(found)
         information, gradient = without_roll(T, information, gradient)
         # Voltages that the model explains badly say less than their noise promises.

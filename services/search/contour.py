@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from services.search.evidence import JOINT, Intrinsics
+from services.search.evidence import Intrinsics
 from shared import geometry, raster
 from shared.body import Mesh
 
@@ -25,7 +25,7 @@ COLUMN = 8
 APART = 0.01
 """Two points of the contour whose depths differ by more than this [m] belong to two parts."""
 SHAPE = 0.006
-"""How well the mesh's cross-section is known [m]: what an ellipse this far from a circle says about its roll is not believed."""
+"""How well the mesh's cross-section is known [m]."""
 CREASE = 0.8
 """Facets that meet at a larger angle [rad] are a crease of the body, and not a sample of a round surface."""
 
@@ -204,13 +204,13 @@ def _nearest(image, u, v):
     return image[y, x]
 
 
-DROPPED, MEASURED, BOUNDED, AT_JOINT = 0, 1, 2, 3
+DROPPED, MEASURED, BOUNDED = 0, 1, 2
 """What became of a contour point. BOUNDED: on the way to the boundary something covers the view, which only says that the contour
 has to move at least that far."""
 
 
 @njit(cache=True, nogil=True)
-def match(points, field, state, guarded, reach):
+def match(points, field, guarded, reach):
     """Offsets r (n,) [px] along the outward normal from each contour point to the mask's boundary, and their kinds (n,)."""
     n = len(points)
     r = np.zeros(n)
@@ -235,27 +235,24 @@ def match(points, field, state, guarded, reach):
             if (value < 0.5) == (way > 0.0):
                 r[i] = t - way * (value - 0.5) / (value - before)
                 kind[i] = MEASURED
-                if _nearest(state, u + (r[i] + 2.0) * nx, v + (r[i] + 2.0) * ny) == JOINT:
-                    kind[i] = AT_JOINT
                 break
             before = value
     return r, kind
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(points, r, kind, origin, axis, fx, fy, edge, correlation, joint, huber, bounded):
+def normal_equations(points, r, kind, origin, axis, fx, fy, edge, correlation, huber, bounded):
     """Of the pose error along the camera's axes and the dilation: the 7 x 7 information, its right side (7,), the length of
     contour measured [px], the sum of length times Huber-limited squared offset [px^3], the length that costs, Huber's cost (chi^2
-    where all is within `huber`), and the share of the information about the roll that comes from levers longer than SHAPE. `origin` (3,) [m] and `axis` (3,) of the target; `bounded`: whether BOUNDED points inform."""
+    where all is within `huber`), and the share of the information about the roll that comes from levers longer than SHAPE.
+
+    `origin` (3,) [m] and `axis` (3,) of the target; `bounded`: whether BOUNDED points inform, beside that they cost.
+    """
     H = np.zeros((7, 7))
     g = np.zeros(7)
     J = np.empty(7)
     length, square, counted, cost = 0.0, 0.0, 0.0, 0.0
     rolls, long_rolls = 1e-12, 0.0
-    joint_length = 0.0
-    for i in range(len(points)):
-        if kind[i] == AT_JOINT:
-            joint_length += points[i, 7]
     for i in range(len(points)):
         if kind[i] == DROPPED:
             continue
@@ -269,21 +266,16 @@ def normal_equations(points, r, kind, origin, axis, fx, fy, edge, correlation, j
         J[4] = J[0] * z - J[2] * x
         J[5] = J[1] * x - J[0] * y
         J[6] = 1.0
-        limit, share, sigma = huber, points[i, 7] / correlation, edge
-        if kind[i] == AT_JOINT:
-            sigma = max(edge, joint * fx / Z)
-            limit = max(huber, sigma)
-            share = points[i, 7] / max(joint_length, correlation)
-        elif kind[i] == MEASURED:
+        if kind[i] == MEASURED:
             length += points[i, 7]
             square += points[i, 7] * min(r[i] * r[i], huber * huber)
-        weight = share / (sigma * sigma)
+        weight = points[i, 7] / (correlation * edge * edge)
         counted += points[i, 7]
-        if abs(r[i]) <= limit:
+        if abs(r[i]) <= huber:
             cost += weight * r[i] * r[i]
         else:
-            cost += weight * limit * (2.0 * abs(r[i]) - limit)
-            weight *= limit / abs(r[i])
+            cost += weight * huber * (2.0 * abs(r[i]) - huber)
+            weight *= huber / abs(r[i])
         if kind[i] == BOUNDED and not bounded:
             continue
         roll = abs(J[3] * axis[0] + J[4] * axis[1] + J[5] * axis[2])

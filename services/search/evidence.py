@@ -1,4 +1,4 @@
-"""What each pixel of a mask tells about the target: seen, not there, hidden by something, or another part of the same limb."""
+"""What each pixel of a mask tells about the target: seen, not there, or hidden by something."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from shared.cell import Camera
 from shared.classes import Label
 
-FREE, TARGET, COVERED, JOINT = 0, 1, 2, 3
-"""State of a pixel. COVERED: something stands in front, or nothing is known there. JOINT: a neighbouring part of the limb, whose
-border with the target is anatomy and less sharp than a silhouette."""
+FREE, TARGET, COVERED = 0, 1, 2
+"""State of a pixel. COVERED: something stands in front, or nothing is known there. The limb's other parts cover too: the
+upper arm's rounded end hides a few centimetres of the elbow, so that their border is not the target's contour."""
 
 SMOOTHING_PX = 1.0
 """Standard deviation of the blur that makes the boundary of a hard mask sub-pixel: about the stairs' own period."""
@@ -25,8 +25,6 @@ GUARD_PX = 2
 """Within this distance of a covered pixel a boundary may be the occluder's and not the target's."""
 DEPTH_MARGIN = 0.05
 """What lies further than this behind the target's furthest point [m] is behind it for certain: half a limb's thickness."""
-
-_LIMB = (Label.UPPER_ARM, Label.FOREARM, Label.HAND)
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,6 @@ def classify(
     """
     table = np.full(256, COVERED, np.uint8)
     table[[Label.BACKGROUND, Label.TORSO]] = FREE
-    table[list(_LIMB)] = COVERED
     table[list(target_labels)] = TARGET
     state = table[labels]
     if robot_depth is not None:

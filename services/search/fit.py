@@ -5,7 +5,8 @@ One pass, from a pose T_camera_target:
   2. keep the points on the outside of the silhouette and outside everything that covers the target;
   3. from each, walk along the contour's normal to the mask's boundary: the offset r [px] (`match`);
   4. solve the damped normal equations for the pose error and for the mask's dilation b, r = J e + b + noise.
-The passes are Levenberg-Marquardt with Huber's weights, from coarse to fine. What is hidden is dropped and not scored.
+The passes are Levenberg-Marquardt with Huber's weights; where they end badly, they start again after coarse passes with a longer
+walk. What is hidden is dropped and not scored.
 
 The covariance is that of the measurement alone. Neighbouring points of a mask's boundary err together, so the contour counts as
 one independent point per correlation length; the dilation b is a nuisance with a prior of its own and is marginalised, because
@@ -35,14 +36,12 @@ class Noise:
     """How a mask's boundary errs, in pixels of the mask.
 
     `edge`: standard deviation along the normal; `correlation`: length along the contour over which errors are one error;
-    `dilation`: standard deviation of the whole mask's being too large or small; `joint`: deviation [m] of the border with
-    the limb's next part, which is one error along its whole length. Defaults: a trained network's masks.
+    `dilation`: standard deviation of the whole mask's being too large or small. Defaults: a trained network's masks.
     """
 
     edge: float = 0.5
     correlation: float = 14.0
     dilation: float = 0.3
-    joint: float = 0.015
 
 
 @dataclass(frozen=True)
@@ -62,17 +61,16 @@ class Limits:
         return np.diag([self.position**-2.0] * 3 + [self.rotation**-2.0] * 3)
 
 
-COARSE, FINE = (24.0, 5.0, 4), (8.0, 2.0, 7)
-"""Reach of the walk [px], Huber's threshold [px], passes at most. The coarse passes take every step, as the contour points that
-are matched change with each; the fine ones only what lowers the cost."""
+COARSE, FINE = (24.0, 5.0, 4), (8.0, 2.0, 8)
+"""Reach of the walk [px], Huber's threshold [px], passes at most."""
 CONVERGED = 1e-3
 """A pass that moves less than this [m], and four times it [rad], is the last of its stage."""
 MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
 """Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
 DAMPING = (1e-3, 10.0, 1e2)
 """Marquardt's factor at the start, its change after a pass that gained or lost, and where the search gives up."""
-MISFIT = 3.0
-"""A larger `Fit.misfit` has one fit of a hundred that are right, and most that are wrong."""
+GOOD, MISFIT = 2.0, 3.0
+"""A smaller `Fit.misfit` has nearly every fit that is right; a larger one has one of a hundred, and most that are wrong."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +123,7 @@ class _Problem:
         V = self.model.in_camera(T)
         silhouette = self.model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1]))
         points = trace(V, self.model.faces, self.model.edges, *intrinsics, silhouette, SPACING_PX)
-        offsets, kind = match(points, evidence.field, evidence.state, evidence.guarded, reach)
+        offsets, kind = match(points, evidence.field, evidence.guarded, reach)
         r = offsets - moved[6]
         H, g, _, _, counted, cost, _ = self.normal_equations(T, points, r, kind, huber, True)
         both, free = compare(evidence.state, silhouette)
@@ -138,9 +136,32 @@ class _Problem:
         self, T: Array, points: Array, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
     ) -> tuple[Array, Array, float, float, float, float, float]:
         noise, k = self.noise, self.evidence.intrinsics
-        return normal_equations(
-            points, r, kind, T[:3, 3], T[:3, 0], k.fx, k.fy, noise.edge, noise.correlation, noise.joint, huber, bounded
-        )
+        return normal_equations(points, r, kind, T[:3, 3], T[:3, 0], k.fx, k.fy, noise.edge, noise.correlation, huber, bounded)
+
+    def coarse(self, T: Array, moved: Array) -> tuple[Array, Array]:
+        """The pose and what it is moved by after steps that are all taken, as the contour points matched change with each."""
+        reach, huber, passes = COARSE
+        for _ in range(passes):
+            step = self.step(self.at(T, moved, reach, huber), 0.0)
+            T, moved = geometry.perturb(T, step[:6]), moved + step
+            if _small(step):
+                break
+        return T, moved
+
+    def fine(self, T: Array, moved: Array) -> _Pass:
+        """The best pose near by, by Levenberg and Marquardt."""
+        reach, huber, passes = FINE
+        here, damping = self.at(T, moved, reach, huber), DAMPING[0]
+        for _ in range(passes):
+            step = self.step(here, damping)
+            there = self.at(geometry.perturb(here.T, step[:6]), here.moved + step, reach, huber)
+            if there.cost < here.cost:
+                here, damping = there, damping / DAMPING[1]
+            else:
+                damping *= DAMPING[1]
+            if _small(step) or damping > DAMPING[2]:
+                break
+        return here
 
     def step(self, here: _Pass, damping: float) -> Array:
         information = here.H + self.regular
@@ -176,33 +197,16 @@ def fit(
     start = np.zeros(7)
     if T_prior is not None:
         start[:6] = geometry.pose_error(T_start, T_prior)
-    T, moved = T_start, start
-    reach, huber, passes = COARSE
-    for _ in range(passes):
-        step = problem.step(problem.at(T, moved, reach, huber), 0.0)
-        T, moved = geometry.perturb(T, step[:6]), moved + step
-        if _small(step):
-            break
-    reach, huber, passes = FINE
-    here = problem.at(T, moved, reach, huber)
-    if here.cost > MISFIT * evidence.measurements(noise.correlation):  # the coarse passes may have left a good start
-        here = min(here, problem.at(T_start, start, reach, huber), key=lambda one: one.cost)
-    damping = DAMPING[0]
-    for _ in range(passes):
-        step = problem.step(here, damping)
-        there = problem.at(geometry.perturb(here.T, step[:6]), here.moved + step, reach, huber)
-        if there.cost < here.cost:
-            here, damping = there, damping / DAMPING[1]
-        else:
-            damping *= DAMPING[1]
-        if _small(step) or damping > DAMPING[2]:
-            break
+    independent = evidence.measurements(noise.correlation)
+    here = problem.fine(T_start, start)
+    if here.cost > GOOD * independent:  # the start was too far away for the short walk
+        here = min(here, problem.fine(*problem.coarse(T_start, start)), key=lambda one: one.cost)
 
     # the pose is final: only what was measured informs
     moved = here.moved
-    H, g, length, square, _, _, rolls = problem.normal_equations(here.T, here.points, here.r, here.kind, huber, False)
+    H, g, length, square, _, _, rolls = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False)
     rms = math.sqrt(square / length) if length > 0 else math.inf
-    misfit = here.cost / evidence.measurements(noise.correlation)
+    misfit = here.cost / independent
     # a mask or a fit worse than expected: believe the residuals
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
     H, g = H * trust, g * trust

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from services.search import contour, detect, evidence, overlap
 from services.search.evidence import TARGET, Evidence, Intrinsics
-from services.search.fit import MISFIT, Fit, Limits, Noise, fit
+from services.search.fit import GOOD, MISFIT, Fit, Limits, Noise, fit
 from services.search.robots import RobotDepth
 from shared import body, geometry
 from shared.cell import Cell
@@ -137,7 +137,7 @@ class Search:
         first = self._fit(seen, T_start, T_start, prior)
         T_mirror = detect.mirrored(first.T_searched)[0]
         away = geometry.pose_error(T_mirror, T_start)
-        if first.overlap < FITS or away @ prior @ away > GATE:
+        if first.overlap < FITS or (first.misfit < GOOD and away @ prior @ away > GATE):
             return first
         other = self._fit(seen, T_mirror, T_start, prior)
         if other.cost < first.cost:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from typing import Any, Protocol
 
@@ -81,7 +82,7 @@ def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str,
                 rows.append((hidden, (f[k] & t[k]).sum() / (f[k] | t[k]).sum(), f[k].sum() / t[k].sum()))
     table = np.array(rows).reshape(-1, 3)
     score: dict[str, Any] = {}
-    for low, high in zip(HIDDEN[:-1], HIDDEN[1:], strict=True):
+    for low, high in itertools.pairwise(HIDDEN):
         part = table[(table[:, 0] >= low) & (table[:, 0] < high)]
         if len(part):
             score[f"hidden {low:.0%} to {high:.0%}"] = {

@@ -23,8 +23,8 @@ TARGET_LABELS = (Label.FOREARM, Label.HAND)
 
 
 class Segmenter:
-    """Masks of one camera's frames, in order. `offset`: added to the logits of forearm and hand, calibrated so that their masks are
-    on average as large as they should be (the search would take a mask too large for an arm too near)."""
+    """Masks of one camera's frames, in order. `offset`: added to the logits of forearm and hand, calibrated so that their masks
+    are on average as large as they should be (the search would take a mask too large for an arm too near)."""
 
     def __init__(self, net: PredNet, offset: float = 0.0, dtype: torch.dtype | None = None):
         self._dtype = fastest_dtype() if dtype is None else dtype
@@ -57,7 +57,7 @@ class Segmenter:
 
 
 def cut(image: NDArray[np.uint8], window: Window) -> torch.Tensor:
-    """The window (1, 3, height, width) in [0, 1] of an RGB image (h, w, 3) uint8; at scales above 1 the mean of the pixels covered."""
+    """The window (1, 3, height, width) in [0, 1] of an RGB image (h, w, 3) uint8; at scales above 1 their means."""
     if min(window.x0, window.y0) < 0 or window.bottom > image.shape[0] or window.right > image.shape[1]:
         raise ValueError(f"a window inside the image of {image.shape[1]} x {image.shape[0]} expected, {window} came")
     part = np.ascontiguousarray(image[window.y0 : window.bottom, window.x0 : window.right])

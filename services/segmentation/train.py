@@ -35,9 +35,10 @@ VALIDATION_SEED = 1_000_000
 
 @dataclass(frozen=True)
 class Schedule:
-    """How training goes. `peak_rate`: of Adam's one cycle; `frames`: that a step plays; `patches`: (from which progress on, pixels a side, sequences a batch);
-    `reuse`: how often a sequence is visited on average while the data set grows up to `most` sequences; `error_weight`,
-    `focal_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights that are exported."""
+    """How training goes. `peak_rate`: of Adam's one cycle; `frames`: that a step plays; `patches`: (from which progress on,
+    pixels a side, sequences a batch); `reuse`: how often a sequence is visited on average while the data set grows up to `most`
+    sequences; `error_weight`, `focal_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights
+    that are exported."""
 
     peak_rate: float = 3e-3
     frames: int = 5
@@ -137,7 +138,7 @@ class Trainer:
         with torch.no_grad():
             for mean, value in zip(self.average.parameters(), self.net.parameters(), strict=True):
                 mean.lerp_(value, 1.0 - keep)
-        return {name: float(value) for name, value in parts.items()} | {"total": float(total)}
+        return {name: float(value.detach()) for name, value in parts.items()} | {"total": float(total.detach())}
 
     def _losses(self, images: torch.Tensor, labels: torch.Tensor, old_state: bool) -> dict[str, torch.Tensor]:
         """images (batch, frames, 3, h, w) in [0, 1], labels (batch, frames, h, w). `old_state`: first play the sequence backwards
@@ -212,8 +213,8 @@ def draw_batch(
 
 
 def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float = 0.2) -> NDArray[np.float32]:
-    """Brightness, contrast, saturation and tint of a picture (..., 3) in [0, 1], changed at random by up to `amount` (the authors':
-    0.4, of photographs; our renderer varies the light itself)."""
+    """Brightness, contrast, saturation and tint of a picture (..., 3) in [0, 1], changed at random by up to `amount` (the
+    authors': 0.4, of photographs; our renderer varies the light itself)."""
     brightness, contrast, saturation = 1.0 + amount * rng.uniform(-1.0, 1.0, 3)
     tint = 1.0 + 0.25 * amount * rng.uniform(-1.0, 1.0, 3)
     grey = picture.mean(axis=-1, keepdims=True)
