@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-import threading
 import time
 from pathlib import Path
 
@@ -14,21 +12,15 @@ import torch
 import trimesh
 
 from services.haptics import network as networks
-from services.haptics import service, train
+from services.haptics import train
 from services.haptics.estimator import Estimator
-from services.haptics.kinematics import PadPoses
 from services.haptics.nearest import nearest_points
 from services.haptics.solve import MODEL_ERROR, peak, solve
-from services.haptics.window import Backlog, Collector
-from shared import bus, geometry, messages, topics
 from shared import cell as cells
+from shared import geometry
 from shared.body import target_mesh
-from shared.robot import robot_models
-from shared.service import Node
 from shared.skin import Skin
 from shared.surface import Surface
-from sim.world import TICK_NS, Sensors, World
-from tests.live import free_port, wait_for
 
 MS = 1_000_000
 WEIGHTS = Path(train.__file__).parent / "weights"
@@ -112,112 +104,6 @@ def test_a_dead_pad_has_only_the_expectation(skin: Skin, limb: Surface) -> None:
     points, covariance = nearest_points(skin, amplitude, skin.noise / 10, alive)
     np.testing.assert_allclose(points[2], [0, 0, 0.15], atol=1e-6)
     assert covariance[2, 2, 2] > 0.1**2 > covariance[3, 2, 2]
-
-
-# ---- windows
-
-
-def batch(skin: Skin, rng: np.random.Generator, level: float = 0.21) -> np.ndarray:
-    return level + 0.0025 * rng.standard_normal((5, 5))
-
-
-def play(collector: Collector, skin: Skin, stamps: list[int], silent: dict[str, int] | None = None) -> list:
-    rng = np.random.default_rng(0)
-    windows = []
-    for stamp in stamps:
-        for pad in skin.pads:
-            if stamp < (silent or {}).get(pad, 1 << 62):
-                windows.append(collector.add(pad, stamp, MS, batch(skin, rng)))
-    return [w for w in windows if w is not None]
-
-
-def test_windows_do_not_overlap_and_are_stamped_at_their_middle(skin: Skin) -> None:
-    windows = play(Collector(skin), skin, [1_000_000_000 + 5 * MS * i for i in range(1, 41)])
-    assert len(windows) == 20
-    assert all(set(w.samples) == {10} and w.alive.all() and not w.faults for w in windows)
-    assert [w.newest_ns - w.stamp_ns for w in windows] == [4_500_000] * 20  # the middle of 0, 1, … 9 ms
-    assert set(np.diff([w.newest_ns for w in windows])) == {10 * MS}
-
-
-def test_a_window_is_complete_with_the_last_pads_batch_and_not_before(skin: Skin) -> None:
-    collector, rng = Collector(skin), np.random.default_rng(0)
-    for stamp in (5 * MS, 10 * MS):
-        done = [collector.add(pad, stamp, MS, batch(skin, rng)) is not None for pad in skin.pads]
-    assert done == [False] * 7 + [True]
-
-
-def test_a_silent_pad_is_waited_for_a_little_and_then_left_out(skin: Skin) -> None:
-    windows = play(Collector(skin), skin, [5 * MS * i for i in range(1, 61)], silent={"p3": 100 * MS})
-    assert windows[-1].faults == {"p3": "silent"} and not windows[-1].alive[3]
-    assert windows[-1].alive.sum() == 7 and windows[-1].newest_ns >= 290 * MS
-    assert np.diff([w.newest_ns for w in windows]).max() <= 40 * MS
-
-
-@pytest.mark.parametrize(
-    ("level", "fault"), [(3.3, "saturated"), (0.0, "saturated"), (3.1, "out of range"), (0.02, "out of range")]
-)
-def test_a_pad_that_reads_what_it_cannot_is_left_out(skin: Skin, level: float, fault: str) -> None:
-    collector, rng = Collector(skin), np.random.default_rng(0)
-    windows = []
-    for stamp in (5 * MS, 10 * MS):
-        for pad in skin.pads:
-            volts = np.full((5, 5), level) if pad == "p1" else batch(skin, rng)
-            windows.append(collector.add(pad, stamp, MS, volts + (1e-4 * rng.standard_normal((5, 5)) if 0 < level < 3.3 else 0)))
-    assert windows[-1].faults["p1"].startswith(fault)
-    assert windows[-1].alive.tolist() == [pad != "p1" for pad in skin.pads]
-
-
-def test_a_pad_without_any_noise_is_stuck(skin: Skin) -> None:
-    collector, rng = Collector(skin), np.random.default_rng(0)
-    for stamp in (5 * MS, 10 * MS):
-        for pad in skin.pads:
-            window = collector.add(pad, stamp, MS, np.full((5, 5), 0.21) if pad == "p0" else batch(skin, rng))
-    assert window is not None and window.faults["p0"].startswith("stuck")
-
-
-def test_after_a_cut_a_window_holds_new_samples_only_and_a_restart_of_the_source_is_followed(skin: Skin) -> None:
-    collector = Collector(skin)
-    play(collector, skin, [5 * MS, 10 * MS])
-    (later,) = play(collector, skin, [500 * MS])
-    assert later.newest_ns == 500 * MS and later.newest_ns - later.stamp_ns < 10 * MS
-    assert len(play(collector, skin, [20 * MS, 25 * MS, 30 * MS])) >= 1  # its clock began again
-
-
-def test_repeated_and_overtaken_batches_are_ignored(skin: Skin) -> None:
-    windows = play(Collector(skin), skin, [5 * MS, 5 * MS, 10 * MS, 5 * MS, 15 * MS, 20 * MS])
-    assert [w.newest_ns for w in windows] == [10 * MS, 20 * MS]
-    assert all(set(w.samples) == {10} for w in windows)
-
-
-def test_a_reader_that_fell_behind_leaves_windows_out_until_it_has_caught_up() -> None:
-    backlog = Backlog()
-    offset = 300 * MS  # the other clock is that much behind
-    delays = [2, 3, 2, 50, 40, 20, 3]
-    late = [backlog.is_late(10 * MS * i, 10 * MS * i + offset + delay * MS) for i, delay in enumerate(delays)]
-    assert late == [False, False, False, True, True, False, False]
-
-
-def test_other_rates_give_windows_too(skin: Skin) -> None:
-    collector, rng = Collector(skin), np.random.default_rng(0)
-    stamps = (np.arange(1, 231) * 1e9 / 231).astype(int)  # the board's own pace: single rows, 231 a second
-    windows = [
-        w
-        for s in stamps
-        for p in skin.pads
-        if (w := collector.add(p, int(s), 4_329_004, 0.2 + 0.003 * rng.standard_normal((1, 5))))
-    ]
-    assert 70 < len(windows) < 100
-    assert all(w.samples.min() >= 2 for w in windows)
-
-
-def test_a_batch_that_fits_no_pad_is_refused_in_words(skin: Skin) -> None:
-    collector = Collector(skin)
-    with pytest.raises(ValueError, match=r"a pad of p0, .* expected, 'p9' came"):
-        collector.add("p9", 1, MS, np.zeros((5, 5)))
-    with pytest.raises(ValueError, match="rows of 5 electrodes expected"):
-        collector.add("p0", 1, MS, np.zeros((5, 4)))
-    with pytest.raises(ValueError, match="positive period_ns"):
-        collector.add("p0", 1, 0, np.zeros((5, 5)))
 
 
 # ---- solve
@@ -355,9 +241,9 @@ def test_an_estimate_takes_a_small_part_of_its_window(table: cells.Cell, skin: S
     taken = []
     for i in range(100):
         amplitude = feel(skin, forearm, T, rng)
-        begin = time.perf_counter()
+        begin = time.process_time()  # of this process: other tests may share the core
         update(which, skin, 10 * MS * (i + 1), amplitude)
-        taken.append(time.perf_counter() - begin)
+        taken.append(time.process_time() - begin)
     assert np.median(taken) < 0.005  # 1 ms on an idle core
 
 
@@ -398,18 +284,18 @@ def test_the_committed_weights_reach_what_their_card_says(name: str) -> None:
     cell = cells.load(name)
     network = networks.load(WEIGHTS / f"{name}-forearm.npz", cell, "forearm")
     card = json.loads((WEIGHTS / f"{name}-forearm.json").read_text())
-    fresh = train.evaluate(train.Scenes(cell, "forearm"), network, seed=77, count=400)
+    fresh = train.evaluate(train.Scenes(cell, "forearm"), network, seed=77, count=250)
     for method in ("paper", "solve"):
         for band in ("4-7.5 cm", "7.5-12.5 cm"):
             promised, got = (c[method][band]["lateral_height_axial_mm"] for c in (card["held_out"], fresh))
-            # some fifty scenes a band: their root mean square scatters by a tenth, more where there are outliers
+            # some forty scenes a band: their root mean square scatters by a tenth, more where there are outliers
             assert got[1] < 2.0 * promised[1] + 2.0
 
 
 def test_training_can_be_interrupted_goes_on_and_writes_weights_with_a_card(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flags = ["--cell", "table", "--out", str(tmp_path / "w.npz"), "--checkpoint", str(tmp_path / "c.pt"), "--scenes", "100"]
+    flags = ["--cell", "table", "--out", str(tmp_path / "w.npz"), "--checkpoint", str(tmp_path / "c.pt"), "--scenes", "40"]
     steps = []
 
     def interrupted(out: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
@@ -428,80 +314,3 @@ def test_training_can_be_interrupted_goes_on_and_writes_weights_with_a_card(
     assert card["settings"]["network"]["steps"] == 6 and card["seed"] == 1
     assert networks.load(tmp_path / "w.npz", cells.load("table"), "forearm").weights[0].shape[1] == 256
     assert not (tmp_path / "c.pt").exists()
-
-
-# ---- kinematics
-
-
-def test_pads_on_a_robot_move_with_its_joints_between_two_messages() -> None:
-    cell = cells.load("arm")
-    models = robot_models(cell)
-    skin = Skin(cell)
-    poses = PadPoses(cell, skin, models)
-    assert poses.at(0) is None
-    (robot,) = models
-    first = np.array([0.0, -0.1, 0.0, -2.0, 0.0, 1.9, 0.7])
-    poses.add(robot, 0, first)
-    poses.add(robot, 10 * MS, first + 0.02)
-    found = poses.at(5 * MS)
-    assert found is not None
-    links = models[robot].link_transforms(first + 0.01)
-    np.testing.assert_allclose(found[0], skin.T_world_pads({f"{robot}/{link}": T for link, T in links.items()}), atol=1e-12)
-    np.testing.assert_allclose(found[1], first + 0.01)
-    assert poses.at(500 * MS) is None  # too long ago
-    with pytest.raises(ValueError, match="7 joint angles expected"):
-        poses.add(robot, 20 * MS, np.zeros(6))
-
-
-def test_fixed_pads_need_no_joint_angles(table: cells.Cell, skin: Skin) -> None:
-    found = PadPoses(table, skin, {}).at(123)
-    assert found is not None and found[1].shape == (0,)
-
-
-# ---- the service
-
-
-def test_the_service_answers_every_window_within_milliseconds_and_goes_on_without_a_silent_pad(table: cells.Cell) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    world = World(table, seed=3)
-    world.plan(3.0)
-    poses: list[tuple[int, messages.HapticPose]] = []
-    options = argparse.Namespace(method="solve", weights=WEIGHTS, window_ms=10.0)
-    haptics = Node("haptics", table, bus.Connection(connect=(endpoint,)))
-    service.start(haptics, options)
-    reader = Node("reader", table, bus.Connection(connect=(endpoint,)))
-    reader.subscribe(topics.HAPTIC, lambda message, names: poses.append((reader.now_ns(), message)))
-    truths = {}
-    with (
-        Node("router", table, bus.Connection("router", listen=(endpoint,))),
-        haptics,
-        reader,
-        Node("emulator", table, bus.Connection(connect=(endpoint,))) as emulator,
-    ):
-        epoch_ns, k, silent_ns = emulator.now_ns(), 0, 1 << 62
-        sensors = Sensors(world, epoch_ns)
-
-        def tick() -> None:
-            nonlocal k
-            k += 1
-            for topic, names, message in sensors.tick(k):
-                if isinstance(message, messages.Truth):
-                    truths[message.stamp_ns] = message
-                elif names.get("pad") != "p5" or message.stamp_ns < silent_ns:
-                    emulator.publish(topic, message, **names)
-            threading.Event().wait(max(0.0, (epoch_ns + (k + 1) * TICK_NS - emulator.now_ns()) * 1e-9))
-
-        def played(count: int) -> None:
-            before = len(poses)
-            wait_for(lambda: tick() or len(poses) >= before + count, 15, f"{count} poses", interval=0.0)
-
-        played(60)
-        silent_ns = emulator.now_ns()
-        played(60)
-    ages_ms = [(came_ns - pose.sample_stamp_ns) * 1e-6 for came_ns, pose in poses]
-    assert np.median(ages_ms) < 25  # two cores shared with other tests; a few milliseconds on an idle machine
-    assert np.median(np.diff([pose.stamp_ns for _, pose in poses])) == pytest.approx(10e6)
-    last = poses[-1][1]
-    truth = truths[last.sample_stamp_ns]
-    assert last.state == ("in_range" if truth.gap < 0.15 else last.state)
-    assert last.gap == pytest.approx(truth.gap, abs=0.03 + 0.3 * truth.gap)

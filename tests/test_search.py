@@ -10,7 +10,7 @@ import pytest
 
 from services.search import detect, evidence, overlap
 from services.search.contour import Model
-from services.search.fit import Noise
+from services.search.fit import Noise, fit
 from services.search.prediction import JointHistory, predict
 from services.search.robots import RobotDepth
 from services.search.search import Search, VisionEstimate
@@ -84,7 +84,7 @@ def position_cm(s: Scene, estimate: VisionEstimate) -> float:
     return 100.0 * float(np.linalg.norm(s.T[:3, 3] - estimate.T[:3, 3]))
 
 
-def test_a_visible_arm_is_found_within_three_millimetres_of_its_depth_on_exact_masks():
+def test_a_visible_arm_is_found_within_three_millimetres_on_exact_masks():
     exact = Search(CELL, noise=EXACT)
     scenes = [scene(seed) for seed in range(1000, 1040)]
     found = [exact.update(s.mask, s.T_start, PRIOR) for s in scenes]
@@ -126,6 +126,38 @@ def test_depth_is_known_worst_and_the_roll_is_lost_with_the_hand(search):
     handless = search.update(Mask(stamp_ns=0, labels=labels, x0=s.mask.x0, y0=s.mask.y0, scale=1), s.T_start, PRIOR)
     axis = np.concatenate([np.zeros(3), s.T[:3, 0]])
     assert axis @ handless.covariance @ axis > 4.0 * axis @ whole.covariance @ axis
+
+
+def test_a_round_limb_made_of_facets_does_not_show_its_roll():
+    x = np.linspace(-0.13, 0.13, 7)
+    vertices, faces = body.loft(np.column_stack([x, 0 * x, 0 * x]), 0.045 - 0.05 * x, 0.045 - 0.05 * x, 18)
+    model = Model(body.Mesh(vertices, faces.astype(np.int32), np.full(len(faces), Label.FOREARM, np.uint8)))
+    T = T_CAMERA_WORLD @ geometry.from_rpy([0.0, 0.0, 0.2], [0.3, 0.1, 0.2])
+    k = evidence.Intrinsics.of_window(CAMERA, 220, 140, 1)
+    labels = np.where(model.silhouette(T, k, (0, 0, 192, 192)), Label.FOREARM, Label.BACKGROUND).astype(np.uint8)
+    found = fit(model, T, evidence.gather(evidence.classify(labels, (Label.FOREARM,)), labels, k))
+    roll = np.concatenate([np.zeros(3), T[:3, 0]])
+    assert np.sqrt(roll @ found.covariance @ roll) > 0.7
+    assert np.sqrt(np.diag(found.covariance)[:3]).max() < 0.05
+
+
+def test_the_upper_arm_over_the_elbow_is_not_taken_for_the_arms_end(search):
+    s = scene(11)
+    beyond = geometry.apply(geometry.inverse(s.T), CAMERA.T_world_camera[:3, 3])  # the camera, seen from the target
+    rows, columns = np.nonzero(s.mask.labels)
+    rays = np.column_stack(
+        [(columns + s.mask.x0 - CAMERA.cx) / CAMERA.fx, (rows + s.mask.y0 - CAMERA.cy) / CAMERA.fy, np.ones(len(rows))]
+    )
+    rays = rays @ (geometry.inverse(s.T) @ CAMERA.T_world_camera)[:3, :3].T
+    nearest = -(beyond[1] * rays[:, 1] + beyond[2] * rays[:, 2]) / (rays[:, 1] ** 2 + rays[:, 2] ** 2)  # to the limb's axis
+    elbow = beyond[0] + nearest * rays[:, 0] < -0.10
+    labels = s.mask.labels.copy()
+    labels[rows[elbow], columns[elbow]] = Label.UPPER_ARM
+    assert elbow.sum() > 200
+    assert (
+        position_cm(s, search.update(Mask(stamp_ns=0, labels=labels, x0=s.mask.x0, y0=s.mask.y0, scale=1), s.T_start, PRIOR))
+        < 1.0
+    )
 
 
 @pytest.mark.parametrize("hidden", [0.0, 0.4, 0.8])
