@@ -65,6 +65,13 @@ class Running:
         pose = self.pose()
         return pose is not None and pose["state"] == "tracking" and pose["stamp_ns"] > after_ns
 
+    def control(self, command: dict) -> dict | None:
+        """The emulator's answer to a control command, or None where nobody answers."""
+        for reply in self.session.get(topics.control(self.cell), payload=json.dumps(command), timeout=1.0):
+            if reply.ok:
+                return json.loads(reply.ok.payload.to_string())
+        return None
+
     def health(self) -> dict[str, dict]:
         """The health of every living instance by service."""
         replies = self.session.get(topics.health(self.cell), timeout=1.0)

@@ -136,6 +136,8 @@ def test_a_batch_that_fits_no_pad_is_refused_in_words(skin: Skin) -> None:
         collector.add("p0", 1, MS, np.zeros((5, 4)))
     with pytest.raises(ValueError, match="positive period_ns"):
         collector.add("p0", 1, 0, np.zeros((5, 5)))
+    with pytest.raises(ValueError, match="--window-ms above zero"):
+        Collector(skin, length_ns=0)
 
 
 # ---- kinematics
