@@ -29,7 +29,7 @@ def containers(service: str) -> list[dict]:
 
 @pytest.fixture(scope="module")
 def running():
-    compose("up", "--build", "--detach", "--wait", "--wait-timeout", "300")
+    compose("up", "--build", "--detach", "--wait", "--wait-timeout", "600")
     try:
         yield
     except BaseException:

@@ -44,7 +44,7 @@ PERSONS = 8
 """Places of the shoulder among which scenes are drawn."""
 DEAD = 0.02
 """Share of pads that are dead in training."""
-BATCH, FRESH, START, POOL = 1024, 128, 4000, 400_000
+BATCH, FRESH, START, POOL = 1024, 128, 2000, 400_000
 """Scenes in a step; of these, drawn anew (the others come from a pool that they join); in the pool at first and at most."""
 CHECKPOINT_S = 20.0
 BANDS = (0.0, 0.04, 0.075, 0.125, 0.175)
@@ -199,13 +199,17 @@ def evaluate(scenes: Scenes, network: PoseNetwork, seed: int, count: int = 4000)
         results[method] = {}
         for low, high in itertools.pairwise(BANDS):
             inside = table[(scene["gap"] >= low) & (scene["gap"] < high)]
+            if not len(inside):
+                continue
             rms = np.sqrt(np.mean(inside[:, :4] ** 2, axis=0))
             known = inside[np.isfinite(inside[:, 4]), 4]
             results[method][f"{100 * low:g}-{100 * high:g} cm"] = {
                 "scenes": len(inside),
                 "lateral_height_axial_mm": [round(1e3 * float(v), 2) for v in rms[:3]],
                 "axis_deg": round(float(np.degrees(rms[3])), 2),
-                "nees_per_direction_median_mean": [round(float(np.median(known)), 2), round(float(np.mean(known)), 2)],
+                "nees_per_direction_median_mean": [round(float(np.median(known)), 2), round(float(np.mean(known)), 2)]
+                if len(known)
+                else None,
             }
     return results
 

@@ -52,10 +52,12 @@ class Collector:
     """Gathers batches and hands out a window when every living pad has filled it.
 
     length_ns: window length (one estimate each); patience_ns: a pad this far behind the newest one is called silent and is
-    no longer waited for.
+    no longer waited for. Raises ValueError for a length that is not positive.
     """
 
     def __init__(self, skin: Skin, length_ns: int = 10_000_000, patience_ns: int = 30_000_000):
+        if length_ns <= 0:
+            raise ValueError(f"a window longer than nothing expected, {length_ns} ns came: give --window-ms above zero")
         self.skin, self.length_ns, self.patience_ns = skin, length_ns, patience_ns
         self._index = {name: k for k, name in enumerate(skin.pads)}
         self._stamps: list[NDArray[np.int64]] = [np.empty(0, np.int64) for _ in skin.pads]

@@ -19,6 +19,7 @@ class RobotDepth:
     """Renders the depth of the cell's robots in windows of one camera's image. T_camera_world: 4 x 4."""
 
     def __init__(self, cell: Cell, T_camera_world: Array):
+        self.robots = cell.robots
         self._models = {}
         if cell.robots:
             from shared.robot import robot_models  # reads URDFs with pybullet, which a cell without robots does not need

@@ -29,6 +29,8 @@ def start(node: Node, options: argparse.Namespace) -> None:
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
     targets = [cell.one("targets", options.target)] if options.target else list(cell.targets)
     searches = {(c, t): Search(cell, c, t, options.method) for c in cameras for t in targets}
+    for search in searches.values():
+        search.prepare()
     history = {robot: JointHistory() for robot in cell.robots}
     fused: dict[str, FusedPose] = {}
 
