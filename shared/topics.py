@@ -37,11 +37,11 @@ class Topic:
 
 
 FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, "emulator", "one RGB image")
-JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 200, 16, 0.1, "emulator", "joint angles [rad]")
-VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 200, 64, 0.1, "emulator",
+JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 100, 16, 0.1, "emulator", "joint angles [rad]")
+VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 100, 32, 0.1, "emulator",
                  "electrode amplitudes [V], 1 kHz in batches")  # fmt: skip
 TRUTH = Topic(
-    "truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 200, 16, 0.2, "emulator", "what the emulator knows"
+    "truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 100, 16, 0.2, "emulator", "what the emulator knows"
 )
 MASK = Topic(
     "mask",

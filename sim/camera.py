@@ -73,6 +73,7 @@ class Renderer:
             (camera.cy - y0 - (scale - 1) / 2) / scale,
         )
         self._raster = raster.Raster(width // scale, height // scale)
+        self._sky: tuple[Appearance, NDArray[np.float32]] | None = None
         self._shadow = raster.Raster(SHADOW_PX, SHADOW_PX)
 
     def render(self, bodies: list[Body], look: Look, rng: np.random.Generator) -> Picture:
@@ -107,11 +108,20 @@ class Renderer:
             T_lamp_world,
             lamp_f,
             self._shadow.depth,
-            look.background.row()[None],
+            self._background(look.background),
             image,
             labels,
         )
         return Picture(_expose(image, look, rng), labels, view.ids.copy())
+
+    def _background(self, appearance: Appearance) -> NDArray[np.float32]:
+        """Albedo (h, w, 3) of what lies at infinity: the camera stands still, so it is made once."""
+        if self._sky is None or self._sky[0] != appearance:
+            albedo = np.empty((*self._raster.ids.shape, 3), np.float32)
+            R = geometry.inverse(self._T_camera_world)[:3, :3]
+            _paint_background(np.array(self._k), R, appearance.row()[None], noise_volume(), albedo)
+            self._sky = appearance, albedo
+        return self._sky[1]
 
     def _cast_shadow(self, bodies: list[Body], lamp: Array) -> tuple[Array, float]:
         """Fills the shadow map; returns T_lamp_world and the map's focal length [px]. The map covers the movable bodies."""
@@ -260,6 +270,19 @@ def _texture(textures, row, x, y, z, volume, out):
 
 
 @njit(cache=True, nogil=True)
+def _paint_background(k, R, textures, volume, out):
+    """Albedo (h, w, 3) of a texture on a sphere of 3 m around the camera, whose axes are the columns of R."""
+    for row in range(out.shape[0]):
+        dy = (row - k[3]) / k[1]
+        for column in range(out.shape[1]):
+            dx = (column - k[2]) / k[0]
+            x = 3.0 * (R[0, 0] * dx + R[0, 1] * dy + R[0, 2])
+            y = 3.0 * (R[1, 0] * dx + R[1, 1] * dy + R[1, 2])
+            z = 3.0 * (R[2, 0] * dx + R[2, 1] * dy + R[2, 2])
+            _texture(textures, 0, x, y, z, volume, out[row, column])
+
+
+@njit(cache=True, nogil=True)
 def _shade(
     depth, ids, triangles, k, R, T, corners, normals, face_labels, textures, volume,
     lamp, lamp_colour, ambient, T_lamp_world, lamp_f, shadow, background, image, labels,
@@ -273,17 +296,16 @@ def _shade(
         dy = (row - k[3]) / k[1]
         for column in range(w):
             dx = (column - k[2]) / k[0]
+            body = ids[row, column]
+            if body == 255:
+                for c in range(3):
+                    image[row, column, c] = background[row, column, c] * (ambient[c] + np.float32(0.5) * lamp_colour[c])
+                labels[row, column] = 0
+                continue
             # the pixel's ray in the world, of unit depth
             rx = R[0, 0] * dx + R[0, 1] * dy + R[0, 2]
             ry = R[1, 0] * dx + R[1, 1] * dy + R[1, 2]
             rz = R[2, 0] * dx + R[2, 1] * dy + R[2, 2]
-            body = ids[row, column]
-            if body == 255:
-                _texture(background, 0, 3.0 * rx, 3.0 * ry, 3.0 * rz, volume, albedo)
-                for c in range(3):
-                    image[row, column, c] = albedo[c] * (ambient[c] + np.float32(0.5) * lamp_colour[c])
-                labels[row, column] = 0
-                continue
             z = depth[row, column]
             px, py, pz = ex + z * rx, ey + z * ry, ez + z * rz
             x = T[body, 0, 0] * px + T[body, 0, 1] * py + T[body, 0, 2] * pz + T[body, 0, 3]

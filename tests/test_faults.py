@@ -9,20 +9,10 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from shared import messages, topics
-from tests.live import penumbra_up, wait_for
+from tests.live import wait_for
 
 NAMES = {"cell": "table", "camera": "front", "robot": "panda", "pad": "p0", "target": "forearm"}
 READ_TOPICS = [topic for topic in topics.TOPICS if topic is not topics.TRUTH]
-
-
-@pytest.fixture(scope="module")
-def running():
-    with penumbra_up("table", 5) as running:
-        wait_for(running.is_tracking, 120, "a tracked pose", 0.2)
-        # in sight and in reach: whatever happens to the pose from here on is the messages' doing
-        for command in ({"command": "occlude", "value": 0}, {"command": "motion", "value": "off"}):
-            wait_for(lambda: running.control(command), 10, f"the emulator's answer to {command}")
-        yield running
 
 
 def good(topic: topics.Topic, stamp_ns: int) -> dict:

@@ -13,7 +13,7 @@ from shared.surface import Surface
 from sim.clearance import hull_points
 from sim.motion import Clock
 from sim.occluder import AWAY, OcclusionSchedule
-from sim.world import TICK_NS, World, record
+from sim.world import BATCH, TICK_NS, World, record
 
 CELLS = {name: cells.load(name) for name in ("table", "arm")}
 SECONDS = 60.0
@@ -216,7 +216,7 @@ def test_a_recording_is_what_the_emulator_publishes_in_order_and_again_the_same(
     first, second = (list(record(cell, 7, 0.35)) for _ in range(2))
     assert [m.stamp_ns for _, _, m in first] == sorted(m.stamp_ns for _, _, m in first)
     counts = Counter(topic.name for topic, _, _ in first)
-    assert counts == {"frame": 8, "voltages": 8 * 70, "joints": 70, "truth": 70}
+    assert counts == {"frame": 8, "voltages": 8 * 35, "joints": 35, "truth": 35}
     for (topic, names, a), (topic_again, names_again, b) in zip(first, second, strict=True):
         assert (topic, names) == (topic_again, names_again)
         for field in vars(a):
@@ -231,10 +231,10 @@ def test_recorded_voltages_are_the_laws_on_the_true_gaps():
     volts: dict[int, list[np.ndarray]] = {}
     for topic, _, m in stream:
         if topic.name == "voltages":
-            assert m.volts.shape == (5, 5) and m.period_ns == 1_000_000
+            assert m.volts.shape == (BATCH, 5) and m.period_ns == 1_000_000
             volts.setdefault(m.stamp_ns, []).append(m.volts[-1])
     signals = []
-    for m in truth[::50]:
+    for m in truth[::25]:
         state = world.state((m.stamp_ns - epoch) * 1e-9)
         gaps = world.gaps(state)
         assert m.gap == gaps.min()

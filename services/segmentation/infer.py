@@ -60,7 +60,7 @@ def cut(image: NDArray[np.uint8], window: Window) -> torch.Tensor:
     """The window (1, 3, height, width) in [0, 1] of an RGB image (h, w, 3) uint8; at scales above 1 their means."""
     if min(window.x0, window.y0) < 0 or window.bottom > image.shape[0] or window.right > image.shape[1]:
         raise ValueError(f"a window inside the image of {image.shape[1]} x {image.shape[0]} expected, {window} came")
-    part = np.ascontiguousarray(image[window.y0 : window.bottom, window.x0 : window.right])
+    part = image[window.y0 : window.bottom, window.x0 : window.right].copy()  # messages are read-only, torch wants to write
     picture = torch.from_numpy(part).permute(2, 0, 1)[None].float() / 255.0  # channels_last, as the image is
     return picture if window.scale == 1 else F.avg_pool2d(picture, window.scale)
 

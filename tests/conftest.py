@@ -1,0 +1,24 @@
+"""Fixtures that several files share."""
+
+import pytest
+
+from shared import messages, topics
+from tests.live import Running, penumbra_up, wait_for
+
+
+@pytest.fixture(scope="session")
+def running() -> Running:
+    """The whole chain on the table cell, held still in sight and in reach: what happens to the pose is the test's doing."""
+    with penumbra_up("table", 5) as running:
+        wait_for(running.is_tracking, 180, "a tracked pose", 0.2)
+        wait_for(lambda: running.control({"command": "occlude", "value": 0}), 10, "the emulator's answer")
+        truths = running.session.declare_subscriber(topics.TRUTH.at(cell="table"))
+        wait_for(lambda: in_reach(truths.recv()), 60, "the arm above the pads", 0.0)
+        wait_for(lambda: running.control({"command": "motion", "value": "off"}), 10, "the emulator's answer")
+        truths.undeclare()
+        wait_for(running.is_tracking, 20, "a tracked pose of the resting arm", 0.2)
+        yield running
+
+
+def in_reach(sample) -> bool:
+    return 0.04 < messages.decode(messages.Truth, sample.payload.to_bytes()).gap < 0.09
