@@ -128,8 +128,8 @@ def draw(
     senses = ", ".join(f"{name} {100 * source.weight:.0f} %" for name, source in sorted(pose.sources.items()))
     deviation_cm = 100 * np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3]).max())
     text = f"{cell.name}: {pose.state}, +-{deviation_cm:.1f} cm  ({senses or 'no sense heard'})"
-    for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(picture, text, (10, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, width, cv2.LINE_AA)
+    picture[:30] = (0.35 * picture[:30]).astype(np.uint8)
+    cv2.putText(picture, text, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return picture
 
 

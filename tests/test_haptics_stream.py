@@ -65,7 +65,8 @@ def test_a_window_is_complete_with_the_last_pads_batch_and_not_before(skin: Skin
 
 
 def test_a_silent_pad_is_waited_for_a_little_and_then_left_out(skin: Skin) -> None:
-    windows = play(Collector(skin), skin, [5 * MS * i for i in range(1, 61)], silent={"p3": 100 * MS})
+    collector = Collector(skin, patience_ns=30 * MS)
+    windows = play(collector, skin, [5 * MS * i for i in range(1, 61)], silent={"p3": 100 * MS})
     assert windows[-1].faults == {"p3": "silent"} and not windows[-1].alive[3]
     assert windows[-1].alive.sum() == 7 and windows[-1].newest_ns >= 290 * MS
     assert np.diff([w.newest_ns for w in windows]).max() <= 40 * MS
@@ -108,7 +109,7 @@ def test_repeated_and_overtaken_batches_are_ignored(skin: Skin) -> None:
 
 
 def test_a_reader_that_fell_behind_leaves_windows_out_until_it_has_caught_up() -> None:
-    backlog = Backlog()
+    backlog = Backlog(patience_ns=30 * MS)
     offset = 300 * MS  # the other clock is that much behind
     delays = [2, 3, 2, 50, 40, 20, 3]
     late = [backlog.is_late(10 * MS * i, 10 * MS * i + offset + delay * MS) for i, delay in enumerate(delays)]

@@ -22,6 +22,8 @@ from shared.topics import HAPTIC, JOINTS, VOLTAGES
 
 NAME = "haptics"
 WEIGHTS = Path(__file__).parent / "weights"
+LASTING_NS = 1_000_000_000
+"""A fault, or its end, is told when it has lasted this long."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +40,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
     collector = Collector(skin, length_ns=int(options.window_ms * 1e6))
     estimators = {name: _estimator(node, options, skin, name) for name in cell.targets}
     backlog = Backlog()
-    known: dict[str, str] = {}
+    told = Faults(node)
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
         poses.add(names["robot"], message.stamp_ns, message.position)
@@ -53,7 +55,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
         faults = dict(window.faults)
         if found is None:
             faults["joints"] = "no joint angles near the time of the voltages: is the robot's source running?"
-        _tell(node, known, faults)
+        told.update(faults, window.stamp_ns)
         for target, estimator in estimators.items():
             if not node.owns(f"haptic/{target}"):
                 continue
@@ -90,15 +92,27 @@ def _estimator(node: Node, options: argparse.Namespace, skin: Skin, target: str)
     return estimator
 
 
-def _tell(node: Node, known: dict[str, str], faults: dict[str, str]) -> None:
-    """Log what is left out when that changes."""
-    for name, reason in faults.items():
-        if known.get(name) != reason:
-            node.log.warning("left out", what=name, why=reason)
-    for name in known.keys() - faults.keys():
-        node.log.info("back in use", what=name)
-    known.clear()
-    known.update(faults)
+class Faults:
+    """Tells what is left out and what is back: only what lasts, so that a hiccup of the machine does not fill the log."""
+
+    def __init__(self, node: Node):
+        self._node = node
+        self._told: dict[str, str] = {}
+        self._since_ns: dict[str, int] = {}
+
+    def update(self, faults: dict[str, str], stamp_ns: int) -> None:
+        """Reasons by what is left out of the window at stamp_ns."""
+        for name in set(self._told) | set(faults) | set(self._since_ns):
+            if faults.get(name) == self._told.get(name):
+                self._since_ns.pop(name, None)
+            elif stamp_ns - self._since_ns.setdefault(name, stamp_ns) >= LASTING_NS:
+                del self._since_ns[name]
+                if name in faults:
+                    self._told[name] = faults[name]
+                    self._node.log.warning("left out", what=name, why=faults[name])
+                else:
+                    del self._told[name]
+                    self._node.log.info("back in use", what=name)
 
 
 def _message(estimate: Estimate, window: Window, target: str, frame: str) -> HapticPose:
