@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -110,9 +110,25 @@ def test_the_covariance_is_that_of_the_errors(search, hidden):
         estimate = search.update(s.mask, s.T_start, PRIOR)
         error = geometry.pose_error(s.T, estimate.T)
         nees.append(error @ np.linalg.solve(estimate.covariance, error))
-    # chi^2 with six degrees of freedom: median 5.3, 90 % below 10.6; 50 draws scatter the median by 0.6
-    assert 2.0 < np.median(nees) < 8.0
+    # chi^2 with six degrees of freedom: median 5.3, 90 % below 10.6; 50 draws scatter the median by 0.6. These masks err less
+    # than a network's, for which the noise is set: the covariance may be cautious here, but not boast.
+    assert 1.5 < np.median(nees) < 8.0
     assert np.quantile(nees, 0.9) < 22.0
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_an_upper_arm_taken_for_forearm_does_not_move_the_pose(search, tracked):
+    errors = []
+    for seed in range(1000, 1010):
+        s = scene(seed)
+        elbow = geometry.apply(T_CAMERA_WORLD @ s.T, (MESH.vertices[:, 0].min() - 0.05, 0.0, 0.02))
+        u, v = (CAMERA.K @ (elbow / elbow[2]))[:2] - (s.mask.x0, s.mask.y0)
+        labels = s.mask.labels.copy()
+        cv2.circle(labels, (round(u), round(v)), 16, int(Label.FOREARM), -1)  # 4 cm of bare upper arm
+        estimate = search.update(replace(s.mask, labels=labels), *((s.T_start, PRIOR) if tracked else ()))
+        assert estimate.state == "tracking"
+        errors.append(position_cm(s, estimate))
+    assert np.median(errors) < 1.5
 
 
 def test_depth_is_known_worst_and_the_roll_is_lost_with_the_hand(search):

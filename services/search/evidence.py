@@ -26,6 +26,9 @@ GUARD_PX = 2
 DEPTH_MARGIN = 0.05
 """What lies further than this behind the target's furthest point [m] is behind it for certain: half a limb's thickness."""
 
+FORESHORTENED = 0.4
+"""A limb whose image is shorter than this share of its length has no side beyond its end in the picture."""
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -95,6 +98,24 @@ def cover_outside(state: NDArray[np.uint8], x0: int, y0: int, scale: int, camera
     right, bottom = (camera.width - x0) // scale, (camera.height - y0) // scale
     state[:top], state[:, :left] = COVERED, COVERED
     state[max(bottom, 0) : h], state[:, max(right, 0) : w] = COVERED, COVERED
+
+
+def cover_beyond(state: NDArray[np.uint8], T: NDArray[np.float64], start: float, k: Intrinsics) -> None:
+    """Marks in place what lies beyond the near end of a limb: the body goes on there, and where bare skin meets bare skin a mask
+    does not know the joint. T_camera_target (4 x 4) has the limb along x, which begins at `start` [m]. A limb that points at the
+    camera has no such side in the image, and is left as it is.
+    """
+    ends = T[:3, 3] + np.outer([start, 0.0], T[:3, 0])
+    if ends[:, 2].min() <= 0.0:
+        return
+    (u, v), (u1, v1) = ends[:, :2] / ends[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
+    along = np.array([u1 - u, v1 - v])
+    length = float(np.hypot(*along))
+    if length < FORESHORTENED * k.fx * abs(start) / ends[0, 2]:
+        return
+    rows, columns = np.arange(state.shape[0])[:, None], np.arange(state.shape[1])
+    beyond = ((columns - u) * along[0] + (rows - v) * along[1]) / length < 0.0
+    state[beyond & (state == TARGET)] = COVERED
 
 
 def gather(state: NDArray[np.uint8], labels: NDArray[np.uint8], intrinsics: Intrinsics) -> Evidence:

@@ -36,6 +36,8 @@ PRIOR_INFLATION = 2.0
 PRIOR_FLOOR = (0.02, 0.09)
 """The prediction's standard deviations are doubled, and these [m, rad] added, before the solve leans on it: it shall only keep
 the fit from wandering off."""
+JOINT_MARGIN = 0.02
+"""Along the limb [m]: how far beyond its predicted near end the mask is still believed, for the prediction may be off."""
 DETECT_FITS = 8
 """Hypotheses that are fitted, of those that overlap best."""
 HOME_WEIGHT = 0.005
@@ -107,38 +109,63 @@ class Search:
             )
         k = Intrinsics.of_window(self._camera, mask.x0, mask.y0, mask.scale)
         T_start = self._T_camera_world @ (self._target.home.transform if T_prior is None else T_prior)
-        seen = self._gather(mask, k, T_start, joints)
         if self.method == "paper":
-            return self._paper(seen, T_start)
-        best = self._detect(seen, T_start) if T_prior is None else self._track(seen, T_start, prior_covariance)
-        return self._lost(T_start) if best is None else self._judge(seen, best)
+            return self._paper(self._gather(mask, k, T_start, joints), T_start)
+        tracked: tuple[Evidence, Fit] | None = None
+        if T_prior is not None:
+            seen = self._gather(mask, k, T_start, joints, limb=T_start)
+            first, certain = self._track(seen, T_start, prior_covariance)
+            if certain or seen.seen_px < detect.SMALLEST_PX:
+                return self._judge(seen, first)
+            tracked = seen, first
+        other = self._detect(self._gather(mask, k, T_start, joints), T_start)
+        if other is not None:
+            seen = self._gather(mask, k, T_start, joints, limb=other.T_searched)
+            other = self._fit(seen, other.T_searched, T_start, self._home_information)
+            if tracked is None or self._is_better(other, tracked[1], T_start, prior_covariance):
+                return self._judge(seen, other)
+        return self._lost(T_start) if tracked is None else self._judge(*tracked)
 
-    def _gather(self, mask: Mask, k: Intrinsics, T: Array, joints: Mapping[str, Array] | None) -> Evidence:
+    def _gather(
+        self, mask: Mask, k: Intrinsics, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None
+    ) -> Evidence:
+        """`limb`: T_camera_target of the limb, where it is known; beyond its near end nothing is believed."""
         depth = self._robots.render(joints, k, mask.labels.shape) if joints else None
         z = self._model.in_camera(T)[:, 2]
         state = evidence.classify(mask.labels, self._target.label_values, depth, (float(z.min()), float(z.max())))
         evidence.cover_outside(state, mask.x0, mask.y0, mask.scale, self._camera)
+        if limb is not None:
+            evidence.cover_beyond(state, limb, float(self._model.vertices[:, 0].min()) - JOINT_MARGIN, k)
         return evidence.gather(state, mask.labels, k)
 
-    def _track(self, seen: Evidence, T_start: Array, prior_covariance: Array | None) -> Fit | None:
+    @property
+    def _home_information(self) -> Array:
+        spread = self._target.home_spread
+        return np.diag(np.repeat([spread.position**-2.0, spread.rotation**-2.0], 3))
+
+    def _predicted(self, prior_covariance: Array | None) -> tuple[Array, Array]:
+        """The prediction's covariance along the camera's axes, and the floor that is added to it."""
         floor = np.diag(np.repeat(np.square(PRIOR_FLOOR), 3))
         covariance = np.zeros((6, 6)) if prior_covariance is None else self._axes.T @ prior_covariance @ self._axes
+        return covariance, floor
+
+    def _track(self, seen: Evidence, T_start: Array, prior_covariance: Array | None) -> tuple[Fit, bool]:
+        """The pose near the prediction, and whether it explains the mask so well that no other need be looked for."""
+        covariance, floor = self._predicted(prior_covariance)
         prior = np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64)
         first = self._with_mirror(seen, T_start, prior)
-        if seen.seen_px < detect.SMALLEST_PX:
-            return first
-        if first.misfit > MISFIT:  # beside the right pose, mostly in roll
+        if seen.seen_px >= detect.SMALLEST_PX and first.misfit > MISFIT:  # beside the right pose, mostly in roll
             beside = [self._fit(seen, T, T_start, prior) for T in detect.mirrored(first.T_searched)]
             first = min((first, *beside), key=lambda found: found.cost)
-        if first.overlap >= FITS_WELL and first.misfit < WRONG:
-            return first
-        other = self._detect(seen, T_start)
-        if other is None or other.overlap <= max(first.overlap, FITS):
-            return first
-        # another pose explains the mask better: believed where the prediction allows it, or where the prediction itself fails
+        return first, first.overlap >= FITS_WELL and first.misfit < WRONG
+
+    def _is_better(self, other: Fit, first: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
+        """Whether another pose explains the mask better, and the prediction allows it or itself fails."""
+        if other.overlap <= max(first.overlap, FITS):
+            return False
+        covariance, floor = self._predicted(prior_covariance)
         error = geometry.pose_error(other.T, T_start)
-        possible = error @ np.linalg.solve(covariance + floor + other.covariance, error) < GATE
-        return other if possible or first.overlap < FITS else first
+        return bool(first.overlap < FITS or error @ np.linalg.solve(covariance + floor + other.covariance, error) < GATE)
 
     def _with_mirror(self, seen: Evidence, T_start: Array, prior: Array) -> Fit:
         """The fit from the prediction, and that from its mirror image where both may be right: an axis nearly parallel to the
@@ -159,8 +186,7 @@ class Search:
         return replace(first, T=geometry.perturb(first.T, share * apart), covariance=covariance)
 
     def _detect(self, seen: Evidence, T_home: Array) -> Fit | None:
-        spread = self._target.home_spread
-        information = np.diag(np.repeat([spread.position**-2.0, spread.rotation**-2.0], 3))
+        spread, information = self._target.home_spread, self._home_information
 
         def score(share: float, T: Array) -> float:
             angle = np.arccos(np.clip((np.sum(T[:3, :3] * T_home[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
