@@ -64,6 +64,14 @@ def test_a_window_is_complete_with_the_last_pads_batch_and_not_before(skin: Skin
     assert done == [False] * 7 + [True]
 
 
+def test_the_first_window_waits_until_every_pad_had_its_chance(skin: Skin) -> None:
+    collector, rng = Collector(skin), np.random.default_rng(0)
+    volts = 0.21 + 0.0025 * rng.standard_normal((10, 5))  # a whole window in a batch
+    windows = [collector.add(pad, 1000 * MS, MS, volts) for pad in skin.pads]
+    assert windows[:7] == [None] * 7
+    assert windows[7] is not None and windows[7].alive.all() and set(windows[7].samples) == {10}
+
+
 def test_a_silent_pad_is_waited_for_a_little_and_then_left_out(skin: Skin) -> None:
     collector = Collector(skin, patience_ns=30 * MS)
     windows = play(collector, skin, [5 * MS * i for i in range(1, 61)], silent={"p3": 100 * MS})
@@ -159,6 +167,9 @@ def test_pads_on_a_robot_move_with_its_joints_between_two_messages() -> None:
     links = models[robot].link_transforms(first + 0.01)
     np.testing.assert_allclose(found[0], skin.T_world_pads({f"{robot}/{link}": T for link, T in links.items()}), atol=1e-12)
     np.testing.assert_allclose(found[1], first + 0.01)
+    ahead = poses.at(15 * MS)
+    assert ahead is not None
+    np.testing.assert_allclose(ahead[1], first + 0.03)  # carried on
     assert poses.at(500 * MS) is None  # too long ago
     with pytest.raises(ValueError, match="7 joint angles expected"):
         poses.add(robot, 20 * MS, np.zeros(6))

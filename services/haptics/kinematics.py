@@ -1,4 +1,5 @@
-"""Where the pads are at a moment: the robots' forward kinematics at joint angles interpolated to it."""
+"""Where the pads are at a moment: the robots' forward kinematics at joint angles interpolated to it, or carried on by the
+last velocity where voltages come before the joint angles of their time."""
 
 from __future__ import annotations
 
@@ -54,9 +55,7 @@ class PadPoses:
             with self._lock:
                 history = list(self._history[name])
             if history and history[0][0] - STALE_NS <= stamp_ns <= history[-1][0] + STALE_NS:
-                times = np.array([t - stamp_ns for t, _ in history], dtype=float)
-                angles = np.array([q for _, q in history])
-                q = np.array([np.interp(0.0, times, column) for column in angles.T])
+                q = _joints_at(history, stamp_ns)
                 links[name] = model.link_transforms(q)
             elif name in self._carriers:
                 return None
@@ -64,3 +63,12 @@ class PadPoses:
                 q = np.zeros(len(model.joints))
             joints.append(q)
         return self.skin.T_world_pads(link_names(links)), np.concatenate(joints) if joints else np.zeros(0)
+
+
+def _joints_at(history: list[tuple[int, Array]], stamp_ns: int) -> Array:
+    """Joint angles (j,) at a time, linear between the two messages around it or beside it; held before the first."""
+    after = max(1, next((i for i, (t, _) in enumerate(history) if t >= stamp_ns), len(history) - 1))
+    if len(history) == 1 or stamp_ns <= history[0][0]:
+        return history[0][1]
+    (t0, q0), (t1, q1) = history[after - 1], history[after]
+    return q0 + (q1 - q0) * ((stamp_ns - t0) / (t1 - t0))

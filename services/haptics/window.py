@@ -63,7 +63,7 @@ class Collector:
         self._stamps: list[NDArray[np.int64]] = [np.empty(0, np.int64) for _ in skin.pads]
         self._volts: list[Array] = [np.empty((0, skin.of(k).stop - skin.of(k).start)) for k in range(len(skin.pads))]
         self._newest = np.full(len(skin.pads), NEVER, dtype=np.int64)
-        self._done_ns = NEVER
+        self._done_ns = self._born_ns = NEVER
 
     def add(self, pad: str, stamp_ns: int, period_ns: int, volts: Array) -> Window | None:
         """Take a batch (samples, electrodes) whose last row has stamp_ns; returns a window when one is complete.
@@ -81,6 +81,8 @@ class Collector:
             if self._newest[k] - stamp_ns < self.patience_ns:
                 return None  # a repeated or overtaken batch
             self._forget()  # time jumped back: the source started again
+        if self._born_ns == NEVER:
+            self._born_ns = stamp_ns
         stamps = stamp_ns - period_ns * np.arange(len(volts) - 1, -1, -1, dtype=np.int64)
         fresh = stamps > max(self._newest[k], stamp_ns - 4 * self.length_ns)
         self._stamps[k] = np.concatenate([self._stamps[k], stamps[fresh]])
@@ -89,7 +91,10 @@ class Collector:
         return self._window(period_ns)
 
     def _window(self, period_ns: int) -> Window | None:
-        heard = self._newest >= self._newest.max() - self.patience_ns
+        newest_ns = int(self._newest.max())
+        if (self._newest == NEVER).any() and newest_ns - self._born_ns < self.patience_ns:
+            return None  # at the start every pad has a chance to be heard
+        heard = self._newest >= newest_ns - self.patience_ns
         end_ns = int(self._newest[heard].min())
         if self._done_ns == NEVER:  # the first window begins where the slowest living pad begins
             self._done_ns = max(int(s[0]) for s, ok in zip(self._stamps, heard, strict=True) if ok) - period_ns
@@ -134,4 +139,4 @@ class Collector:
         for k in range(len(self.skin.pads)):
             self._stamps[k], self._volts[k] = self._stamps[k][:0], self._volts[k][:0]
         self._newest[:] = NEVER
-        self._done_ns = NEVER
+        self._done_ns = self._born_ns = NEVER
