@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,17 +13,38 @@ from scipy.spatial.transform import Rotation
 
 from services.search.contour import Model
 from services.search.evidence import TARGET, Evidence
+from shared.classes import Label
+from shared.messages import Mask
 
 Array = NDArray[np.float64]
 
 SMALLEST_PX = 150
 """A region of fewer pixels has no shape to start from."""
+MOST_PARTS = 3
+"""Regions tried, from the largest: a network that errs about a piece of furniture shall not hide the target."""
 TILTS = (-0.6, -0.3, 0.0, 0.3, 0.6)
 """Samples of the axis's angle out of the image plane [rad]."""
 ROLLS = (-0.5, 0.0, 0.5, np.pi)
 """Samples of the roll about the axis, from that at home [rad]: around it, and the limb turned over."""
 SLIDES = (-0.3, -0.15, 0.0, 0.15, 0.3)
 """Samples of where the visible part's middle is on the limb, in lengths of the limb: one end may be hidden."""
+
+
+def parts(mask: Mask, target_labels: Collection[int], reach_px: float) -> Iterator[Mask]:
+    """Windows of a mask, each `reach_px` around one of its target-coloured regions, the largest first. What was tried in an
+    earlier window is marked as unknown in the later ones."""
+    labels = mask.labels.copy()
+    _, regions, stats, centroids = cv2.connectedComponentsWithStats(np.isin(labels, list(target_labels)).astype(np.uint8))
+    by_size = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA])
+    for region in by_size[:MOST_PARTS]:
+        if stats[region, cv2.CC_STAT_AREA] < SMALLEST_PX:
+            return
+        u, v = centroids[region]
+        rows = slice(max(int(v - reach_px), 0), int(v + reach_px) + 1)
+        columns = slice(max(int(u - reach_px), 0), int(u + reach_px) + 1)
+        x0, y0 = mask.x0 + columns.start * mask.scale, mask.y0 + rows.start * mask.scale
+        yield replace(mask, labels=labels[rows, columns].copy(), x0=x0, y0=y0)
+        labels[regions == region] = Label.OCCLUDER
 
 
 def hypotheses(model: Model, evidence: Evidence, T_home: Array) -> list[Array]:

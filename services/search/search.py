@@ -38,6 +38,11 @@ PRIOR_FLOOR = (0.02, 0.09)
 the fit from wandering off."""
 JOINT_MARGIN = 0.02
 """Along the limb [m]: how far beyond its predicted near end the mask is still believed, for the prediction may be off."""
+DETECT_REACH = 1.2
+"""Lengths of the target around a region of the mask that belong to it: the region may be either end."""
+HOME_GATE = 16.8
+"""Squared Mahalanobis distance from where the target is expected, six degrees of freedom, that one in 100 right poses exceeds:
+a shape further away is not believed to be the target."""
 DETECT_FITS = 8
 """Hypotheses that are fitted, of those that overlap best."""
 HOME_WEIGHT = 0.005
@@ -76,6 +81,7 @@ class Search:
         self._camera = cell.cameras[cell.one("cameras", camera)]
         self._target = cell.targets[cell.one("targets", target)]
         self._model = contour.Model(body.target_mesh(self._target, cell))
+        self._reach = DETECT_REACH * float(np.ptp(self._model.vertices, axis=0).max())
         self._noise, self._limits = noise or Noise(), Limits()
         self._T_camera_world = geometry.inverse(self._camera.T_world_camera)
         self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])  # covariances: camera axes to world axes
@@ -107,29 +113,24 @@ class Search:
                 f"mask: a window of an image of {self._camera.width} x {self._camera.height} at a scale of at least 1 expected, "
                 f"{w} x {h} at scale {mask.scale} came: check the segmentation's camera"
             )
-        k = Intrinsics.of_window(self._camera, mask.x0, mask.y0, mask.scale)
         T_start = self._T_camera_world @ (self._target.home.transform if T_prior is None else T_prior)
         if self.method == "paper":
-            return self._paper(self._gather(mask, k, T_start, joints), T_start)
+            return self._paper(self._gather(mask, T_start, joints), T_start)
         tracked: tuple[Evidence, Fit] | None = None
         if T_prior is not None:
-            seen = self._gather(mask, k, T_start, joints, limb=T_start)
+            seen = self._gather(mask, T_start, joints, limb=T_start)
             first, certain = self._track(seen, T_start, prior_covariance)
             if certain or seen.seen_px < detect.SMALLEST_PX:
                 return self._judge(seen, first)
             tracked = seen, first
-        other = self._detect(self._gather(mask, k, T_start, joints), T_start)
-        if other is not None:
-            seen = self._gather(mask, k, T_start, joints, limb=other.T_searched)
-            other = self._fit(seen, other.T_searched, T_start, self._home_information)
-            if tracked is None or self._is_better(other, tracked[1], T_start, prior_covariance):
-                return self._judge(seen, other)
+        other = self._detect(mask, T_start, joints)
+        if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
+            return self._judge(*other)
         return self._lost(T_start) if tracked is None else self._judge(*tracked)
 
-    def _gather(
-        self, mask: Mask, k: Intrinsics, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None
-    ) -> Evidence:
+    def _gather(self, mask: Mask, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None) -> Evidence:
         """`limb`: T_camera_target of the limb, where it is known; beyond its near end nothing is believed."""
+        k = Intrinsics.of_window(self._camera, mask.x0, mask.y0, mask.scale)
         depth = self._robots.render(joints, k, mask.labels.shape) if joints else None
         z = self._model.in_camera(T)[:, 2]
         state = evidence.classify(mask.labels, self._target.label_values, depth, (float(z.min()), float(z.max())))
@@ -185,7 +186,26 @@ class Search:
         covariance = (1.0 - share) * first.covariance + share * other.covariance + share * (1.0 - share) * np.outer(apart, apart)
         return replace(first, T=geometry.perturb(first.T, share * apart), covariance=covariance)
 
-    def _detect(self, seen: Evidence, T_home: Array) -> Fit | None:
+    def _detect(self, mask: Mask, T_home: Array, joints: Mapping[str, Array] | None) -> tuple[Evidence, Fit] | None:
+        """The target anywhere in the mask, not too far from home: what the first region that is well explained shows, or else
+        the best explained one."""
+        information, best = self._home_information, None
+        reach_px = self._reach * self._camera.fx / mask.scale / max(T_home[2, 3], contour.NEAR)
+        for part in detect.parts(mask, self._target.label_values, reach_px):
+            T = self._best_start(self._gather(part, T_home, joints), T_home)
+            if T is None:
+                continue
+            seen = self._gather(part, T_home, joints, limb=T)
+            found = self._fit(seen, T, T_home, information)
+            away = geometry.pose_error(found.T_searched, T_home)
+            if away @ information @ away < HOME_GATE and (best is None or found.overlap > best[1].overlap):
+                best = seen, found
+                if found.overlap >= FITS_WELL:
+                    break
+        return best
+
+    def _best_start(self, seen: Evidence, T_home: Array) -> Array | None:
+        """The pose that best explains the largest region of a mask."""
         spread, information = self._target.home_spread, self._home_information
 
         def score(share: float, T: Array) -> float:
@@ -204,7 +224,7 @@ class Search:
         best = max((fitted(T) for T in ranked[:DETECT_FITS]), key=lambda pair: pair[0])
         for T in detect.mirrored(best[1].T_searched):
             best = max(best, fitted(T), key=lambda pair: pair[0])
-        return best[1]
+        return best[1].T_searched
 
     def _fit(self, seen: Evidence, T_start: Array, T_prior: Array, prior: Array) -> Fit:
         return fit(self._model, T_start, seen, T_prior, prior, self._noise, self._limits)

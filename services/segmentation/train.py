@@ -187,7 +187,7 @@ def draw_batch(
     chosen: list[NDArray[np.uint8]], frames: int, size: int, rng: np.random.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Patches of so many frames of sequences (n, h, w, 4): images (batch, frames, 3, size, size) in [0, 1] and labels
-    (batch, frames, size, size). Three of four lie around a pixel of the target; mirrored, played backwards and coloured anew at
+    (batch, frames, size, size). Three of five lie around a pixel of the target; mirrored, played backwards and coloured anew at
     random.
     """
     images, labels = [], []
@@ -196,7 +196,7 @@ def draw_batch(
         sequence = sequence[start : start + frames]
         height, width = sequence.shape[1:3]
         middle = rng.integers(0, [height, width])
-        if rng.random() < 0.75:
+        if rng.random() < 0.6:
             target = np.argwhere(np.isin(sequence[rng.integers(len(sequence)), ..., 3], infer.TARGET_LABELS))
             if len(target):
                 middle = target[rng.integers(len(target))] + rng.integers(-size // 3, size // 3 + 1, size=2)
