@@ -28,7 +28,7 @@ from sim.person import Person, frame
 
 CELLS = ("table", "arm")
 PERIOD_S = 0.05
-ASTRAY = 0.06
+ASTRAY = 0.12
 """Share of sequences whose window lies anywhere in the frame."""
 
 
@@ -38,7 +38,7 @@ class Variety:
     [m/s] and turn [rad/s]: the target's largest; jitter [m]: how far the window's middle is off the target's."""
 
     frames: int = 8
-    size: int = 160
+    size: int = 192
     scale: tuple[float, float] = (0.4, 1.5)
     speed: float = 0.5
     turn: float = 1.2
@@ -156,7 +156,7 @@ def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.rando
         position, look_at = target + rng.uniform(1.1, 2.2) * away, target + rng.normal(0.0, 0.1, 3)
     low, high = variety.scale
     choice = rng.random()  # around 1: the crop at native resolution; around 0.5: the whole frame at scale 2
-    scale = rng.uniform(0.85, 1.15) if choice < 0.7 else rng.uniform(0.45, 0.6) if choice < 0.85 else rng.uniform(low, high)
+    scale = rng.uniform(0.85, 1.15) if choice < 0.65 else rng.uniform(0.45, 0.6) if choice < 0.87 else rng.uniform(low, high)
     scale = float(np.clip(scale, low, high))
     width, height = (max(round(scale * n), variety.size) for n in (camera.width, camera.height))
     return camera.model_copy(

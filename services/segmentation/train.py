@@ -42,7 +42,7 @@ class Schedule:
 
     peak_rate: float = 3e-3
     frames: int = 5
-    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.8, 128, 4))
+    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.15, 128, 4), (0.45, 160, 3), (0.75, 192, 2))
     reuse: int = 6
     most: int = 6000
     error_weight: float = 0.3
@@ -113,6 +113,7 @@ class Trainer:
         torch.manual_seed(seed)
         self.settings, self.schedule, self.seed = settings, schedule, seed
         self.net = PredNet(settings)
+        self.started_from: dict[str, Any] | None = None
         self.average = copy.deepcopy(self.net)
         self.optimizer = torch.optim.Adam(self.net.parameters(), betas=(0.9, 0.98))
         self.step, self.minutes = 0, 0.0
@@ -167,7 +168,15 @@ class Trainer:
         part = path.with_suffix(".part")
         content = {"net": self.net.state_dict(), "average": self.average.state_dict(), "optimizer": self.optimizer.state_dict()}
         torch.save(
-            {**content, "step": self.step, "minutes": self.minutes, "settings": asdict(self.settings), "seed": self.seed}, part
+            {
+                **content,
+                "step": self.step,
+                "minutes": self.minutes,
+                "settings": asdict(self.settings),
+                "seed": self.seed,
+                "started_from": self.started_from,
+            },
+            part,
         )
         part.replace(path)
 
@@ -179,7 +188,18 @@ class Trainer:
         trainer.net.load_state_dict(content["net"])
         trainer.average.load_state_dict(content["average"])
         trainer.optimizer.load_state_dict(content["optimizer"])
-        trainer.step, trainer.minutes = content["step"], content["minutes"]
+        trainer.step, trainer.minutes, trainer.started_from = content["step"], content["minutes"], content["started_from"]
+        return trainer
+
+    @classmethod
+    def begin(cls, path: Path, schedule: Schedule, seed: int) -> Trainer:
+        """A trainer that starts from weights with a card; the card it writes tells of them."""
+        net, card = prednet.load(path)
+        trainer = cls(net.settings, schedule, seed)
+        trainer.net.load_state_dict(net.state_dict())
+        trainer.average.load_state_dict(net.state_dict())
+        trainer.started_from = {key: card[key] for key in ("seed", "date", "started_from") if key in card}
+        trainer.started_from |= {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
         return trainer
 
 
@@ -235,6 +255,7 @@ def export(trainer: Trainer, out: Path, sequences_each: int) -> dict[str, Any]:
             "steps": trainer.step,
             "minutes": round(trainer.minutes, 1),
         },
+        **({"started_from": trainer.started_from} if trainer.started_from else {}),
         "parameters": sum(p.numel() for p in trainer.net.parameters()),
         "calibration": {"seed": seed, "target_logit_offset": offset, **calibrated},
         "held_out": {"seed": seed + 1, **held_out(trainer.average, offset, _rendered(seed + 1, sequences_each))},
@@ -259,6 +280,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of data, initial weights and batches")
     parser.add_argument("--size", type=int, nargs="+", help="channels of each layer (default: 16 16 32 64)")
     parser.add_argument("--delay", action=argparse.BooleanOptionalAction, default=False, help="axonal delays between the layers")
+    parser.add_argument("--start", type=Path, help="start from these weights, of their size and delay, instead of random ones")
     parser.add_argument("--checkpoint", type=Path, default=Path("segmentation.checkpoint"), help="written every few minutes")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if there is one")
     parser.add_argument("--data", type=Path, default=Path("segmentation-data"), help="folder of the rendered sequences (some GB)")
@@ -274,6 +296,8 @@ def main(argv: list[str] | None = None) -> int:
     schedule = Schedule()
     if options.resume and options.checkpoint.is_file():
         trainer = Trainer.restore(options.checkpoint, schedule)
+    elif options.start:
+        trainer = Trainer.begin(options.start, schedule, options.seed)
     else:
         channels = tuple(options.size or Settings.channels)
         kernels = (*(3 for _ in channels[:-2]), 5, 5)
