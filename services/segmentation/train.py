@@ -38,7 +38,7 @@ class Schedule:
     """How training goes. `peak_rate`: of Adam's one cycle; `frames`: that a step plays; `patches`: (from which progress on,
     pixels a side, sequences a batch); `reuse`: how often a sequence is visited on average while the data set grows up to `most`
     sequences; `error_weight`, `focal_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights
-    that are exported."""
+    that are exported; `seen`: (frames that the state has seen before those that are learned from, how often)."""
 
     peak_rate: float = 3e-3
     frames: int = 5
@@ -49,6 +49,7 @@ class Schedule:
     focal_weight: float = 5.0
     clip: float = 1.0
     averaging: float = 0.995
+    seen: tuple[tuple[int, float], ...] = ((0, 0.35), (4, 0.3), (12, 0.2), (36, 0.15))
 
     def rate(self, progress: float) -> float:
         """The learning rate of the one-cycle policy (Smith 2018, arXiv:1708.07120) at a progress in [0, 1]."""
@@ -57,6 +58,11 @@ class Schedule:
             return self.peak_rate * (0.05 + 0.95 * progress / rise)
         fall = min((progress - rise) / (1.0 - rise), 1.0)
         return self.peak_rate * (0.005 + 0.995 * 0.5 * (1.0 + float(np.cos(np.pi * fall))))
+
+    def before(self, rng: np.random.Generator) -> int:
+        """Frames that the state shall have seen, drawn from `seen`."""
+        counts, shares = zip(*self.seen, strict=True)
+        return int(rng.choice(counts, p=shares))
 
     def patch(self, progress: float) -> tuple[int, int]:
         """Pixels a side and sequences a batch at a progress."""
@@ -128,7 +134,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = self.schedule.rate(progress)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
-            parts = self._losses(images, labels, old_state=rng.random() < 0.3)
+            parts = self._losses(images, labels, self.schedule.before(rng))
         total = parts["dice"] + self.schedule.focal_weight * parts["focal"] + self.schedule.error_weight * parts["error"]
         self.optimizer.zero_grad()
         total.backward()
@@ -141,20 +147,21 @@ class Trainer:
                 mean.lerp_(value, 1.0 - keep)
         return {name: float(value.detach()) for name, value in parts.items()} | {"total": float(total.detach())}
 
-    def _losses(self, images: torch.Tensor, labels: torch.Tensor, old_state: bool) -> dict[str, torch.Tensor]:
-        """images (batch, frames, 3, h, w) in [0, 1], labels (batch, frames, h, w). `old_state`: first play the sequence backwards
-        without learning, so that the network is also trained with a state that has seen much, as it is in use."""
+    def _losses(self, images: torch.Tensor, labels: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
+        """images (batch, frames, 3, h, w) in [0, 1], labels (batch, frames, h, w). `before`: frames played without learning,
+        forth and back through the sequence, so that the network is also trained with a state that has seen much. Without it
+        masks decay within seconds of use."""
         frames = images.shape[1]
         state = self.net.initial_state(images.shape[0], *images.shape[-2:])
-        if old_state:
-            with torch.no_grad():
-                for t in reversed(range(1, frames)):
-                    _, _, state = self.net(images[:, t], state)
+        with torch.no_grad():
+            for n in range(before, 0, -1):  # the last one played is the second frame, from which the first is one step
+                turn, t = divmod(n, frames - 1)
+                _, _, state = self.net(images[:, t if turn % 2 == 0 else frames - 1 - t], state)
         logits, errors = [], []
         for t in range(frames):
             out, missed, state = self.net(images[:, t], state)
             logits.append(out.float())
-            if t > 0 or old_state:  # nothing can be predicted from nothing
+            if t > 0 or before:  # nothing can be predicted from nothing
                 errors.append(loss.prediction_error([m.float() for m in missed]))
         all_logits, all_labels = torch.cat(logits), labels.transpose(0, 1).flatten(0, 1)
         return {
