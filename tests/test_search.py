@@ -210,6 +210,51 @@ def test_without_a_prediction_most_arms_are_found_from_the_mask_alone(search, hi
     assert np.min(ends) > 0.5  # the hand is where the hand is
 
 
+def in_the_whole_frame(mask: Mask) -> Mask:
+    labels = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    h, w = mask.labels.shape
+    labels[mask.y0 : mask.y0 + h, mask.x0 : mask.x0 + w] = mask.labels
+    return replace(mask, labels=labels, x0=0, y0=0)
+
+
+def test_a_larger_thing_that_the_network_takes_for_the_target_does_not_hide_it(search):
+    for seed in range(3000, 3006):
+        s = scene(seed)
+        mask = in_the_whole_frame(s.mask)
+        mask.labels[380:470, 420:620] = Label.FOREARM
+        found = search.update(mask)
+        assert found.state == "tracking"
+        assert position_cm(s, found) < 4.0
+
+
+def test_what_has_the_targets_shape_far_from_home_is_not_the_target(search):
+    s = scene(5)
+    far = geometry.transform([0.0, 0.55, 0.0])
+    moved = T_CAMERA_WORLD @ (far @ s.T)
+    labels = raster.silhouette(
+        geometry.apply(moved, MESH.vertices),
+        MESH.faces,
+        (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy),
+        (0, 0, CAMERA.width, CAMERA.height),
+    ).astype(np.uint8) * np.uint8(Label.FOREARM)
+    assert np.count_nonzero(labels) > detect.SMALLEST_PX
+    mask = Mask(stamp_ns=0, labels=labels, x0=0, y0=0, scale=1)
+    assert search.update(mask).state == "lost"
+    assert search.update(mask, far @ s.T, PRIOR).state == "tracking"  # but what was followed to there is
+
+
+def test_a_small_piece_is_believed_only_where_a_sure_prediction_expects_it(search):
+    unsure = PRIOR + np.diag([0.1**2] * 3 + [0.5**2] * 3)
+    aside = CAMERA.T_world_camera[:3, 0]
+    for seed in range(1000, 1005):
+        s = scene(seed, hidden=0.7)
+        assert search.update(s.mask, s.T, PRIOR).state == "tracking"
+        elsewhere = s.T.copy()
+        elsewhere[:3, 3] += 0.08 * aside
+        for estimate in (search.update(s.mask), search.update(s.mask, s.T, unsure), search.update(s.mask, elsewhere, PRIOR)):
+            assert estimate.state != "tracking"
+
+
 def test_a_coarser_mask_and_one_that_hangs_over_the_border_give_the_same_pose(search):
     s = scene(7, size=256)
     coarse = Mask(stamp_ns=0, labels=np.ascontiguousarray(s.mask.labels[::2, ::2]), x0=s.mask.x0, y0=s.mask.y0, scale=2)

@@ -32,6 +32,13 @@ WRONG = 6.0
 """`Fit.misfit` from which a pose is wrong whatever its overlap."""
 GATE = 27.9
 """Squared Mahalanobis distance, six degrees of freedom, that one in 10^4 right poses exceeds."""
+RECOGNISED = 0.5
+"""Up to this hidden share a shape is the target's; a smaller piece may be anything, and is believed only where a sure prediction
+expects it."""
+SURE = 0.05
+"""Standard deviation of the position [m] along its worst direction up to which a prediction is sure."""
+EXPECTED = 10.6
+"""Squared Mahalanobis distance, six degrees of freedom, from such a prediction that one in 10 right poses exceeds."""
 PRIOR_INFLATION = 2.0
 PRIOR_FLOOR = (0.02, 0.09)
 """The prediction's standard deviations are doubled, and these [m, rad] added, before the solve leans on it: it shall only keep
@@ -120,13 +127,16 @@ class Search:
         if T_prior is not None:
             seen = self._gather(mask, T_start, joints, limb=T_start)
             first, certain = self._track(seen, T_start, prior_covariance)
-            if certain or seen.seen_px < detect.SMALLEST_PX:
-                return self._judge(seen, first)
             tracked = seen, first
+            if certain or seen.seen_px < detect.SMALLEST_PX:
+                return self._judge(*tracked, self._is_expected(first, T_start, prior_covariance))
         other = self._detect(mask, T_start, joints)
         if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
-            return self._judge(*other)
-        return self._lost(T_start) if tracked is None else self._judge(*tracked)
+            tracked = other
+        if tracked is None:
+            return self._lost(T_start)
+        expected = T_prior is not None and self._is_expected(tracked[1], T_start, prior_covariance)
+        return self._judge(*tracked, expected)
 
     def _gather(self, mask: Mask, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None) -> Evidence:
         """`limb`: T_camera_target of the limb, where it is known; beyond its near end nothing is believed."""
@@ -167,6 +177,15 @@ class Search:
         covariance, floor = self._predicted(prior_covariance)
         error = geometry.pose_error(other.T, T_start)
         return bool(first.overlap < FITS or error @ np.linalg.solve(covariance + floor + other.covariance, error) < GATE)
+
+    def _is_expected(self, found: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
+        """Whether the prediction is sure, and the pose found is where it says."""
+        covariance, floor = self._predicted(prior_covariance)
+        if np.linalg.eigvalsh(covariance[:3, :3])[-1] > SURE**2:
+            return False
+        error = geometry.pose_error(found.T, T_start)
+        uncertain = covariance + found.covariance + (floor if prior_covariance is None else 0.0)
+        return bool(error @ np.linalg.solve(uncertain, error) < EXPECTED)
 
     def _with_mirror(self, seen: Evidence, T_start: Array, prior: Array) -> Fit:
         """The fit from the prediction, and that from its mirror image where both may be right: an axis nearly parallel to the
@@ -234,11 +253,12 @@ class Search:
         both, free = evidence.compare(seen.state, self._model.silhouette(T, seen.intrinsics, (0, 0, w, h)))
         return both / max(seen.seen_px + free, 1)
 
-    def _judge(self, seen: Evidence, best: Fit) -> VisionEstimate:
+    def _judge(self, seen: Evidence, best: Fit, expected: bool) -> VisionEstimate:
+        """`expected`: a sure prediction says the same."""
         amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
         hidden = float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0))
         explained = 1.0 - (best.both + best.free) / amodal  # covered, or outside the window
-        if hidden > HIDDEN or best.length < SHORTEST_PX:
+        if hidden > (HIDDEN if expected else RECOGNISED) or best.length < SHORTEST_PX:
             state: State = "occluded" if explained > 0.5 else "lost"
         else:
             state = "tracking" if best.overlap >= FITS and best.misfit < WRONG else "lost"
