@@ -131,13 +131,13 @@ def occluder(rng: np.random.Generator) -> Texture:
 
 
 def person(rng: np.random.Generator) -> dict[Label, Appearance]:
-    """Skin, and clothes: a sleeve of any length on the forearm, the same cloth on upper arm and torso."""
+    """Skin, and clothes of one cloth: mostly short sleeves, some rolled up on the forearm or down to the wrist."""
     bare, shirt = skin(rng), cloth(rng)
     gloss = rng.uniform(0.0, 0.06)
     length = rng.uniform()
-    if length < 0.65:  # short sleeves
+    if length < 0.85:  # short sleeves
         forearm, upper_arm = Appearance(bare, gloss=gloss), Appearance(bare, shirt, rng.uniform(0.1, 0.32), gloss)
-    elif length < 0.8:  # rolled up somewhere on the forearm
+    elif length < 0.93:  # rolled up somewhere on the forearm
         forearm, upper_arm = Appearance(bare, shirt, rng.uniform(-0.12, 0.1), gloss), Appearance(shirt)
     else:
         forearm, upper_arm = Appearance(bare, shirt, rng.uniform(0.1, 0.15), gloss), Appearance(shirt)

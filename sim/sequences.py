@@ -137,7 +137,7 @@ def _path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.G
     """Poses (frames, 4, 4) of the target at a constant twist; one sequence of seven stands still."""
     position = rng.uniform(np.subtract(motion.low, 0.06), np.add(motion.high, 0.06))
     rpy = 1.4 * rng.uniform(motion.rpy_low, motion.rpy_high)
-    if rng.random() < 0.25:
+    if rng.random() < 0.15:
         rpy += rng.normal(0.0, (1.2, 0.3, 0.5))
     twist = np.concatenate([_direction(rng) * variety.speed, _direction(rng) * variety.turn]) * rng.random() ** 1.5
     if rng.random() < 1.0 / 7.0:
@@ -147,16 +147,16 @@ def _path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.G
 
 
 def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.random.Generator) -> cells.Camera:
-    """A camera near the cell's or, once in ten, anywhere around the target; its resolution scaled."""
+    """A camera near the cell's or, once in twenty, anywhere around the target; its resolution scaled."""
     position = np.asarray(camera.position) + rng.normal(0.0, 0.1, 3)
     look_at = np.asarray(camera.look_at or target) + rng.normal(0.0, 0.08, 3)
-    if rng.random() < 0.1:
+    if rng.random() < 0.05:
         azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.1, 1.3)
         away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
         position, look_at = target + rng.uniform(1.1, 2.2) * away, target + rng.normal(0.0, 0.1, 3)
     low, high = variety.scale
     choice = rng.random()  # around 1: the crop at native resolution; around 0.5: the whole frame at scale 2
-    scale = rng.uniform(0.85, 1.15) if choice < 0.65 else rng.uniform(0.45, 0.6) if choice < 0.87 else rng.uniform(low, high)
+    scale = rng.uniform(0.85, 1.15) if choice < 0.65 else rng.uniform(0.45, 0.6) if choice < 0.93 else rng.uniform(low, high)
     scale = float(np.clip(scale, low, high))
     width, height = (max(round(scale * n), variety.size) for n in (camera.width, camera.height))
     return camera.model_copy(
@@ -229,7 +229,7 @@ def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, 
     another shape somewhere on the line of sight."""
     frames = len(times)
     looks = Appearance(appearance.occluder(rng))
-    if rng.random() < 0.4:
+    if rng.random() < 0.6:
         panel = Panel(int(rng.integers(2**31)))
         level = rng.uniform(-0.5, 1.0) + times * rng.choice([0.0, rng.normal(0.0, 2.5)])
         poses = [panel.pose(float(np.clip(a, -0.99, 1.0)), camera, target, T) for a, T in zip(level, T_target, strict=True)]

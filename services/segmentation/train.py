@@ -43,13 +43,13 @@ class Schedule:
     peak_rate: float = 3e-3
     frames: int = 5
     patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.15, 128, 4), (0.45, 160, 3), (0.75, 192, 2))
-    reuse: int = 6
+    reuse: int = 4
     most: int = 6000
     error_weight: float = 0.3
     focal_weight: float = 5.0
     clip: float = 1.0
     averaging: float = 0.995
-    seen: tuple[tuple[int, float], ...] = ((0, 0.35), (4, 0.3), (12, 0.2), (36, 0.15))
+    seen: tuple[tuple[int, float], ...] = ((0, 0.4), (4, 0.3), (12, 0.2), (36, 0.1))
 
     def rate(self, progress: float) -> float:
         """The learning rate of the one-cycle policy (Smith 2018, arXiv:1708.07120) at a progress in [0, 1]."""
