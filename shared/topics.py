@@ -37,11 +37,11 @@ class Topic:
 
 
 FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, "emulator", "one RGB image")
-JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 100, 16, 0.1, "emulator", "joint angles [rad]")
-VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 100, 32, 0.1, "emulator",
+JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, "emulator", "joint angles [rad]")
+VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1, "emulator",
                  "electrode amplitudes [V], 1 kHz in batches")  # fmt: skip
 TRUTH = Topic(
-    "truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 100, 16, 0.2, "emulator", "what the emulator knows"
+    "truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 50, 16, 0.2, "emulator", "what the emulator knows"
 )
 MASK = Topic(
     "mask",
@@ -55,7 +55,7 @@ MASK = Topic(
 )
 VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, "search",
                "the camera's pose and covariance")  # fmt: skip
-HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 100, 16, 0.1, "haptics",
+HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 50, 16, 0.1, "haptics",
                "the skin's pose and information")  # fmt: skip
 FUSED = Topic("fused", "penumbra/{cell}/target/{target}/pose/fused", messages.FusedPose, 200, 4, 0.1, "fusion", "the one pose")
 

@@ -175,7 +175,7 @@ class World:
         self.occlusion_clock.set_rate(time_s, 0.0 if self._paused else 1.0)
 
 
-BATCH = 10
+BATCH = 20
 """Samples of a voltage message."""
 SAMPLE_NS = 1_000_000
 """Time between two samples of an electrode."""

@@ -50,7 +50,7 @@ def play(collector: Collector, skin: Skin, stamps: list[int], silent: dict[str, 
 
 
 def test_windows_do_not_overlap_and_are_stamped_at_their_middle(skin: Skin) -> None:
-    windows = play(Collector(skin), skin, [1_000_000_000 + 5 * MS * i for i in range(1, 41)])
+    windows = play(Collector(skin, 10 * MS), skin, [1_000_000_000 + 5 * MS * i for i in range(1, 41)])
     assert len(windows) == 20
     assert all(set(w.samples) == {10} and w.alive.all() and not w.faults for w in windows)
     assert [w.newest_ns - w.stamp_ns for w in windows] == [4_500_000] * 20  # the middle of 0, 1, … 9 ms
@@ -58,14 +58,14 @@ def test_windows_do_not_overlap_and_are_stamped_at_their_middle(skin: Skin) -> N
 
 
 def test_a_window_is_complete_with_the_last_pads_batch_and_not_before(skin: Skin) -> None:
-    collector, rng = Collector(skin), np.random.default_rng(0)
+    collector, rng = Collector(skin, 10 * MS), np.random.default_rng(0)
     for stamp in (5 * MS, 10 * MS):
         done = [collector.add(pad, stamp, MS, batch(skin, rng)) is not None for pad in skin.pads]
     assert done == [False] * 7 + [True]
 
 
 def test_the_first_window_waits_until_every_pad_had_its_chance(skin: Skin) -> None:
-    collector, rng = Collector(skin), np.random.default_rng(0)
+    collector, rng = Collector(skin, 10 * MS), np.random.default_rng(0)
     volts = 0.21 + 0.0025 * rng.standard_normal((10, 5))  # a whole window in a batch
     windows = [collector.add(pad, 1000 * MS, MS, volts) for pad in skin.pads]
     assert windows[:7] == [None] * 7
@@ -73,7 +73,7 @@ def test_the_first_window_waits_until_every_pad_had_its_chance(skin: Skin) -> No
 
 
 def test_a_silent_pad_is_waited_for_a_little_and_then_left_out(skin: Skin) -> None:
-    collector = Collector(skin, patience_ns=30 * MS)
+    collector = Collector(skin, 10 * MS, patience_ns=30 * MS)
     windows = play(collector, skin, [5 * MS * i for i in range(1, 61)], silent={"p3": 100 * MS})
     assert windows[-1].faults == {"p3": "silent"} and not windows[-1].alive[3]
     assert windows[-1].alive.sum() == 7 and windows[-1].newest_ns >= 290 * MS
@@ -84,7 +84,7 @@ def test_a_silent_pad_is_waited_for_a_little_and_then_left_out(skin: Skin) -> No
     ("level", "fault"), [(3.3, "saturated"), (0.0, "saturated"), (3.1, "out of range"), (0.02, "out of range")]
 )
 def test_a_pad_that_reads_what_it_cannot_is_left_out(skin: Skin, level: float, fault: str) -> None:
-    collector, rng = Collector(skin), np.random.default_rng(0)
+    collector, rng = Collector(skin, 10 * MS), np.random.default_rng(0)
     windows = []
     for stamp in (5 * MS, 10 * MS):
         for pad in skin.pads:
@@ -95,7 +95,7 @@ def test_a_pad_that_reads_what_it_cannot_is_left_out(skin: Skin, level: float, f
 
 
 def test_a_pad_without_any_noise_is_stuck(skin: Skin) -> None:
-    collector, rng = Collector(skin), np.random.default_rng(0)
+    collector, rng = Collector(skin, 10 * MS), np.random.default_rng(0)
     for stamp in (5 * MS, 10 * MS):
         for pad in skin.pads:
             window = collector.add(pad, stamp, MS, np.full((5, 5), 0.21) if pad == "p0" else batch(skin, rng))
@@ -103,7 +103,7 @@ def test_a_pad_without_any_noise_is_stuck(skin: Skin) -> None:
 
 
 def test_after_a_cut_a_window_holds_new_samples_only_and_a_restart_of_the_source_is_followed(skin: Skin) -> None:
-    collector = Collector(skin)
+    collector = Collector(skin, 10 * MS)
     play(collector, skin, [5 * MS, 10 * MS])
     (later,) = play(collector, skin, [500 * MS])
     assert later.newest_ns == 500 * MS and later.newest_ns - later.stamp_ns < 10 * MS
@@ -111,7 +111,7 @@ def test_after_a_cut_a_window_holds_new_samples_only_and_a_restart_of_the_source
 
 
 def test_repeated_and_overtaken_batches_are_ignored(skin: Skin) -> None:
-    windows = play(Collector(skin), skin, [5 * MS, 5 * MS, 10 * MS, 5 * MS, 15 * MS, 20 * MS])
+    windows = play(Collector(skin, 10 * MS), skin, [5 * MS, 5 * MS, 10 * MS, 5 * MS, 15 * MS, 20 * MS])
     assert [w.newest_ns for w in windows] == [10 * MS, 20 * MS]
     assert all(set(w.samples) == {10} for w in windows)
 
@@ -125,7 +125,7 @@ def test_a_reader_that_fell_behind_leaves_windows_out_until_it_has_caught_up() -
 
 
 def test_other_rates_give_windows_too(skin: Skin) -> None:
-    collector, rng = Collector(skin), np.random.default_rng(0)
+    collector, rng = Collector(skin, 10 * MS), np.random.default_rng(0)
     stamps = (np.arange(1, 231) * 1e9 / 231).astype(int)  # the board's own pace: single rows, 231 a second
     windows = [
         w
@@ -138,7 +138,7 @@ def test_other_rates_give_windows_too(skin: Skin) -> None:
 
 
 def test_a_batch_that_fits_no_pad_is_refused_in_words(skin: Skin) -> None:
-    collector = Collector(skin)
+    collector = Collector(skin, 10 * MS)
     with pytest.raises(ValueError, match=r"a pad of p0, .* expected, 'p9' came"):
         collector.add("p9", 1, MS, np.zeros((5, 5)))
     with pytest.raises(ValueError, match="rows of 5 electrodes expected"):

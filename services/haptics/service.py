@@ -1,4 +1,4 @@
-"""Voltages and joint angles in, haptic poses out: one for each window of the skin's own samples, 100 a second."""
+"""Voltages and joint angles in, haptic poses out: one for each window of the skin's own samples, 50 a second."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     method = "solve: least squares, started by the network; paper: the network alone (default: %(default)s)"
     parser.add_argument("--method", choices=("solve", "paper"), default="solve", help=method)
     parser.add_argument("--weights", type=Path, default=WEIGHTS, help="folder of CELL-TARGET.npz (default: the built-in ones)")
-    parser.add_argument("--window-ms", type=float, default=10.0, help="voltages averaged for one pose (default: %(default)s)")
+    parser.add_argument("--window-ms", type=float, default=20.0, help="voltages averaged for one pose (default: %(default)s)")
 
 
 def start(node: Node, options: argparse.Namespace) -> None:

@@ -55,7 +55,7 @@ class Collector:
     no longer waited for. Raises ValueError for a length that is not positive.
     """
 
-    def __init__(self, skin: Skin, length_ns: int = 10_000_000, patience_ns: int = 100_000_000):
+    def __init__(self, skin: Skin, length_ns: int, patience_ns: int = 100_000_000):
         if length_ns <= 0:
             raise ValueError(f"a window longer than nothing expected, {length_ns} ns came: give --window-ms above zero")
         self.skin, self.length_ns, self.patience_ns = skin, length_ns, patience_ns
