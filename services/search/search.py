@@ -50,6 +50,8 @@ DETECT_REACH = 1.2
 HOME_GATE = 16.8
 """Squared Mahalanobis distance from where the target is expected, six degrees of freedom, that one in 100 right poses exceeds:
 a shape further away is not believed to be the target."""
+DETECT_EVERY_NS = 200_000_000
+"""Least time between two detections: each takes as long as twenty frames that are tracked."""
 DETECT_FITS = 8
 """Hypotheses that are fitted, of those that overlap best."""
 HOME_WEIGHT = 0.005
@@ -93,6 +95,7 @@ class Search:
         self._T_camera_world = geometry.inverse(self._camera.T_world_camera)
         self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])  # covariances: camera axes to world axes
         self._robots = RobotDepth(cell, self._T_camera_world)
+        self._detected_ns: int | None = None
 
     def prepare(self) -> None:
         """Compiles what `update` needs, so that the first frame does not wait for it."""
@@ -130,7 +133,7 @@ class Search:
             tracked = seen, first
             if certain or seen.seen_px < detect.SMALLEST_PX:
                 return self._judge(*tracked, self._is_expected(first, T_start, prior_covariance))
-        other = self._detect(mask, T_start, joints)
+        other = self._detect(mask, T_start, joints) if self._is_detection_due(mask.stamp_ns) else None
         if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
             tracked = other
         if tracked is None:
@@ -204,6 +207,12 @@ class Search:
         apart = geometry.pose_error(other.T, first.T)
         covariance = (1.0 - share) * first.covariance + share * other.covariance + share * (1.0 - share) * np.outer(apart, apart)
         return replace(first, T=geometry.perturb(first.T, share * apart), covariance=covariance)
+
+    def _is_detection_due(self, stamp_ns: int) -> bool:
+        if self._detected_ns is not None and 0 < stamp_ns - self._detected_ns < DETECT_EVERY_NS:
+            return False
+        self._detected_ns = stamp_ns
+        return True
 
     def _detect(self, mask: Mask, T_home: Array, joints: Mapping[str, Array] | None) -> tuple[Evidence, Fit] | None:
         """The target anywhere in the mask, not too far from home: what the first region that is well explained shows, or else
