@@ -258,7 +258,7 @@ def test_a_small_piece_is_believed_only_where_a_sure_prediction_expects_it(searc
 def test_the_costly_search_of_the_whole_mask_waits_a_little_before_it_is_tried_again(search):
     s = scene(3000)
     second = 10**9
-    stamps = (5 * second, 5 * second + 50_000_000, 5 * second + 250_000_000, second)  # the last one: a recording starts again
+    stamps = (5 * second, 5 * second + 50_000_000, 5 * second + 300_000_000, second)  # the last one: a recording starts again
     states = [search.update(replace(s.mask, stamp_ns=stamp)).state for stamp in stamps]
     assert states == ["tracking", "lost", "tracking", "tracking"]
 

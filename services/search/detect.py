@@ -24,17 +24,19 @@ MOST_PARTS = 3
 """Regions tried, from the largest: a network that errs about a piece of furniture shall not hide the target."""
 TILTS = (-0.6, -0.3, 0.0, 0.3, 0.6)
 """Samples of the axis's angle out of the image plane [rad]."""
-ROLLS = (-0.5, 0.0, 0.5, np.pi)
+ROLLS = (0.0, np.pi)
 """Samples of the roll about the axis, from that at home [rad]: around it, and the limb turned over."""
 SLIDES = (-0.3, -0.15, 0.0, 0.15, 0.3)
 """Samples of where the visible part's middle is on the limb, in lengths of the limb: one end may be hidden."""
 
 
-def parts(mask: Mask, target_labels: Collection[int], reach_px: float) -> Iterator[Mask]:
-    """Windows of a mask, each `reach_px` around one of its target-coloured regions, the largest first. What was tried in an
-    earlier window is marked as unknown in the later ones."""
+def regions(mask: Mask, target_labels: Collection[int], reach_px: float) -> Iterator[tuple[Mask, list[Mask]]]:
+    """Windows of a mask, each `reach_px` around one of its target-coloured regions, the largest first, and the same with less of
+    the region to start from: all of it, then either half, for where the upper arm is bare a network may colour it too, and the
+    region has a bend. The rest, and the regions of earlier windows, are marked as unknown.
+    """
     labels = mask.labels.copy()
-    _, regions, stats, centroids = cv2.connectedComponentsWithStats(np.isin(labels, list(target_labels)).astype(np.uint8))
+    _, numbers, stats, centroids = cv2.connectedComponentsWithStats(np.isin(labels, list(target_labels)).astype(np.uint8))
     by_size = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA])
     for region in by_size[:MOST_PARTS]:
         if stats[region, cv2.CC_STAT_AREA] < SMALLEST_PX:
@@ -43,8 +45,25 @@ def parts(mask: Mask, target_labels: Collection[int], reach_px: float) -> Iterat
         rows = slice(max(int(v - reach_px), 0), int(v + reach_px) + 1)
         columns = slice(max(int(u - reach_px), 0), int(u + reach_px) + 1)
         x0, y0 = mask.x0 + columns.start * mask.scale, mask.y0 + rows.start * mask.scale
-        yield replace(mask, labels=labels[rows, columns].copy(), x0=x0, y0=y0)
-        labels[regions == region] = Label.OCCLUDER
+        inside = numbers == region
+        window = replace(mask, labels=np.ascontiguousarray(labels[rows, columns]), x0=x0, y0=y0)
+        halves = [
+            replace(window, labels=np.where(other[rows, columns], np.uint8(Label.OCCLUDER), window.labels))
+            for other in _halves(inside)
+        ]
+        yield window, [window, *halves]
+        labels = np.where(inside, np.uint8(Label.OCCLUDER), labels)
+
+
+def _halves(inside: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """A region (h, w) cut across its longest direction through its middle."""
+    pixels = np.argwhere(inside)
+    from_middle = pixels - pixels.mean(axis=0)
+    longest = np.linalg.eigh(from_middle.T @ from_middle)[1][:, 1]
+    one, other = np.zeros_like(inside), np.zeros_like(inside)
+    one[tuple(pixels[from_middle @ longest > 0.0].T)] = True
+    other[tuple(pixels[from_middle @ longest <= 0.0].T)] = True
+    return one, other
 
 
 def hypotheses(model: Model, evidence: Evidence, T_home: Array) -> list[Array]:
@@ -98,7 +117,7 @@ def mirrored(T: Array) -> list[Array]:
 def _directions(evidence: Evidence, rows: NDArray[np.intp], columns: NDArray[np.intp], axis: Array) -> list[Array]:
     """The axis (2,) in the image, pointing to the hand; both ways where the hand is not told apart."""
     is_hand = evidence.hand[rows, columns] != 0
-    if not 0.02 < is_hand.mean() < 0.98:
+    if not 0.02 < is_hand.mean() < 0.75:  # where nearly all is called a hand, the network guesses
         return [axis, -axis]
     pixels = np.column_stack([columns, rows])
     lead = (pixels[is_hand].mean(axis=0) - pixels[~is_hand].mean(axis=0)) @ axis

@@ -50,9 +50,11 @@ DETECT_REACH = 1.2
 HOME_GATE = 16.8
 """Squared Mahalanobis distance from where the target is expected, six degrees of freedom, that one in 100 right poses exceeds:
 a shape further away is not believed to be the target."""
-DETECT_EVERY_NS = 200_000_000
+DETECT_EVERY_NS = 250_000_000
 """Least time between two detections: each takes as long as twenty frames that are tracked."""
-DETECT_FITS = 8
+EXPLAINED = 0.5
+"""Overlap with all of a region, a bare upper arm included, from which no other region is tried."""
+DETECT_FITS = 4
 """Hypotheses that are fitted, of those that overlap best."""
 HOME_WEIGHT = 0.005
 """Overlap that one standard deviation from home costs a detection: decides between mirror images, which overlap equally."""
@@ -215,21 +217,25 @@ class Search:
         return True
 
     def _detect(self, mask: Mask, T_home: Array, joints: Mapping[str, Array] | None) -> tuple[Evidence, Fit] | None:
-        """The target anywhere in the mask, not too far from home: what the first region that is well explained shows, or else
-        the best explained one."""
-        information, best = self._home_information, None
+        """The target anywhere in the mask, not too far from home: the pose that explains most of the first region it fits."""
+        information, best, most = self._home_information, None, (False, 0.0)
         reach_px = self._reach * self._camera.fx / mask.scale / max(T_home[2, 3], contour.NEAR)
-        for part in detect.parts(mask, self._target.label_values, reach_px):
-            T = self._best_start(self._gather(part, T_home, joints), T_home)
-            if T is None:
-                continue
-            seen = self._gather(part, T_home, joints, limb=T)
-            found = self._fit(seen, T, T_home, information)
-            away = geometry.pose_error(found.T_searched, T_home)
-            if away @ information @ away < HOME_GATE and (best is None or found.overlap > best[1].overlap):
-                best = seen, found
-                if found.overlap >= FITS_WELL:
-                    break
+        for window, pieces in detect.regions(mask, self._target.label_values, reach_px):
+            whole = self._gather(window, T_home, joints)
+            for piece in pieces:
+                T = self._best_start(self._gather(piece, T_home, joints), T_home)
+                if T is None:
+                    continue
+                seen = self._gather(window, T, joints, limb=T)
+                found = self._fit(seen, T, T_home, information)
+                away = geometry.pose_error(found.T_searched, T_home)
+                fits = found.overlap >= FITS, self._overlap(whole, found.T_searched)
+                if away @ information @ away < HOME_GATE and fits > most:
+                    best, most = (seen, found), fits
+                if most > (True, FITS):
+                    return best
+            if most > (True, EXPLAINED):
+                break
         return best
 
     def _best_start(self, seen: Evidence, T_home: Array) -> Array | None:
