@@ -144,6 +144,17 @@ def test_training_that_was_interrupted_ends_with_the_same_weights(data, tmp_path
         torch.testing.assert_close(a, b, msg=name)
 
 
+def test_training_may_start_from_weights_and_its_card_tells_of_them(tmp_path):
+    net = PredNet(SMALL)
+    prednet.save(tmp_path / "old.npz", net, {"seed": 7, "date": "2026-01-01", "settings": {"minutes": 3.0}})
+    trainer = train.Trainer.begin(tmp_path / "old.npz", train.Schedule(), seed=1)
+    for a, b in zip(net.parameters(), trainer.net.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)  # half precision
+    trainer.save(tmp_path / "checkpoint")
+    again = train.Trainer.restore(tmp_path / "checkpoint", train.Schedule())
+    assert again.started_from == {"seed": 7, "date": "2026-01-01", "minutes": 3.0}
+
+
 def test_training_lowers_the_loss(data):
     trainer = train.Trainer(SMALL, train.Schedule(frames=2, patches=((0.0, 64, 4),), most=24), seed=1)
     losses = [trainer.train_step(data, 0.15)["focal"] for _ in range(40)]

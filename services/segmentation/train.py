@@ -12,6 +12,7 @@ import copy
 import datetime
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -299,6 +300,7 @@ def arguments() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Train, then write weights and card."""
     options = arguments().parse_args(argv)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C: checkpoint written, renderer stopped
     torch.set_num_threads(1)
     schedule = Schedule()
     if options.resume and options.checkpoint.is_file():
