@@ -43,7 +43,7 @@ class Schedule:
 
     peak_rate: float = 3e-3
     frames: int = 5
-    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.15, 128, 4), (0.45, 160, 3), (0.75, 192, 2))
+    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.15, 128, 4), (0.45, 160, 3))
     reuse: int = 4
     most: int = 6000
     error_weight: float = 0.3
