@@ -50,8 +50,8 @@ DETECT_REACH = 1.2
 HOME_GATE = 16.8
 """Squared Mahalanobis distance from where the target is expected, six degrees of freedom, that one in 100 right poses exceeds:
 a shape further away is not believed to be the target."""
-DETECT_EVERY_NS = 250_000_000
-"""Least time between two detections: each takes as long as twenty frames that are tracked."""
+DETECT_EVERY_NS = {"lost": 250_000_000, "doubtful": 1_000_000_000}
+"""Least time between two detections, for each takes as long as twenty frames that are tracked."""
 EXPLAINED = 0.5
 """Overlap with all of a region, a bare upper arm included, from which no other region is tried."""
 DETECT_FITS = 4
@@ -135,7 +135,9 @@ class Search:
             tracked = seen, first
             if certain or seen.seen_px < detect.SMALLEST_PX:
                 return self._judge(*tracked, self._is_expected(first, T_start, prior_covariance))
-        other = self._detect(mask, T_start, joints) if self._is_detection_due(mask.stamp_ns) else None
+        usable = tracked is not None and tracked[1].overlap >= FITS and tracked[1].misfit < WRONG
+        due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost")
+        other = self._detect(mask, T_start, joints) if due else None
         if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
             tracked = other
         if tracked is None:
@@ -210,8 +212,8 @@ class Search:
         covariance = (1.0 - share) * first.covariance + share * other.covariance + share * (1.0 - share) * np.outer(apart, apart)
         return replace(first, T=geometry.perturb(first.T, share * apart), covariance=covariance)
 
-    def _is_detection_due(self, stamp_ns: int) -> bool:
-        if self._detected_ns is not None and 0 < stamp_ns - self._detected_ns < DETECT_EVERY_NS:
+    def _is_detection_due(self, stamp_ns: int, case: str) -> bool:
+        if self._detected_ns is not None and 0 < stamp_ns - self._detected_ns < DETECT_EVERY_NS[case]:
             return False
         self._detected_ns = stamp_ns
         return True
