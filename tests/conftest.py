@@ -6,6 +6,11 @@ from shared import messages, topics
 from tests.live import Running, penumbra_up, wait_for
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of the running chain come last: it would take the cores from all others until the session ends."""
+    items.sort(key=lambda item: "running" in getattr(item, "fixturenames", ()))
+
+
 @pytest.fixture(scope="session")
 def running() -> Running:
     """The whole chain on the table cell, held still in sight and in reach: what happens to the pose is the test's doing."""

@@ -65,6 +65,11 @@ class Running:
         pose = self.pose()
         return pose is not None and pose["state"] == "tracking" and pose["stamp_ns"] > after_ns
 
+    def has_pose(self, after_ns: int = 0) -> bool:
+        """Whether a pose newer than `after_ns` is known: tracked or, on a busy machine, bridged between two measurements."""
+        pose = self.pose()
+        return pose is not None and pose["state"] != "lost" and pose["stamp_ns"] > after_ns
+
     def control(self, command: dict) -> dict | None:
         """The emulator's answer to a control command, or None where nobody answers."""
         for reply in self.session.get(topics.control(self.cell), payload=json.dumps(command), timeout=1.0):
@@ -83,7 +88,10 @@ class Running:
         launcher = psutil.Process(self.launcher.pid)
         out = {"launcher": launcher}
         for child in launcher.children(recursive=True):
-            words = child.cmdline()
+            try:
+                words = child.cmdline()
+            except psutil.NoSuchProcess:  # it has ended since
+                continue
             if "services.cli" in words:
                 name = words[words.index("services.cli") + 1]
                 out[name if name not in out else f"{name}-{child.pid}"] = child

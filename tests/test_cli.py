@@ -1,7 +1,6 @@
 """The `penumbra` command as a user meets it."""
 
 import json
-import resource
 import subprocess
 import sys
 
@@ -117,11 +116,13 @@ def test_pose_as_json_is_exactly_what_fusion_answers(endpoint, capsys):
     assert json.loads(capsys.readouterr().out).keys() == json.loads(pose_json()).keys()
 
 
-def test_pose_takes_less_than_a_second_of_cpu(endpoint):
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert run("pose", "--json", "--connect", endpoint).returncode == 0
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.0
+def test_pose_loads_nothing_heavy(endpoint):
+    program = (
+        "import sys; from services import cli; cli.main(['pose', '--json', '--connect', sys.argv[1]]); "
+        "print([name for name in ('torch', 'numba', 'cv2', 'pybullet', 'trimesh') if name in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", program, endpoint], capture_output=True, text=True, timeout=30)
+    assert result.stdout.splitlines()[-1] == "[]", result
 
 
 def test_watch_prints_pose_after_pose_until_ctrl_c(endpoint):

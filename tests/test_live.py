@@ -60,7 +60,7 @@ def test_the_pose_is_near_the_truth(running):
 
 def test_penumbra_pose_prints_the_answer_and_its_json(running):
     result = penumbra(running, "pose")
-    assert result.returncode == 0 and "tracking" in result.stdout, result
+    assert result.returncode == 0 and ("tracking" in result.stdout or "coasting" in result.stdout), result
     assert json.loads(penumbra(running, "pose", "--json").stdout)["target"] == "forearm"
 
 
@@ -77,7 +77,8 @@ def test_a_snapshot_shows_the_camera_s_picture_with_the_arm_outlined(running, tm
     picture = cv2.imread(str(tmp_path / "out.png"))
     assert picture.shape == (480, 640, 3)
     green = (picture[..., 1] > 200) & (picture[..., 0] < 120) & (picture[..., 2] < 120)
-    assert green.sum() > 100  # the outline of a tracked pose
+    amber = (picture[..., 1] > 160) & (picture[..., 0] < 90) & (picture[..., 2] > 220)
+    assert (green | amber).sum() > 100  # the outline of a pose, tracked or bridged
 
 
 def restarted(running, service: str, before: int) -> bool:
@@ -91,7 +92,7 @@ def test_a_service_that_dies_is_started_again_and_the_pose_comes_back(running):
         os.kill(before, signal.SIGKILL)
         wait_for(lambda service=service, before=before: restarted(running, service, before), 10, f"{service} started again")
         killed_ns = time.time_ns()
-        wait_for(lambda killed_ns=killed_ns: running.is_tracking(killed_ns), 30, f"the pose after {service} died")
+        wait_for(lambda killed_ns=killed_ns: running.has_pose(killed_ns), 30, f"the pose after {service} died")
 
 
 @pytest.mark.parametrize(("flag", "word"), [("--camera", "camera"), ("--target", "target")])
