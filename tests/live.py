@@ -65,11 +65,6 @@ class Running:
         pose = self.pose()
         return pose is not None and pose["state"] == "tracking" and pose["stamp_ns"] > after_ns
 
-    def has_pose(self, after_ns: int = 0) -> bool:
-        """Whether a pose newer than `after_ns` is known: tracked or, on a busy machine, bridged between two measurements."""
-        pose = self.pose()
-        return pose is not None and pose["state"] != "lost" and pose["stamp_ns"] > after_ns
-
     def control(self, command: dict) -> dict | None:
         """The emulator's answer to a control command, or None where nobody answers."""
         for reply in self.session.get(topics.control(self.cell), payload=json.dumps(command), timeout=1.0):

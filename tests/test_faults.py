@@ -80,7 +80,7 @@ def test_a_thousand_bad_messages_of_each_kind_do_not_stop_anything(running, topi
     for _ in range(1000 if topic.message.MAX_BYTES < 10**6 else 3):  # images: three of 64 MB say as much as a thousand
         publisher.put(bytes(topic.message.MAX_BYTES + 1))
     ended_ns = time.time_ns()
-    wait_for(lambda: running.has_pose(ended_ns), 1.0, "a pose within a second of the storm")
+    wait_for(lambda: running.is_tracking(ended_ns), 1.0, "a tracked pose within a second of the storm")
     assert {name: process.pid for name, process in running.processes().items()} == pids, "a process was restarted"
 
 

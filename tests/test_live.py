@@ -59,8 +59,12 @@ def test_the_pose_is_near_the_truth(running):
 
 
 def test_penumbra_pose_prints_the_answer_and_its_json(running):
-    result = penumbra(running, "pose")
-    assert result.returncode == 0 and ("tracking" in result.stdout or "coasting" in result.stdout), result
+    def prints_a_tracked_pose() -> bool:
+        result = penumbra(running, "pose")
+        assert result.returncode == 0, result
+        return "tracking" in result.stdout
+
+    wait_for(prints_a_tracked_pose, 20, "a tracked pose, printed")  # a busy machine coasts now and then
     assert json.loads(penumbra(running, "pose", "--json").stdout)["target"] == "forearm"
 
 
@@ -72,13 +76,15 @@ def test_penumbra_topics_tells_what_arrives(running):
 
 
 def test_a_snapshot_shows_the_camera_s_picture_with_the_arm_outlined(running, tmp_path):
-    result = penumbra(running, "snapshot", str(tmp_path / "out.png"))
-    assert result.returncode == 0, result.stderr
-    picture = cv2.imread(str(tmp_path / "out.png"))
-    assert picture.shape == (480, 640, 3)
-    green = (picture[..., 1] > 200) & (picture[..., 0] < 120) & (picture[..., 2] < 120)
-    amber = (picture[..., 1] > 160) & (picture[..., 0] < 90) & (picture[..., 2] > 220)
-    assert (green | amber).sum() > 100  # the outline of a pose, tracked or bridged
+    def shows_the_outline_of_a_tracked_pose() -> bool:
+        result = penumbra(running, "snapshot", str(tmp_path / "out.png"))
+        assert result.returncode == 0, result.stderr
+        picture = cv2.imread(str(tmp_path / "out.png"))
+        assert picture.shape == (480, 640, 3)
+        green = (picture[..., 1] > 200) & (picture[..., 0] < 120) & (picture[..., 2] < 120)
+        return bool(green.sum() > 100)
+
+    wait_for(shows_the_outline_of_a_tracked_pose, 30, "a green outline")
 
 
 def restarted(running, service: str, before: int) -> bool:
@@ -92,7 +98,7 @@ def test_a_service_that_dies_is_started_again_and_the_pose_comes_back(running):
         os.kill(before, signal.SIGKILL)
         wait_for(lambda service=service, before=before: restarted(running, service, before), 10, f"{service} started again")
         killed_ns = time.time_ns()
-        wait_for(lambda killed_ns=killed_ns: running.has_pose(killed_ns), 30, f"the pose after {service} died")
+        wait_for(lambda killed_ns=killed_ns: running.is_tracking(killed_ns), 30, f"the pose after {service} died")
 
 
 @pytest.mark.parametrize(("flag", "word"), [("--camera", "camera"), ("--target", "target")])
