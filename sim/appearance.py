@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import dataclasses
 import functools
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from shared.classes import Label
 
-PLAIN, BLOTCHES, STRIPES, CHECKS, WOOD = range(5)
+PLAIN, BLOTCHES, STRIPES, CHECKS, WOOD, PICTURE = range(6)
 TEXTURE_FIELDS = 20
 CUFF, GLOSS = 18, 19
 """A row of a body's texture: two of Texture.fields (nine numbers each: its own and its sleeve's), cuff, gloss."""
@@ -22,7 +23,7 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Texture:
-    """Two linear RGB colours mixed by a pattern of `period` [m], by at most `contrast`."""
+    """Two linear RGB colours mixed by a pattern of `period` [m], by at most `contrast`; PICTURE mixes each channel on its own."""
 
     colour: Colour
     accent: Colour
@@ -53,7 +54,7 @@ class Appearance:
 @dataclass(frozen=True)
 class Look:
     """What is common to a picture: lamp position [m] and colours (linear RGB), background at infinity, and the sensor's blur
-    [px], noise (share of full scale) and white balance."""
+    [px], noise (share of full scale), white balance and JPEG quality in percent (None: not compressed)."""
 
     lamp: tuple[float, float, float]
     lamp_colour: Colour
@@ -62,6 +63,7 @@ class Look:
     blur_px: float = 0.6
     noise: float = 0.012
     gain: Colour = (1.0, 1.0, 1.0)
+    jpeg: int | None = None
 
 
 @functools.cache
@@ -88,8 +90,8 @@ def skin(rng: np.random.Generator) -> Texture:
 
 
 def cloth(rng: np.random.Generator) -> Texture:
-    """Work clothes: any hue, mostly plain; seldom the colour of skin."""
-    hue = rng.uniform(0.15, 0.97)
+    """Work clothes: any hue, that of skin less often; mostly plain."""
+    hue = rng.uniform(0.12, 0.97) if rng.uniform() < 0.8 else rng.uniform()
     colour = hsv(hue, rng.uniform(0.05, 0.8), rng.uniform(0.15, 0.9))
     accent = hsv(hue + rng.uniform(-0.1, 0.1), rng.uniform(0.05, 0.8), rng.uniform(0.15, 0.9))
     pattern = int(rng.choice([PLAIN, BLOTCHES, STRIPES, CHECKS], p=[0.45, 0.35, 0.1, 0.1]))
@@ -121,34 +123,53 @@ def tabletop(rng: np.random.Generator) -> Texture:
 
 
 def occluder(rng: np.random.Generator) -> Texture:
-    """Boards, boxes and tools: strong colours and any pattern; one in fifty has the colour of skin."""
-    if rng.uniform() < 0.02:
+    """Boards, boxes and tools: any colour and pattern, one in sixteen that of skin."""
+    choice = rng.uniform()
+    if choice < 0.06:
         return skin(rng)
-    hue, value = rng.uniform(0.14, 0.95), rng.uniform(0.15, 0.95)
-    accent = hsv(hue + rng.uniform(-0.15, 0.15), rng.uniform(0.2, 0.95), np.clip(value + rng.uniform(-0.4, 0.4), 0.1, 1.0))
+    if choice < 0.2:
+        return picture(rng)
+    hue, value = rng.uniform(0.12, 0.97), rng.uniform(0.1, 0.95)
+    accent = hsv(hue + rng.uniform(-0.15, 0.15), rng.uniform(0.0, 0.95), np.clip(value + rng.uniform(-0.4, 0.4), 0.1, 1.0))
     pattern = int(rng.choice([PLAIN, BLOTCHES, STRIPES, CHECKS], p=[0.4, 0.3, 0.15, 0.15]))
-    return Texture(hsv(hue, rng.uniform(0.35, 0.95), value), accent, pattern, _period(rng, 0.02, 0.2), rng.uniform(0.2, 1.0))
+    return Texture(hsv(hue, rng.uniform(0.0, 0.95), value), accent, pattern, _period(rng, 0.02, 0.2), rng.uniform(0.2, 1.0))
+
+
+def picture(rng: np.random.Generator) -> Texture:
+    """Patches of many colours, as a crowded room or a poster has them."""
+    colours = [hsv(rng.uniform(), rng.uniform(0.1, 0.9), value) for value in (rng.uniform(0.1, 0.5), rng.uniform(0.5, 1.0))]
+    return Texture(colours[0], colours[1], PICTURE, _period(rng, 0.03, 0.4), rng.uniform(0.4, 1.0))
 
 
 def person(rng: np.random.Generator) -> dict[Label, Appearance]:
-    """Skin, and clothes of one cloth: mostly short sleeves, some rolled up on the forearm or down to the wrist."""
+    """Skin, and clothes of one cloth: short sleeves, rolled up on the forearm, or down to the wrist; now and then gloves."""
     bare, shirt = skin(rng), cloth(rng)
     gloss = rng.uniform(0.0, 0.06)
-    length = rng.uniform()
-    if length < 0.85:  # short sleeves
-        forearm, upper_arm = Appearance(bare, gloss=gloss), Appearance(bare, shirt, rng.uniform(0.1, 0.32), gloss)
-    elif length < 0.93:  # rolled up somewhere on the forearm
-        forearm, upper_arm = Appearance(bare, shirt, rng.uniform(-0.12, 0.1), gloss), Appearance(shirt)
-    else:
-        forearm, upper_arm = Appearance(bare, shirt, rng.uniform(0.1, 0.15), gloss), Appearance(shirt)
+    length, gloves = rng.uniform(), rng.uniform() < 0.15
+    glove, wrist = cloth(rng), rng.uniform(0.08, 0.14)
+    if length < 0.55:  # short sleeves
+        forearm = Appearance(glove, bare, wrist, gloss) if gloves else Appearance(bare, gloss=gloss)
+        return _dressed(forearm, Appearance(bare, shirt, rng.uniform(0.08, 0.32), gloss), shirt)
+    if length < 0.75:  # rolled up somewhere on the forearm
+        return _dressed(Appearance(bare, shirt, rng.uniform(-0.12, 0.1), gloss), Appearance(shirt), shirt)
+    return _dressed(Appearance(glove if gloves else bare, shirt, rng.uniform(0.1, 0.15), gloss), Appearance(shirt), shirt)
+
+
+def _dressed(forearm: Appearance, upper_arm: Appearance, shirt: Texture) -> dict[Label, Appearance]:
     return {Label.FOREARM: forearm, Label.UPPER_ARM: upper_arm, Label.TORSO: Appearance(shirt)}
 
 
 def background(rng: np.random.Generator) -> Appearance:
-    """Walls and what stands before them, far away: light and rather grey, with blotches or edges of low contrast."""
-    hue, value = rng.uniform(), rng.uniform(0.35, 0.95)
-    colour = hsv(hue, rng.uniform(0.0, 0.2), value)
-    accent = hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0.0, 0.3), np.clip(value + rng.uniform(-0.3, 0.2), 0.1, 1.0))
+    """Walls and what stands before them, far away: half of them light and rather grey, with blotches or edges of low contrast;
+    the others of many colours, and a few all in colours of skin."""
+    choice = rng.uniform()
+    if choice < 0.35:
+        return Appearance(dataclasses.replace(picture(rng), period=_period(rng, 0.1, 1.0)), casts_shadow=False)
+    if choice < 0.42:
+        return Appearance(dataclasses.replace(skin(rng), period=_period(rng, 0.1, 1.0), contrast=1.0), casts_shadow=False)
+    hue, value = rng.uniform(), rng.uniform(0.2, 0.95)
+    colour = hsv(hue, rng.uniform(0.0, 0.3), value)
+    accent = hsv(hue + rng.uniform(-0.2, 0.2), rng.uniform(0.0, 0.4), np.clip(value + rng.uniform(-0.4, 0.3), 0.1, 1.0))
     pattern = int(rng.choice([PLAIN, BLOTCHES, STRIPES, CHECKS], p=[0.2, 0.5, 0.15, 0.15]))
     return Appearance(Texture(colour, accent, pattern, _period(rng, 0.2, 2.0), rng.uniform(0.2, 0.8)), casts_shadow=False)
 
@@ -158,14 +179,15 @@ def look(rng: np.random.Generator, around: tuple[float, float, float] = (0.0, 0.
     angle = rng.uniform(0, 2 * np.pi)
     distance, height = rng.uniform(0.2, 1.8), rng.uniform(1.4, 2.4)
     lamp = (around[0] + distance * np.cos(angle), around[1] + distance * np.sin(angle), around[2] + height)
-    warmth, strength, fill = rng.uniform(-0.08, 0.08), rng.uniform(0.5, 0.9), rng.uniform(0.25, 0.5)
+    warmth, strength, fill = rng.uniform(-0.12, 0.12), rng.uniform(0.35, 1.0), rng.uniform(0.18, 0.55)
     tint = np.array([1 + warmth, 1.0, 1 - warmth])
     return Look(
         lamp=lamp,
         lamp_colour=tuple(strength * tint),
         ambient=tuple(fill * np.ones(3)),
         background=background(rng),
-        blur_px=rng.uniform(0.4, 0.9),
-        noise=rng.uniform(0.004, 0.025),
-        gain=tuple(rng.uniform(0.85, 1.1) * (1 + rng.uniform(-0.04, 0.04, 3))),
+        blur_px=rng.uniform(0.4, 1.1),
+        noise=rng.uniform(0.004, 0.035),
+        gain=tuple(rng.uniform(0.8, 1.15) * (1 + rng.uniform(-0.06, 0.06, 3))),
+        jpeg=int(rng.integers(50, 96)) if rng.uniform() < 0.3 else None,
     )

@@ -164,13 +164,16 @@ class _Tables:
 
 
 def _expose(image: NDArray[np.float32], look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The sensor: blur, shot and read noise, gamma of the display, 8 bits."""
+    """The sensor: blur, shot and read noise, gamma of the display, 8 bits, and what JPEG leaves of them."""
     if look.blur_px > 0:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), look.blur_px), np.float32)
     noise = _grain()
     start = int(rng.integers(0, noise.size - 1))
     out = np.empty(image.shape, np.uint8)
     _develop(image.reshape(-1), noise, start, np.float32(look.noise), np.asarray(look.gain, np.float32), out.reshape(-1))
+    if look.jpeg is not None:
+        _, packed = cv2.imencode(".jpg", out[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, look.jpeg])
+        out = np.ascontiguousarray(cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1])
     return out
 
 
@@ -261,11 +264,15 @@ def _texture(textures, row, x, y, z, volume, out):
         mix = np.float32(1.0) if (u + v + w) - math.floor(u + v + w) < 0.5 else np.float32(0.0)
     elif pattern == 3:  # checks
         mix = np.float32((int(math.floor(u + 0.37)) + int(math.floor(v + 0.41)) + int(math.floor(w + 0.43))) & 1)
-    else:  # wood: stretched noise, in rings
+    elif pattern == 4:  # wood: stretched noise, in rings
         ring = 4.0 * _noise(volume, 0.15 * u, v, w) + 0.6 * _noise(volume, u, 5.0 * v, 5.0 * w)
         mix = np.float32(ring - math.floor(ring))
+    else:
+        mix = np.float32(0.0)
     mix *= textures[row, base + 2]
     for c in range(3):
+        if pattern == 5:  # each channel in steps of its own
+            mix = np.float32(math.floor(4.0 * _noise(volume, u + 9.0 * c, v, w)) / 3.0) * textures[row, base + 2]
         out[c] = textures[row, base + 3 + c] * (np.float32(1.0) - mix) + textures[row, base + 6 + c] * mix
 
 

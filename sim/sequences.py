@@ -99,7 +99,7 @@ def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells
     cell = _cell(CELLS[rng.integers(len(CELLS))])
     assert cell.sim is not None
     times: Array = np.arange(variety.frames, dtype=float) * PERIOD_S - variety.frames * PERIOD_S / 2
-    measures = {name: value * rng.uniform(0.9, 1.1) for name, value in cell.body.model_dump().items()}
+    measures = {name: value * rng.uniform(0.86, 1.14) for name, value in cell.body.model_dump().items()}
     varied = cell.model_copy(update={"body": cells.Body(**measures)})
     shoulder = np.asarray(cell.sim.shoulder) + rng.normal(0.0, 0.06, 3)
     target = next(iter(cell.targets.values()))
@@ -116,7 +116,7 @@ def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells
     camera = _camera(next(iter(cell.cameras.values())), middle[:3, 3], variety, rng)
     things += _robot(cell, times, rng)
     things += _furniture(cell.sim.table or (1.2, 0.8), len(times), rng)
-    if rng.random() < 0.75:
+    for _ in range(rng.choice([0, 1, 2], p=[0.2, 0.65, 0.15])):
         things.append(_between(camera, person.meshes[0], T_target, times, rng))
     return camera, things
 
@@ -147,16 +147,16 @@ def _path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.G
 
 
 def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.random.Generator) -> cells.Camera:
-    """A camera near the cell's or, once in twenty, anywhere around the target; its resolution scaled."""
+    """A camera near the cell's or, one time of six, anywhere around the target; its resolution scaled."""
     position = np.asarray(camera.position) + rng.normal(0.0, 0.1, 3)
     look_at = np.asarray(camera.look_at or target) + rng.normal(0.0, 0.08, 3)
-    if rng.random() < 0.05:
+    if rng.random() < 1.0 / 6.0:
         azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.1, 1.3)
         away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
         position, look_at = target + rng.uniform(1.1, 2.2) * away, target + rng.normal(0.0, 0.1, 3)
     low, high = variety.scale
     choice = rng.random()  # around 1: the crop at native resolution; around 0.5: the whole frame at scale 2
-    scale = rng.uniform(0.85, 1.15) if choice < 0.65 else rng.uniform(0.45, 0.6) if choice < 0.93 else rng.uniform(low, high)
+    scale = rng.uniform(0.85, 1.15) if choice < 0.7 else rng.uniform(0.45, 0.6) if choice < 0.9 else rng.uniform(low, high)
     scale = float(np.clip(scale, low, high))
     width, height = (max(round(scale * n), variety.size) for n in (camera.width, camera.height))
     return camera.model_copy(
@@ -177,7 +177,7 @@ def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.rando
 def _robot(cell: cells.Cell, times: Array, rng: np.random.Generator) -> list[Thing]:
     """The cell's robots, somewhere in and around their joint bounds and moving; the table cell borrows the other's at times."""
     if not cell.robots:
-        if rng.random() < 0.93:
+        if rng.random() < 0.75:
             return []
         cell = _cell("arm")
     assert cell.sim is not None
@@ -212,7 +212,7 @@ def _furniture(table: tuple[float, float], frames: int, rng: np.random.Generator
                 for k in range(columns):
                     at = ((k - (columns - 1) / 2) * pitch, (i - (rows - 1) / 2) * pitch, -0.0015)
                     things.append(_standing(box((side, side, 0.003), at, Label.BACKGROUND), np.eye(4), frames, plate))
-    for _ in range(rng.integers(1, 4) if rng.random() < 0.15 else 0):
+    for _ in range(rng.integers(1, 6) if rng.random() < 0.35 else 0):
         size = rng.uniform(0.03, 0.25, 3)
         T = geometry.from_rpy([*rng.uniform(-0.6, 0.6, 2), size[2] / 2], [0.0, 0.0, rng.uniform(0.0, np.pi)])
         colours = Appearance(appearance.occluder(rng))
@@ -245,13 +245,16 @@ def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, 
 
 
 def _shape(rng: np.random.Generator) -> Mesh:
-    kind = rng.integers(3)
+    kind = rng.integers(4)
     if kind == 0:
         return box(rng.uniform(0.04, 0.3, 3), (0.0, 0.0, 0.0), Label.OCCLUDER)
     if kind == 1:
         return box((*rng.uniform(0.1, 0.45, 2), 0.005), (0.0, 0.0, 0.0), Label.OCCLUDER)
-    tube = trimesh.creation.cylinder(radius=rng.uniform(0.01, 0.09), height=rng.uniform(0.15, 0.8), sections=20)
-    return Mesh(np.asarray(tube.vertices), tube.faces.astype(np.int32), np.full(len(tube.faces), Label.OCCLUDER, np.uint8))
+    if kind == 2:
+        solid = trimesh.creation.cylinder(radius=rng.uniform(0.01, 0.09), height=rng.uniform(0.15, 0.8), sections=20)
+    else:  # a stone
+        solid = trimesh.convex.convex_hull(rng.normal(size=(14, 3)) * rng.uniform(0.03, 0.12, 3))
+    return Mesh(np.asarray(solid.vertices), solid.faces.astype(np.int32), np.full(len(solid.faces), Label.OCCLUDER, np.uint8))
 
 
 def _direction(rng: np.random.Generator) -> Array:

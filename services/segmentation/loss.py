@@ -1,10 +1,13 @@
-"""The training loss: sum of the layers' prediction errors + Dice + focal (section "PredNet Model")."""
+"""The training loss: sum of the layers' prediction errors + Dice + focal (section "PredNet Model"), and once more
+Dice of the target's classes as one, which is what the search looks at."""
 
 from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from services.segmentation.infer import TARGET_LABELS
 
 ERROR_WEIGHTS = (1.0, 0.1)
 """Of the first layer's prediction error and of every other's, as in Lotter et al. 2017 (L_all): an upper layer can also lower its
@@ -23,6 +26,18 @@ def dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
     score = (2.0 * both + smooth) / (sum_p + sum_t + smooth)
     present = sum_t > 0
     return 1.0 - score[present].mean()
+
+
+def target_dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
+    """1 - the mean over the pictures that show the target of 2 |P and T| / (|P| + |T|), its classes taken as one: a picture of
+    which little is visible weighs as much as another. Shapes as for `dice`."""
+    target = list(TARGET_LABELS)
+    probability = logits.softmax(1)[:, target].sum(1)
+    truth = torch.isin(labels, torch.tensor(target)).to(probability.dtype)
+    both, sum_p, sum_t = ((probability * truth).sum((1, 2)), probability.sum((1, 2)), truth.sum((1, 2)))
+    score = (2.0 * both + smooth) / (sum_p + sum_t + smooth)
+    shown = sum_t > 0
+    return 1.0 - (score[shown].mean() if shown.any() else score.mean())
 
 
 def focal(logits: Tensor, labels: Tensor, gamma: float = 2.0) -> Tensor:

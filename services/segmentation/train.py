@@ -38,16 +38,17 @@ VALIDATION_SEED = 1_000_000
 class Schedule:
     """How training goes. `peak_rate`: of Adam's one cycle; `frames`: that a step plays; `patches`: (from which progress on,
     pixels a side, sequences a batch); `reuse`: how often a sequence is visited on average while the data set grows up to `most`
-    sequences; `error_weight`, `focal_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights
-    that are exported; `seen`: (frames that the state has seen before those that are learned from, how often)."""
+    sequences; `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`:
+    of the weights that are exported; `seen`: (frames that the state has seen before those that are learned from, how often)."""
 
     peak_rate: float = 3e-3
     frames: int = 5
-    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.15, 128, 4), (0.45, 160, 3))
+    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.1, 128, 4), (0.4, 160, 3))
     reuse: int = 4
     most: int = 6000
     error_weight: float = 0.3
     focal_weight: float = 5.0
+    target_weight: float = 1.0
     clip: float = 1.0
     averaging: float = 0.995
     seen: tuple[tuple[int, float], ...] = ((0, 0.4), (4, 0.3), (12, 0.2), (36, 0.1))
@@ -136,7 +137,9 @@ class Trainer:
             group["lr"] = self.schedule.rate(progress)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
             parts = self._losses(images, labels, self.schedule.before(rng))
-        total = parts["dice"] + self.schedule.focal_weight * parts["focal"] + self.schedule.error_weight * parts["error"]
+        schedule = self.schedule
+        weights = {"focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
+        total = parts["dice"] + sum(weight * parts[name] for name, weight in weights.items())
         self.optimizer.zero_grad()
         total.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), self.schedule.clip)
@@ -168,6 +171,7 @@ class Trainer:
         return {
             "dice": loss.dice(all_logits, all_labels),
             "focal": loss.focal(all_logits, all_labels),
+            "target": loss.target_dice(all_logits, all_labels),
             "error": torch.stack(errors).mean(),
         }
 
