@@ -172,8 +172,8 @@ def _expose(image: NDArray[np.float32], look: Look, rng: np.random.Generator) ->
     out = np.empty(image.shape, np.uint8)
     _develop(image.reshape(-1), noise, start, np.float32(look.noise), np.asarray(look.gain, np.float32), out.reshape(-1))
     if look.jpeg is not None:
-        _, packed = cv2.imencode(".jpg", out[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, look.jpeg])
-        out = np.ascontiguousarray(cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1])
+        _, packed = cv2.imencode(".jpg", cv2.cvtColor(out, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, look.jpeg])
+        out = cv2.cvtColor(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8), cv2.COLOR_BGR2RGB)
     return out
 
 
