@@ -173,7 +173,7 @@ def _expose(image: NDArray[np.float32], look: Look, rng: np.random.Generator) ->
     _develop(image.reshape(-1), noise, start, np.float32(look.noise), np.asarray(look.gain, np.float32), out.reshape(-1))
     if look.jpeg is not None:
         _, packed = cv2.imencode(".jpg", cv2.cvtColor(out, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, look.jpeg])
-        out = cv2.cvtColor(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8), cv2.COLOR_BGR2RGB)
+        return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1].copy()
     return out
 
 
