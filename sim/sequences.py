@@ -104,7 +104,7 @@ def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells
     shoulder = np.asarray(cell.sim.shoulder) + rng.normal(0.0, 0.06, 3)
     target = next(iter(cell.targets.values()))
     person = Person(varied, cell.sim.model_copy(update={"shoulder": tuple(shoulder)}), target)
-    T_target = _path(cell.sim.motion, variety, times, rng)
+    T_target = path(cell.sim.motion, variety, times, rng)
     clothes = appearance.person(rng)
     things = [
         Thing(Shape.of(mesh), T, clothes[label])
@@ -115,7 +115,7 @@ def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells
     middle = T_target[len(times) // 2]
     camera = _camera(next(iter(cell.cameras.values())), middle[:3, 3], variety, rng)
     things += _robot(cell, times, rng)
-    things += _furniture(cell.sim.table or (1.2, 0.8), len(times), rng)
+    things += furniture(cell.sim.table or (1.2, 0.8), len(times), rng)
     for _ in range(rng.choice([0, 1, 2], p=[0.2, 0.65, 0.15])):
         things.append(_between(camera, person.meshes[0], T_target, times, rng))
     return camera, things
@@ -127,13 +127,14 @@ def _cell(name: str) -> cells.Cell:
 
 
 @functools.cache
-def _robots(name: str) -> list[tuple[RobotModel, dict[str, Shape]]]:
-    return [
-        (model, {link: Shape.of(mesh) for link, mesh in model.meshes.items()}) for model in robot_models(_cell(name)).values()
-    ]
+def _robots(name: str) -> dict[str, tuple[RobotModel, dict[str, Shape]]]:
+    return {
+        robot: (model, {link: Shape.of(mesh) for link, mesh in model.meshes.items()})
+        for robot, model in robot_models(_cell(name)).items()
+    }
 
 
-def _path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.Generator) -> Array:
+def path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.Generator) -> Array:
     """Poses (frames, 4, 4) of the target at a constant twist; one sequence of seven stands still."""
     position = rng.uniform(np.subtract(motion.low, 0.06), np.add(motion.high, 0.06))
     rpy = 1.4 * rng.uniform(motion.rpy_low, motion.rpy_high)
@@ -175,18 +176,24 @@ def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.rando
 
 
 def _robot(cell: cells.Cell, times: Array, rng: np.random.Generator) -> list[Thing]:
-    """The cell's robots, somewhere in and around their joint bounds and moving; the table cell borrows the other's at times."""
+    """The cell's robots, a little beside where they stand; the table cell borrows the other's at times."""
     if not cell.robots:
         if rng.random() < 0.75:
             return []
         cell = _cell("arm")
+    return robots(cell, times, rng, astray=0.06)[0]
+
+
+def robots(cell: cells.Cell, times: Array, rng: np.random.Generator, astray: float = 0.0) -> tuple[list[Thing], dict[str, Array]]:
+    """The robots of a built-in cell and their joints (frames, n) [rad], somewhere in and around their bounds and moving; `astray`
+    [m]: standard deviation of where they stand."""
     assert cell.sim is not None
-    things = []
+    things, joints = [], {}
     offset = np.eye(4)
-    offset[:3, 3] = rng.normal(0.0, 0.06, 3)
+    offset[:3, 3] = rng.normal(0.0, astray, 3)
     paint = Appearance(appearance.metal(rng), gloss=rng.uniform(0.0, 0.4))
     plates = Appearance(appearance.metal(rng) if rng.random() < 0.5 else appearance.cloth(rng))
-    for model, shapes in _robots(cell.name):
+    for name, (model, shapes) in _robots(cell.name).items():
         low, high = np.asarray(cell.sim.joints_low), np.asarray(cell.sim.joints_high)
         q = rng.uniform(low - 0.3, high + 0.3) + times[:, None] * rng.normal(0.0, 0.3, len(low))
         links = model.link_transforms(q)
@@ -194,10 +201,11 @@ def _robot(cell: cells.Cell, times: Array, rng: np.random.Generator) -> list[Thi
         plate = Shape.of(box((0.09, 0.09, 0.003), (0.0, 0.0, -0.0015), Label.ROBOT))
         for pad in cell.pads.values():
             things.append(Thing(plate, offset @ links[pad.link.partition("/")[2]] @ pad.T_link_pad, plates))
-    return things
+        joints[name] = q
+    return things, joints
 
 
-def _furniture(table: tuple[float, float], frames: int, rng: np.random.Generator) -> list[Thing]:
+def furniture(table: tuple[float, float], frames: int, rng: np.random.Generator) -> list[Thing]:
     """A table, plates in it and clutter on it: all of it background."""
     things = []
     if rng.random() < 0.9:
@@ -234,7 +242,7 @@ def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, 
         level = rng.uniform(-0.5, 1.0) + times * rng.choice([0.0, rng.normal(0.0, 2.5)])
         poses = [panel.pose(float(np.clip(a, -0.99, 1.0)), camera, target, T) for a, T in zip(level, T_target, strict=True)]
         return Thing(Shape.of(panel.mesh), np.stack([T for T in poses if T is not None]), looks)
-    mesh = _shape(rng)
+    mesh = shape(rng)
     hidden = geometry.apply(T_target[frames // 2], target.vertices[rng.integers(len(target.vertices))])
     eye = np.asarray(camera.position)
     share = rng.uniform(0.35, 0.92)
@@ -244,7 +252,8 @@ def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, 
     return Thing(Shape.of(mesh), frame(rotation[:3, :3], middle + times[:, None] * velocity), looks)
 
 
-def _shape(rng: np.random.Generator) -> Mesh:
+def shape(rng: np.random.Generator) -> Mesh:
+    """A box, a board, a tube or a stone that covers the target."""
     kind = rng.integers(4)
     if kind == 0:
         return box(rng.uniform(0.04, 0.3, 3), (0.0, 0.0, 0.0), Label.OCCLUDER)
