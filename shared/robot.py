@@ -6,6 +6,7 @@ nothing of it is needed: forward kinematics is a chain of small matrix products,
 
 from __future__ import annotations
 
+import functools
 import threading
 from pathlib import Path
 
@@ -113,7 +114,7 @@ class RobotModel:
 
 def robot_models(cell: cells.Cell) -> dict[str, RobotModel]:
     """The model of every robot of the cell. Raises CellError, also where a pad sits on a link that its robot has not."""
-    models = {name: RobotModel(robot, cell.folder) for name, robot in cell.robots.items()}
+    models = {name: _model(robot, cell.folder) for name, robot in cell.robots.items()}
     for name, pad in cell.pads.items():
         robot, _, link = pad.link.partition("/")
         if robot in models and link not in models[robot].links:
@@ -121,6 +122,12 @@ def robot_models(cell: cells.Cell) -> dict[str, RobotModel]:
                 f"pads.{name}.link: robot {robot} has no link {link!r}: it has {', '.join(models[robot].links)}"
             )
     return models
+
+
+@functools.lru_cache(maxsize=8)
+def _model(robot: cells.Robot, folder: Path) -> RobotModel:
+    """Read once: pybullet takes half a second for a Panda, and everything of a process may use the same model."""
+    return RobotModel(robot, folder)
 
 
 _MOVING = (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)
