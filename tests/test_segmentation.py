@@ -1,12 +1,13 @@
 """PredNet and what surrounds it: the network's shape and state, the window that follows the target, training and weights."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 import torch
 
-from services.segmentation import evaluate, infer, loss, prednet, train
+from services.segmentation import compiled, evaluate, infer, loss, prednet, train
 from services.segmentation.crop import Window, corners_of, extrapolate, shift_state, whole_frame, window_around
 from services.segmentation.prednet import PredNet, Settings
 from shared import body, cell, geometry
@@ -28,6 +29,20 @@ def step(net: PredNet, images: torch.Tensor, state=None):
     return net(images, state)
 
 
+@pytest.mark.parametrize("cell", prednet.CELLS)
+def test_the_cells_have_nearly_as_many_parameters_and_a_state_of_one_form(cell):
+    ours, theirs = PredNet(Settings(cell=cell)), PredNet(Settings())
+    count, wanted = (sum(p.numel() for p in net.parameters()) for net in (ours, theirs))
+    assert abs(count / wanted - 1.0) < 0.03
+    _, _, state = step(ours, torch.rand(1, 3, 32, 32))
+    assert [s.shape for s in state] == [s.shape for s in theirs.initial_state(1, 32, 32)]
+
+
+def test_a_cell_that_does_not_exist_is_refused_with_those_that_do():
+    with pytest.raises(ValueError, match="one of hgru, convlstm, conv expected, 'gru' came"):
+        Settings(cell="gru")
+
+
 @pytest.mark.parametrize("delay", [False, True])
 def test_a_step_gives_a_logit_per_class_and_pixel_an_error_per_layer_and_a_state(delay):
     net = PredNet(Settings(SMALL.channels, SMALL.kernels, delay=delay))
@@ -38,8 +53,9 @@ def test_a_step_gives_a_logit_per_class_and_pixel_an_error_per_layer_and_a_state
     assert len(state) == (6 if delay else 3)
 
 
-def test_every_parameter_learns_from_mask_and_prediction():
-    net = PredNet(SMALL)
+@pytest.mark.parametrize("cell", prednet.CELLS)
+def test_every_parameter_learns_from_mask_and_prediction(cell):
+    net = PredNet(Settings(SMALL.channels, SMALL.kernels, SMALL.decoder_channels, cell=cell))
     images, labels = torch.rand(1, 3, 32, 32), torch.randint(0, len(Label), (1, 32, 32))
     state = None
     for _ in range(3):  # the first layer's cell is heard of in the next prediction, its inhibition one step later still
@@ -191,6 +207,51 @@ def test_a_segmenter_forgets_when_time_jumps_and_remembers_when_it_flows():
     np.testing.assert_array_equal(first(image, window, 10**9 + 10**10), start)
     with pytest.raises(ValueError, match="window inside the image of 64 x 64 expected"):
         first(image, Window(8, 0, 64, 64), 10**9 + 10**10)
+
+
+def scene(frames=6, size=96):
+    return sequences.render(987_654, 3, sequences.Variety(frames=frames, size=size)).images
+
+
+@pytest.mark.parametrize("settings", [SMALL, Settings(SMALL.channels, SMALL.kernels, delay=True), Settings(cell="convlstm")])
+def test_compiled_the_network_gives_torch_s_logits_and_state(settings):
+    pytest.importorskip("openvino")
+    net = PredNet(settings).eval()
+    for p in net.parameters():
+        p.data += 0.05 * torch.randn_like(p)
+    quick = compiled.Compiled(net, torch.float32)
+    for images in (scene(4, 96), scene(4, 96)[:, :64]):
+        state = other = net.initial_state(1, *images.shape[1:3])
+        for image in images:
+            picture = infer.cut(image, Window(0, 0, image.shape[1], image.shape[0]))
+            with torch.inference_mode():
+                logits, _, state = net(picture, state)
+            found, other = quick(picture, other)
+            torch.testing.assert_close(found, logits, rtol=1e-3, atol=1e-3)
+            for a, b in zip(other, state, strict=True):
+                torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3)
+
+
+def test_masks_of_the_compiled_network_are_torch_s_but_for_rounding(monkeypatch):
+    pytest.importorskip("openvino")
+    images = scene()
+    window = Window(0, 0, 96, 96)
+    ours = infer.load_segmenter()
+    monkeypatch.setitem(sys.modules, "openvino", None)  # as where it is not installed
+    theirs = infer.load_segmenter(dtype=torch.float32)
+    for t, image in enumerate(images):
+        a, b = (segmenter(image, window, (t + 1) * 50_000_000) for segmenter in (ours, theirs))
+        assert (a != b).mean() < 0.02  # bfloat16, where the processor has it
+    assert len(np.unique(a)) > 1
+
+
+def test_sizes_made_ready_in_the_background_give_the_same_masks():
+    images, window = scene(2), Window(0, 0, 96, 96)
+    plain, prepared = infer.load_segmenter(), infer.load_segmenter()
+    prepared.prepare(window)
+    for t, image in enumerate(images):
+        a, b = (segmenter(image, window, (t + 1) * 50_000_000) for segmenter in (plain, prepared))
+        np.testing.assert_array_equal(a, b)
 
 
 def test_the_card_says_on_what_the_weights_were_made():

@@ -1,10 +1,10 @@
-"""PredNet with hGRU cells: a stack of layers that predict their own input, and a decoder that reads a mask from them.
+"""PredNet: a stack of layers that predict their own input, and a decoder that reads a mask from them.
 
 One time step (section "PredNet Model"):
 
 1. Bottom-up. Layer l predicts its input A_l from its representation R_l of the last step. What the prediction missed is the
    error E_l, split into what was too little and what too much; convolved and pooled it is the input A_{l+1} of the next layer.
-2. Top-down. From the last layer to the first, R_l is updated by an hGRU cell driven by E_l and R_{l+1}.
+2. Top-down. From the last layer to the first, R_l is updated by a cell (hGRU; others for comparison) driven by E_l and R_{l+1}.
 3. The mask is decoded from all R_l but the first: brought to one resolution, summed, convolved.
 
 The picture enters folded: 2 x 2 pixels become 12 channels (space to depth). The first layer therefore works at half resolution
@@ -37,16 +37,21 @@ FOLD = 2
 
 @dataclass(frozen=True)
 class Settings:
-    """Size of the network. channels, kernels: of the hGRU cell of each layer. The authors have 64-128-256-512 and kernels of 5;
+    """Size of the network. channels, kernels: of the cell of each layer. The authors have 64-128-256-512 and kernels of 5;
     kernels of 5 in the two coarse layers alone cost a tenth of the time of 5 everywhere and reach as far. `delay`: axonal
-    delays."""
+    delays. `cell`: one of CELLS, all of nearly the same number of parameters."""
 
     channels: tuple[int, ...] = (16, 16, 32, 64)
     kernels: tuple[int, ...] = (3, 3, 5, 5)
     decoder_channels: int = 16
     delay: bool = False
+    cell: str = "hgru"
 
     def __post_init__(self) -> None:
+        if self.cell not in CELLS:
+            raise ValueError(f"cell: one of {', '.join(CELLS)} expected, {self.cell!r} came")
+        if self.cell == "convlstm" and any(n % 2 for n in self.channels):
+            raise ValueError(f"even channels expected, a ConvLSTM halves them, {self.channels} came")
         if len(self.channels) != len(self.kernels) or len(self.channels) < 2:
             raise ValueError(f"one kernel for each of at least 2 layers expected, got {self.channels} and {self.kernels}")
 
@@ -78,8 +83,47 @@ class HGRU(nn.Module):
 
 
 def _scale(x: Tensor, gain: Tensor, offset: Tensor | None = None) -> Tensor:
-    """gain * x + offset per channel. As a 1 x 1 convolution: with channels innermost in memory broadcasting is 4 times slower."""
+    """gain * x + offset per channel. As a 1 x 1 convolution: with channels innermost in memory torch's broadcasting is 4 times
+    slower. OpenVINO, for which the network is traced, has it the other way round."""
+    if torch.jit.is_tracing():
+        scaled = x * gain[:, None, None]
+        return scaled if offset is None else scaled + offset[:, None, None]
     return F.conv2d(x, torch.diag(gain)[:, :, None, None], offset)
+
+
+class ConvLSTM(nn.Module):
+    """Convolutional long short-term memory (Shi et al. 2015, arXiv:1506.04214, without peepholes). Its state holds output and
+    memory, one behind the other, with half of the channels each: as many parameters and as large a state as the hGRU's."""
+
+    def __init__(self, channels: int, kernel: int):
+        super().__init__()
+        half = channels // 2
+        self.recurrent = nn.Conv2d(half, 4 * half, kernel, padding=kernel // 2)
+        self.input = nn.Conv2d(channels, 4 * half, 1, bias=False)
+
+    def forward(self, drive: Tensor, state: Tensor) -> Tensor:
+        """The new state (batch, channels, h, w) from the drive and the old state of the same shape."""
+        output, memory = state.chunk(2, 1)
+        enter, keep, leave, new = (self.recurrent(output) + self.input(drive)).chunk(4, 1)
+        memory = torch.sigmoid(keep) * memory + torch.sigmoid(enter) * torch.tanh(new)
+        return torch.cat([torch.sigmoid(leave) * torch.tanh(memory), memory], 1)
+
+
+class Convolution(nn.Module):
+    """A recurrent convolution without gates (Elman's cell): tanh(W * state + V drive)."""
+
+    def __init__(self, channels: int, kernel: int):
+        super().__init__()
+        self.recurrent = nn.Conv2d(channels, channels, kernel, padding=kernel // 2)
+        self.input = nn.Conv2d(channels, channels, 1, bias=False)
+
+    def forward(self, drive: Tensor, state: Tensor) -> Tensor:
+        """The new state (batch, channels, h, w) from the drive and the old state of the same shape."""
+        return torch.tanh(self.recurrent(state) + self.input(drive))
+
+
+CELLS: dict[str, type[nn.Module]] = {"hgru": HGRU, "convlstm": ConvLSTM, "conv": Convolution}
+"""What updates a layer's representation, by the name that the settings give."""
 
 
 class PredNet(nn.Module):
@@ -94,7 +138,7 @@ class PredNet(nn.Module):
         self.ascend = nn.ModuleList(nn.Conv2d(2 * inputs[i], inputs[i + 1], 3, padding=1) for i in range(n - 1))
         self.drive = nn.ModuleList(nn.Conv2d(2 * inputs[i], c[i], 3, padding=1) for i in range(n))
         self.descend = nn.ModuleList(nn.Conv2d(c[i + 1], c[i], 1) for i in range(n - 1))
-        self.cells = nn.ModuleList(HGRU(c[i], settings.kernels[i]) for i in range(n))
+        self.cells = nn.ModuleList(CELLS[settings.cell](c[i], settings.kernels[i]) for i in range(n))
         self.decode = nn.ModuleList(nn.Conv2d(c[i], settings.decoder_channels, 1) for i in range(1, n))
         self.head = nn.Conv2d(settings.decoder_channels, len(Label) * FOLD * FOLD, 3, padding=1)
         for module in self.modules():  # channels innermost: what convolutions on a CPU are fastest with

@@ -39,6 +39,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
 
     def watch(name: str, camera: Camera, segmenter: Segmenter) -> None:
         window = whole_frame(camera)
+        segmenter.prepare(window)
 
         def on_frame(frame: Frame, _: dict[str, str]) -> None:
             nonlocal window
@@ -54,6 +55,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
             if all(T is not None for T, _ in known):
                 around = window_around(camera, [(T, box) for T, box in known if T is not None], window)
             window = around or whole_frame(camera)
+            segmenter.prepare(window)
             labels = segmenter(frame.image, window, frame.stamp_ns)
             mask = Mask(stamp_ns=frame.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=window.scale)
             node.publish(MASK, mask, camera=name)

@@ -1,0 +1,133 @@
+"""PredNet compiled by OpenVINO: the step of `prednet.PredNet` in less than half of torch's time.
+
+It is compiled for every size of the picture apart: for all sizes at once a step takes two thirds longer, as little can be fused.
+Compiling takes some tenths of a second, so the sizes that may come next are compiled ahead, in a thread of low priority. A size
+that is not there yet is waited for: what comes out depends on pictures alone and not on time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import os
+import threading
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from services.segmentation.prednet import PredNet, State
+
+MOST = 24
+"""Sizes that are kept, each some megabytes."""
+
+
+class Compiled:
+    """One time step of a network for pictures of any size. `dtype`, bfloat16 or float32: of the state and the computation.
+
+    Raises ImportError where OpenVINO is not installed.
+    """
+
+    def __init__(self, net: PredNet, dtype: torch.dtype):
+        import openvino
+
+        self._ov = openvino
+        self._net, self._dtype = net, dtype
+        self._core = openvino.Core()
+        self._type = openvino.Type.bf16 if dtype is torch.bfloat16 else openvino.Type.f32
+        self._model = self._convert(copy.deepcopy(net).float().eval())
+        self._requests: dict[tuple[int, int], Any] = {}
+        self._asked: set[tuple[int, int]] = set()
+        self._lock = threading.Lock()
+
+    def __call__(self, image: Tensor, state: State) -> tuple[Tensor, State]:
+        """(class logits (1, classes, h, w) float32, new state) of an image (1, 3, h, w) in [0, 1] and the old state."""
+        request = self._request(*image.shape[-2:])
+        new = tuple(torch.empty_like(s, memory_format=torch.channels_last) for s in state)
+        held = [_rows(t) for t in (image.to(self._dtype), *state)]
+        for i, tensor in enumerate(held):
+            request.set_input_tensor(i, self._tensor(tensor))
+        for i, tensor in enumerate(new, 1):
+            request.set_output_tensor(i, self._tensor(_rows(tensor)))
+        request.infer()
+        return torch.from_numpy(request.get_output_tensor(0).data.copy()), new
+
+    def prepare(self, sizes: list[tuple[int, int]]) -> None:
+        """Compile for pictures of these sizes (height, width) in the background, in this order."""
+        fresh = [size for size in sizes if size not in self._asked]
+        if fresh:
+            self._asked.update(fresh)
+            threading.Thread(target=self._compile_ahead, args=(fresh,), name="compile").start()
+
+    def _compile_ahead(self, sizes: list[tuple[int, int]]) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # not everywhere has a thread a priority
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        for size in sizes:
+            self._request(*size)
+
+    def _request(self, height: int, width: int) -> Any:
+        if (height, width) not in self._requests:
+            with self._lock:
+                if (height, width) not in self._requests:
+                    if len(self._requests) >= MOST:
+                        del self._requests[next(iter(self._requests))]
+                    self._requests[height, width] = self._compile(height, width)
+        return self._requests[height, width]
+
+    def _compile(self, height: int, width: int) -> Any:
+        shapes = [s.shape for s in (torch.empty(1, 3, height, width), *self._net.initial_state(1, height, width))]
+        model = self._model.clone()
+        model.reshape({port: [1, h, w, c] for port, (_, c, h, w) in zip(model.inputs, shapes, strict=True)})
+        settings = {
+            "INFERENCE_NUM_THREADS": 1,
+            "NUM_STREAMS": 1,
+            "ENABLE_CPU_PINNING": False,  # two processes would be tied to the same core
+            "INFERENCE_PRECISION_HINT": self._type.get_type_name(),
+        }
+        return self._core.compile_model(model, "CPU", settings).create_infer_request()
+
+    def _convert(self, net: PredNet) -> Any:
+        """The network as OpenVINO's model; not by `openvino.convert_model`, which reports its use over the internet."""
+        from openvino.frontend import FrontEndManager
+        from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
+        from openvino.preprocess import PrePostProcessor
+
+        side = 4 * net.multiple
+        inputs = [_rows(t) for t in (torch.zeros(1, 3, side, side), *net.initial_state(1, side, side))]
+        with torch.inference_mode(), warnings.catch_warnings():
+            # `torch.export`, which torch would rather have used, ties a model to one size of picture.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            traced = torch.jit.trace(_Rows(net), inputs, check_trace=False)
+        decoder = TorchScriptPythonDecoder(traced)
+        frontend = FrontEndManager().load_by_framework("pytorch")
+        model = frontend.convert(frontend.load(decoder))
+        model.reshape({port: [1, -1, -1, t.shape[-1]] for port, t in zip(model.inputs, inputs, strict=True)})
+        types = PrePostProcessor(model)
+        for i in range(len(inputs)):
+            types.input(i).tensor().set_element_type(self._type)
+        for i in range(1, len(inputs)):
+            types.output(i).tensor().set_element_type(self._type)
+        return types.build()
+
+    def _tensor(self, rows: Tensor) -> Any:
+        """OpenVINO's view of a tensor's memory; numpy has no bfloat16, so it sees integers of its size."""
+        memory = rows.view(torch.int16) if rows.dtype is torch.bfloat16 else rows
+        return self._ov.Tensor(memory.numpy(), self._ov.Shape(list(rows.shape)), self._type)
+
+
+class _Rows(nn.Module):
+    """The step with channels innermost, as the state lies in memory: nothing is reordered on its way in and out."""
+
+    def __init__(self, net: PredNet):
+        super().__init__()
+        self.net = net
+
+    def forward(self, image: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        logits, _, new = self.net(image.permute(0, 3, 1, 2), tuple(s.permute(0, 3, 1, 2) for s in state))
+        return (logits, *(s.permute(0, 2, 3, 1) for s in new))
+
+
+def _rows(tensor: Tensor) -> Tensor:
+    """(1, c, h, w) as (1, h, w, c), contiguous; without a copy where channels are innermost."""
+    return tensor.permute(0, 2, 3, 1).contiguous()
