@@ -241,12 +241,13 @@ def match(points, field, guarded, reach):
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(points, r, kind, origin, axis, fx, fy, edge, correlation, huber, bounded):
+def normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bounded):
     """Of the pose error along the camera's axes and the dilation: the 7 x 7 information, its right side (7,), the length of
     contour measured [px], the sum of length times Huber-limited squared offset [px^3], the length that costs, Huber's cost (chi^2
     where all is within `huber`), and the share of the information about the roll that comes from levers longer than SHAPE.
 
-    `origin` (3,) [m] and `axis` (3,) of the target; `bounded`: whether BOUNDED points inform, beside that they cost.
+    `weights` (n,) [1/px^2] of the points; `origin` (3,) [m] and `axis` (3,) of the target; `bounded`: whether BOUNDED points
+    inform, beside that they cost.
     """
     H = np.zeros((7, 7))
     g = np.zeros(7)
@@ -269,7 +270,7 @@ def normal_equations(points, r, kind, origin, axis, fx, fy, edge, correlation, h
         if kind[i] == MEASURED:
             length += points[i, 7]
             square += points[i, 7] * min(r[i] * r[i], huber * huber)
-        weight = points[i, 7] / (correlation * edge * edge)
+        weight = weights[i]
         counted += points[i, 7]
         if abs(r[i]) <= huber:
             cost += weight * r[i] * r[i]

@@ -52,7 +52,8 @@ class Intrinsics:
 class Evidence:
     """`state` (h, w) uint8; `field` (h, w) float32, the smoothed share of the target in what is known, 0.5 on its boundary;
     `guarded` (h, w) uint8, 1 where COVERED is near; `hand` (h, w) uint8, 1 on the part of the target that lies towards +x;
-    `seen_px`: pixels that show the target, and `boundary_px`: those on a boundary that is its own."""
+    `seen_px`: pixels that show the target, and `boundary_px`: those on a boundary that is its own; `x0`, `y0`, `scale`: its
+    window as in `messages.Mask`."""
 
     state: NDArray[np.uint8]
     field: NDArray[np.float32]
@@ -61,6 +62,9 @@ class Evidence:
     seen_px: int
     boundary_px: int
     intrinsics: Intrinsics
+    x0: int = 0
+    y0: int = 0
+    scale: int = 1
 
     def measurements(self, correlation: float) -> float:
         """The number of independent measurements, with those that the six unknowns of a pose need."""
@@ -118,8 +122,10 @@ def cover_beyond(state: NDArray[np.uint8], T: NDArray[np.float64], start: float,
     state[beyond & (state == TARGET)] = COVERED
 
 
-def gather(state: NDArray[np.uint8], labels: NDArray[np.uint8], intrinsics: Intrinsics) -> Evidence:
-    """The evidence of a mask from its states and labels (h, w)."""
+def gather(
+    state: NDArray[np.uint8], labels: NDArray[np.uint8], intrinsics: Intrinsics, x0: int = 0, y0: int = 0, scale: int = 1
+) -> Evidence:
+    """The evidence of a mask from its states and labels (h, w); `x0`, `y0`, `scale`: its window as in `messages.Mask`."""
     target = (state == TARGET).astype(np.float32)
     covered = (state == COVERED).astype(np.uint8)
     field = _blur(target)
@@ -131,7 +137,7 @@ def gather(state: NDArray[np.uint8], labels: NDArray[np.uint8], intrinsics: Intr
     hand = ((labels == Label.HAND) & (state == TARGET)).astype(np.uint8)
     seen_px = int(np.count_nonzero(target))
     boundary_px = _boundary_px(state, field, guarded)
-    return Evidence(state, field, guarded.astype(np.uint8, copy=False), hand, seen_px, boundary_px, intrinsics)
+    return Evidence(state, field, guarded.astype(np.uint8, copy=False), hand, seen_px, boundary_px, intrinsics, x0, y0, scale)
 
 
 @njit(cache=True, nogil=True)

@@ -136,7 +136,8 @@ class _Problem:
         self, T: Array, points: Array, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
     ) -> tuple[Array, Array, float, float, float, float, float]:
         noise, k = self.noise, self.evidence.intrinsics
-        return normal_equations(points, r, kind, T[:3, 3], T[:3, 0], k.fx, k.fy, noise.edge, noise.correlation, huber, bounded)
+        weights = points[:, 7] / (noise.correlation * noise.edge**2)
+        return normal_equations(points, r, kind, weights, T[:3, 3], T[:3, 0], k.fx, k.fy, huber, bounded)
 
     def coarse(self, T: Array, moved: Array) -> tuple[Array, Array]:
         """The pose and what it is moved by after steps that are all taken, as the contour points matched change with each."""
@@ -210,17 +211,26 @@ def fit(
     # a mask or a fit worse than expected: believe the residuals
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
     H, g = H * trust, g * trust
-    # the dilation is marginalised (Schur complement), and the prior left out
+    T, covariance = marginal(here.T, moved, H, g, regular, rolls, limits)
+    return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
+
+
+def marginal(T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float, limits: Limits) -> tuple[Array, Array]:
+    """The pose and covariance (6, 6) that the measurement alone says, from the normal equations of pose error and dilation at T,
+    which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out, the dilation marginalised (Schur complement).
+
+    `rolls`: share of the information about the roll that is believed, see `normal_equations`.
+    """
     gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
+    weak = limits.information
     covariance = np.linalg.inv(H[:6, :6] - np.outer(gain, H[6, :6]) + weak)
     offset = covariance @ (g[:6] - gain * (g[6] - regular[6, 6] * moved[6]) - weak @ moved[:6])
     # the roll that a nearly round section shows is doubted, and with it all that leans on it
-    c = covariance[:, 3:] @ here.T[:3, 0]
-    roll = float(here.T[:3, 0] @ c[3:])
+    c = covariance[:, 3:] @ T[:3, 0]
+    roll = float(T[:3, 0] @ c[3:])
     doubt = min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll)
     covariance = (covariance + covariance.T) / 2.0 + doubt * np.outer(c, c) / roll
-    T = geometry.perturb(here.T, offset)
-    return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
+    return geometry.perturb(T, offset), covariance
 
 
 def _small(step: Array) -> bool:

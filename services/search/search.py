@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from services.search import contour, detect, evidence, overlap
 from services.search.evidence import TARGET, Evidence, Intrinsics
 from services.search.fit import GOOD, MISFIT, Fit, Limits, Noise, fit
+from services.search.refine import refine
 from services.search.robots import RobotDepth
 from shared import body, geometry
 from shared.cell import Cell
@@ -102,8 +103,13 @@ class Search:
     def prepare(self) -> None:
         """Compiles what `update` needs, so that the first frame does not wait for it."""
         joints = {name: np.zeros(len(robot.joints)) for name, robot in self._robots.robots.items()}
-        blank = Mask(stamp_ns=0, labels=np.zeros((32, 32), np.uint8), x0=0, y0=0, scale=1)
-        self.update(blank, self._target.home.transform, np.eye(6), joints)
+        T_home, size = self._target.home.transform, (self._camera.width, self._camera.height)
+        k = Intrinsics.of_window(self._camera, 0, 0, 1)
+        shown = self._model.silhouette(self._T_camera_world @ T_home, k, (0, 0, *size))
+        mask = Mask(stamp_ns=0, labels=shown * np.uint8(self._target.label_values[0]), x0=0, y0=0, scale=1)
+        image = np.repeat(mask.labels[..., None] * np.uint8(20), 3, axis=2)
+        self.update(mask, T_home, 1e-4 * np.eye(6), joints, image)
+        self._detected_ns = None
 
     def update(
         self,
@@ -111,13 +117,15 @@ class Search:
         T_prior: Array | None = None,
         prior_covariance: Array | None = None,
         joints: Mapping[str, Array] | None = None,
+        image: NDArray[np.uint8] | None = None,
     ) -> VisionEstimate:
-        """What a mask says about the target's pose.
+        """What a mask, and the image it is of, say about the target's pose.
 
         T_prior (4 x 4): the predicted T_world_target, None where nothing is known; `prior_covariance` (6, 6) along the world's
-        axes; `joints` (n,) [rad] by robot, to know exactly what the robots hide.
+        axes; `joints` (n,) [rad] by robot, to know exactly what the robots hide; `image` (h, w, 3) uint8 RGB: without it the mask
+        alone is used.
 
-        Raises ValueError for a mask that cannot be this camera's.
+        Raises ValueError for a mask or an image that cannot be this camera's.
         """
         h, w = mask.labels.shape
         if mask.scale < 1 or h * mask.scale > 2 * self._camera.height or w * mask.scale > 2 * self._camera.width:
@@ -125,6 +133,9 @@ class Search:
                 f"mask: a window of an image of {self._camera.width} x {self._camera.height} at a scale of at least 1 expected, "
                 f"{w} x {h} at scale {mask.scale} came: check the segmentation's camera"
             )
+        if image is not None and image.shape[:2] != (self._camera.height, self._camera.width):
+            expected_size, came = f"{self._camera.width} x {self._camera.height}", f"{image.shape[1]} x {image.shape[0]}"
+            raise ValueError(f"image: {expected_size} expected, as the mask's camera has, {came} came")
         T_start = self._T_camera_world @ (self._target.home.transform if T_prior is None else T_prior)
         if self.method == "paper":
             return self._paper(self._gather(mask, T_start, joints), T_start)
@@ -134,7 +145,7 @@ class Search:
             first, certain = self._track(seen, T_start, prior_covariance)
             tracked = seen, first
             if certain or seen.seen_px < detect.SMALLEST_PX:
-                return self._judge(*tracked, self._is_expected(first, T_start, prior_covariance))
+                return self._conclude(seen, first, T_start, prior_covariance, image)
         usable = tracked is not None and tracked[1].overlap >= FITS and tracked[1].misfit < WRONG
         due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost")
         other = self._detect(mask, T_start, joints) if due else None
@@ -142,8 +153,22 @@ class Search:
             tracked = other
         if tracked is None:
             return self._lost(T_start)
-        expected = T_prior is not None and self._is_expected(tracked[1], T_start, prior_covariance)
-        return self._judge(*tracked, expected)
+        return self._conclude(*tracked, T_start if T_prior is not None else None, prior_covariance, image)
+
+    def _conclude(
+        self, seen: Evidence, found: Fit, T_prior: Array | None, covariance: Array | None, image: NDArray[np.uint8] | None
+    ) -> VisionEstimate:
+        """The estimate of a fit, refined on the image if there is one. T_prior: T_camera_target, None where nothing is known."""
+        expected = T_prior is not None and self._is_expected(found, T_prior, covariance)
+        if image is not None and found.overlap >= FITS and found.misfit < WRONG:
+            if T_prior is None:
+                closer = refine(self._model, found, image, seen, found.T_searched, np.zeros((6, 6)))
+            else:
+                closer = refine(self._model, found, image, seen, T_prior, self._leaning(covariance))
+            away = geometry.pose_error(closer.T_searched, found.T_searched)
+            if away @ np.linalg.solve(found.covariance + closer.covariance, away) < GATE and closer.overlap >= FITS:
+                found = closer
+        return self._judge(seen, found, expected)
 
     def _gather(self, mask: Mask, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None) -> Evidence:
         """`limb`: T_camera_target of the limb, where it is known; beyond its near end nothing is believed."""
@@ -154,7 +179,7 @@ class Search:
         evidence.cover_outside(state, mask.x0, mask.y0, mask.scale, self._camera)
         if limb is not None:
             evidence.cover_beyond(state, limb, float(self._model.vertices[:, 0].min()) - JOINT_MARGIN, k)
-        return evidence.gather(state, mask.labels, k)
+        return evidence.gather(state, mask.labels, k, mask.x0, mask.y0, mask.scale)
 
     @property
     def _home_information(self) -> Array:
@@ -167,10 +192,14 @@ class Search:
         covariance = np.zeros((6, 6)) if prior_covariance is None else self._axes.T @ prior_covariance @ self._axes
         return covariance, floor
 
+    def _leaning(self, prior_covariance: Array | None) -> Array:
+        """The information (6, 6) about the prediction that the solve leans on."""
+        covariance, floor = self._predicted(prior_covariance)
+        return np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64)
+
     def _track(self, seen: Evidence, T_start: Array, prior_covariance: Array | None) -> tuple[Fit, bool]:
         """The pose near the prediction, and whether it explains the mask so well that no other need be looked for."""
-        covariance, floor = self._predicted(prior_covariance)
-        prior = np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64)
+        prior = self._leaning(prior_covariance)
         first = self._with_mirror(seen, T_start, prior)
         if seen.seen_px >= detect.SMALLEST_PX and first.misfit > MISFIT:  # beside the right pose, mostly in roll
             beside = [self._fit(seen, T, T_start, prior) for T in detect.mirrored(first.T_searched)]

@@ -1,17 +1,20 @@
-"""Wires the search to the bus: masks, joints and the fused pose in, the camera's pose out."""
+"""Wires the search to the bus: masks, frames, joints and the fused pose in, the camera's pose out."""
 
 from __future__ import annotations
 
 import argparse
+from collections import deque
 
 from services.search.prediction import JointHistory, predict
 from services.search.search import METHODS, Search
 from shared import geometry
-from shared.messages import FusedPose, Joints, Mask, VisionPose
+from shared.messages import Frame, FusedPose, Joints, Mask, VisionPose
 from shared.service import Node
-from shared.topics import FUSED, JOINTS, MASK, VISION
+from shared.topics import FRAME, FUSED, JOINTS, MASK, VISION
 
 NAME = "search"
+FRAMES_KEPT = 4
+"""Of a camera, until their masks come."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +36,10 @@ def start(node: Node, options: argparse.Namespace) -> None:
         search.prepare()
     history = {robot: JointHistory() for robot in cell.robots}
     fused: dict[str, FusedPose] = {}
+    frames: dict[str, deque[Frame]] = {camera: deque(maxlen=FRAMES_KEPT) for camera in cameras}
+
+    def on_frame(message: Frame, names: dict[str, str]) -> None:
+        frames[names["camera"]].append(message)
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
         robot, expected = names["robot"], len(cell.robots[names["robot"]].joints)
@@ -44,12 +51,13 @@ def start(node: Node, options: argparse.Namespace) -> None:
         fused[names["target"]] = message
 
     def on_mask(message: Mask, names: dict[str, str]) -> None:
+        image = next((frame.image for frame in frames[names["camera"]] if frame.stamp_ns == message.stamp_ns), None)
         joints = {robot: q for robot, h in history.items() if (q := h.at(message.stamp_ns)) is not None}
         for (camera, target), search in searches.items():
             if camera != names["camera"] or not node.owns(f"{camera}/{target}"):
                 continue
             T_prior, covariance = predict(fused.get(target), message.stamp_ns)
-            estimate = search.update(message, T_prior, covariance, joints)
+            estimate = search.update(message, T_prior, covariance, joints, image)
             position, orientation = geometry.position_orientation(estimate.T)
             pose = VisionPose(
                 stamp_ns=message.stamp_ns,
@@ -70,4 +78,5 @@ def start(node: Node, options: argparse.Namespace) -> None:
     for target in targets:
         node.subscribe(FUSED, on_fused, target=target)
     for camera in cameras:
+        node.subscribe(FRAME, on_frame, camera=camera)
         node.subscribe(MASK, on_mask, camera=camera)
