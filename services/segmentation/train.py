@@ -16,7 +16,7 @@ import signal
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -292,10 +292,12 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of data, initial weights and batches")
     parser.add_argument("--size", type=int, nargs="+", help="channels of each layer (default: 16 16 32 64)")
     parser.add_argument("--delay", action=argparse.BooleanOptionalAction, default=False, help="axonal delays between the layers")
+    parser.add_argument("--cell", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations")
+    parser.add_argument("--error-weight", type=float, help="of the prediction errors in the loss (default: 0.3; 0: without)")
     parser.add_argument("--start", type=Path, help="start from these weights, of their size and delay, instead of random ones")
     parser.add_argument("--checkpoint", type=Path, default=Path("segmentation.checkpoint"), help="written every few minutes")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if there is one")
-    parser.add_argument("--data", type=Path, default=Path("segmentation-data"), help="folder of the rendered sequences (some GB)")
+    parser.add_argument("--cache", type=Path, default=Path("segmentation-data"), help="folder of rendered sequences (some GB)")
     parser.add_argument("--out", type=Path, default=infer.WEIGHTS, help="the weights; the card is written beside them")
     parser.add_argument("--held-out", type=int, default=60, help="sequences for calibration, and as many for the score")
     return parser
@@ -307,6 +309,8 @@ def main(argv: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C: checkpoint written, renderer stopped
     torch.set_num_threads(1)
     schedule = Schedule()
+    if options.error_weight is not None:
+        schedule = replace(schedule, error_weight=options.error_weight)
     if options.resume and options.checkpoint.is_file():
         trainer = Trainer.restore(options.checkpoint, schedule)
     elif options.start:
@@ -314,8 +318,8 @@ def main(argv: list[str] | None = None) -> int:
     else:
         channels = tuple(options.size or Settings.channels)
         kernels = (*(3 for _ in channels[:-2]), 5, 5)
-        trainer = Trainer(Settings(channels, kernels, delay=options.delay), schedule, options.seed)
-    data = DataSet(options.data, trainer.seed, schedule.most)
+        trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.cell), schedule, options.seed)
+    data = DataSet(options.cache, trainer.seed, schedule.most)
     try:
         run(trainer, data, options.steps, options.minutes, options.checkpoint)
     except KeyboardInterrupt:
@@ -331,8 +335,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def run(
     trainer: Trainer, data: DataSet, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0
-) -> None:
-    """Train up to so many steps, or minutes (over all runs); shows a progress bar."""
+) -> dict[str, float]:
+    """Train up to so many steps, or minutes (over all runs); shows a progress bar. Returns the loss's parts, smoothed."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     total = steps if steps is not None else int(minutes * 60)
     saved = last = time.monotonic()
@@ -351,3 +355,4 @@ def run(
                 trainer.save(checkpoint)
                 saved = now
     trainer.save(checkpoint)
+    return smooth
