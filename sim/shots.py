@@ -109,16 +109,19 @@ def clip(
     domain: Domain = "wide",
     frames: int = 4,
     images: bool = True,
+    present: bool = True,
 ) -> list[Shot]:
     """Pictures PERIOD_S apart, of which the last has the hidden share asked for (within WITHIN): target, robot and occluder move
-    a little. `distance_m`: depth of the target's middle; images: whether they are painted, or only labelled (much faster)."""
+    a little. `distance_m`: depth of the target's middle; images: whether they are painted, or only labelled (much faster);
+    present: whether the person is there at all."""
     if not 0.0 <= hidden <= 1.0:
         raise ValueError(f"hidden: a share from 0 to 1 expected, {hidden} came")
     for attempt in itertools.count():
         rng = np.random.default_rng([seed, index, attempt])
         scene = _Scene(rng, index, (width, height), distance_m, domain, frames)
         if (occluder := scene.occluder(hidden, rng)) is not None:
-            return list(scene.film([*scene.things, *occluder], rng, images))
+            things = scene.things if present else scene.things[len(scene.person.meshes) :]
+            return list(scene.film([*things, *occluder], rng, images))
     raise AssertionError("endless")
 
 
@@ -175,7 +178,8 @@ class _Scene:
         self.T_target = T_target
         target = next(iter(cell.targets.values()))
         person = Person(cell, sim.model_copy(update={"shoulder": tuple(shoulder)}), target)
-        self.mesh = person.meshes[0]
+        self.person, self.mesh = person, person.meshes[0]
+        self._target_labels = np.unique(self.mesh.labels)
         name, camera = next(iter(cell.cameras.items()))
         self.camera = _camera(camera, self.mesh, self.T_target, size, distance_m, rng)
         clothes = appearance.person(rng) if domain == "wide" else _bare(rng)
@@ -226,7 +230,7 @@ class _Scene:
             image: NDArray[np.uint8] | None = None
             if images:
                 picture = renderer.render(bodies, self.look, rng)
-                image, labels, seen = picture.image, picture.labels, picture.bodies == 0
+                image, labels = picture.image, picture.labels
             else:
                 view = raster.Raster(self.camera.width, self.camera.height)
                 for index, one in enumerate(bodies):
@@ -234,9 +238,9 @@ class _Scene:
                     view.draw(vertices, one.shape.mesh.faces, *k, index)
                 kinds = np.concatenate([one.shape.mesh.labels for one in bodies])
                 labels = np.where(view.triangles >= 0, kinds[view.triangles], np.uint8(Label.BACKGROUND))
-                seen = view.ids == 0
             vertices = geometry.apply(T_camera_world @ self.T_target[t], self.mesh.vertices)
             whole = raster.silhouette(vertices, self.mesh.faces, k, (0, 0, self.camera.width, self.camera.height))
+            seen = np.isin(labels, self._target_labels) & whole
             hidden = 1.0 - int(seen.sum()) / max(int(whole.sum()), 1)
             near = slice(max(t - 1, 0), t + 2)
             T = self.T_target[near]

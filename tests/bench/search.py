@@ -1,0 +1,504 @@
+"""`penumbra bench search`: how near the search comes to the truth, and to what a mask can tell at all.
+
+Random scenes that hide a given share of the target (`sim.shots`), starts perturbed by 2 cm and 4 degrees. Exact masks come from
+the renderer, network masks from the trained segmentation, which saw the frames before in the window that the service would cut.
+Beside each row stand the paper's search and the Cramér-Rao bound of an exact mask (`tests.bound`): the median of the position
+errors that an efficient estimator would make on the same pictures, the prior left out, as the published pose leaves it out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, rankdata
+
+from services.search.fit import Noise
+from services.search.search import Search, VisionEstimate
+from services.segmentation.crop import Window, corners_of, whole_frame, window_around
+from services.segmentation.infer import Segmenter, load_segmenter
+from shared import geometry
+from shared.classes import Label
+from shared.geometry import Array
+from shared.messages import Mask
+from sim import shots
+from sim.shots import Shot
+from tests import bound
+
+HIDDEN = (0.0, 0.3, 0.6, 0.85)
+VIEWS = ((320, 240, 1.5), (640, 480, 1.5), (1280, 960, 4.5), (1280, 960, 8.0))
+"""Pictures' width and height [px], distance [m]."""
+NEES_VIEW = VIEWS[1]
+"""Also that of the goals for the whole chain, and of the frames for the other numbers."""
+START = (0.02, np.radians(4.0))
+"""Root mean square length of the starts' errors: position [m], rotation [rad]."""
+PRIOR = np.diag(np.repeat(np.square(START) / 3.0, 3))
+EXACT = Noise(edge=0.29, correlation=4.0, dilation=0.02)
+"""Noise of an exact mask, for the search: uniform in a pixel."""
+LOST = (0.05, np.radians(20.0))
+"""An error in position [m] or of the limb's axis [rad] beyond which a pose is wrong."""
+GONE = 0.95
+"""A larger share hidden leaves nothing to track."""
+GOALS = {0.0: (0.25, 0.4), 0.3: (0.3, 0.5), 0.6: (0.6, 1.2), 0.85: (1.5, 2.5)}
+"""Position error of the whole chain at NEES_VIEW, median and mean [cm], by the share hidden."""
+BOUND_GOAL, FASTER_GOAL, BETTER_GOAL, AUC_GOAL = 1.2, 10.0, 5.0, 0.97
+WARM_FRAMES = 4
+TAKES_IMAGE = "image" in inspect.signature(Search.update).parameters
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How many scenes: of each row, of each NEES row, of each kind of frame for the detector of lost poses, of hidden arms."""
+
+    scenes: int
+    nees: int
+    lost: int
+    gone: int
+
+
+FULL, QUICK = Sizes(60, 220, 60, 160), Sizes(4, 6, 3, 4)
+
+
+@dataclass(frozen=True)
+class Result:
+    """One search of one frame, its time [ms], and its errors: position, depth (along the line of sight) and lateral [m], axis and
+    roll [rad]."""
+
+    estimate: VisionEstimate
+    shot: Shot
+    ms: float
+
+    @property
+    def error(self) -> Array:
+        return geometry.pose_error(self.shot.T_world_target, self.estimate.T)
+
+    @property
+    def position(self) -> float:
+        return float(np.linalg.norm(self.error[:3]))
+
+    @property
+    def with_prior(self) -> float:
+        """Position error [m] of the pose that is the most probable together with the start."""
+        return float(np.linalg.norm(self.shot.T_world_target[:3, 3] - self.estimate.T_searched[:3, 3]))
+
+    @property
+    def depth(self) -> float:
+        sight = self.shot.T_world_target[:3, 3] - self.shot.camera.T_world_camera[:3, 3]
+        return float(abs(self.error[:3] @ sight) / np.linalg.norm(sight))
+
+    @property
+    def lateral(self) -> float:
+        return float(np.sqrt(max(self.position**2 - self.depth**2, 0.0)))
+
+    @property
+    def axis(self) -> float:
+        return geometry.axis_angle_error(self.shot.T_world_target, self.estimate.T)
+
+    @property
+    def roll(self) -> float:
+        """Twist about the limb's axis of the rotation between the two poses."""
+        x, _, _, w = Rotation.from_matrix(self.shot.T_world_target[:3, :3].T @ self.estimate.T[:3, :3]).as_quat()
+        return float(abs((2.0 * np.arctan2(x, w) + np.pi) % (2.0 * np.pi) - np.pi))
+
+    @property
+    def is_wrong(self) -> bool:
+        return self.position > LOST[0] or self.axis > LOST[1]
+
+
+def perturbed(shot: Shot, rng: np.random.Generator) -> Array:
+    """A pose error (6,) of a start."""
+    return rng.normal(size=6) * np.sqrt(np.diag(PRIOR))
+
+
+def search_of(shot: Shot, method: str, exact: bool) -> Search:
+    return Search(shot.cell, method=method, noise=EXACT if exact else None)
+
+
+def searched(shot: Shot, search: Search, mask: Mask, T_prior: Array | None, with_image: bool) -> Result:
+    """One update and the processor's time for it: what other processes take does not count."""
+    more: dict[str, Any] = {"image": shot.image} if TAKES_IMAGE and with_image else {}
+    begin = time.process_time()
+    estimate = search.update(mask, T_prior, None if T_prior is None else PRIOR, shot.joints, **more)
+    return Result(estimate, shot, 1e3 * (time.process_time() - begin))
+
+
+def window_of(shot: Shot, T: Array, previous: Window | None = None) -> Window:
+    """The window that the segmentation service would cut around a pose."""
+    around = window_around(shot.camera, [(T, corners_of(shot.mesh.vertices))], previous)
+    return around or whole_frame(shot.camera)
+
+
+def exact_mask(shot: Shot, window: Window) -> Mask:
+    """The labels of a window at the picture's own resolution."""
+    labels = np.ascontiguousarray(shot.labels[window.y0 : window.bottom, window.x0 : window.right])
+    return Mask(stamp_ns=shot.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=1)
+
+
+def network_masks(segmenter: Segmenter, film: list[Shot], window_at: Callable[[Shot, Window | None], Window]) -> Iterator[Mask]:
+    """The masks of a film, in the window that `window_at` gives for each frame and the window before."""
+    window = None
+    for shot in film:
+        window = window_at(shot, window)
+        assert shot.image is not None
+        labels = segmenter(shot.image, window, shot.stamp_ns)
+        yield Mask(stamp_ns=shot.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=window.scale)
+
+
+def exact_results(
+    seed: int, view: tuple[int, int, float], hidden: float, count: int
+) -> tuple[dict[str, list[Result]], list[Shot]]:
+    """Searches of exact masks by method, and the pictures."""
+    out: dict[str, list[Result]] = {"contour": [], "paper": []}
+    pictures = []
+    for index in range(count):
+        shot = shots.shot(seed, index, *view, hidden, images=False)
+        T_prior = geometry.perturb(shot.T_world_target, perturbed(shot, np.random.default_rng([seed, index, 1])))
+        mask = exact_mask(shot, window_of(shot, T_prior))
+        for method in out:
+            search = search_of(shot, "default" if method == "contour" else method, True)
+            out[method].append(searched(shot, search, mask, T_prior, False))
+        pictures.append(shot)
+    return out, pictures
+
+
+def network_results(
+    seed: int, view: tuple[int, int, float], hidden: float, count: int, segmenter: Segmenter
+) -> tuple[dict[str, list[Result]], list[Shot]]:
+    """Searches of the network's masks by method, after some frames that warm its state, and the pictures."""
+    out: dict[str, list[Result]] = {"contour": [], "paper": []}
+    pictures = []
+    for index in range(count):
+        film = shots.clip(seed, index, *view, hidden, frames=WARM_FRAMES)
+        error = perturbed(film[-1], np.random.default_rng([seed, index, 1]))
+
+        def window_at(shot: Shot, previous: Window | None, error: Array = error) -> Window:
+            return window_of(shot, geometry.perturb(shot.T_world_target, error), previous)
+
+        *_, mask = network_masks(segmenter, film, window_at)
+        T_prior = geometry.perturb(film[-1].T_world_target, error)
+        for method in out:
+            search = search_of(film[-1], "default" if method == "contour" else method, False)
+            out[method].append(searched(film[-1], search, mask, T_prior, True))
+        pictures.append(film[-1])
+    return out, pictures
+
+
+def row(masks: str, view: tuple[int, int, float], hidden: float, method: str, results: list[Result], bounds: dict[str, float]):
+    """A row of the table as JSON: medians, and the 90th percentiles and means beside them."""
+    measured = {
+        "position_cm": (100.0, [r.position for r in results]),
+        "lateral_cm": (100.0, [r.lateral for r in results]),
+        "depth_cm": (100.0, [r.depth for r in results]),
+        "axis_deg": (180.0 / np.pi, [r.axis for r in results]),
+        "roll_deg": (180.0 / np.pi, [r.roll for r in results]),
+    }
+    medians = {key: round(scale * float(np.median(values)), 4) for key, (scale, values) in measured.items()}
+    p90 = {key: round(scale * float(np.quantile(values, 0.9)), 4) for key, (scale, values) in measured.items()}
+    mean = round(100.0 * float(np.mean(measured["position_cm"][1])), 4)
+    width, height, distance_m = view
+    return {
+        "masks": masks,
+        "width": width,
+        "height": height,
+        "distance_m": distance_m,
+        "occlusion": hidden,
+        "method": method,
+        **medians,
+        "position_cm": {"median": medians["position_cm"], "p90": p90["position_cm"], "mean": mean},
+        "p90": {key: value for key, value in p90.items() if key != "position_cm"},
+        **bounds,
+        "ms": round(float(np.median([r.ms for r in results])), 3),
+        "searched_cm": round(100.0 * float(np.median([r.with_prior for r in results])), 4),
+        "not_tracking": round(float(np.mean([r.estimate.state != "tracking" for r in results])), 4),
+        "frames": len(results),
+    }
+
+
+def bounds_of(pictures: Iterable[Shot]) -> dict[str, float]:
+    """The bound of pictures [cm]: median position error for a round limb, the same where the mesh's flat sides show its roll, and
+    the root mean square for the round limb."""
+    pictures = list(pictures)
+    round_limb = [bound.information(shot) for shot in pictures]
+    with_facets = [bound.information(shot, facets=True) for shot in pictures]
+    return {
+        "bound_cm": round(100.0 * float(np.median(bound.position_errors(round_limb))), 4),
+        "bound_facets_cm": round(100.0 * float(np.median(bound.position_errors(with_facets))), 4),
+        "bound_rms_cm": round(100.0 * bound.position_rms(round_limb), 4),
+    }
+
+
+def nees(results: list[Result]) -> dict[str, Any]:
+    """Normalised estimation error squared of the tracked poses without the roll (5 degrees of freedom): its mean, the band in
+    which that lies with 95 % if the covariances are true, and its median (4.35 expected)."""
+    values = []
+    for result in results:
+        if result.estimate.state != "tracking":
+            continue
+        basis = np.zeros((5, 6))
+        basis[:3, :3] = np.eye(3)
+        basis[3:, 3:] = result.shot.T_world_target[:3, 1:3].T
+        error = basis @ result.error
+        values.append(float(error @ np.linalg.solve(basis @ result.estimate.covariance @ basis.T, error)))
+    if not values:
+        return {"frames": 0, "mean": None, "median": None, "band": None}
+    n = 5 * len(values)
+    band = [round(float(chi2.ppf(p, n)) / len(values), 3) for p in (0.025, 0.975)]
+    return {
+        "frames": len(values),
+        "mean": round(float(np.mean(values)), 3),
+        "median": round(float(np.median(values)), 3),
+        "band": band,
+    }
+
+
+def doubt(estimate: VisionEstimate) -> float:
+    """How much an estimate doubts itself, as a score for ranking: infinite where it is not tracking."""
+    if estimate.state != "tracking":
+        return np.inf
+    confidence = getattr(estimate, "confidence", None)
+    if confidence is not None:
+        return 1.0 - float(confidence)
+    sigma = [np.sqrt(np.linalg.eigvalsh(estimate.covariance[i : i + 3, i : i + 3])[-1]) for i in (0, 3)]
+    return float(max(sigma[0] / LOST[0], (1.0 - estimate.overlap) / 0.2))
+
+
+def auc(scores: Array, positive: np.ndarray) -> float | None:
+    """Area under the ROC curve: the probability that a positive scores above a negative, ties counted half."""
+    n, p = int((~positive).sum()), int(positive.sum())
+    if not n or not p:
+        return None
+    return float((rankdata(scores)[positive].sum() - p * (p + 1) / 2.0) / (n * p))
+
+
+KINDS = ("good start", "bad start", "wrong mask", "no prior", "absent")
+
+
+def lost_frames(seed: int, count: int, segmenter: Segmenter) -> Iterator[tuple[str, float, bool]]:
+    """Frames of all KINDS: kind, the estimate's doubt, and whether its pose is wrong."""
+    for index in range(count):
+        rng = np.random.default_rng([seed, index, 2])
+        hidden = HIDDEN[index % len(HIDDEN)]
+        film = shots.clip(seed, index, *NEES_VIEW, hidden, frames=3)
+        last, error = film[-1], perturbed(film[-1], rng)
+        far = np.concatenate([_length(rng, 0.08, 0.4), _length(rng, 0.3, 1.5)])
+        for kind, start in (("good start", error), ("bad start", far)):
+            *_, mask = network_masks(
+                segmenter, film, lambda shot, before, e=start: window_of(shot, geometry.perturb(shot.T_world_target, e), before)
+            )
+            found = searched(last, search_of(last, "default", False), mask, geometry.perturb(last.T_world_target, start), True)
+            yield kind, doubt(found.estimate), found.is_wrong
+            if kind == "good start":
+                wrong = spoiled(mask, rng)
+                found = searched(
+                    last, search_of(last, "default", False), wrong, geometry.perturb(last.T_world_target, start), True
+                )
+                yield "wrong mask", doubt(found.estimate), found.is_wrong
+        *_, mask = network_masks(segmenter, film, lambda shot, before: whole_frame(shot.camera))
+        found = searched(last, search_of(last, "default", False), mask, None, True)
+        yield "no prior", doubt(found.estimate), found.is_wrong
+        empty = shots.clip(seed, index, *NEES_VIEW, 0.0, frames=3, present=False)
+        *_, mask = network_masks(
+            segmenter, empty, lambda shot, before, e=error: window_of(shot, geometry.perturb(shot.T_world_target, e), before)
+        )
+        T_prior = geometry.perturb(empty[-1].T_world_target, error) if index % 2 else None
+        found = searched(empty[-1], search_of(empty[-1], "default", False), mask, T_prior, True)
+        yield "absent", doubt(found.estimate), True
+
+
+def _length(rng: np.random.Generator, low: float, high: float) -> Array:
+    v = rng.normal(size=3)
+    return rng.uniform(low, high) * v / np.linalg.norm(v)
+
+
+def spoiled(mask: Mask, rng: np.random.Generator) -> Mask:
+    """A mask that is wrong about where the target is: mirrored, turned by a half, moved away, or with the upper arm's region
+    called the target and the target background."""
+    labels = mask.labels
+    kind = rng.integers(4)
+    if kind == 0:
+        labels = labels[:, ::-1]
+    elif kind == 1:
+        labels = labels[::-1, ::-1]
+    elif kind == 2:
+        labels = np.roll(labels, rng.choice([-1, 1], 2) * np.array(labels.shape) // 4, axis=(0, 1))
+    else:
+        table = np.arange(256, dtype=np.uint8)
+        table[[Label.FOREARM, Label.HAND, Label.UPPER_ARM]] = Label.BACKGROUND, Label.BACKGROUND, Label.FOREARM
+        labels = table[labels]
+    return Mask(stamp_ns=mask.stamp_ns, labels=np.ascontiguousarray(labels), x0=mask.x0, y0=mask.y0, scale=mask.scale)
+
+
+def gone_frames(seed: int, count: int, segmenter: Segmenter) -> Iterator[tuple[float, str]]:
+    """Frames in which more than GONE of the target is hidden: the share hidden and the search's state."""
+    for index in range(count):
+        film = shots.clip(seed, index, *NEES_VIEW, (0.975, 0.99, 1.0)[index % 3], frames=5)
+        error = perturbed(film[-1], np.random.default_rng([seed, index, 3]))
+        search = search_of(film[-1], "default", False)
+        for shot, mask in zip(
+            film,
+            network_masks(
+                segmenter, film, lambda s, before, e=error: window_of(s, geometry.perturb(s.T_world_target, e), before)
+            ),
+            strict=True,
+        ):
+            found = searched(shot, search, mask, geometry.perturb(shot.T_world_target, error), True)
+            if shot.hidden > GONE:
+                yield shot.hidden, found.estimate.state
+
+
+def rows_of(seed: int, sizes: Sizes, masks: tuple[str, ...]) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """All rows of the table, and the NEES at NEES_VIEW by kind of mask and share hidden."""
+    segmenter = load_segmenter() if "network" in masks else None
+    rows, consistency = [], {kind: {} for kind in masks}
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("rows", total=len(masks) * len(VIEWS) * len(HIDDEN))
+        for kind in masks:
+            for view in VIEWS:
+                for hidden in HIDDEN:
+                    count = sizes.nees if view == NEES_VIEW and kind == "network" else sizes.scenes
+                    if kind == "network" and segmenter is not None:
+                        results, pictures = network_results(seed, view, hidden, count, segmenter)
+                    else:
+                        results, pictures = exact_results(seed, view, hidden, count)
+                    bounds = bounds_of(pictures)
+                    rows += [row(kind, view, hidden, method, found, bounds) for method, found in results.items()]
+                    if view == NEES_VIEW:
+                        consistency[kind][f"{hidden:g}"] = nees(results["contour"])
+                    progress.advance(task)
+    return rows, consistency
+
+
+def overall(parts: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The NEES over all shares hidden, beside its parts."""
+    used = [part for part in parts.values() if part["frames"]]
+    n = sum(part["frames"] for part in used)
+    mean = sum(part["mean"] * part["frames"] for part in used) / n if n else None
+    band = [round(float(chi2.ppf(p, 5 * n)) / n, 3) for p in (0.025, 0.975)] if n else None
+    return {"mean": None if mean is None else round(mean, 3), "band": band, "frames": n, "by_occlusion": parts}
+
+
+def judged(seed: int, sizes: Sizes) -> dict[str, Any]:
+    """What the search says about itself: as a detector of wrong poses, and where nothing is left to see."""
+    segmenter = load_segmenter()
+    frames = list(lost_frames(seed, sizes.lost, segmenter))
+    scores, wrong = np.array([score for _, score, _ in frames]), np.array([bad for _, _, bad in frames])
+    kinds = {}
+    for kind in KINDS:
+        chosen = np.array([name == kind for name, _, _ in frames])
+        kinds[kind] = {
+            "frames": int(chosen.sum()),
+            "wrong": int(wrong[chosen].sum()),
+            "tracking": int(np.isfinite(scores[chosen]).sum()),
+            "wrong_and_tracking": int((np.isfinite(scores) & wrong)[chosen].sum()),
+        }
+    gone = list(gone_frames(seed, sizes.gone, segmenter))
+    area = auc(scores, wrong)
+    return {
+        "lost_auc": None if area is None else round(area, 4),
+        "lost": kinds,
+        "false_tracking": sum(state == "tracking" for _, state in gone),
+        "hidden_frames": len(gone),
+    }
+
+
+def measure(seed: int, sizes: Sizes, parts: tuple[str, ...]) -> dict[str, Any]:
+    """The whole benchmark; `parts` of exact, network, judged."""
+    torch.set_num_threads(1)
+    masks = tuple(part for part in parts if part != "judged")
+    rows_of(seed + 1, Sizes(1, 1, 1, 1), masks)  # compiles and warms up
+    result: dict[str, Any] = {"seed": seed}
+    result["rows"], consistency = rows_of(seed, sizes, masks)
+    result["nees"] = overall(consistency["network"]) if "network" in masks else {}
+    if "exact" in masks:
+        result["nees"]["exact"] = overall(consistency["exact"])
+    return result | (judged(seed, sizes) if "judged" in parts else {})
+
+
+def show(result: dict[str, Any], console: Console) -> None:
+    """The tables."""
+    title = f"seed {result['seed']}: errors, median (90th percentile)"
+    table = Table(
+        "masks", "picture", "hidden", "method", "position cm", "mean", "with prior", "bound cm", "lateral cm", "depth cm", "axis deg", "roll deg",
+        "ms", "not tracking", "goal", title=title,
+    )  # fmt: skip
+    papers = {_key(row): row for row in result["rows"] if row["method"] == "paper"}
+    for row in result["rows"]:
+        position = row["position_cm"]
+        cells = [f"{row[key]:.2f} ({row['p90'][key]:.2f})" for key in ("lateral_cm", "depth_cm", "axis_deg", "roll_deg")]
+        table.add_row(
+            row["masks"], f"{row['width']} x {row['height']}, {row['distance_m']:g} m", f"{row['occlusion']:.0%}", row["method"],
+            f"{position['median']:.2f} ({position['p90']:.2f})", f"{position['mean']:.2f}", f"{row['searched_cm']:.2f}",
+            f"{row['bound_cm']:.2f}", *cells,
+            f"{row['ms']:.2f}", f"{row['not_tracking']:.0%}", _goal(row, papers.get(_key(row))),
+        )  # fmt: skip
+    console.print(table)
+    for name, part in (("network masks", result["nees"]), ("exact masks", result["nees"].get("exact", {}))):
+        for hidden, each in part.get("by_occlusion", {}).items():
+            if each["frames"]:
+                verdict = "inside" if each["band"][0] <= each["mean"] <= each["band"][1] else "outside"
+                console.print(
+                    f"NEES of 5 degrees of freedom, {name}, {float(hidden):.0%} hidden: mean {each['mean']} {verdict} "
+                    f"{each['band']}, median {each['median']} (4.35), {each['frames']} frames"
+                )
+    if "lost_auc" in result:
+        console.print(f"wrong poses told: area under the ROC curve {result['lost_auc']} (goal {AUC_GOAL})")
+        for kind, each in result["lost"].items():
+            console.print(f"  {kind}: " + ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in each.items()))
+        console.print(
+            f"more than {GONE:.0%} hidden and tracking: {result['false_tracking']} of {result['hidden_frames']} (goal 0)"
+        )
+
+
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return row["masks"], row["width"], row["distance_m"], row["occlusion"]
+
+
+def _goal(row: dict[str, Any], paper: dict[str, Any] | None) -> str:
+    """What a row reaches of its goals."""
+    if row["method"] == "paper" or paper is None:
+        return ""
+    position = row["position_cm"]
+    if row["masks"] == "exact":
+        better, faster = paper["position_cm"]["median"] / max(position["median"], 1e-9), paper["ms"] / row["ms"]
+        ratio = position["median"] / row["bound_cm"]
+        return f"{ratio:.2f} of bound (<= {BOUND_GOAL:g}), {better:.0f} x better (5), {faster:.0f} x faster (10)"
+    if (row["width"], row["height"], row["distance_m"]) != NEES_VIEW:
+        return ""
+    median, mean = GOALS[row["occlusion"]]
+    return f"median <= {median:g}, mean <= {mean:g}"
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="penumbra bench search", description=__doc__)
+    parser.add_argument("--seed", type=int, default=1, help="draws scenes and starts: nothing was fitted to 9000 and above")
+    parser.add_argument("--frames", type=int, help=f"scenes of each row (default {FULL.scenes}; at least 200 for the NEES)")
+    parser.add_argument("--quick", action="store_true", help="a few scenes of everything, to see that it runs")
+    parser.add_argument("--parts", nargs="+", choices=("exact", "network", "judged"), default=["exact", "network", "judged"])
+    parser.add_argument("--json", type=Path, help="write the numbers to this file")
+    options = parser.parse_args(argv)
+    sizes = QUICK if options.quick else FULL
+    if options.frames:
+        sizes = Sizes(options.frames, max(options.frames, 200), options.frames, options.frames)
+    started = time.monotonic()
+    result = measure(options.seed, sizes, tuple(options.parts))
+    result["wall_s"] = round(time.monotonic() - started, 1)
+    show(result, Console())
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
