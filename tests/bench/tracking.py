@@ -1,0 +1,203 @@
+"""`penumbra bench tracking`: an occluder passes before the moving arm, and the camera alone has to hold it.
+
+Films of 10 s (`sim.shots.passing`) are played through the services in one process (`tests.replay`): segmentation, search and
+fusion without the skin, so that the window follows the pose predicted while nothing is seen. Scored are the camera's own poses
+(errors, false reports of tracking, frames until recovered), and the fused one while everything is hidden.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from shared import geometry, topics
+from shared.geometry import Array
+from shared.messages import Frame, FusedPose, Message, VisionPose
+from shared.topics import Topic
+from sim import shots
+from sim.shots import Domain, Shot
+from tests.bench.search import GONE, LOST
+from tests.replay import Replay
+
+BACKGROUNDS: dict[str, Domain] = {"plain": "easy", "cluttered": "wide"}
+SERVICES = ("segmentation", "search", "fusion")
+VISIBLE = 0.33
+"""At most this share hidden: visible."""
+BACK = 0.5
+"""The arm counts as back in sight when less than this share is hidden again."""
+SKIPPED_S = 1.0
+"""At the start, until the arm is found, nothing is scored."""
+RECOVERY_GOAL = 5
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A frame of a film: stamp, T_world_target (4, 4), share hidden."""
+
+    stamp_ns: int
+    T: Array
+    hidden: float
+
+
+@dataclass(frozen=True)
+class Film:
+    """What was said about a film. vision, fused: by the stamp of the frame that they belong to."""
+
+    truths: list[Truth]
+    vision: dict[int, VisionPose]
+    fused: dict[int, FusedPose]
+
+    def errors(self, pose: VisionPose | FusedPose, truth: Truth) -> tuple[float, float]:
+        """Position error [m] and the axis's [rad]."""
+        T = geometry.transform(pose.position, pose.orientation)
+        return float(np.linalg.norm(T[:3, 3] - truth.T[:3, 3])), geometry.axis_angle_error(truth.T, T)
+
+    def is_right(self, truth: Truth) -> bool:
+        """Whether the camera's pose is tracked and not wrong."""
+        pose = self.vision.get(truth.stamp_ns)
+        return pose is not None and pose.state == "tracking" and bool(np.less(self.errors(pose, truth), LOST).all())
+
+
+def played(film: Iterator[Shot]) -> Film:
+    """A film through the services."""
+    first = next(film)
+    truths: list[Truth] = []
+
+    def recording() -> Iterator[tuple[Topic, dict[str, str], Message]]:
+        shot: Shot | None = first
+        while shot is not None:
+            assert shot.image is not None
+            truths.append(Truth(shot.stamp_ns, shot.T_world_target, shot.hidden))
+            yield topics.FRAME, {"camera": next(iter(shot.cell.cameras))}, Frame(stamp_ns=shot.stamp_ns, image=shot.image)
+            shot = next(film, None)
+
+    heard = Replay(first.cell, SERVICES).run(recording())
+    vision = {item.message.stamp_ns: item.message for item in heard if item.topic is topics.VISION}
+    said = [item.message for item in heard if item.topic is topics.FUSED]
+    stamps = np.array([message.stamp_ns for message in said])
+    fused = {truth.stamp_ns: said[int(np.argmin(np.abs(stamps - truth.stamp_ns)))] for truth in truths}
+    return Film(truths, vision, fused)
+
+
+def passes(film: Film) -> list[tuple[int, int, int]]:
+    """The times that everything was hidden: the first and last frame of each (more than GONE hidden), and the first one after
+    that shows enough again."""
+    hidden = np.array([truth.hidden for truth in film.truths])
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (hidden > GONE).astype(np.int8), [0]])))
+    out = []
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        back = np.flatnonzero(hidden[end:] < BACK)
+        if len(back):
+            out.append((int(begin), int(end) - 1, int(end + back[0])))
+    return out
+
+
+def recovery(film: Film, back: int) -> int | None:
+    """Frames from the first that shows the arm again to the first right pose, both counted; None where none came before the end
+    or the next time that the arm was hidden."""
+    for k, truth in enumerate(film.truths[back:]):
+        if truth.hidden > GONE:
+            break
+        if film.is_right(truth):
+            return k + 1
+    return None
+
+
+def scored(films: list[Film]) -> dict[str, Any]:
+    """The numbers of the films with one background."""
+    errors: dict[str, list[float]] = {"visible_cm": [], "partly_hidden_cm": [], "fused_while_hidden_cm": []}
+    axis, false_tracking, gone, tracked, seen, recoveries = [], 0, 0, 0, 0, []
+    for film in films:
+        begin_ns = film.truths[0].stamp_ns + SKIPPED_S * 1e9
+        for truth in film.truths:
+            pose = film.vision.get(truth.stamp_ns)
+            if truth.stamp_ns < begin_ns or pose is None:
+                continue
+            is_tracked = pose.state == "tracking"
+            if truth.hidden > GONE:
+                gone += 1
+                false_tracking += is_tracked
+                errors["fused_while_hidden_cm"].append(100.0 * film.errors(film.fused[truth.stamp_ns], truth)[0])
+                continue
+            seen, tracked = seen + 1, tracked + is_tracked
+            if is_tracked:
+                position, angle = film.errors(pose, truth)
+                errors["visible_cm" if truth.hidden <= VISIBLE else "partly_hidden_cm"].append(100.0 * position)
+                axis.append(np.degrees(angle))
+        recoveries += [recovery(film, back) for _, _, back in passes(film)]
+    return {
+        "films": len(films),
+        "seconds": round(sum((f.truths[-1].stamp_ns - f.truths[0].stamp_ns) * 1e-9 for f in films), 1),
+        **{key: _spread(values) for key, values in errors.items()},
+        "axis_deg": _spread(axis),
+        "tracked": round(tracked / max(seen, 1), 4),
+        "passes": len(recoveries),
+        "recovery_frames": recoveries,
+        "not_recovered": sum(frames is None for frames in recoveries),
+        "slow_recoveries": sum(frames is None or frames > RECOVERY_GOAL for frames in recoveries),
+        "false_tracking": false_tracking,
+        "hidden_frames": gone,
+    }
+
+
+def _spread(values: list[float]) -> dict[str, float | int | None]:
+    if not values:
+        return {"median": None, "p90": None, "max": None}
+    median, p90 = np.quantile(values, [0.5, 0.9])
+    return {"median": round(float(median), 3), "p90": round(float(p90), 3), "max": round(float(max(values)), 3)}
+
+
+def show(result: dict[str, Any], console: Console) -> None:
+    """The table."""
+    table = Table("", *BACKGROUNDS, "goal", title=f"seed {result['seed']}: median / 90th percentile / largest")
+    rows = result["rows"]
+    names = {
+        "visible_cm": "position error cm, at most a third hidden",
+        "partly_hidden_cm": "position error cm, a third to 95 % hidden",
+        "fused_while_hidden_cm": "the same of the predicted pose, all hidden",
+        "axis_deg": "axis error deg",
+    }
+    for key, name in names.items():
+        table.add_row(name, *("{median} / {p90} / {max}".format(**row[key]) for row in rows), "")
+    table.add_row("frames tracked, up to 95 % hidden", *(f"{row['tracked']:.1%}" for row in rows), "")
+    recovered = (", ".join("-" if n is None else str(n) for n in row["recovery_frames"]) for row in rows)
+    table.add_row("frames until recovered", *recovered, f"<= {RECOVERY_GOAL}")
+    false = (f"{row['false_tracking']} of {row['hidden_frames']}" for row in rows)
+    table.add_row("more than 95 % hidden and tracking", *false, "0")
+    console.print(table)
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="penumbra bench tracking", description=__doc__)
+    parser.add_argument("--seed", type=int, default=1, help="draws persons, motions, occluders and looks")
+    parser.add_argument("--films", type=int, default=4, help="films with each background")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of a film")
+    parser.add_argument("--quick", action="store_true", help="one film of 4 s each, to see that it runs")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file")
+    options = parser.parse_args(argv)
+    count, seconds = (1, 4.0) if options.quick else (options.films, options.seconds)
+    started = time.monotonic()
+    films: dict[str, list[Film]] = {name: [] for name in BACKGROUNDS}
+    jobs = [(name, index) for name in BACKGROUNDS for index in range(count)]
+    for name, index in track(jobs, "films", console=Console(stderr=True), transient=True):
+        films[name].append(played(shots.passing(options.seed, index, domain=BACKGROUNDS[name], seconds=seconds)))
+    rows = [{"background": name, **scored(each)} for name, each in films.items()]
+    result = {"seed": options.seed, "rows": rows, "wall_s": round(time.monotonic() - started, 1)}
+    show(result, Console())
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
