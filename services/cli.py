@@ -20,8 +20,8 @@ COMMANDS = {
     "up": "start every process of a cell with a router, and show what they do",
     "router": "the meeting point of all processes",
     "emulator": "a simulated cell: frames, joints, skin and truth",
-    "segmentation": "frames to masks (`segmentation train`: learn the network again)",
-    "search": "masks to the camera's pose",
+    "segmentation": "frames to masks (`segmentation infer`: of files; `segmentation train`: learn the network again)",
+    "search": "masks to the camera's pose (`search refine`, `search track`: of any rigid mesh on mask files)",
     "haptics": "voltages to the skin's pose (`haptics train`: learn the network again)",
     "fusion": "both poses to the one pose",
     "pose": "print the current pose",
@@ -32,7 +32,14 @@ COMMANDS = {
     "doctor": "check this machine and say how to mend it",
 }
 SERVICES = ("router", "emulator", "segmentation", "search", "haptics", "fusion")
-LEARNED = ("segmentation", "haptics")
+TOOLS = {
+    ("segmentation", "train"): "services.segmentation.train:main",
+    ("segmentation", "infer"): "services.segmentation.files:main",
+    ("search", "refine"): "services.search.tools:refine",
+    ("search", "track"): "services.search.tools:track",
+    ("haptics", "train"): "services.haptics.train:main",
+}
+"""What a service's name can be followed by: `penumbra segmentation infer`."""
 SWITCH_S = 0.0005
 """A reader thread waits at most this long for a computing one; Python's 5 ms would be half of the skin's period."""
 FUNCTIONS = {
@@ -73,15 +80,14 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(command: str, argv: list[str]) -> int:
-    if command in LEARNED and argv[:1] == ["train"]:
-        return importlib.import_module(f"services.{command}.train").main(argv[1:]) or 0
-    if command in SERVICES:
+    tool = TOOLS.get((command, argv[0])) if argv else None
+    if tool is None and command in SERVICES:
         return serve(command, argv)
-    if command == "bench":
+    if tool is None and command == "bench":
         return _bench(argv)
-    module, _, function = FUNCTIONS[command].partition(":")
+    module, _, function = (tool or FUNCTIONS[command]).partition(":")
     run: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
-    return run(argv) or 0
+    return run(argv[1:] if tool else argv) or 0
 
 
 def serve(name: str, argv: list[str]) -> int:

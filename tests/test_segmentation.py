@@ -135,7 +135,7 @@ def test_sequences_are_a_function_of_seed_and_index_and_show_the_target():
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sequences")
-    data = train.DataSet(folder, 1, 24)
+    data = train.Simulated(folder, 1, 24)
     data.ensure(24, ahead=0)
     yield data
     data.close()

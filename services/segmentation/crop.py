@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -61,7 +62,16 @@ def corners_of(vertices: Array) -> Array:
     return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
 
 
-def whole_frame(camera: Camera) -> Window:
+class Sized(Protocol):
+    """Something so many pixels wide and high: a camera, a window."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+
+
+def whole_frame(camera: Sized) -> Window:
     """The window of (nearly) the whole frame: what is left over at the right and lower edge is less than STEP pixels."""
     scale = 1
     while camera.width * camera.height > MAX_PIXELS_WHOLE * scale * scale:

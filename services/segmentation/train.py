@@ -1,6 +1,6 @@
-"""Makes weights/ again: `penumbra segmentation train`.
+"""Makes weights/ again: `penumbra segmentation train`; with --data, weights for a user's own frames and masks.
 
-Sequences are rendered by a second process into a growing data set on disk while the network learns from those already there.
+Simulated sequences are rendered by a second process into a growing data set on disk while the network learns from those there.
 Step n takes its sequences, patches and colours from a generator seeded by (seed, n), and all schedules are functions of the
 progress, so that a run of --steps interrupted and resumed ends with the same weights as one that was not.
 """
@@ -13,20 +13,21 @@ import datetime
 import multiprocessing
 import os
 import signal
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from services.segmentation import infer, loss, prednet
-from services.segmentation.evaluate import calibrate, held_out
+from services.segmentation import infer, loss, prednet, recordings
+from services.segmentation.evaluate import Labelled, calibrate, held_out
 from services.segmentation.prednet import PredNet, Settings
 from sim import sequences
 
@@ -71,12 +72,42 @@ class Schedule:
         return next((size, batch) for start, size, batch in reversed(self.patches) if progress >= start)
 
 
-class DataSet:
-    """Sequences on disk, rendered in order by a process of low priority; `render`: sequences.render or alike."""
+class Data(Protocol):
+    """Sequences to learn from, red, green, blue and class (frames, h, w, 4), and others for the calibration and the score.
+    jitter: how much their colours are changed; side: the largest patch [px] that fits in all; sources: what a card says of the
+    calibration's and the score's."""
 
-    def __init__(self, folder: Path, seed: int, most: int):
+    jitter: float
+    side: int
+
+    @property
+    def sources(self) -> tuple[dict[str, Any], dict[str, Any]]: ...
+    @property
+    def calibration(self) -> Iterable[Labelled]: ...
+    @property
+    def held_out(self) -> Iterable[Labelled]: ...
+    def ensure(self, count: int) -> int:
+        """Wait until `count` sequences are there, or all; returns how many may be used."""
+
+    def __getitem__(self, index: int, /) -> Any: ...
+    def close(self) -> None:
+        """Make no more."""
+
+
+Render = Callable[[int, int], sequences.Sequence]
+
+
+class Simulated:
+    """Sequences rendered in order by a process of low priority, kept on disk. `each`: for the calibration, and for the score;
+    `render`: sequence of a seed and an index, a function that another process can import."""
+
+    jitter = 0.2
+    """Less than the authors' of photographs: our renderer varies the light itself."""
+    side = sequences.Variety.size
+
+    def __init__(self, folder: Path, seed: int, most: int, each: int = 60, render: Render = sequences.render):
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._seed, self._most = folder, seed, most
+        self._folder, self._seed, self._most, self._each, self._render = folder, seed, most, each, render
         self._asked = 0
         self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=os.nice, initargs=(10,))
         self._pending: list[Future[None]] = []
@@ -86,7 +117,7 @@ class DataSet:
         """Wait until `count` sequences (at most `most`) are there, ask for some more; returns how many may be used."""
         count = min(count, self._most)
         for index in range(self._asked, min(count + ahead, self._most)):
-            self._pending.append(self._pool.submit(_render_to, self._path(index), self._seed, index))
+            self._pending.append(self._pool.submit(_render_to, self._path(index), self._render, self._seed, index))
             self._asked = index + 1
         while len(self._arrays) < count:
             self._pending[len(self._arrays)].result()
@@ -97,6 +128,21 @@ class DataSet:
         """Red, green, blue and class (frames, h, w, 4) of a sequence that is there."""
         return self._arrays[index]
 
+    @property
+    def sources(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Seeds that nothing else is made of."""
+        return {"seed": VALIDATION_SEED + self._seed}, {"seed": VALIDATION_SEED + self._seed + 1}
+
+    @property
+    def calibration(self) -> Iterator[sequences.Sequence]:
+        """Sequences for the calibration, rendered as they are asked for."""
+        return (self._render(VALIDATION_SEED + self._seed, index) for index in range(self._each))
+
+    @property
+    def held_out(self) -> Iterator[sequences.Sequence]:
+        """Sequences for the score."""
+        return (self._render(VALIDATION_SEED + self._seed + 1, index) for index in range(self._each))
+
     def close(self) -> None:
         """Render no more."""
         self._pool.shutdown(cancel_futures=True)
@@ -105,10 +151,10 @@ class DataSet:
         return self._folder / f"{self._seed}-{index:06d}.npy"
 
 
-def _render_to(path: Path, seed: int, index: int) -> None:
+def _render_to(path: Path, render: Render, seed: int, index: int) -> None:
     if path.is_file():
         return
-    sequence = sequences.render(seed, index)
+    sequence = render(seed, index)
     part = path.with_suffix(".part.npy")
     np.save(part, np.concatenate([sequence.images, sequence.labels[..., None]], axis=-1))
     part.replace(path)  # a file is there wholly or not at all
@@ -127,12 +173,15 @@ class Trainer:
         self.step, self.minutes = 0, 0.0
         self._half = infer.fastest_dtype() is torch.bfloat16
 
-    def train_step(self, data: DataSet, progress: float) -> dict[str, float]:
+    def train_step(self, data: Data, progress: float) -> dict[str, float]:
         """One step of gradient descent; returns the parts of the loss."""
         size, batch = self.schedule.patch(progress)
+        size = min(size, data.side)
         rng = np.random.default_rng([self.seed, 1, self.step])
         count = data.ensure(8 * batch + self.step * batch // self.schedule.reuse)
-        images, labels = draw_batch([data[i] for i in rng.integers(count, size=batch)], self.schedule.frames, size, rng)
+        images, labels = draw_batch(
+            [data[i] for i in rng.integers(count, size=batch)], self.schedule.frames, size, rng, data.jitter
+        )
         for group in self.optimizer.param_groups:
             group["lr"] = self.schedule.rate(progress)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
@@ -216,11 +265,11 @@ class Trainer:
 
 
 def draw_batch(
-    chosen: list[NDArray[np.uint8]], frames: int, size: int, rng: np.random.Generator
+    chosen: Iterable[Any], frames: int, size: int, rng: np.random.Generator, amount: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Patches of so many frames of sequences (n, h, w, 4): images (batch, frames, 3, size, size) in [0, 1] and labels
     (batch, frames, size, size). Three of five lie around a pixel of the target; mirrored, played backwards and coloured anew at
-    random.
+    random, by `amount`.
     """
     images, labels = [], []
     for sequence in chosen:
@@ -238,15 +287,14 @@ def draw_batch(
             patch = patch[:, :, ::-1]
         if rng.random() < 0.5:
             patch = patch[::-1]
-        picture = jitter(patch[..., :3].astype(np.float32) / 255.0, rng)
+        picture = jitter(patch[..., :3].astype(np.float32) / 255.0, rng, amount)
         images.append(torch.from_numpy(picture).movedim(-1, 1))
         labels.append(torch.from_numpy(patch[..., 3].astype(np.int64)))
     return torch.stack(images), torch.stack(labels)
 
 
-def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float = 0.2) -> NDArray[np.float32]:
-    """Brightness, contrast, saturation and tint of a picture (..., 3) in [0, 1], changed at random by up to `amount` (the
-    authors': 0.4, of photographs; our renderer varies the light itself)."""
+def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float) -> NDArray[np.float32]:
+    """Brightness, contrast, saturation and tint of a picture (..., 3) in [0, 1], changed at random by up to `amount`."""
     brightness, contrast, saturation = 1.0 + amount * rng.uniform(-1.0, 1.0, 3)
     tint = 1.0 + 0.25 * amount * rng.uniform(-1.0, 1.0, 3)
     grey = picture.mean(axis=-1, keepdims=True)
@@ -255,10 +303,9 @@ def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float
     return np.clip((mean + contrast * (picture - mean)) * brightness * tint, 0.0, 1.0, dtype=np.float32)
 
 
-def export(trainer: Trainer, out: Path, sequences_each: int) -> dict[str, Any]:
+def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
     """Calibrate and score the averaged weights on held-out sequences, write them with their card; returns the card."""
-    seed = VALIDATION_SEED + trainer.seed
-    offset, calibrated = calibrate(trainer.average, _rendered(seed, sequences_each))
+    offset, calibrated = calibrate(trainer.average, data.calibration)
     card = {
         "seed": trainer.seed,
         "date": datetime.date.today().isoformat(),
@@ -269,22 +316,21 @@ def export(trainer: Trainer, out: Path, sequences_each: int) -> dict[str, Any]:
         },
         **({"started_from": trainer.started_from} if trainer.started_from else {}),
         "parameters": sum(p.numel() for p in trainer.net.parameters()),
-        "calibration": {"seed": seed, "target_logit_offset": offset, **calibrated},
-        "held_out": {"seed": seed + 1, **held_out(trainer.average, offset, _rendered(seed + 1, sequences_each))},
+        "calibration": {**data.sources[0], "target_logit_offset": offset, **calibrated},
+        "held_out": {**data.sources[1], **held_out(trainer.average, offset, data.held_out)},
     }
     out.parent.mkdir(parents=True, exist_ok=True)
     prednet.save(out, trainer.average, card)
     return card
 
 
-def _rendered(seed: int, count: int) -> Iterator[sequences.Sequence]:
-    return (sequences.render(seed, index) for index in range(count))
-
-
 def arguments() -> argparse.ArgumentParser:
     """The flags of `penumbra segmentation train`."""
     parser = argparse.ArgumentParser(
-        prog="penumbra segmentation train", description="Train the segmentation network on simulated sequences."
+        prog="penumbra segmentation train",
+        description="Train the segmentation network on simulated sequences, or on your own frames and masks.",
+        epilog=recordings.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--minutes", type=float, default=60.0, help="train for so long (default: 60)")
@@ -294,12 +340,21 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--delay", action=argparse.BooleanOptionalAction, default=False, help="axonal delays between the layers")
     parser.add_argument("--cell", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations")
     parser.add_argument("--error-weight", type=float, help="of the prediction errors in the loss (default: 0.3; 0: without)")
-    parser.add_argument("--start", type=Path, help="start from these weights, of their size and delay, instead of random ones")
+    parser.add_argument(
+        "--start",
+        type=Path,
+        nargs="?",
+        const=infer.WEIGHTS,
+        help="start from these weights (without a value: the committed ones), of their size, instead of random ones",
+    )
+    parser.add_argument("--data", type=Path, help="your own frames and masks, in the forms below, instead of simulated sequences")
     parser.add_argument("--checkpoint", type=Path, default=Path("segmentation.checkpoint"), help="written every few minutes")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if there is one")
     parser.add_argument("--cache", type=Path, default=Path("segmentation-data"), help="folder of rendered sequences (some GB)")
-    parser.add_argument("--out", type=Path, default=infer.WEIGHTS, help="the weights; the card is written beside them")
-    parser.add_argument("--held-out", type=int, default=60, help="sequences for calibration, and as many for the score")
+    parser.add_argument(
+        "--out", type=Path, help="the weights, their card beside them (default: the committed ones; with --data segmentation.npz)"
+    )
+    parser.add_argument("--held-out", type=int, default=60, help="simulated sequences for calibration, and as many for the score")
     return parser
 
 
@@ -319,7 +374,16 @@ def main(argv: list[str] | None = None) -> int:
         channels = tuple(options.size or Settings.channels)
         kernels = (*(3 for _ in channels[:-2]), 5, 5)
         trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.cell), schedule, options.seed)
-    data = DataSet(options.cache, trainer.seed, schedule.most)
+    try:
+        data: Data = (
+            recordings.Recordings(options.data, trainer.seed)
+            if options.data
+            else Simulated(options.cache, trainer.seed, schedule.most, options.held_out)
+        )
+    except recordings.DataError as error:
+        print(f"penumbra segmentation train: {error}", file=sys.stderr)
+        return 2
+    out = options.out or (Path("segmentation.npz") if options.data else infer.WEIGHTS)
     try:
         run(trainer, data, options.steps, options.minutes, options.checkpoint)
     except KeyboardInterrupt:
@@ -328,13 +392,13 @@ def main(argv: list[str] | None = None) -> int:
         return 130
     finally:
         data.close()
-    card = export(trainer, options.out, options.held_out)
-    print(f"{options.out}: {card['held_out']}")
+    card = export(trainer, out, data)
+    print(f"{out}: {card['held_out']}")
     return 0
 
 
 def run(
-    trainer: Trainer, data: DataSet, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0
+    trainer: Trainer, data: Data, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0
 ) -> dict[str, float]:
     """Train up to so many steps, or minutes (over all runs); shows a progress bar. Returns the loss's parts, smoothed."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())

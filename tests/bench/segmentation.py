@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +38,12 @@ BACK = 0.9
 GOALS = {"iou": (0.93, 0.88, 0.78), "area_bias": 0.01, "contour_mean_px": 0.1, "contour_rms_px": 0.6, "recovery": 5, "ms": 15.0}
 
 
-def rows(segmenter: infer.Segmenter, seed: int, frames: int) -> list[FrameScore]:
-    """Scores of about so many frames of held-out sequences."""
+def rows(segmenter: infer.Segmenter, data: Iterable[evaluate.Labelled]) -> list[FrameScore]:
+    """Scores of the frames of sequences after their first ones."""
     scores: list[FrameScore] = []
-    window = Window(0, 0, VARIETY.size, VARIETY.size)
-    count = -(-frames // (VARIETY.frames - WARM_UP))
-    for index in track(range(count), "sequences", transient=True):
-        sequence = sequences.render(SEED_BASE + seed, index, VARIETY)
-        start_ns = (index + 1) * 10**10  # a gap after which the state is forgotten
+    for index, sequence in enumerate(data, 1):
+        height, width = sequence.labels.shape[1:]
+        window, start_ns = Window(0, 0, width, height), index * 10**10  # a gap after which the state is forgotten
         masks = [segmenter(image, window, start_ns + t * PERIOD_NS) for t, image in enumerate(sequence.images)]
         scores += evaluate.frame_scores(np.stack(masks)[WARM_UP:], sequence.labels[WARM_UP:], sequence.hidden[WARM_UP:])
     return scores
@@ -127,7 +126,9 @@ def main(argv: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     segmenter = infer.load_segmenter(options.weights)
     ms = infer.speed(segmenter, VARIETY.size, VARIETY.size, 200)
-    scores = rows(segmenter, options.seed, options.frames)
+    count = -(-options.frames // (VARIETY.frames - WARM_UP))
+    held_out = (sequences.render(SEED_BASE + options.seed, index, VARIETY) for index in range(count))
+    scores = rows(segmenter, track(held_out, "sequences", total=count, transient=True))
     recovered: list[int] = []
     for index in track(range(options.films), "films", transient=True):
         recovered += recoveries(*film_scores(segmenter, list(shots.passing(SEED_BASE + options.seed, index))))

@@ -1,0 +1,173 @@
+"""`penumbra segmentation infer`: masks and overlays of picture and film files.
+
+A film's frames, and with --sequence the pictures given, are looked at in order, and what the network remembers goes from one to
+the next. Other pictures stand for themselves: each is shown SETTLE times, as the network needs some frames to make up its mind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.progress import track
+
+from services.segmentation import infer
+from services.segmentation.crop import STEP, Window, whole_frame
+from shared.classes import Label
+
+SETTLE = 4
+PERIOD_NS = 50_000_000
+COLOURS: dict[Label, tuple[int, int, int]] = {
+    Label.ROBOT: (90, 120, 200),
+    Label.TORSO: (150, 110, 170),
+    Label.UPPER_ARM: (230, 170, 60),
+    Label.FOREARM: (60, 190, 90),
+    Label.HAND: (20, 230, 200),
+    Label.OCCLUDER: (200, 60, 60),
+}
+"""RGB of the overlay; background stays as it is."""
+
+
+class FileError(ValueError):
+    """A file that cannot be read or written. The text says which, what was expected and what to do."""
+
+
+def arguments() -> argparse.ArgumentParser:
+    """The flags of `penumbra segmentation infer`."""
+    parser = argparse.ArgumentParser(
+        prog="penumbra segmentation infer",
+        description="Write masks and overlays of pictures and films. For NAME.png: NAME_mask.png, one channel of class indices ("
+        + ", ".join(f"{label.value} {label.name.lower()}" for label in Label)
+        + "), and NAME_overlay.png; for a film NAME.mp4: a mask a frame in NAME_masks/ and NAME_overlay.mp4.",
+    )
+    parser.add_argument("files", type=Path, nargs="+", metavar="IMAGE|VIDEO")
+    parser.add_argument("--out", type=Path, default=Path("masks"), help="folder to write to (default: masks)")
+    parser.add_argument("--weights", type=Path, default=infer.WEIGHTS, help="the network (default: the committed one)")
+    parser.add_argument("--sequence", action="store_true", help="the pictures are frames of one film, in this order")
+    parser.add_argument(
+        "--scale",
+        type=int,
+        help="look at means of so many pixels a side (default: 2 at 640 x 480, as the service at a whole frame)",
+    )
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Write the masks; returns 2 where a file cannot be read."""
+    options = arguments().parse_args(argv)
+    torch.set_num_threads(1)
+    try:
+        names = [path.stem for path in options.files]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise FileError(f"files of different names expected, {twice} came twice: call it once for each, with an --out each")
+        options.out.mkdir(parents=True, exist_ok=True)
+        segmenter = infer.load_segmenter(options.weights)
+        stamp_ns = 0
+        for path in options.files:
+            if is_picture(path):
+                image = read(path)
+                if not options.sequence:
+                    stamp_ns += 2 * round(infer.MAX_GAP_S * 1e9)  # so long that the last picture is forgotten
+                for _ in range(1 if options.sequence else SETTLE):
+                    stamp_ns += PERIOD_NS
+                    mask = whole_mask(segmenter, image, options.scale, stamp_ns)
+                write(options.out / f"{path.stem}_mask.png", mask)
+                write(options.out / f"{path.stem}_overlay.png", overlay(image, mask)[..., ::-1])
+            else:
+                stamp_ns += 2 * round(infer.MAX_GAP_S * 1e9)
+                stamp_ns = film(segmenter, path, options.out, options.scale, stamp_ns)
+    except (FileError, FileNotFoundError) as error:
+        print(f"penumbra segmentation infer: {error}", file=sys.stderr)
+        return 2
+    print(f"{len(options.files)} masked: {options.out}")
+    return 0
+
+
+def is_picture(path: Path) -> bool:
+    """Whether a file is a picture; else it may be a film. Raises FileNotFoundError."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {path}: a picture or a film expected")
+    return bool(cv2.haveImageReader(str(path)))
+
+
+def read(path: Path) -> NDArray[np.uint8]:
+    """An RGB image (h, w, 3)."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise FileError(f"{path}: a picture expected, it begins as one but cannot be read: is it whole?")
+    return np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
+
+
+def film(segmenter: infer.Segmenter, path: Path, out: Path, scale: int | None, stamp_ns: int) -> int:
+    """Masks and overlay of a film; returns the stamp of its last frame. Raises FileError."""
+    source = cv2.VideoCapture(str(path))
+    rate = source.get(cv2.CAP_PROP_FPS) or 1e9 / PERIOD_NS
+    count = max(int(source.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+    folder, target = out / f"{path.stem}_masks", out / f"{path.stem}_overlay.mp4"
+    writer: cv2.VideoWriter | None = None
+    for index, image in enumerate(track(frames(source), path.name, total=count or None, transient=True)):
+        stamp_ns += PERIOD_NS
+        mask = whole_mask(segmenter, image, scale, stamp_ns)
+        if writer is None:
+            folder.mkdir(exist_ok=True)
+            size = (image.shape[1], image.shape[0])
+            writer = cv2.VideoWriter(str(target), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+            if not writer.isOpened():
+                raise FileError(f"{target}: OpenCV cannot write films here: give it pictures")
+        write(folder / f"{index:06d}.png", mask)
+        writer.write(np.ascontiguousarray(overlay(image, mask)[..., ::-1]))
+    if writer is None:
+        raise FileError(f"{path}: a picture or a film expected, OpenCV reads no frame of it")
+    writer.release()
+    return stamp_ns
+
+
+def frames(source: cv2.VideoCapture) -> Iterator[NDArray[np.uint8]]:
+    """The RGB frames (h, w, 3) of a film."""
+    while True:
+        there, image = source.read()
+        if not there:
+            return
+        yield np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
+
+
+def whole_mask(segmenter: infer.Segmenter, image: NDArray[np.uint8], scale: int | None, stamp_ns: int) -> NDArray[np.uint8]:
+    """Classes (h, w) of a whole image (h, w, 3), looked at as the service does where it knows of no pose; what is left over at
+    the edges is background. Raises FileError where the image is too small for the network."""
+    height, width = image.shape[:2]
+    if scale is None:
+        window = whole_frame(Window(0, 0, width, height))
+    else:
+        window = Window(0, 0, width // (STEP * scale) * STEP, height // (STEP * scale) * STEP, scale)
+    if not (0 < window.right <= width and 0 < window.bottom <= height):
+        least = STEP * window.scale
+        raise FileError(f"a picture of at least {least} x {least} pixels expected, {width} x {height} came")
+    labels = segmenter(image, window, stamp_ns)
+    mask = np.full((height, width), Label.BACKGROUND, np.uint8)
+    mask[: window.bottom, : window.right] = labels.repeat(window.scale, axis=0).repeat(window.scale, axis=1)
+    return mask
+
+
+def overlay(image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image (h, w, 3) with every class but background in its colour, and the target's contour in white."""
+    colours = image.copy()
+    for label, colour in COLOURS.items():
+        colours[mask == label] = colour
+    blended = (image // 2 + colours // 2).astype(np.uint8)
+    blended[mask == Label.BACKGROUND] = image[mask == Label.BACKGROUND]
+    target = np.isin(mask, infer.TARGET_LABELS).astype(np.uint8)
+    contours, _ = cv2.findContours(target, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(cv2.drawContours(blended, contours, -1, (255, 255, 255), 1), np.uint8)
+
+
+def write(path: Path, image: NDArray[np.uint8]) -> None:
+    """A picture's file: one channel, or blue, green, red. Raises FileError."""
+    if not cv2.imwrite(str(path), image):
+        raise FileError(f"{path}: cannot be written")

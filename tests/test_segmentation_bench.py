@@ -1,0 +1,62 @@
+"""The benchmarks of the segmentation: what recovery is, the form of the JSON file, that variants learn from the same data."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.segmentation.prednet import Settings
+from tests.bench import ablation, segmentation
+
+
+def test_recovery_is_counted_from_half_free_again_to_the_overlap_of_before():
+    hidden = [0.0] * 12 + [0.6] + [1.0] * 8 + [0.8, 0.4, 0.2, 0.0, 0.0, 0.0]
+    iou = [0.9] * 12 + [0.8] + [np.nan] * 8 + [0.2, 0.5, 0.7, 0.8, 0.82, 0.9]
+    assert segmentation.recoveries(hidden, iou) == [4]  # 0.82 is the first of at least 0.9 * 0.9
+    assert (
+        segmentation.recoveries(hidden, [v * (0.4 if k < 13 else 1.0) for k, v in enumerate(iou)]) == []
+    )  # nothing to return to
+    assert segmentation.recoveries(hidden[:22], iou[:22]) == []  # nothing follows
+    assert segmentation.recoveries(hidden, iou[:20] + [0.1] * 7) == [6]  # never: as long as it was watched, and one more
+    twice = segmentation.recoveries(hidden + hidden[1:], iou + iou[1:])
+    assert twice == [4, 4]
+
+
+def test_the_benchmark_writes_the_agreed_numbers(tmp_path, capsys):
+    assert segmentation.main(["--seed", "3", "--frames", "20", "--films", "0", "--json", str(tmp_path / "out.json")]) == 0
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert list(found) == ["seed", "rows", "recovery_frames", "ms_per_frame"]
+    assert [row["occlusion"] for row in found["rows"]] == [[0.0, 0.33], [0.33, 0.66], [0.66, 0.95]]
+    keys = {"occlusion", "frames", "iou", "area_bias", "contour_mean_px", "contour_rms_px"}
+    assert all(set(row) == keys for row in found["rows"])
+    assert 0 < sum(row["frames"] for row in found["rows"]) <= 22
+    assert "0.93" in capsys.readouterr().out  # the goal beside it
+
+
+def test_the_ablation_trains_each_variant_as_long_and_scores_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(ablation, "SCHEDULE", replace(ablation.SCHEDULE, patches=((0.0, 32, 1),), seen=((0, 1.0),), most=3))
+    monkeypatch.setattr(ablation, "HELD_OUT", 2)
+    tiny = Settings(channels=(4, 4), kernels=(3, 3))
+    small = {"hGRU": (tiny, 0.3), "ConvLSTM, no prediction loss": (replace(tiny, cell="convlstm"), 0.0)}
+    monkeypatch.setattr(ablation, "VARIANTS", small)
+    flags = ["--steps", "2", "--seed", "5", "--cache", str(tmp_path / "cache"), "--json", str(tmp_path / "out.json")]
+    assert ablation.main(flags) == 0
+    found = json.loads((tmp_path / "out.json").read_text())["variants"]
+    assert [(one["variant"], one["steps"]) for one in found] == [(name, 2) for name in small]
+    assert all(sum(row["frames"] for row in one["rows"]) > 0 for one in found)
+
+
+def test_the_authors_variants_are_of_one_size_and_differ_in_one_thing_each():
+    reference, others = Settings(), [value for name, value in ablation.VARIANTS.items() if name != "hGRU"]
+    for settings, error_weight in others:
+        differs = [settings.delay != reference.delay, settings.cell != reference.cell, error_weight != 0.3]
+        assert sum(differs) == 1
+        assert settings.channels == reference.channels
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_easy_scenes_show_the_target_and_are_a_function_of_seed_and_index(index):
+    first, again = ablation.easy(9, index), ablation.easy(9, index)
+    np.testing.assert_array_equal(first.images, again.images)
+    assert first.images.shape == (8, ablation.SIDE, ablation.SIDE, 3) and first.labels.max() > 0
