@@ -58,7 +58,8 @@ WARM_FRAMES = 4
 
 @dataclass(frozen=True)
 class Sizes:
-    """How many scenes: of each row, of each NEES row, of each kind of frame for the detector of lost poses, of hidden arms."""
+    """How many scenes: of each row; of the rows for the NEES, tracked ones; of each kind of frame for the detector of lost poses;
+    of hidden arms."""
 
     scenes: int
     nees: int
@@ -66,7 +67,7 @@ class Sizes:
     gone: int
 
 
-FULL, QUICK = Sizes(60, 220, 60, 160), Sizes(2, 4, 2, 2)
+FULL, QUICK = Sizes(40, 200, 50, 110), Sizes(2, 3, 2, 2)
 
 
 @dataclass(frozen=True)
@@ -171,12 +172,16 @@ def exact_results(
 
 
 def network_results(
-    seed: int, view: tuple[int, int, float], hidden: float, count: int, segmenter: Segmenter
+    seed: int, view: tuple[int, int, float], hidden: float, count: int, segmenter: Segmenter, tracked: int = 0
 ) -> tuple[dict[str, list[Result]], list[Shot]]:
-    """Searches of the network's masks by method, after some frames that warm its state, and the pictures."""
+    """Searches of the network's masks by method, after some frames that warm its state, and the pictures: `count` of them, and
+    up to twice as many until so many are `tracked`."""
     out: dict[str, list[Result]] = {"contour": [], "paper": []}
-    pictures = []
-    for index in range(count):
+    pictures: list[Shot] = []
+    while len(pictures) < count or (
+        len(pictures) < 2 * count and sum(r.estimate.state == "tracking" for r in out["contour"]) < tracked
+    ):
+        index = len(pictures)
         film = shots.clip(seed, index, *view, hidden, frames=WARM_FRAMES)
         error = perturbed(film[-1], np.random.default_rng([seed, index, 1]))
 
@@ -362,11 +367,12 @@ def rows_of(seed: int, sizes: Sizes, masks: tuple[str, ...]) -> tuple[list[dict[
         for kind in masks:
             for view in VIEWS:
                 for hidden in HIDDEN:
-                    count = sizes.nees if view == NEES_VIEW and kind == "network" else sizes.scenes
-                    if kind == "network" and segmenter is not None:
-                        results, pictures = network_results(seed, view, hidden, count, segmenter)
+                    if kind == "exact" or segmenter is None:
+                        results, pictures = exact_results(seed, view, hidden, sizes.scenes)
+                    elif view == NEES_VIEW:
+                        results, pictures = network_results(seed, view, hidden, sizes.nees, segmenter, sizes.nees)
                     else:
-                        results, pictures = exact_results(seed, view, hidden, count)
+                        results, pictures = network_results(seed, view, hidden, sizes.scenes, segmenter)
                     bounds = bounds_of(pictures)
                     rows += [row(kind, view, hidden, method, found, bounds) for method, found in results.items()]
                     if view == NEES_VIEW:
