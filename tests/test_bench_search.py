@@ -38,8 +38,7 @@ def test_the_bound_is_that_of_the_contour_which_the_search_would_trace_in_a_fine
     model, k = contour.Model(shot.mesh), Intrinsics.of_window(camera, 0, 0, 1)
     fine = Intrinsics(k.fx * finer, k.fy * finer, (k.cx + 0.5) * finer - 0.5, (k.cy + 0.5) * finer - 0.5)
     V = model.in_camera(T)
-    silhouette = model.silhouette_of(V, fine, (0, 0, camera.width * finer, camera.height * finer))
-    points = contour.trace(V, model.faces, model.edges, fine.fx, fine.fy, fine.cx, fine.cy, silhouette, 0.5 * finer)
+    points = model.outline(V, fine, (camera.height * finer, camera.width * finer), 0.5 * finer)
     near = bound._visible(shot, (points[:, 3:5] + 0.5) / finer - 0.5)
     normals, X = points[near, 5:7], points[near, :3]
     a, b = normals[:, 0] * k.fx / X[:, 2], normals[:, 1] * k.fy / X[:, 2]

@@ -42,9 +42,19 @@ NOISE = Noise(edge=2.0, correlation=40.0, dilation=0.7)
 """How a network's mask of any object errs [px of the image]."""
 FARTHEST_PX = 8.0
 """A pixel further from the mask's boundary than this [px of the image] counts no more: a missing part is one mistake."""
+AROUND = 0.5
+"""Diagonals of the mask around it that are looked at."""
 DAMPING = 0.02
 MAX_STEP = np.array([0.08, 0.08, 0.15, 0.3, 0.3, 0.3])
 """Largest step of a pass [m, rad] for an object a metre away."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """An object about its own middle: with few triangles for the small picture, and with all."""
+
+    coarse: Model
+    fine: Model
 
 
 @dataclass(frozen=True)
@@ -61,8 +71,8 @@ class Level:
         return self.evidence.state.shape[0], self.evidence.state.shape[1]
 
 
-def level(state: NDArray[np.uint8], k: Intrinsics, scale: int) -> Level:
-    """The state (h, w) of all pixels of an image with intrinsics k, made smaller."""
+def level(state: NDArray[np.uint8], k: Intrinsics, x0: int, y0: int, scale: int) -> Level:
+    """The state (h, w) of the pixels from (x0, y0) on of an image with intrinsics k, made smaller."""
     if scale > 1:
         h, w = state.shape[0] // scale, state.shape[1] // scale
         cut = state[: h * scale, : w * scale]
@@ -72,13 +82,13 @@ def level(state: NDArray[np.uint8], k: Intrinsics, scale: int) -> Level:
 
         target, covered = share(TARGET), share(COVERED)
         state = np.where(covered >= 0.5, COVERED, np.where(target > 0.5 * (1.0 - covered), TARGET, FREE)).astype(np.uint8)
-        offset = (scale - 1) / 2.0
-        k = Intrinsics(k.fx / scale, k.fy / scale, (k.cx - offset) / scale, (k.cy - offset) / scale)
+    half = (scale - 1) / 2.0
+    k = Intrinsics(k.fx / scale, k.fy / scale, (k.cx - x0 - half) / scale, (k.cy - y0 - half) / scale)
     target = (state == TARGET).astype(np.uint8)
     distance = np.where(
         target != 0, cv2.distanceTransform(target, cv2.DIST_L2, 5), cv2.distanceTransform(1 - target, cv2.DIST_L2, 5)
     )
-    return Level(evidence.gather(state, np.zeros_like(state), k), (distance - 0.5).astype(np.float32), scale)
+    return Level(evidence.gather(state, np.zeros_like(state), k, x0, y0, scale), (distance - 0.5).astype(np.float32), scale)
 
 
 @njit(cache=True, nogil=True)
@@ -196,8 +206,10 @@ class Contour:
 def contour(model: Model, at: Level, T: Array, reach: float, spacing: float = 2.0) -> Contour:
     """The contour at a pose, compared with the mask within `reach` [px of the level]."""
     k = at.evidence.intrinsics
-    points = model.outline(model.in_camera(T), k, at.shape, spacing)
-    r, kind = match(points, at.evidence.field, at.evidence.guarded, reach)
+    V = model.in_camera(T)
+    points = model.outline(V, k, at.shape, spacing)
+    own = at.evidence.field_of(model.silhouette_of(V, k, (0, 0, *at.shape[::-1])))
+    r, kind = match(points, at.evidence.field, at.evidence.guarded, own, reach)
     return Contour(points, r, kind)
 
 
@@ -244,11 +256,16 @@ class Pyramid:
 
 
 def pyramid(state: NDArray[np.uint8], k: Intrinsics) -> Pyramid:
-    """`state` (h, w): FREE, TARGET or COVERED for every pixel of an image with intrinsics k."""
-    size = math.sqrt(np.count_nonzero(state == TARGET)) + 1e-9
+    """`state` (h, w): FREE, TARGET or COVERED for every pixel of an image with intrinsics k. Far from the mask it is left out."""
+    target = state == TARGET
+    rows, columns = np.flatnonzero(target.any(axis=1)), np.flatnonzero(target.any(axis=0))
+    size = math.sqrt(np.count_nonzero(target))
     fine = max(1, int(size / FINE_PX))
     coarse = max(fine, round(size / COARSE_PX))
-    return Pyramid(level(state, k, coarse), level(state, k, fine))
+    margin = int(AROUND * math.hypot(rows[-1] - rows[0] + 1, columns[-1] - columns[0] + 1)) + 8 * coarse
+    x0, y0 = max(int(columns[0]) - margin, 0), max(int(rows[0]) - margin, 0)
+    window = state[y0 : rows[-1] + margin + 1, x0 : columns[-1] + margin + 1]
+    return Pyramid(level(window, k, x0, y0, coarse), level(window, k, x0, y0, fine))
 
 
 COARSE_WIDTHS = (16.0, 12.0, 10.0, 8.0, 8.0)
@@ -256,14 +273,15 @@ MORE_WIDTHS = (8.0, 6.0, 6.0, 5.0, 5.0)
 FINE_WIDTHS = (5.0, 4.0, 4.0, 3.0, 3.0, 3.0)
 
 
-def search(model: Model, masks: Pyramid, prior: Prior, noise: Noise = NOISE) -> list[tuple[Score, Array]]:
+def search(shape: Shape, masks: Pyramid, prior: Prior, noise: Noise = NOISE) -> list[tuple[Score, Array]]:
     """The poses T_camera_object near the prior that explain the mask best, best first."""
-    at, full = masks.coarse, masks.fine
+    model, at = shape.coarse, masks.coarse
     found = ranked(model, at, [align(model, at, T) for T in starts(prior.T)], prior, noise)[: SURVIVORS[0]]
     for widths in (COARSE_WIDTHS, MORE_WIDTHS):
         found = distinct(ranked(model, at, [descend(model, at, T, prior, widths, noise) for _, T in found], prior, noise))
-    poses = [descend(model, full, T, prior, FINE_WIDTHS, noise) for _, T in found[: SURVIVORS[1]]]
-    return distinct(ranked(model, full, poses, prior, noise))
+    model, at = shape.fine, masks.fine
+    poses = [descend(model, at, T, prior, FINE_WIDTHS, noise) for _, T in found[: SURVIVORS[1]]]
+    return distinct(ranked(model, at, poses, prior, noise))
 
 
 def ranked(model: Model, at: Level, poses: list[Array], prior: Prior, noise: Noise) -> list[tuple[Score, Array]]:

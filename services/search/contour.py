@@ -18,8 +18,13 @@ SPACING_PX = 3.0
 """Distance of the sampled contour points: closer ones bring no new information."""
 NEAR = 0.05
 """Edges nearer to the camera than this are left out [m]."""
-BESIDE = 4.0
+BESIDE = 1.5
 """Contours of two parts that are nearer than this [px] are told apart by nothing."""
+FINE = 4
+"""The silhouette that tells the outer contour from the inner has so many pixels on each of the mask's: fingers far away are as
+wide as one."""
+ACROSS = 0.35
+"""Distance [px] on both sides of the contour at which it is looked up."""
 COLUMN = 8
 """Width of the columns [px] in which they are looked for, at least BESIDE."""
 APART = 0.01
@@ -46,6 +51,21 @@ class Model:
     def silhouette(self, T: Array, k: Intrinsics, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
         """The silhouette (h, w) in a window (x0, y0, w, h) of the image with intrinsics k."""
         return self.silhouette_of(self.in_camera(T), k, window)
+
+    def outline(self, V: Array, k: Intrinsics, shape: tuple[int, ...], spacing: float) -> Array:
+        """Points of the outer contour (`trace`) in a window (h, w) of vertices (n, 3) [m] in the camera's frame."""
+        if V[:, 2].min() < NEAR:
+            return np.empty((0, 8))
+        h, w = shape
+        u, v = k.fx * V[:, 0] / V[:, 2] + k.cx, k.fy * V[:, 1] / V[:, 2] + k.cy
+        x0, y0 = max(int(u.min()) - 2, 0), max(int(v.min()) - 2, 0)
+        x1, y1 = min(int(u.max()) + 3, w), min(int(v.max()) + 3, h)
+        if x1 <= x0 or y1 <= y0:
+            return np.empty((0, 8))
+        half = (FINE - 1) / 2.0
+        finer = Intrinsics(k.fx * FINE, k.fy * FINE, k.cx * FINE + half, k.cy * FINE + half)
+        fine = self.silhouette_of(V, finer, (x0 * FINE, y0 * FINE, (x1 - x0) * FINE, (y1 - y0) * FINE))
+        return np.asarray(trace(V, self.faces, self.edges, k.fx, k.fy, k.cx, k.cy, fine, x0, y0, w, h, spacing))
 
     def silhouette_of(self, V: Array, k: Intrinsics, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
         """The same of vertices (n, 3) [m] that are in the camera's frame already."""
@@ -95,14 +115,14 @@ def _lean(V, edge, N, X, Y, Z):
 
 
 @njit(cache=True, nogil=True)
-def trace(V, faces, edges, fx, fy, cx, cy, silhouette, spacing):
+def trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing):
     """Points of the outer occluding contour: (n, 8) rows of X, Y, Z in the camera's frame [m], u, v, outward normal (2) and
-    the length of contour [px] that the point stands for. V (n, 3) [m]; silhouette (h, w) of the same pose.
+    the length of contour [px] that the point stands for. V (n, 3) [m]; fine: silhouette of the same pose with FINE x FINE pixels
+    on each of the window's, from pixel (x0, y0) on; w, h: size of the window.
 
     Where two parts (thumb and palm) end within BESIDE of one another, the points are left out: the smallest motion decides which
     of the two is the contour, so that neither predicts how it moves.
     """
-    h, w = silhouette.shape
     n_faces, n_vertices = len(faces), len(V)
     N = np.empty((n_faces, 4))  # unit normal and twice the area
     front = np.empty(n_faces, np.bool_)
@@ -139,11 +159,10 @@ def trace(V, faces, edges, fx, fy, cx, cy, silhouette, spacing):
         for m in range(count):
             s = (m + 0.5) / count
             u, v = P[i, 0] + s * dx, P[i, 1] + s * dy
-            uo, vo = int(math.floor(u + 1.5 * nx + 0.5)), int(math.floor(v + 1.5 * ny + 0.5))
-            ui, vi = int(math.floor(u - 1.5 * nx + 0.5)), int(math.floor(v - 1.5 * ny + 0.5))
-            if not (0 <= uo < w and 0 <= vo < h and 0 <= ui < w and 0 <= vi < h) or n == len(out):
+            if not (0 <= u < w - 1 and 0 <= v < h - 1) or n == len(out):
                 continue
-            outer[n] = not silhouette[vo, uo] and silhouette[vi, ui]
+            outer[n] = not _lookup(fine, u + ACROSS * nx - x0, v + ACROSS * ny - y0)
+            outer[n] = outer[n] and _lookup(fine, u - ACROSS * nx - x0, v - ACROSS * ny - y0)
             # the point of the edge in space that projects to (u, v): linear in the inverse depth
             z = 1.0 / ((1.0 - s) / V[i, 2] + s / V[j, 2])
             x, y = (u - cx) / fx * z, (v - cy) / fy * z
@@ -166,6 +185,13 @@ def trace(V, faces, edges, fx, fy, cx, cy, silhouette, spacing):
             points[kept] = out[i]
             kept += 1
     return points[:kept]
+
+
+@njit(cache=True, nogil=True)
+def _lookup(fine, u, v):
+    """Whether a silhouette of FINE times the resolution covers the point (u, v)."""
+    x, y = int(math.floor((u + 0.5) * FINE)), int(math.floor((v + 0.5) * FINE))
+    return 0 <= x < fine.shape[1] and 0 <= y < fine.shape[0] and fine[y, x]
 
 
 @njit(cache=True, nogil=True)
@@ -204,14 +230,20 @@ def _nearest(image, u, v):
     return image[y, x]
 
 
+LEVELS = (0.2, 0.7)
+"""Bounds of the value of a field that is taken for a boundary."""
 DROPPED, MEASURED, BOUNDED = 0, 1, 2
 """What became of a contour point. BOUNDED: on the way to the boundary something covers the view, which only says that the contour
 has to move at least that far."""
 
 
 @njit(cache=True, nogil=True)
-def match(points, field, guarded, reach):
-    """Offsets r (n,) [px] along the outward normal from each contour point to the mask's boundary, and their kinds (n,)."""
+def match(points, field, guarded, own, reach):
+    """Offsets r (n,) [px] along the outward normal from each contour point to the mask's boundary, and their kinds (n,).
+
+    The boundary is where the mask's `field` (h, w) has the value that the silhouette's `own` field (h, w) has on the contour:
+    half on a straight one, less on a finger's, which blurring makes smaller.
+    """
     n = len(points)
     r = np.zeros(n)
     kind = np.zeros(n, np.uint8)
@@ -220,7 +252,8 @@ def match(points, field, guarded, reach):
         before = _bilinear(field, u, v)
         if before < 0.0 or _nearest(guarded, u, v) != 0:
             continue
-        way = 1.0 if before >= 0.5 else -1.0  # inside the mask: the boundary lies outwards
+        level = min(max(_bilinear(own, u, v), LEVELS[0]), LEVELS[1])
+        way = 1.0 if before >= level else -1.0  # inside the mask: the boundary lies outwards
         r[i] = way * reach  # where no boundary is in reach: at least so far
         kind[i] = BOUNDED
         for step in range(1, int(reach) + 1):
@@ -232,8 +265,8 @@ def match(points, field, guarded, reach):
                 if step <= 2:
                     kind[i] = DROPPED
                 break
-            if (value < 0.5) == (way > 0.0):
-                r[i] = t - way * (value - 0.5) / (value - before)
+            if (value < level) == (way > 0.0):
+                r[i] = t - way * (value - level) / (value - before)
                 kind[i] = MEASURED
                 break
             before = value

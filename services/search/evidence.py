@@ -66,6 +66,10 @@ class Evidence:
     y0: int = 0
     scale: int = 1
 
+    def field_of(self, silhouette: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """The field (h, w) of a mask that shows what a silhouette (h, w) shows, where something is known."""
+        return _field((silhouette & (self.state != COVERED)).astype(np.float32), self.state)
+
     def measurements(self, correlation: float) -> float:
         """The number of independent measurements, with those that the six unknowns of a pose need."""
         return self.boundary_px / correlation + 6.0
@@ -128,10 +132,7 @@ def gather(
     """The evidence of a mask from its states and labels (h, w); `x0`, `y0`, `scale`: its window as in `messages.Mask`."""
     target = (state == TARGET).astype(np.float32)
     covered = (state == COVERED).astype(np.uint8)
-    field = _blur(target)
-    if covered.any():
-        known = _blur((1 - covered).astype(np.float32))
-        field = np.divide(field, known, out=np.zeros_like(field), where=known > 1e-3)
+    field = _field(target, state)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GUARD_PX + 1, 2 * GUARD_PX + 1))
     guarded = cv2.dilate(covered, disc, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     hand = ((labels == Label.HAND) & (state == TARGET)).astype(np.uint8)
@@ -148,6 +149,14 @@ def _boundary_px(state, field, guarded):
             if state[y, x] == TARGET and field[y, x] < INNER and guarded[y, x] == 0:
                 count += 1
     return count
+
+
+def _field(target: NDArray[np.float32], state: NDArray[np.uint8]) -> NDArray[np.float32]:
+    field, known = _blur(target), (state != COVERED).astype(np.float32)
+    if known.all():
+        return field
+    share = _blur(known)
+    return np.divide(field, share, out=np.zeros_like(field), where=share > 1e-3)
 
 
 def _blur(image: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.contour import Model, match, normal_equations, trace
+from services.search.contour import Model, match, normal_equations
 from services.search.evidence import Evidence, compare
 from shared import geometry
 
@@ -119,11 +119,10 @@ class _Problem:
 
     def at(self, T: Array, moved: Array, reach: float, huber: float) -> _Pass:
         evidence, k = self.evidence, self.evidence.intrinsics
-        intrinsics = (k.fx, k.fy, k.cx, k.cy)
         V = self.model.in_camera(T)
         silhouette = self.model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1]))
-        points = trace(V, self.model.faces, self.model.edges, *intrinsics, silhouette, SPACING_PX)
-        offsets, kind = match(points, evidence.field, evidence.guarded, reach)
+        points = self.model.outline(V, k, evidence.state.shape, SPACING_PX)
+        offsets, kind = match(points, evidence.field, evidence.guarded, evidence.field_of(silhouette), reach)
         r = offsets - moved[6]
         H, g, _, _, counted, cost, _ = self.normal_equations(T, points, r, kind, huber, True)
         both, free = compare(evidence.state, silhouette)

@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from services.search.contour import MEASURED, Model, match, normal_equations, trace
+from services.search.contour import MEASURED, Model, match, normal_equations
 from services.search.evidence import Evidence, Intrinsics, compare
 from services.search.fit import Fit, Limits, marginal
 from shared import geometry
@@ -103,7 +103,6 @@ def refine(
     settings, limits = settings or Settings(), limits or Limits()
     image, evidence = native(image, evidence)
     k = evidence.intrinsics
-    intrinsics = (k.fx, k.fy, k.cx, k.cy)
     weak = limits.information
     regular = np.zeros((7, 7))
     regular[:6, :6] = prior + weak
@@ -113,9 +112,9 @@ def refine(
     moved[:6] = geometry.pose_error(T, T_prior)
     for _ in range(settings.passes):
         V = model.in_camera(T)
-        silhouette = model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1]))
-        points = trace(V, model.faces, model.edges, *intrinsics, silhouette, settings.spacing)
-        by_mask, mask_kind = match(points, evidence.field, evidence.guarded, LINE)
+        points = model.outline(V, k, evidence.state.shape, settings.spacing)
+        own = evidence.field_of(model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1])))
+        by_mask, mask_kind = match(points, evidence.field, evidence.guarded, own, LINE)
         r, sigma, kind = offsets(
             points, image, evidence.guarded, by_mask, mask_kind,
             settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask,

@@ -200,11 +200,15 @@ class Search:
     def _track(self, seen: Evidence, T_start: Array, prior_covariance: Array | None) -> tuple[Fit, bool]:
         """The pose near the prediction, and whether it explains the mask so well that no other need be looked for."""
         prior = self._leaning(prior_covariance)
-        first = self._with_mirror(seen, T_start, prior)
-        if seen.seen_px >= detect.SMALLEST_PX and first.misfit > MISFIT:  # beside the right pose, mostly in roll
-            beside = [self._fit(seen, T, T_start, prior) for T in detect.mirrored(first.T_searched)]
-            first = min((first, *beside), key=lambda found: found.cost)
+        first = self._settled(seen, self._with_mirror(seen, T_start, prior), T_start, prior)
         return first, first.overlap >= FITS_WELL and first.misfit < WRONG
+
+    def _settled(self, seen: Evidence, first: Fit, T_prior: Array, prior: Array) -> Fit:
+        """A fit, or where it is bad a better one beside it: what went wrong is mostly the roll, or the tilt's sign."""
+        if seen.seen_px < detect.SMALLEST_PX or first.misfit <= MISFIT:
+            return first
+        beside = [self._fit(seen, T, T_prior, prior) for T in detect.mirrored(first.T_searched)]
+        return min((first, *beside), key=lambda found: found.cost)
 
     def _is_better(self, other: Fit, first: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
         """Whether another pose explains the mask better, and the prediction allows it or itself fails."""
@@ -258,9 +262,9 @@ class Search:
                 if T is None:
                     continue
                 seen = self._gather(window, T, joints, limb=T)
-                found = self._fit(seen, T, T_home, information)
+                found = self._settled(seen, self._fit(seen, T, T_home, information), T_home, information)
                 away = geometry.pose_error(found.T_searched, T_home)
-                fits = found.overlap >= FITS, self._overlap(whole, found.T_searched)
+                fits = found.overlap >= FITS and found.misfit < WRONG, self._overlap(whole, found.T_searched)
                 if away @ information @ away < HOME_GATE and fits > most:
                     best, most = (seen, found), fits
                 if most > (True, FITS):
