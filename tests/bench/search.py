@@ -12,7 +12,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,17 +57,18 @@ WARM_FRAMES = 4
 
 
 @dataclass(frozen=True)
-class Sizes:
+class Plan:
     """How many scenes: of each row; of the rows for the NEES, tracked ones; of each kind of frame for the detector of lost poses;
-    of hidden arms."""
+    of hidden arms. domain: looks of the scenes."""
 
     scenes: int
     nees: int
     lost: int
     gone: int
+    domain: shots.Domain = "wide"
 
 
-FULL, QUICK = Sizes(40, 200, 50, 110), Sizes(2, 3, 2, 2)
+FULL, QUICK = Plan(40, 200, 50, 110), Plan(2, 3, 2, 2)
 
 
 @dataclass(frozen=True)
@@ -172,7 +173,13 @@ def exact_results(
 
 
 def network_results(
-    seed: int, view: tuple[int, int, float], hidden: float, count: int, segmenter: Segmenter, tracked: int = 0
+    seed: int,
+    view: tuple[int, int, float],
+    hidden: float,
+    count: int,
+    segmenter: Segmenter,
+    domain: shots.Domain = "wide",
+    tracked: int = 0,
 ) -> tuple[dict[str, list[Result]], list[Shot]]:
     """Searches of the network's masks by method, after some frames that warm its state, and the pictures: `count` of them, and
     up to twice as many until so many are `tracked`."""
@@ -182,7 +189,7 @@ def network_results(
         len(pictures) < 2 * count and sum(r.estimate.state == "tracking" for r in out["contour"]) < tracked
     ):
         index = len(pictures)
-        film = shots.clip(seed, index, *view, hidden, frames=WARM_FRAMES)
+        film = shots.clip(seed, index, *view, hidden, domain, WARM_FRAMES)
         error = perturbed(film[-1], np.random.default_rng([seed, index, 1]))
 
         def window_at(shot: Shot, previous: Window | None, error: Array = error) -> Window:
@@ -287,12 +294,12 @@ def auc(scores: Array, positive: np.ndarray) -> float | None:
 KINDS = ("good start", "bad start", "wrong mask", "no prior", "absent")
 
 
-def lost_frames(seed: int, count: int, segmenter: Segmenter) -> Iterator[tuple[str, float, bool]]:
+def lost_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domain) -> Iterator[tuple[str, float, bool]]:
     """Frames of all KINDS: kind, the estimate's doubt, and whether its pose is wrong."""
     for index in range(count):
         rng = np.random.default_rng([seed, index, 2])
         hidden = HIDDEN[index % len(HIDDEN)]
-        film = shots.clip(seed, index, *NEES_VIEW, hidden, frames=3)
+        film = shots.clip(seed, index, *NEES_VIEW, hidden, domain, 3)
         last, error = film[-1], perturbed(film[-1], rng)
         far = np.concatenate([_length(rng, 0.08, 0.4), _length(rng, 0.3, 1.5)])
         for kind, start in (("good start", error), ("bad start", far)):
@@ -308,7 +315,7 @@ def lost_frames(seed: int, count: int, segmenter: Segmenter) -> Iterator[tuple[s
         *_, mask = network_masks(segmenter, film, lambda shot, before: whole_frame(shot.camera))
         found = searched(last, search_of(last, "default", False), mask, None)
         yield "no prior", doubt(found.estimate), found.is_wrong
-        empty = shots.clip(seed, index, *NEES_VIEW, 0.0, frames=3, present=False)
+        empty = shots.clip(seed, index, *NEES_VIEW, 0.0, domain, 3, present=False)
         *_, mask = network_masks(
             segmenter, empty, lambda shot, before, e=error: window_of(shot, geometry.perturb(shot.T_world_target, e), before)
         )
@@ -340,10 +347,10 @@ def spoiled(mask: Mask, rng: np.random.Generator) -> Mask:
     return Mask(stamp_ns=mask.stamp_ns, labels=np.ascontiguousarray(labels), x0=mask.x0, y0=mask.y0, scale=mask.scale)
 
 
-def gone_frames(seed: int, count: int, segmenter: Segmenter) -> Iterator[tuple[float, str]]:
+def gone_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domain) -> Iterator[tuple[float, str]]:
     """Frames in which more than GONE of the target is hidden: the share hidden and the search's state."""
     for index in range(count):
-        film = shots.clip(seed, index, *NEES_VIEW, (0.975, 0.99, 1.0)[index % 3], frames=5)
+        film = shots.clip(seed, index, *NEES_VIEW, (0.975, 0.99, 1.0)[index % 3], domain, 5)
         error = perturbed(film[-1], np.random.default_rng([seed, index, 3]))
         search = search_of(film[-1], "default", False)
         for shot, mask in zip(
@@ -358,7 +365,7 @@ def gone_frames(seed: int, count: int, segmenter: Segmenter) -> Iterator[tuple[f
                 yield shot.hidden, found.estimate.state
 
 
-def rows_of(seed: int, sizes: Sizes, masks: tuple[str, ...]) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+def rows_of(seed: int, plan: Plan, masks: tuple[str, ...]) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
     """All rows of the table, and the NEES at NEES_VIEW by kind of mask and share hidden."""
     segmenter = load_segmenter() if "network" in masks else None
     rows, consistency = [], {kind: {} for kind in masks}
@@ -368,11 +375,11 @@ def rows_of(seed: int, sizes: Sizes, masks: tuple[str, ...]) -> tuple[list[dict[
             for view in VIEWS:
                 for hidden in HIDDEN:
                     if kind == "exact" or segmenter is None:
-                        results, pictures = exact_results(seed, view, hidden, sizes.scenes)
+                        results, pictures = exact_results(seed, view, hidden, plan.scenes)
                     elif view == NEES_VIEW:
-                        results, pictures = network_results(seed, view, hidden, sizes.nees, segmenter, sizes.nees)
+                        results, pictures = network_results(seed, view, hidden, plan.nees, segmenter, plan.domain, plan.nees)
                     else:
-                        results, pictures = network_results(seed, view, hidden, sizes.scenes, segmenter)
+                        results, pictures = network_results(seed, view, hidden, plan.scenes, segmenter, plan.domain)
                     bounds = bounds_of(pictures)
                     rows += [row(kind, view, hidden, method, found, bounds) for method, found in results.items()]
                     if view == NEES_VIEW:
@@ -390,10 +397,10 @@ def overall(parts: dict[str, dict[str, Any]]) -> dict[str, Any]:
     return {"mean": None if mean is None else round(mean, 3), "band": band, "frames": n, "by_occlusion": parts}
 
 
-def judged(seed: int, sizes: Sizes) -> dict[str, Any]:
+def judged(seed: int, plan: Plan) -> dict[str, Any]:
     """What the search says about itself: as a detector of wrong poses, and where nothing is left to see."""
     segmenter = load_segmenter()
-    frames = list(lost_frames(seed, sizes.lost, segmenter))
+    frames = list(lost_frames(seed, plan.lost, segmenter, plan.domain))
     scores, wrong = np.array([score for _, score, _ in frames]), np.array([bad for _, _, bad in frames])
     kinds = {}
     for kind in KINDS:
@@ -404,7 +411,7 @@ def judged(seed: int, sizes: Sizes) -> dict[str, Any]:
             "tracking": int(np.isfinite(scores[chosen]).sum()),
             "wrong_and_tracking": int((np.isfinite(scores) & wrong)[chosen].sum()),
         }
-    gone = list(gone_frames(seed, sizes.gone, segmenter))
+    gone = list(gone_frames(seed, plan.gone, segmenter, plan.domain))
     area = auc(scores, wrong)
     return {
         "lost_auc": None if area is None else round(area, 4),
@@ -414,24 +421,24 @@ def judged(seed: int, sizes: Sizes) -> dict[str, Any]:
     }
 
 
-def measure(seed: int, sizes: Sizes, parts: tuple[str, ...]) -> dict[str, Any]:
+def measure(seed: int, plan: Plan, parts: tuple[str, ...]) -> dict[str, Any]:
     """The whole benchmark; `parts` of exact, network, judged."""
     torch.set_num_threads(1)
     masks = tuple(part for part in parts if part != "judged")
     exact_results(seed + 1, VIEWS[0], 0.3, 1)  # compiles and warms up
     if "network" in masks:
         network_results(seed + 1, VIEWS[0], 0.3, 1, load_segmenter())
-    result: dict[str, Any] = {"seed": seed}
-    result["rows"], consistency = rows_of(seed, sizes, masks)
+    result: dict[str, Any] = {"seed": seed, "domain": plan.domain}
+    result["rows"], consistency = rows_of(seed, plan, masks)
     result["nees"] = overall(consistency["network"]) if "network" in masks else {}
     if "exact" in masks:
         result["nees"]["exact"] = overall(consistency["exact"])
-    return result | (judged(seed, sizes) if "judged" in parts else {})
+    return result | (judged(seed, plan) if "judged" in parts else {})
 
 
 def show(result: dict[str, Any], console: Console) -> None:
     """The tables."""
-    title = f"seed {result['seed']}: errors, median (90th percentile)"
+    title = f"seed {result['seed']}, {result['domain']} domain: errors, median (90th percentile)"
     table = Table(
         "masks", "picture", "hidden", "method", "position cm", "mean", "with prior", "bound cm", "lateral cm", "depth cm",
         "axis deg", "roll deg", "ms", "not tracking", "goal", title=title,
@@ -485,17 +492,18 @@ def _goal(row: dict[str, Any], paper: dict[str, Any] | None) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="penumbra bench search", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1, help="draws scenes and starts: nothing was fitted to 9000 and above")
+    parser.add_argument("--seed", type=int, default=1, help="draws scenes and starts")
     parser.add_argument("--frames", type=int, help=f"scenes of each row (default {FULL.scenes}; at least 200 for the NEES)")
     parser.add_argument("--quick", action="store_true", help="a few scenes of everything, to see that it runs")
+    parser.add_argument("--domain", choices=("wide", "easy"), default="wide", help="looks of the network's scenes")
     parser.add_argument("--parts", nargs="+", choices=("exact", "network", "judged"), default=["exact", "network", "judged"])
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)
-    sizes = QUICK if options.quick else FULL
+    plan = replace(QUICK if options.quick else FULL, domain=options.domain)
     if options.frames:
-        sizes = Sizes(options.frames, max(options.frames, 200), options.frames, options.frames)
+        plan = Plan(options.frames, max(options.frames, 200), options.frames, options.frames, options.domain)
     started = time.monotonic()
-    result = measure(options.seed, sizes, tuple(options.parts))
+    result = measure(options.seed, plan, tuple(options.parts))
     result["wall_s"] = round(time.monotonic() - started, 1)
     show(result, Console())
     if options.json:

@@ -37,7 +37,16 @@ BACK = 0.5
 """The arm counts as back in sight when less than this share is hidden again."""
 SKIPPED_S = 1.0
 """At the start, until the arm is found, nothing is scored."""
+AFTER_S = 1.0
+"""So long after it came back is the time after an occlusion."""
 RECOVERY_GOAL = 5
+ERRORS = {
+    "visible_cm": "position error cm, at most a third hidden",
+    "partly_hidden_cm": "position error cm, a third to 95 % hidden",
+    "after_cm": "position error cm, within a second of coming back",
+    "fused_while_hidden_cm": "position error cm of the predicted pose, all hidden",
+    "axis_deg": "axis error deg, up to 95 % hidden",
+}
 
 
 @dataclass(frozen=True)
@@ -115,10 +124,11 @@ def recovery(film: Film, back: int) -> int | None:
 
 def scored(films: list[Film]) -> dict[str, Any]:
     """The numbers of the films with one background."""
-    errors: dict[str, list[float]] = {"visible_cm": [], "partly_hidden_cm": [], "fused_while_hidden_cm": []}
+    errors: dict[str, list[float]] = {key: [] for key in ERRORS if key != "axis_deg"}
     axis, false_tracking, gone, tracked, seen, recoveries = [], 0, 0, 0, 0, []
     for film in films:
         begin_ns = film.truths[0].stamp_ns + SKIPPED_S * 1e9
+        after_ns = [film.truths[back].stamp_ns for _, _, back in passes(film)]
         for truth in film.truths:
             pose = film.vision.get(truth.stamp_ns)
             if truth.stamp_ns < begin_ns or pose is None:
@@ -133,6 +143,8 @@ def scored(films: list[Film]) -> dict[str, Any]:
             if is_tracked:
                 position, angle = film.errors(pose, truth)
                 errors["visible_cm" if truth.hidden <= VISIBLE else "partly_hidden_cm"].append(100.0 * position)
+                if any(0.0 <= (truth.stamp_ns - back_ns) * 1e-9 < AFTER_S for back_ns in after_ns):
+                    errors["after_cm"].append(100.0 * position)
                 axis.append(np.degrees(angle))
         recoveries += [recovery(film, back) for _, _, back in passes(film)]
     return {
@@ -161,13 +173,7 @@ def show(result: dict[str, Any], console: Console) -> None:
     """The table."""
     table = Table("", *BACKGROUNDS, "goal", title=f"seed {result['seed']}: median / 90th percentile / largest")
     rows = result["rows"]
-    names = {
-        "visible_cm": "position error cm, at most a third hidden",
-        "partly_hidden_cm": "position error cm, a third to 95 % hidden",
-        "fused_while_hidden_cm": "the same of the predicted pose, all hidden",
-        "axis_deg": "axis error deg",
-    }
-    for key, name in names.items():
+    for key, name in ERRORS.items():
         table.add_row(name, *("{median} / {p90} / {max}".format(**row[key]) for row in rows), "")
     table.add_row("frames tracked, up to 95 % hidden", *(f"{row['tracked']:.1%}" for row in rows), "")
     recovered = (", ".join("-" if n is None else str(n) for n in row["recovery_frames"]) for row in rows)
