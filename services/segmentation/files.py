@@ -53,7 +53,8 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument(
         "--scale",
         type=int,
-        help="look at means of so many pixels a side (default: 2 at 640 x 480, as the service at a whole frame)",
+        choices=(1, 2, 4, 8),
+        help="look at means of so many pixels a side (default: as the service at a whole frame, 2 at 640 x 480)",
     )
     return parser
 
