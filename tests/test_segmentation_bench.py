@@ -14,10 +14,9 @@ def test_recovery_is_counted_from_half_free_again_to_the_overlap_of_before():
     hidden = [0.0] * 12 + [0.6] + [1.0] * 8 + [0.8, 0.4, 0.2, 0.0, 0.0, 0.0]
     iou = [0.9] * 12 + [0.8] + [np.nan] * 8 + [0.2, 0.5, 0.7, 0.8, 0.82, 0.9]
     assert segmentation.recoveries(hidden, iou) == [4]  # 0.82 is the first of at least 0.9 * 0.9
-    assert (
-        segmentation.recoveries(hidden, [v * (0.4 if k < 13 else 1.0) for k, v in enumerate(iou)]) == []
-    )  # nothing to return to
-    assert segmentation.recoveries(hidden[:22], iou[:22]) == []  # nothing follows
+    unseen = [0.3] * 13 + iou[13:]
+    assert segmentation.recoveries(hidden, unseen) == [None]  # nothing to return to
+    assert segmentation.recoveries(hidden[:22], iou[:22]) == [None]  # the film ends
     assert segmentation.recoveries(hidden, iou[:20] + [0.1] * 7) == [6]  # never: as long as it was watched, and one more
     twice = segmentation.recoveries(hidden + hidden[1:], iou + iou[1:])
     assert twice == [4, 4]

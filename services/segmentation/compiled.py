@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from services.segmentation.prednet import PredNet, State
 
-MOST = 24
-"""Sizes that are kept, each some megabytes."""
+MOST = 16
+"""Sizes that are kept, each some 17 MB."""
 
 
 class Compiled:

@@ -65,10 +65,10 @@ def film_scores(segmenter: infer.Segmenter, film: list[shots.Shot]) -> tuple[lis
     return hidden, iou
 
 
-def recoveries(hidden: list[float], iou: list[float]) -> list[int]:
+def recoveries(hidden: list[float], iou: list[float]) -> list[int | None]:
     """For each full occlusion: which frame, counted from the first in which half of the target is free again, is the first whose
-    IoU is BACK of what it was before. An occlusion before which nothing was found, or that nothing follows, says nothing."""
-    found = []
+    IoU is BACK of what it was before. None where that says nothing: nothing was found before, or the film ends."""
+    found: list[int | None] = []
     covered = [k for k, share in enumerate(hidden) if share >= WHOLLY]
     last = [k for k, following in itertools.zip_longest(covered, covered[1:]) if following is None or following > k + 1]
     first = [k for before, k in zip([None, *covered], covered, strict=False) if before is None or k > before + 1]
@@ -76,6 +76,7 @@ def recoveries(hidden: list[float], iou: list[float]) -> list[int]:
         seen = [iou[k] for k in range(max(begin - 2 * BEFORE, 0), begin) if hidden[k] < FREE][-BEFORE:]
         free = next((k for k in range(end + 1, len(hidden)) if hidden[k] < FREE), None)
         if not seen or free is None or not np.nanmedian(seen) > 0.5:
+            found.append(None)
             continue
         limit = next((k for k in range(free, len(hidden)) if hidden[k] >= WHOLLY), len(hidden))
         back = next((k for k in range(free, limit) if iou[k] >= BACK * np.nanmedian(seen)), limit)
@@ -83,7 +84,7 @@ def recoveries(hidden: list[float], iou: list[float]) -> list[int]:
     return found
 
 
-def result(seed: int, scores: list[FrameScore], recovered: list[int], ms: dict[str, float]) -> dict[str, Any]:
+def result(seed: int, scores: list[FrameScore], recovered: list[int | None], ms: dict[str, float]) -> dict[str, Any]:
     """What the JSON file holds. recovery_frames: nine of ten full occlusions need no more; ms_per_frame: of the processor."""
     table = []
     for (low, high), part in evaluate.by_hidden(scores).items():
@@ -91,11 +92,14 @@ def result(seed: int, scores: list[FrameScore], recovered: list[int], ms: dict[s
         names = {"iou": "iou_mean", "area_bias": "area_bias_median", "contour_mean_px": "contour_mean_px"}
         names |= {"contour_rms_px": "contour_rms_px"}
         table.append({"occlusion": [low, high], "frames": len(part), **{name: row.get(key) for name, key in names.items()}})
-    frames = float(np.percentile(recovered, 90)) if recovered else None
+    known = [n for n in recovered if n is not None]
+    frames = round(float(np.percentile(known, 90)), 1) if known else None
     return {"seed": seed, "rows": table, "recovery_frames": frames, "ms_per_frame": ms["cpu_ms"]}
 
 
-def show(found: dict[str, Any], scores: list[FrameScore], recovered: list[int], ms: dict[str, float], console: Console) -> None:
+def show(
+    found: dict[str, Any], scores: list[FrameScore], recovered: list[int | None], ms: dict[str, float], console: Console
+) -> None:
     """The result beside the issue's goals."""
     title = f"forearm with hand, visible pixels, seed {found['seed']}"
     table = Table("hidden", "frames", "IoU mean (median)", "goal", "area bias", "contour mean px", "contour RMS px", title=title)
@@ -108,9 +112,10 @@ def show(found: dict[str, Any], scores: list[FrameScore], recovered: list[int], 
     limits = (f"within {GOALS['area_bias']:.0%}", f"within {GOALS['contour_mean_px']}", f"<= {GOALS['contour_rms_px']}")
     table.add_row("goal", "", "", "", *limits)
     console.print(table)
-    if recovered:
-        text = f"{np.median(recovered):.0f} median, {found['recovery_frames']:.1f} nine of ten, {max(recovered)} worst"
-        console.print(f"frames until recovered from {len(recovered)} full occlusions: {text} (goal: {GOALS['recovery']})")
+    if known := [n for n in recovered if n is not None]:
+        text = f"{np.median(known):.0f} median, {found['recovery_frames']} nine of ten, {max(known)} worst"
+        text += f"; after {len(recovered) - len(known)} more it cannot be told"
+        console.print(f"frames until recovered from {len(known)} full occlusions: {text} (goal: {GOALS['recovery']})")
     times = f"{ms['cpu_ms']} ms of processor time, {ms['wall_ms']} ms by the clock (goal: {GOALS['ms']:.0f})"
     console.print(f"a frame of {VARIETY.size} x {VARIETY.size} on one thread: {times}")
 
@@ -129,7 +134,7 @@ def main(argv: list[str] | None = None) -> int:
     count = -(-options.frames // (VARIETY.frames - WARM_UP))
     held_out = (sequences.render(SEED_BASE + options.seed, index, VARIETY) for index in range(count))
     scores = rows(segmenter, track(held_out, "sequences", total=count, transient=True))
-    recovered: list[int] = []
+    recovered: list[int | None] = []
     for index in track(range(options.films), "films", transient=True):
         recovered += recoveries(*film_scores(segmenter, list(shots.passing(SEED_BASE + options.seed, index))))
     found = result(options.seed, scores, recovered, ms)
