@@ -67,13 +67,15 @@ class Compiled:
             self._request(*size)
 
     def _request(self, height: int, width: int) -> Any:
-        if (height, width) not in self._requests:
+        size = height, width
+        request = self._requests.pop(size, None)
+        if request is None:
             with self._lock:
-                if (height, width) not in self._requests:
-                    if len(self._requests) >= MOST:
-                        del self._requests[next(iter(self._requests))]
-                    self._requests[height, width] = self._compile(height, width)
-        return self._requests[height, width]
+                request = self._requests.pop(size, None) or self._compile(height, width)
+                while len(self._requests) >= MOST:
+                    self._requests.pop(next(iter(self._requests)), None)
+        self._requests[size] = request  # the last one used is the last to go
+        return request
 
     def _compile(self, height: int, width: int) -> Any:
         shapes = [s.shape for s in (torch.empty(1, 3, height, width), *self._net.initial_state(1, height, width))]

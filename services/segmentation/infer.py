@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from services.segmentation import prednet
 from services.segmentation.compiled import Compiled
-from services.segmentation.crop import SIZE_STEP, Window, shift_state
+from services.segmentation.crop import MAX_PIXELS, SIZE_STEP, Window, shift_state
 from services.segmentation.prednet import PredNet, State
 from shared.classes import Label
 
@@ -56,11 +56,12 @@ class Segmenter:
             return classes((logits.float() + self._offset)[0])
 
     def prepare(self, window: Window) -> None:
-        """Make ready, in the background, for windows of this size and, one after another, of the sizes next to it."""
+        """Make ready, in the background, for windows of this size and, one after another, of the sizes that may follow."""
         if self._compiled:
             steps = ((0, 0), (0, SIZE_STEP), (0, -SIZE_STEP), (SIZE_STEP, 0), (-SIZE_STEP, 0))
             sizes = [(window.height + dy, window.width + dx) for dx, dy in steps]
-            self._compiled.prepare([size for size in sizes if min(size) >= SIZE_STEP])
+            around = [(h, w) for h, w in sizes[1:] if min(h, w) >= SIZE_STEP and h * w <= MAX_PIXELS]
+            self._compiled.prepare([sizes[0], *around])
 
     def _remembered(self, window: Window, stamp_ns: int) -> State:
         follows = 0 < stamp_ns - self._stamp_ns <= MAX_GAP_S * 1e9
