@@ -42,6 +42,8 @@ NOISE = Noise(edge=2.0, correlation=40.0, dilation=0.7)
 """How a network's mask of any object errs [px of the image]."""
 FARTHEST_PX = 8.0
 """A pixel further from the mask's boundary than this [px of the image] counts no more: a missing part is one mistake."""
+PIECE = 0.2
+"""Least share of the mask that a piece of it has, to be taken for the whole object."""
 AROUND = 0.5
 """Diagonals of the mask around it that are looked at."""
 DAMPING = 0.02
@@ -157,12 +159,25 @@ def starts(T: Array) -> list[Array]:
     return [T, *(geometry.perturb(T, turn) for turn in turns)]
 
 
-def align(model: Model, at: Level, T: Array, passes: int = 2) -> Array:
-    """The pose shifted so that the silhouette's middle and area are the mask's; what is covered counts on neither side."""
+Moments = tuple[float, float, float]
+"""Area [px] and middle (u, v) of a region."""
+
+
+def regions(at: Level) -> list[Moments]:
+    """The mask, and where it is of several pieces each of the large ones: the others may be another object's."""
+    target = at.evidence.state == TARGET
+    count, _, sizes, middles = cv2.connectedComponentsWithStats(target.astype(np.uint8))
+    areas = sizes[1:, cv2.CC_STAT_AREA]
+    large = [i for i in range(count - 1) if areas[i] > PIECE * areas.sum()]
+    pieces = [(float(areas[i]), float(middles[1 + i][0]), float(middles[1 + i][1])) for i in large] if count > 2 else []
+    return [_moments(target), *pieces]
+
+
+def align(model: Model, at: Level, T: Array, wanted: Moments) -> Array:
+    """The pose shifted so that the silhouette's area and middle are those of a region; what is covered does not count."""
     state, k = at.evidence.state, at.evidence.intrinsics
     h, w = at.shape
-    wanted = _moments(state == TARGET)
-    for _ in range(passes):
+    for _ in range(2):  # the second time in the right place and of nearly the right size
         found = _moments(model.silhouette(T, k, (0, 0, w, h)) & (state != COVERED))
         T = T.copy()
         if found[0] < 4.0:  # outside the picture: its origin goes to the mask's middle
@@ -175,8 +190,7 @@ def align(model: Model, at: Level, T: Array, passes: int = 2) -> Array:
     return T
 
 
-def _moments(mask: Bool) -> tuple[float, float, float]:
-    """Area [px] and middle (u, v) of a mask (h, w)."""
+def _moments(mask: Bool) -> Moments:
     columns, rows = mask.sum(axis=0), mask.sum(axis=1)
     area = float(columns.sum())
     if area == 0.0:
@@ -276,7 +290,8 @@ FINE_WIDTHS = (5.0, 4.0, 4.0, 3.0, 3.0, 3.0)
 def search(shape: Shape, masks: Pyramid, prior: Prior, noise: Noise = NOISE) -> list[tuple[Score, Array]]:
     """The poses T_camera_object near the prior that explain the mask best, best first."""
     model, at = shape.coarse, masks.coarse
-    found = ranked(model, at, [align(model, at, T) for T in starts(prior.T)], prior, noise)[: SURVIVORS[0]]
+    aligned = [align(model, at, T, region) for region in regions(at) for T in starts(prior.T)]
+    found = ranked(model, at, aligned, prior, noise)[: SURVIVORS[0]]
     for widths in (COARSE_WIDTHS, MORE_WIDTHS):
         found = distinct(ranked(model, at, [descend(model, at, T, prior, widths, noise) for _, T in found], prior, noise))
     model, at = shape.fine, masks.fine

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from services.search import basin, meshes
 from services.search import refine as colours
-from services.search.basin import Level, Prior, Score
+from services.search.basin import Level, Prior, Score, Shape
 from services.search.contour import MEASURED, Model
 from services.search.evidence import COVERED, FREE, TARGET, Intrinsics
 from services.search.fit import Fit, Limits, Noise
@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 State = Literal["tracking", "occluded", "lost"]
 
-FACES = 4000
-"""Triangles that a mesh is thinned out to: finer ones are smaller than a pixel."""
-START = (0.03, 0.25)
-"""Standard deviations [m, rad] of a start, along and about each axis: between 3 cm, 20 degrees and 5 cm, 30 degrees in all."""
+FACES = (800, 4000)
+"""Triangles that a mesh is thinned out to, for small pictures and for all others: finer ones are smaller than a pixel."""
+START = (0.03, 0.35)
+"""Standard deviations [m, rad] of a start, along and about each axis: 5 cm and 34 degrees in all."""
 SMALLEST_PX = 60
 """A smaller mask shows no pose."""
 FITS = 0.65
@@ -39,17 +39,21 @@ COVERS = 0.6
 """Share of the silhouette that is covered, from which a pose that fits is called occluded."""
 EDGE_PX = (0.4, 6.0)
 """Least and largest standard deviation [px] of a mask's boundary that is believed."""
+CORRELATION, DILATION = 30.0, 0.35
+"""Length over which a mask's boundary errs together [px], and how much too large or small the mask is [px], for each pixel that
+the boundary errs: fitted to the masks of `penumbra bench objects`."""
 
 
 class RigidObject:
     """A mesh prepared for contours, about its own middle. Raises InputError for a mesh without a surface."""
 
     def __init__(self, mesh: Mesh):
-        mesh = meshes.mend(mesh, FACES)
+        mesh = meshes.mend(mesh, FACES[1])
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         self.T_object_middle = geometry.transform((low + high) / 2.0)
         self.T_middle_object = geometry.inverse(self.T_object_middle)
-        self.model = Model(Mesh(mesh.vertices - (low + high) / 2.0, mesh.faces, mesh.labels))
+        mesh = Mesh(mesh.vertices - (low + high) / 2.0, mesh.faces, mesh.labels)
+        self.shape = Shape(Model(meshes.mend(mesh, FACES[0])), Model(mesh))
         self.diameter = float(np.linalg.norm(high - low))
 
     def published(self, found: Estimate) -> Estimate:
@@ -102,7 +106,7 @@ def refine(
     if np.count_nonzero(state == TARGET) < SMALLEST_PX:
         return rigid.published(_lost(prior.T))
     masks = basin.pyramid(state, k)
-    return rigid.published(judged(rigid.model, masks.fine, basin.search(rigid.model, masks, prior), prior, picture))
+    return rigid.published(judged(rigid.shape.fine, masks.fine, basin.search(rigid.shape, masks, prior), prior, picture))
 
 
 def judged(
@@ -137,7 +141,7 @@ def measured_noise(model: Model, at: Level, T: Array) -> Noise:
     if not len(r):
         return basin.NOISE
     edge = min(max(1.48 * float(np.median(r)), EDGE_PX[0]), EDGE_PX[1])
-    return Noise(edge, max(14.0, 20.0 * edge), 0.35 * edge)
+    return Noise(edge, max(14.0, CORRELATION * edge), DILATION * edge)
 
 
 def _on_picture(
@@ -215,20 +219,20 @@ class Tracker:
     def _look(self, state: NDArray[np.uint8], prior: Prior, picture: NDArray[np.uint8] | None) -> Estimate | None:
         if np.count_nonzero(state == TARGET) < SMALLEST_PX:
             return None
-        model, masks = self._rigid.model, basin.pyramid(state, self._k)
+        model, masks = self._rigid.shape.fine, basin.pyramid(state, self._k)
         if self._missed == 0:
             T = basin.descend(model, masks.fine, prior.T, prior, FRAME_WIDTHS)
             near = basin.ranked(model, masks.fine, [T], prior, basin.NOISE)
             if near[0][0].overlap > max(FITS, self._usual - DROP):
                 return judged(model, masks.fine, near, prior, picture)
-        return judged(model, masks.fine, basin.search(model, masks, prior), prior, picture)
+        return judged(model, masks.fine, basin.search(self._rigid.shape, masks, prior), prior, picture)
 
     def _miss(self, state: NDArray[np.uint8], found: Estimate | None) -> Estimate:
         """The object is where it was, as far as is known: covered where something stands there."""
         self._missed += 1
         self._velocity = np.zeros(6)
         h, w = state.shape
-        silhouette = self._rigid.model.silhouette(self._T, self._k, (0, 0, w, h))
+        silhouette = self._rigid.shape.fine.silhouette(self._T, self._k, (0, 0, w, h))
         drawn = int(np.count_nonzero(silhouette))
         covered = drawn > 0 and np.count_nonzero(silhouette & (state == COVERED)) > COVERS * drawn
         lost = Estimate(self._T, Limits().covariance, found.overlap if found else 0.0, "occluded" if covered else "lost")

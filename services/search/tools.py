@@ -311,7 +311,7 @@ def check_mask(mask: Bool, path: Path) -> None:
 
 def check_start(rigid: RigidObject, T: Array, k: Intrinsics, mask: Bool, occluder: Bool | None, path: Path) -> None:
     """Raises InputError for a start T_camera_object from which the mask cannot be reached."""
-    V = rigid.model.in_camera(T @ rigid.T_object_middle)
+    V = rigid.shape.fine.in_camera(T @ rigid.T_object_middle)
     if V[:, 2].min() < NEAR:
         z = (T @ rigid.T_object_middle)[2, 3]
         raise InputError(
@@ -377,7 +377,7 @@ def overlay(
     """The frame (h, w, 3) uint8 BGR with the mask's boundary in white and the pose's silhouette in its state's colour."""
     h, w = mask.shape
     out = np.zeros((h, w, 3), np.uint8) if picture is None else np.ascontiguousarray(picture[..., ::-1])
-    silhouette = rigid.model.silhouette(found.T @ rigid.T_object_middle, k, (0, 0, w, h))
+    silhouette = rigid.shape.fine.silhouette(found.T @ rigid.T_object_middle, k, (0, 0, w, h))
     for region, colour in ((mask, (255, 255, 255)), (silhouette, COLOURS[found.state])):
         lines, _ = cv2.findContours(region.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(out, lines, -1, colour, 1 if region is mask else 2, cv2.LINE_AA)
