@@ -108,6 +108,26 @@ def test_the_area_under_the_curve_counts_pairs_in_order():
     assert search.auc(np.ones(4), np.zeros(4, bool)) is None
 
 
+def test_a_mask_shows_the_target_where_it_agrees_with_the_truth_at_any_scale():
+    shot = shots.shot(48, 0, 320, 240, hidden=0.3, images=False)
+    window = search.window_of(shot, shot.T_world_target)
+    mask = search.exact_mask(shot, window)
+    assert search.shows_target(mask, shot)
+    coarse = replace(mask, labels=np.ascontiguousarray(mask.labels[::2, ::2]), scale=2)
+    assert search.shows_target(coarse, shot)
+    assert not search.shows_target(replace(mask, labels=np.zeros_like(mask.labels)), shot)
+    assert not search.shows_target(replace(mask, x0=mask.x0 // 2, y0=mask.y0 // 2 + 40), shot)
+
+
+def test_giving_up_is_right_where_a_mask_shows_something_else_and_the_start_was_right_by_luck():
+    def told(doubt: float, wrong: bool, shown: bool) -> bool:
+        return search.Judgement("wrong mask", doubt, wrong, shown).should_be_doubted
+
+    assert told(np.inf, False, False) and told(np.inf, True, True) and told(0.1, True, True)
+    assert not told(np.inf, False, True)  # it could have been measured
+    assert not told(0.1, False, False)  # right all the same
+
+
 def test_the_search_s_benchmark_runs_and_tells_all_rows(tmp_path):
     out = tmp_path / "search.json"
     assert search.main(["--seed", "46", "--quick", "--json", str(out)]) == 0

@@ -117,7 +117,7 @@ class Result:
         return self.position > LOST[0] or self.axis > LOST[1]
 
 
-def perturbed(shot: Shot, rng: np.random.Generator) -> Array:
+def perturbed(rng: np.random.Generator) -> Array:
     """A pose error (6,) of a start."""
     return rng.normal(size=6) * np.sqrt(np.diag(PRIOR))
 
@@ -137,6 +137,11 @@ def window_of(shot: Shot, T: Array, previous: Window | None = None) -> Window:
     """The window that the segmentation service would cut around a pose."""
     around = window_around(shot.camera, [(T, corners_of(shot.mesh.vertices))], previous)
     return around or whole_frame(shot.camera)
+
+
+def around(error: Array) -> Callable[[Shot, Window | None], Window]:
+    """The window around the true pose moved by an error (6,), for a frame and the window before."""
+    return lambda shot, previous: window_of(shot, geometry.perturb(shot.T_world_target, error), previous)
 
 
 def exact_mask(shot: Shot, window: Window) -> Mask:
@@ -163,7 +168,7 @@ def exact_results(
     pictures = []
     for index in range(count):
         shot = shots.shot(seed, index, *view, hidden, images=False)
-        T_prior = geometry.perturb(shot.T_world_target, perturbed(shot, np.random.default_rng([seed, index, 1])))
+        T_prior = geometry.perturb(shot.T_world_target, perturbed(np.random.default_rng([seed, index, 1])))
         mask = exact_mask(shot, window_of(shot, T_prior))
         for method in out:
             search = search_of(shot, "default" if method == "contour" else method, True)
@@ -190,12 +195,8 @@ def network_results(
     ):
         index = len(pictures)
         film = shots.clip(seed, index, *view, hidden, domain, WARM_FRAMES)
-        error = perturbed(film[-1], np.random.default_rng([seed, index, 1]))
-
-        def window_at(shot: Shot, previous: Window | None, error: Array = error) -> Window:
-            return window_of(shot, geometry.perturb(shot.T_world_target, error), previous)
-
-        *_, mask = network_masks(segmenter, film, window_at)
+        error = perturbed(np.random.default_rng([seed, index, 1]))
+        *_, mask = network_masks(segmenter, film, around(error))
         T_prior = geometry.perturb(film[-1].T_world_target, error)
         for method in out:
             search = search_of(film[-1], "default" if method == "contour" else method, False)
@@ -294,34 +295,64 @@ def auc(scores: Array, positive: np.ndarray) -> float | None:
 KINDS = ("good start", "bad start", "wrong mask", "no prior", "absent")
 
 
-def lost_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domain) -> Iterator[tuple[str, float, bool]]:
-    """Frames of all KINDS: kind, the estimate's doubt, and whether its pose is wrong."""
+@dataclass(frozen=True)
+class Judgement:
+    """A frame of one of KINDS: how much the estimate doubts itself, whether its pose is wrong, whether the mask shows the target.
+
+    Where the search gives up, the pose told is the start's: with a good start and a mask that shows something else it is right by
+    no merit of its own. Such a frame counts as one that should be doubted.
+    """
+
+    kind: str
+    doubt: float
+    is_wrong: bool
+    is_shown: bool
+
+    @property
+    def is_told(self) -> bool:
+        return bool(np.isfinite(self.doubt))
+
+    @property
+    def should_be_doubted(self) -> bool:
+        return self.is_wrong or not (self.is_shown or self.is_told)
+
+
+def lost_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domain) -> Iterator[Judgement]:
+    """Frames of all KINDS."""
+
+    def judgement(kind: str, shot: Shot, mask: Mask, T_prior: Array | None) -> Judgement:
+        found = searched(shot, search_of(shot, "default", False), mask, T_prior)
+        return Judgement(kind, doubt(found.estimate), found.is_wrong or kind == "absent", shows_target(mask, shot))
+
     for index in range(count):
         rng = np.random.default_rng([seed, index, 2])
-        hidden = HIDDEN[index % len(HIDDEN)]
-        film = shots.clip(seed, index, *NEES_VIEW, hidden, domain, 3)
-        last, error = film[-1], perturbed(film[-1], rng)
-        far = np.concatenate([_length(rng, 0.08, 0.4), _length(rng, 0.3, 1.5)])
-        for kind, start in (("good start", error), ("bad start", far)):
-            *_, mask = network_masks(
-                segmenter, film, lambda shot, before, e=start: window_of(shot, geometry.perturb(shot.T_world_target, e), before)
-            )
-            found = searched(last, search_of(last, "default", False), mask, geometry.perturb(last.T_world_target, start))
-            yield kind, doubt(found.estimate), found.is_wrong
-            if kind == "good start":
-                wrong = spoiled(mask, rng)
-                found = searched(last, search_of(last, "default", False), wrong, geometry.perturb(last.T_world_target, start))
-                yield "wrong mask", doubt(found.estimate), found.is_wrong
-        *_, mask = network_masks(segmenter, film, lambda shot, before: whole_frame(shot.camera))
-        found = searched(last, search_of(last, "default", False), mask, None)
-        yield "no prior", doubt(found.estimate), found.is_wrong
+        film = shots.clip(seed, index, *NEES_VIEW, HIDDEN[index % len(HIDDEN)], domain, 3)
+        last = film[-1]
+        near, far = perturbed(rng), np.concatenate([_length(rng, 0.08, 0.4), _length(rng, 0.3, 1.5)])
+        T_near, T_far = (geometry.perturb(last.T_world_target, error) for error in (near, far))
+        *_, mask = network_masks(segmenter, film, around(near))
+        yield judgement("good start", last, mask, T_near)
+        yield judgement("wrong mask", last, spoiled(mask, rng), T_near)
+        *_, mask = network_masks(segmenter, film, around(far))
+        yield judgement("bad start", last, mask, T_far)
+        *_, mask = network_masks(segmenter, film, lambda shot, previous: whole_frame(shot.camera))
+        yield judgement("no prior", last, mask, None)
         empty = shots.clip(seed, index, *NEES_VIEW, 0.0, domain, 3, present=False)
-        *_, mask = network_masks(
-            segmenter, empty, lambda shot, before, e=error: window_of(shot, geometry.perturb(shot.T_world_target, e), before)
-        )
-        T_prior = geometry.perturb(empty[-1].T_world_target, error) if index % 2 else None
-        found = searched(empty[-1], search_of(empty[-1], "default", False), mask, T_prior)
-        yield "absent", doubt(found.estimate), True
+        T_prior = geometry.perturb(empty[-1].T_world_target, near) if index % 2 else None
+        *_, mask = network_masks(segmenter, empty, around(near))
+        yield judgement("absent", empty[-1], mask, T_prior)
+
+
+def shows_target(mask: Mask, shot: Shot) -> bool:
+    """Whether at least half of what the mask or the truth calls the target is called so by both."""
+    target = (Label.FOREARM, Label.HAND)
+    ours = np.zeros(shot.labels.shape, bool)
+    h, w = (n * mask.scale for n in mask.labels.shape)
+    ours[mask.y0 : mask.y0 + h, mask.x0 : mask.x0 + w] = np.kron(
+        np.isin(mask.labels, target), np.ones((mask.scale, mask.scale), bool)
+    )
+    theirs = np.isin(shot.labels, target)
+    return bool((ours & theirs).sum() >= 0.5 * max((ours | theirs).sum(), 1))
 
 
 def _length(rng: np.random.Generator, low: float, high: float) -> Array:
@@ -351,15 +382,9 @@ def gone_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domai
     """Frames in which more than GONE of the target is hidden: the share hidden and the search's state."""
     for index in range(count):
         film = shots.clip(seed, index, *NEES_VIEW, (0.975, 0.99, 1.0)[index % 3], domain, 5)
-        error = perturbed(film[-1], np.random.default_rng([seed, index, 3]))
+        error = perturbed(np.random.default_rng([seed, index, 3]))
         search = search_of(film[-1], "default", False)
-        for shot, mask in zip(
-            film,
-            network_masks(
-                segmenter, film, lambda s, before, e=error: window_of(s, geometry.perturb(s.T_world_target, e), before)
-            ),
-            strict=True,
-        ):
+        for shot, mask in zip(film, network_masks(segmenter, film, around(error)), strict=True):
             found = searched(shot, search, mask, geometry.perturb(shot.T_world_target, error))
             if shot.hidden > GONE:
                 yield shot.hidden, found.estimate.state
@@ -368,7 +393,8 @@ def gone_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domai
 def rows_of(seed: int, plan: Plan, masks: tuple[str, ...]) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
     """All rows of the table, and the NEES at NEES_VIEW by kind of mask and share hidden."""
     segmenter = load_segmenter() if "network" in masks else None
-    rows, consistency = [], {kind: {} for kind in masks}
+    rows: list[dict[str, Any]] = []
+    consistency: dict[str, dict[str, Any]] = {kind: {} for kind in masks}
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rows", total=len(masks) * len(VIEWS) * len(HIDDEN))
         for kind in masks:
@@ -401,20 +427,23 @@ def judged(seed: int, plan: Plan) -> dict[str, Any]:
     """What the search says about itself: as a detector of wrong poses, and where nothing is left to see."""
     segmenter = load_segmenter()
     frames = list(lost_frames(seed, plan.lost, segmenter, plan.domain))
-    scores, wrong = np.array([score for _, score, _ in frames]), np.array([bad for _, _, bad in frames])
+    doubts = np.array([frame.doubt for frame in frames])
+    area = auc(doubts, np.array([frame.should_be_doubted for frame in frames]))
+    by_error = auc(doubts, np.array([frame.is_wrong for frame in frames]))
     kinds = {}
     for kind in KINDS:
-        chosen = np.array([name == kind for name, _, _ in frames])
+        chosen = [frame for frame in frames if frame.kind == kind]
         kinds[kind] = {
-            "frames": int(chosen.sum()),
-            "wrong": int(wrong[chosen].sum()),
-            "tracking": int(np.isfinite(scores[chosen]).sum()),
-            "wrong_and_tracking": int((np.isfinite(scores) & wrong)[chosen].sum()),
+            "frames": len(chosen),
+            "wrong": sum(frame.is_wrong for frame in chosen),
+            "not shown": sum(not frame.is_shown for frame in chosen),
+            "tracking": sum(frame.is_told for frame in chosen),
+            "wrong and tracking": sum(frame.is_told and frame.is_wrong for frame in chosen),
         }
     gone = list(gone_frames(seed, plan.gone, segmenter, plan.domain))
-    area = auc(scores, wrong)
     return {
         "lost_auc": None if area is None else round(area, 4),
+        "lost_auc_by_error_alone": None if by_error is None else round(by_error, 4),
         "lost": kinds,
         "false_tracking": sum(state == "tracking" for _, state in gone),
         "hidden_frames": len(gone),
@@ -438,6 +467,30 @@ def measure(seed: int, plan: Plan, parts: tuple[str, ...]) -> dict[str, Any]:
 
 def show(result: dict[str, Any], console: Console) -> None:
     """The tables."""
+    if result["rows"]:
+        show_rows(result, console)
+    for name, part in (("network masks", result["nees"]), ("exact masks", result["nees"].get("exact", {}))):
+        for hidden, each in part.get("by_occlusion", {}).items():
+            if each["frames"]:
+                verdict = "inside" if each["band"][0] <= each["mean"] <= each["band"][1] else "outside"
+                console.print(
+                    f"NEES of 5 degrees of freedom, {name}, {float(hidden):.0%} hidden: mean {each['mean']} {verdict} "
+                    f"{each['band']}, median {each['median']} (4.35), {each['frames']} frames"
+                )
+    if "lost_auc" in result:
+        console.print(
+            f"wrong poses doubted: area under the ROC curve {result['lost_auc']} (goal {AUC_GOAL}); "
+            f"{result['lost_auc_by_error_alone']} if giving up is wrong wherever the start was right"
+        )
+        for kind, each in result["lost"].items():
+            console.print(f"  {kind}: " + ", ".join(f"{value} {key}" for key, value in each.items()))
+        console.print(
+            f"more than {GONE:.0%} hidden and tracking: {result['false_tracking']} of {result['hidden_frames']} (goal 0)"
+        )
+
+
+def show_rows(result: dict[str, Any], console: Console) -> None:
+    """The table of all rows."""
     title = f"seed {result['seed']}, {result['domain']} domain: errors, median (90th percentile)"
     table = Table(
         "masks", "picture", "hidden", "method", "position cm", "mean", "with prior", "bound cm", "lateral cm", "depth cm",
@@ -454,21 +507,6 @@ def show(result: dict[str, Any], console: Console) -> None:
             f"{row['ms']:.2f}", f"{row['not_tracking']:.0%}", _goal(row, papers.get(_key(row))),
         )  # fmt: skip
     console.print(table)
-    for name, part in (("network masks", result["nees"]), ("exact masks", result["nees"].get("exact", {}))):
-        for hidden, each in part.get("by_occlusion", {}).items():
-            if each["frames"]:
-                verdict = "inside" if each["band"][0] <= each["mean"] <= each["band"][1] else "outside"
-                console.print(
-                    f"NEES of 5 degrees of freedom, {name}, {float(hidden):.0%} hidden: mean {each['mean']} {verdict} "
-                    f"{each['band']}, median {each['median']} (4.35), {each['frames']} frames"
-                )
-    if "lost_auc" in result:
-        console.print(f"wrong poses told: area under the ROC curve {result['lost_auc']} (goal {AUC_GOAL})")
-        for kind, each in result["lost"].items():
-            console.print(f"  {kind}: " + ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in each.items()))
-        console.print(
-            f"more than {GONE:.0%} hidden and tracking: {result['false_tracking']} of {result['hidden_frames']} (goal 0)"
-        )
 
 
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:
