@@ -47,6 +47,8 @@ PIECE = 0.2
 AROUND = 0.5
 """Diagonals of the mask around it that are looked at."""
 DAMPING = 0.02
+STILL = (3e-4, 1.5e-3)
+"""A step smaller than this [m, rad] is the last."""
 MAX_STEP = np.array([0.08, 0.08, 0.15, 0.3, 0.3, 0.3])
 """Largest step of a pass [m, rad] for an object a metre away."""
 
@@ -255,6 +257,8 @@ def descend(model: Model, at: Level, T: Array, prior: Prior, widths: tuple[float
         step /= max(1.0, float(np.max(np.abs(step) / MAX_STEP)))
         T = geometry.perturb(T, step)
         T[2, 3] = max(T[2, 3], 2.0 * NEAR)
+        if width == widths[-1] and np.abs(step[:3]).max() < STILL[0] and np.abs(step[3:]).max() < STILL[1]:
+            break
     return T
 
 

@@ -11,12 +11,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from services.search import basin, meshes
 from services.search import refine as colours
-from services.search.basin import Level, Prior, Score, Shape
+from services.search.basin import Level, Prior, Pyramid, Score, Shape
 from services.search.contour import MEASURED, Model
 from services.search.evidence import COVERED, FREE, TARGET, Intrinsics
 from services.search.fit import Fit, Limits, Noise
@@ -106,13 +107,14 @@ def refine(
     if np.count_nonzero(state == TARGET) < SMALLEST_PX:
         return rigid.published(_lost(prior.T))
     masks = basin.pyramid(state, k)
-    return rigid.published(judged(rigid.shape.fine, masks.fine, basin.search(rigid.shape, masks, prior), prior, picture))
+    return rigid.published(judged(rigid.shape, masks, basin.search(rigid.shape, masks, prior), prior, picture))
 
 
 def judged(
-    model: Model, at: Level, found: list[tuple[Score, Array]], prior: Prior, picture: NDArray[np.uint8] | None = None
+    shape: Shape, masks: Pyramid, found: list[tuple[Score, Array]], prior: Prior, picture: NDArray[np.uint8] | None = None
 ) -> Estimate:
     """The estimate of the middle's pose, T_camera_middle, from those that `basin` found, best first."""
+    model, at = shape.fine, masks.fine
     noise = measured_noise(model, at, found[0][1])
     widths = (2.0 * noise.edge,) * 4
     poses = [basin.descend(model, at, T, prior, widths, noise) for _, T in found]
@@ -127,7 +129,7 @@ def judged(
     apart = sum((w * np.outer(e, e) for w, e in zip(weights, errors, strict=True)), np.zeros((6, 6)))
     covariance = covariance + apart / weights.sum()
     if picture is not None:
-        T, covariance = _on_picture(model, at, T, covariance, best, noise, picture)
+        T, covariance = _on_picture(shape, masks, T, covariance, best, noise, picture)
     state = _state(best, contour.points[contour.kind == MEASURED, 7].sum() * at.scale)
     if state == "lost":
         return _lost(T, best.overlap)
@@ -145,20 +147,26 @@ def measured_noise(model: Model, at: Level, T: Array) -> Noise:
 
 
 def _on_picture(
-    model: Model, at: Level, T: Array, covariance: Array, best: Score, noise: Noise, picture: NDArray[np.uint8]
+    shape: Shape, masks: Pyramid, T: Array, covariance: Array, best: Score, noise: Noise, picture: NDArray[np.uint8]
 ) -> tuple[Array, Array]:
-    """The pose and covariance with what the colours on both sides of the contour say; unchanged where they say nothing."""
-    first = Fit(T, covariance, T, 0.0, math.inf, 0.0, best.cost, 0.0, best.both, best.either, best.either - best.both)
+    """The pose and covariance with what the colours on both sides of the contour say, on the small picture and then on the full
+    one; unchanged where they say nothing, or what the mask contradicts."""
     prior = np.asarray(np.linalg.inv(covariance), np.float64)
-    settings = colours.Settings(mask=max(noise.edge / at.scale, 0.8))
-    second = colours.refine(model, first, picture, at.evidence, T, prior, settings)
-    if second.overlap < best.overlap - WORSE or second.length < SHORTEST * at.evidence.boundary_px:
+    found = Fit(T, covariance, T, 0.0, math.inf, 0.0, best.cost, 0.0, best.both, best.either, best.either - best.both)
+    for model, at in ((shape.coarse, masks.coarse), (shape.fine, masks.fine)):
+        (h, w), e = at.shape, at.evidence
+        window = picture[e.y0 : e.y0 + h * e.scale, e.x0 : e.x0 + w * e.scale]
+        small = np.asarray(cv2.resize(window, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
+        settings = colours.Settings(mask=max(noise.edge / at.scale, 0.8))
+        found = colours.refine(model, found, small, replace(e, x0=0, y0=0, scale=1), T, prior, settings)
+    error = geometry.pose_error(found.T_searched, T)
+    if found.length < SHORTEST * masks.fine.evidence.boundary_px or error @ prior @ error > GATE:
         return T, covariance
-    return second.T_searched, np.asarray(np.linalg.inv(np.linalg.inv(second.covariance) + prior), np.float64)
+    return found.T_searched, np.asarray(np.linalg.inv(np.linalg.inv(found.covariance) + prior), np.float64)
 
 
-WORSE = 0.05
-"""Overlap with the mask that a pose may lose on the picture."""
+GATE = 27.9
+"""Squared Mahalanobis distance, six degrees of freedom, that one in 10^4 right poses exceeds."""
 SHORTEST = 0.4
 """Share of the mask's boundary along which the picture has to show an edge."""
 
@@ -173,7 +181,7 @@ def _lost(T: Array, overlap: float = 0.0) -> Estimate:
     return Estimate(T, Limits().covariance, overlap, "lost")
 
 
-FRAME_WIDTHS = (8.0, 6.0, 5.0, 4.0)
+FRAME_WIDTHS = (8.0, 6.0, 5.0, 5.0, 5.0)
 """Of the steps from the prediction, see `basin.descend`."""
 DROP = 0.12
 """Overlap less than usual by this has the surroundings searched too."""
@@ -221,11 +229,11 @@ class Tracker:
             return None
         model, masks = self._rigid.shape.fine, basin.pyramid(state, self._k)
         if self._missed == 0:
-            T = basin.descend(model, masks.fine, prior.T, prior, FRAME_WIDTHS)
+            T = basin.descend(self._rigid.shape.coarse, masks.coarse, prior.T, prior, FRAME_WIDTHS)
             near = basin.ranked(model, masks.fine, [T], prior, basin.NOISE)
             if near[0][0].overlap > max(FITS, self._usual - DROP):
-                return judged(model, masks.fine, near, prior, picture)
-        return judged(model, masks.fine, basin.search(self._rigid.shape, masks, prior), prior, picture)
+                return judged(self._rigid.shape, masks, near, prior, picture)
+        return judged(self._rigid.shape, masks, basin.search(self._rigid.shape, masks, prior), prior, picture)
 
     def _miss(self, state: NDArray[np.uint8], found: Estimate | None) -> Estimate:
         """The object is where it was, as far as is known: covered where something stands there."""
