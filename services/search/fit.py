@@ -69,6 +69,9 @@ MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
 """Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
 DAMPING = (1e-3, 10.0, 1e2)
 """Marquardt's factor at the start, its change after a pass that gained or lost, and where the search gives up."""
+KEPT = 0.05
+"""Share of the prior's information that stays in the measurement: without any, what the contour hardly shows would be
+extrapolated far beyond where the problem is linear."""
 GOOD, MISFIT = 2.0, 3.0
 """A smaller `Fit.misfit` has nearly every fit that is right; a larger one has one of a hundred, and most that are wrong."""
 
@@ -78,7 +81,7 @@ class Fit:
     """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
     `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
     `cost`: chi^2 of contour, dilation and prior together; `misfit`: the same per measurement, 1 to 3 where the pose
-    is right; `both`, `either`, `free`: see `compare`."""
+    is right; `both`, `either`, `free`: see `compare`; `sharp`: whether the image has edges along the contour (`refine`)."""
 
     T: Array
     covariance: Array
@@ -91,6 +94,7 @@ class Fit:
     both: int
     either: int
     free: int
+    sharp: bool = False
 
     @property
     def overlap(self) -> float:
@@ -216,12 +220,13 @@ def fit(
 
 def marginal(T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float, limits: Limits) -> tuple[Array, Array]:
     """The pose and covariance (6, 6) that the measurement alone says, from the normal equations of pose error and dilation at T,
-    which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out, the dilation marginalised (Schur complement).
+    which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out but for KEPT, the dilation marginalised (Schur
+    complement).
 
     `rolls`: share of the information about the roll that is believed, see `normal_equations`.
     """
     gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
-    weak = limits.information
+    weak = (1.0 - KEPT) * limits.information + KEPT * regular[:6, :6]
     covariance = np.linalg.inv(H[:6, :6] - np.outer(gain, H[6, :6]) + weak)
     offset = covariance @ (g[:6] - gain * (g[6] - regular[6, 6] * moved[6]) - weak @ moved[:6])
     # the roll that a nearly round section shows is doubted, and with it all that leans on it
@@ -230,6 +235,12 @@ def marginal(T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: 
     doubt = min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll)
     covariance = (covariance + covariance.T) / 2.0 + doubt * np.outer(c, c) / roll
     return geometry.perturb(T, offset), covariance
+
+
+def with_prior(T: Array, covariance: Array, T_prior: Array, prior: Array) -> Array:
+    """The most probable pose of a measurement T with its covariance (6, 6) and of a prior with its information (6, 6)."""
+    information = np.linalg.inv(covariance)
+    return geometry.perturb(T_prior, np.linalg.solve(information + prior, information @ geometry.pose_error(T, T_prior)))
 
 
 def _small(step: Array) -> bool:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from services.search.contour import MEASURED, Model, match, normal_equations
 from services.search.evidence import Evidence, Intrinsics, compare
-from services.search.fit import Fit, Limits, marginal
+from services.search.fit import Fit, Limits, marginal, with_prior
 from shared import geometry
 
 Array = NDArray[np.float64]
@@ -52,9 +52,9 @@ class Settings:
     temperature: float = 2.0
     mask: float = 1.2
     huber: float = 0.5
-    edge: float = 0.15
-    correlation: float = 6.0
-    dilation: float = 0.05
+    edge: float = 0.2
+    correlation: float = 9.0
+    dilation: float = 0.12
 
 
 def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uint8], Evidence]:
@@ -101,52 +101,107 @@ def refine(
     `prior` (6, 6): information about T_prior (4 x 4) along the camera's axes, taken out of the result again as by `fit`.
     """
     settings, limits = settings or Settings(), limits or Limits()
-    image, evidence = native(image, evidence)
-    k = evidence.intrinsics
-    weak = limits.information
     regular = np.zeros((7, 7))
-    regular[:6, :6] = prior + weak
+    regular[:6, :6] = prior + limits.information
     regular[6, 6] = settings.dilation**-2
-    T = first.T_searched
-    moved = np.zeros(7)
-    moved[:6] = geometry.pose_error(T, T_prior)
-    for _ in range(settings.passes):
-        V = model.in_camera(T)
-        points = model.outline(V, k, evidence.state.shape, settings.spacing)
-        own = evidence.field_of(model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1])))
+    picture = _Picture(model, *native(image, evidence), settings, T_prior, regular)
+    best = picture.descend(with_prior(first.T, first.covariance, T_prior, prior), settings.passes)
+    if best.rms >= SHARP and prior.any():  # the mask led astray: from the prediction, with twice the reach at first
+        T = picture.halved().descend(T_prior, settings.passes).T
+        best = min(best, picture.descend(T, settings.passes), key=lambda one: one.rms)
+    trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
+    T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits)
+    k = evidence.intrinsics
+    both, free = compare(evidence.state, model.silhouette(best.T, k, (0, 0, *evidence.state.shape[::-1])))
+    return replace(
+        first,
+        T=T,
+        covariance=covariance,
+        T_searched=best.T,
+        length=best.length / evidence.scale,
+        rms=best.rms,
+        both=both,
+        either=evidence.seen_px + free,
+        free=free,
+        sharp=best.rms < SHARP,
+    )
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
+    square of the offsets left [px] and the share of the roll that is believed."""
+
+    T: Array
+    moved: Array
+    H: Array
+    g: Array
+    length: float
+    rms: float
+    rolls: float
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """An image (h, w, 3) uint8 with the evidence of its pixels, in which the pose is looked for."""
+
+    model: Model
+    image: NDArray[np.uint8]
+    evidence: Evidence
+    settings: Settings
+    T_prior: Array
+    regular: Array
+
+    def halved(self) -> _Picture:
+        """The same at half the resolution: twice the reach."""
+        h, w = self.evidence.state.shape[0] // 2, self.evidence.state.shape[1] // 2
+        k, evidence = self.evidence.intrinsics, self.evidence
+
+        def half(array: NDArray) -> NDArray:
+            return np.asarray(cv2.resize(array[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA))
+
+        smaller = replace(
+            evidence,
+            state=np.ascontiguousarray(evidence.state[: 2 * h : 2, : 2 * w : 2]),
+            field=half(evidence.field).astype(np.float32, copy=False),
+            guarded=(half(evidence.guarded * np.uint8(4)) > 0).astype(np.uint8),
+            intrinsics=Intrinsics(k.fx / 2.0, k.fy / 2.0, (k.cx - 0.5) / 2.0, (k.cy - 0.5) / 2.0),
+        )
+        return replace(self, image=half(self.image).astype(np.uint8, copy=False), evidence=smaller)
+
+    def descend(self, T: Array, passes: int) -> _Pass:
+        """The pose reached from T by Gauss-Newton's steps."""
+        moved = np.zeros(7)
+        moved[:6] = geometry.pose_error(T, self.T_prior)
+        for _ in range(passes):
+            here = self._at(T, moved)
+            step = np.linalg.solve(here.H + self.regular, here.g - self.regular @ moved)
+            step /= max(1.0, float(np.max(np.abs(step[:6]) / MAX_STEP)))
+            T, moved = geometry.perturb(T, step[:6]), moved + step
+            if np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED:
+                break
+        # the derivatives are those before the last step, which hardly moved them
+        return replace(here, T=T, moved=moved, g=here.g - here.H @ step)
+
+    def _at(self, T: Array, moved: Array) -> _Pass:
+        evidence, settings, k = self.evidence, self.settings, self.evidence.intrinsics
+        V = self.model.in_camera(T)
+        points = self.model.outline(V, k, evidence.state.shape, settings.spacing)
+        own = evidence.field_of(self.model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1])))
         by_mask, mask_kind = match(points, evidence.field, evidence.guarded, own, LINE)
-        r, sigma, kind = offsets(
-            points, image, evidence.guarded, by_mask, mask_kind,
-            settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask,
-        )  # fmt: skip
+        believed = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
+        r, sigma, kind = offsets(points, self.image, evidence.guarded, by_mask, mask_kind, *believed)
         weight = points[:, 7] / (settings.correlation * (sigma**2 + settings.edge**2))
         H, g, length, square, _, _, rolls = normal_equations(
             points, r - moved[6], kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False
         )
-        step = np.linalg.solve(H + regular, g - regular @ moved)
-        step /= max(1.0, float(np.max(np.abs(step[:6]) / MAX_STEP)))
-        T, moved = geometry.perturb(T, step[:6]), moved + step
-        if np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED:
-            break
-    # the residuals and derivatives are those of the last pass's start, which the last step hardly left
-    g = g - H @ step
-    pose, covariance = marginal(T, moved, H, g, regular, rolls, limits)
-    silhouette = model.silhouette(T, k, (0, 0, *evidence.state.shape[::-1]))
-    both, free = compare(evidence.state, silhouette)
-    rms = math.sqrt(square / length) if length > 0 else math.inf
-    return replace(
-        first,
-        T=pose,
-        covariance=covariance,
-        T_searched=T,
-        length=length,
-        rms=rms,
-        both=both,
-        either=evidence.seen_px + free,
-        free=free,
-    )
+        return _Pass(T, moved, H, g, length, math.sqrt(square / length) if length > 0 else math.inf, rolls)
 
 
+TYPICAL = 0.2
+"""Offsets left [px] up to which the covariance is that of the settings; of larger ones it grows with their fourth power."""
+SHARP = 0.3
+"""Offsets of the image's edges left [px], each counted up to `Settings.huber`, with which a pose is believed."""
 MAX_STEP = np.array([0.02, 0.02, 0.05, 0.1, 0.1, 0.1])
 """Largest step of a pass [m, rad]."""
 CONVERGED = 2e-4

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from services.search import contour, detect, evidence, overlap
 from services.search.evidence import TARGET, Evidence, Intrinsics
-from services.search.fit import GOOD, MISFIT, Fit, Limits, Noise, fit
+from services.search.fit import GOOD, MISFIT, Fit, Limits, Noise, fit, with_prior
 from services.search.refine import refine
 from services.search.robots import RobotDepth
 from shared import body, geometry
@@ -143,32 +143,24 @@ class Search:
         if T_prior is not None:
             seen = self._gather(mask, T_start, joints, limb=T_start)
             first, certain = self._track(seen, T_start, prior_covariance)
-            tracked = seen, first
-            if certain or seen.seen_px < detect.SMALLEST_PX:
-                return self._conclude(seen, first, T_start, prior_covariance, image)
+            tracked = seen, self._closer(seen, first, T_start, self._leaning(prior_covariance), image)
+            if certain or tracked[1].sharp or seen.seen_px < detect.SMALLEST_PX:
+                return self._judge(*tracked, image is not None, T_start, prior_covariance)
         usable = tracked is not None and tracked[1].overlap >= FITS and tracked[1].misfit < WRONG
         due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost")
         other = self._detect(mask, T_start, joints) if due else None
         if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
-            tracked = other
+            tracked = other[0], self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
         if tracked is None:
             return self._lost(T_start)
-        return self._conclude(*tracked, T_start if T_prior is not None else None, prior_covariance, image)
+        return self._judge(*tracked, image is not None, T_start if T_prior is not None else None, prior_covariance)
 
-    def _conclude(
-        self, seen: Evidence, found: Fit, T_prior: Array | None, covariance: Array | None, image: NDArray[np.uint8] | None
-    ) -> VisionEstimate:
-        """The estimate of a fit, refined on the image if there is one. T_prior: T_camera_target, None where nothing is known."""
-        expected = T_prior is not None and self._is_expected(found, T_prior, covariance)
-        if image is not None and found.overlap >= FITS and found.misfit < WRONG:
-            if T_prior is None:
-                closer = refine(self._model, found, image, seen, found.T_searched, np.zeros((6, 6)))
-            else:
-                closer = refine(self._model, found, image, seen, T_prior, self._leaning(covariance))
-            away = geometry.pose_error(closer.T_searched, found.T_searched)
-            if away @ np.linalg.solve(found.covariance + closer.covariance, away) < GATE and closer.overlap >= FITS:
-                found = closer
-        return self._judge(seen, found, expected)
+    def _closer(self, seen: Evidence, found: Fit, T_prior: Array, prior: Array, image: NDArray[np.uint8] | None) -> Fit:
+        """A fit, or where the image shows edges at a pose near it, that pose."""
+        if image is None or seen.seen_px < detect.SMALLEST_PX:
+            return found
+        closer = refine(self._model, found, image, seen, T_prior, prior)
+        return closer if closer.sharp and closer.overlap >= FITS else found
 
     def _gather(self, mask: Mask, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None) -> Evidence:
         """`limb`: T_camera_target of the limb, where it is known; beyond its near end nothing is believed."""
@@ -303,17 +295,27 @@ class Search:
         both, free = evidence.compare(seen.state, self._model.silhouette(T, seen.intrinsics, (0, 0, w, h)))
         return both / max(seen.seen_px + free, 1)
 
-    def _judge(self, seen: Evidence, best: Fit, expected: bool) -> VisionEstimate:
-        """`expected`: a sure prediction says the same."""
+    def _judge(
+        self, seen: Evidence, best: Fit, with_image: bool, T_prior: Array | None, prior_covariance: Array | None
+    ) -> VisionEstimate:
+        """The estimate of a fit; `with_image`: an image was there to confirm it; T_prior: T_camera_target as predicted, None
+        where nothing is known."""
+        fits = best.sharp if with_image else best.misfit < WRONG
+        expected, T_probable = False, best.T_searched
+        if T_prior is not None:
+            expected = self._is_expected(best, T_prior, prior_covariance)
+            if prior_covariance is not None:
+                information = np.asarray(np.linalg.inv(self._predicted(prior_covariance)[0]), np.float64)
+                T_probable = with_prior(best.T, best.covariance, T_prior, information)
         amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
         hidden = float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0))
         explained = 1.0 - (best.both + best.free) / amodal  # covered, or outside the window
         if hidden > (HIDDEN if expected else RECOGNISED) or best.length < SHORTEST_PX:
             state: State = "occluded" if explained > 0.5 else "lost"
         else:
-            state = "tracking" if best.overlap >= FITS and best.misfit < WRONG else "lost"
+            state = "tracking" if best.overlap >= FITS and fits else "lost"
         if state == "tracking":
-            return self._estimate(best.T, best.covariance, best.overlap, hidden, state, best.T_searched)
+            return self._estimate(best.T, best.covariance, best.overlap, hidden, state, T_probable)
         return self._estimate(best.T_searched, self._limits.covariance, best.overlap, hidden, state, best.T_searched)
 
     def _amodal_px(self, T: Array, k: Intrinsics) -> int:
