@@ -174,7 +174,8 @@ def show(result: dict[str, Any], console: Console) -> None:
     table = Table("", *BACKGROUNDS, "goal", title=f"seed {result['seed']}: median / 90th percentile / largest")
     rows = result["rows"]
     for key, name in ERRORS.items():
-        table.add_row(name, *("{median} / {p90} / {max}".format(**row[key]) for row in rows), "")
+        columns = ("-" if row[key]["median"] is None else "{median} / {p90} / {max}".format(**row[key]) for row in rows)
+        table.add_row(name, *columns, "")
     table.add_row("frames tracked, up to 95 % hidden", *(f"{row['tracked']:.1%}" for row in rows), "")
     recovered = (", ".join("-" if n is None else str(n) for n in row["recovery_frames"]) for row in rows)
     table.add_row("frames until recovered", *recovered, f"<= {RECOVERY_GOAL}")
