@@ -386,3 +386,15 @@ def test_track_asks_for_a_picture_of_every_mask(given, tmp_path, capsys):
     argv = ["search", "track", "--mesh-unit", "mm", *(word for name, path in files.items() for word in (f"--{name}", str(path)))]
     assert cli.main(argv) == 2
     assert "an image for every mask expected, by name, 1 of 2 are missing, first b" in capsys.readouterr().err
+
+
+def test_the_benchmark_writes_a_row_for_every_object_mask_and_start(tmp_path, capsys):
+    path = tmp_path / "result.json"
+    assert cli.main(["bench", "objects", "--objects", "duck", "--starts", "1", "--seed", "3", "--json", str(path)]) == 0
+    result = json.loads(path.read_text())
+    assert result["seed"] == 3
+    assert [(row["object"], row["mask_iou"], row["start_deg"]) for row in result["rows"]] == [
+        (name, mask, degrees) for name in ("duck", "all") for mask in ("exact", "0.86") for degrees in (20.0, 30.0)
+    ]
+    assert all(row["converged"] in (0.0, 1.0) and row["ms_median"] > 0 for row in result["rows"])
+    assert "share converged" in capsys.readouterr().out

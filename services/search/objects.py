@@ -191,8 +191,8 @@ SMOOTHING = 0.3
 """Share of a frame's velocity that is believed at once."""
 UNKNOWN = (0.6, 3.0)
 """Standard deviations of what a constant velocity misses, [m/s] and [rad/s], grown over the time bridged."""
-LONGEST = 10
-"""Frames without a sight of the object after which it is looked for no further away than before."""
+LONGEST_S = 0.3
+"""Time without a sight of the object [s] after which it is looked for no further away than before."""
 
 
 class Tracker:
@@ -207,14 +207,16 @@ class Tracker:
         self._rigid, self._k, self._dt = rigid, k, dt_s
         self._growth = np.diag(np.repeat(np.square(UNKNOWN) * dt_s**2, 3))
         self._T = T_start @ rigid.T_object_middle
-        self._covariance = np.diag(np.repeat(np.square(spread), 3)) - self._growth
-        self._velocity, self._usual, self._missed = np.zeros(6), 0.0, 1
+        self._covariance = np.diag(np.repeat(np.square(spread), 3))
+        self._velocity, self._usual = np.zeros(6), 0.0
+        self._missed = -1  # frames since the last pose; there was none before the start
 
     def update(self, mask: Bool, occluder: Bool | None = None, picture: NDArray[np.uint8] | None = None) -> Estimate:
         """The pose in the next frame; arguments as of `refine`. Lost, the pose is the last one and the covariance wide."""
         state = observed(mask, occluder)
         T = geometry.perturb(self._T, self._velocity * self._dt)
-        covariance = self._covariance + min(1 + self._missed, LONGEST) ** 2 * self._growth
+        bridged = min(1.0 + self._missed, max(LONGEST_S / self._dt, 1.0))
+        covariance = self._covariance + bridged**2 * self._growth
         prior = Prior(T, np.asarray(np.linalg.inv(covariance), np.float64))
         found = self._look(state, prior, picture)
         if found is None or found.state == "lost":
@@ -239,7 +241,7 @@ class Tracker:
 
     def _miss(self, state: NDArray[np.uint8], found: Estimate | None) -> Estimate:
         """The object is where it was, as far as is known: covered where something stands there."""
-        self._missed += 1
+        self._missed = max(self._missed, 0) + 1
         self._velocity = np.zeros(6)
         h, w = state.shape
         silhouette = self._rigid.shape.fine.silhouette(self._T, self._k, (0, 0, w, h))
