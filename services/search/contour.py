@@ -20,7 +20,7 @@ NEAR = 0.05
 """Edges nearer to the camera than this are left out [m]."""
 BESIDE = 1.5
 """Contours of two parts that are nearer than this [px] are told apart by nothing."""
-FINE = 4
+FINE = 2
 """The silhouette that tells the outer contour from the inner has so many pixels on each of the mask's: fingers far away are as
 wide as one."""
 ACROSS = 0.35

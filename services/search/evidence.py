@@ -52,8 +52,8 @@ class Intrinsics:
 class Evidence:
     """`state` (h, w) uint8; `field` (h, w) float32, the smoothed share of the target in what is known, 0.5 on its boundary;
     `guarded` (h, w) uint8, 1 where COVERED is near; `hand` (h, w) uint8, 1 on the part of the target that lies towards +x;
-    `seen_px`: pixels that show the target, and `boundary_px`: those on a boundary that is its own; `x0`, `y0`, `scale`: its
-    window as in `messages.Mask`."""
+    `known` (h, w) float32, the smoothed share of what is known, None where all is; `seen_px`: pixels that show the target,
+    and `boundary_px`: those on a boundary that is its own; `x0`, `y0`, `scale`: its window as in `messages.Mask`."""
 
     state: NDArray[np.uint8]
     field: NDArray[np.float32]
@@ -62,13 +62,15 @@ class Evidence:
     seen_px: int
     boundary_px: int
     intrinsics: Intrinsics
+    known: NDArray[np.float32] | None = None
     x0: int = 0
     y0: int = 0
     scale: int = 1
 
     def field_of(self, silhouette: NDArray[np.bool_]) -> NDArray[np.float32]:
         """The field (h, w) of a mask that shows what a silhouette (h, w) shows, where something is known."""
-        return _field((silhouette & (self.state != COVERED)).astype(np.float32), self.state)
+        shown = _blur((silhouette & (self.state != COVERED)).astype(np.float32))
+        return shown if self.known is None else _share(shown, self.known)
 
     def measurements(self, correlation: float) -> float:
         """The number of independent measurements, with those that the six unknowns of a pose need."""
@@ -132,13 +134,16 @@ def gather(
     """The evidence of a mask from its states and labels (h, w); `x0`, `y0`, `scale`: its window as in `messages.Mask`."""
     target = (state == TARGET).astype(np.float32)
     covered = (state == COVERED).astype(np.uint8)
-    field = _field(target, state)
+    known = _blur((1 - covered).astype(np.float32)) if covered.any() else None
+    field = _blur(target) if known is None else _share(_blur(target), known)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GUARD_PX + 1, 2 * GUARD_PX + 1))
     guarded = cv2.dilate(covered, disc, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     hand = ((labels == Label.HAND) & (state == TARGET)).astype(np.uint8)
     seen_px = int(np.count_nonzero(target))
     boundary_px = _boundary_px(state, field, guarded)
-    return Evidence(state, field, guarded.astype(np.uint8, copy=False), hand, seen_px, boundary_px, intrinsics, x0, y0, scale)
+    return Evidence(
+        state, field, guarded.astype(np.uint8, copy=False), hand, seen_px, boundary_px, intrinsics, known, x0, y0, scale
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -151,12 +156,8 @@ def _boundary_px(state, field, guarded):
     return count
 
 
-def _field(target: NDArray[np.float32], state: NDArray[np.uint8]) -> NDArray[np.float32]:
-    field, known = _blur(target), (state != COVERED).astype(np.float32)
-    if known.all():
-        return field
-    share = _blur(known)
-    return np.divide(field, share, out=np.zeros_like(field), where=share > 1e-3)
+def _share(shown: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.divide(shown, known, out=np.zeros_like(shown), where=known > 1e-3)
 
 
 def _blur(image: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -152,10 +152,9 @@ class _Problem:
                 break
         return T, moved
 
-    def fine(self, T: Array, moved: Array) -> _Pass:
+    def fine(self, here: _Pass) -> _Pass:
         """The best pose near by, by Levenberg and Marquardt."""
-        reach, huber, passes = FINE
-        here, damping = self.at(T, moved, reach, huber), DAMPING[0]
+        (reach, huber, passes), damping = FINE, DAMPING[0]
         for _ in range(passes):
             step = self.step(here, damping)
             there = self.at(geometry.perturb(here.T, step[:6]), here.moved + step, reach, huber)
@@ -202,9 +201,12 @@ def fit(
     if T_prior is not None:
         start[:6] = geometry.pose_error(T_start, T_prior)
     independent = evidence.measurements(noise.correlation)
-    here = problem.fine(T_start, start)
-    if here.cost > GOOD * independent:  # the start was too far away for the short walk
-        here = min(here, problem.fine(*problem.coarse(T_start, start)), key=lambda one: one.cost)
+    here = problem.at(T_start, start, *FINE[:2])
+    if here.cost <= GOOD * independent:
+        here = problem.fine(here)
+    else:  # the start may be too far away for the short walk
+        there = problem.fine(problem.at(*problem.coarse(T_start, start), *FINE[:2]))
+        here = there if there.cost <= GOOD * independent else min(there, problem.fine(here), key=lambda one: one.cost)
 
     # the pose is final: only what was measured informs
     moved = here.moved

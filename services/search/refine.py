@@ -77,6 +77,7 @@ def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uin
         evidence,
         state=enlarged(evidence.state, cv2.INTER_NEAREST),
         field=enlarged(evidence.field, cv2.INTER_LINEAR),
+        known=None if evidence.known is None else enlarged(evidence.known, cv2.INTER_LINEAR),
         guarded=enlarged(evidence.guarded, cv2.INTER_NEAREST),
         hand=enlarged(evidence.hand, cv2.INTER_NEAREST),
         seen_px=evidence.seen_px * scale**2,
@@ -164,6 +165,7 @@ class _Picture:
             evidence,
             state=np.ascontiguousarray(evidence.state[: 2 * h : 2, : 2 * w : 2]),
             field=half(evidence.field).astype(np.float32, copy=False),
+            known=None if evidence.known is None else half(evidence.known).astype(np.float32, copy=False),
             guarded=(half(evidence.guarded * np.uint8(4)) > 0).astype(np.uint8),
             intrinsics=Intrinsics(k.fx / 2.0, k.fy / 2.0, (k.cx - 0.5) / 2.0, (k.cy - 0.5) / 2.0),
         )

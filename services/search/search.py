@@ -142,9 +142,14 @@ class Search:
         tracked: tuple[Evidence, Fit] | None = None
         if T_prior is not None:
             seen = self._gather(mask, T_start, joints, limb=T_start)
-            first, certain = self._track(seen, T_start, prior_covariance)
-            tracked = seen, self._closer(seen, first, T_start, self._leaning(prior_covariance), image)
-            if certain or tracked[1].sharp or seen.seen_px < detect.SMALLEST_PX:
+            prior = self._leaning(prior_covariance)
+            first = self._fit(seen, T_start, T_start, prior)
+            tracked = seen, self._closer(seen, first, T_start, prior, image)
+            if not tracked[1].sharp:
+                first = self._settled(seen, self._with_mirror(seen, first, T_start, prior), T_start, prior)
+                tracked = seen, self._closer(seen, first, T_start, prior, image)
+            certain = tracked[1].sharp or (first.overlap >= FITS_WELL and first.misfit < WRONG)
+            if certain or seen.seen_px < detect.SMALLEST_PX:
                 return self._judge(*tracked, image is not None, T_start, prior_covariance)
         usable = tracked is not None and tracked[1].overlap >= FITS and tracked[1].misfit < WRONG
         due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost")
@@ -189,12 +194,6 @@ class Search:
         covariance, floor = self._predicted(prior_covariance)
         return np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64)
 
-    def _track(self, seen: Evidence, T_start: Array, prior_covariance: Array | None) -> tuple[Fit, bool]:
-        """The pose near the prediction, and whether it explains the mask so well that no other need be looked for."""
-        prior = self._leaning(prior_covariance)
-        first = self._settled(seen, self._with_mirror(seen, T_start, prior), T_start, prior)
-        return first, first.overlap >= FITS_WELL and first.misfit < WRONG
-
     def _settled(self, seen: Evidence, first: Fit, T_prior: Array, prior: Array) -> Fit:
         """A fit, or where it is bad a better one beside it: what went wrong is mostly the roll, or the tilt's sign."""
         if seen.seen_px < detect.SMALLEST_PX or first.misfit <= MISFIT:
@@ -219,10 +218,9 @@ class Search:
         uncertain = covariance + found.covariance + (floor if prior_covariance is None else 0.0)
         return bool(error @ np.linalg.solve(uncertain, error) < EXPECTED)
 
-    def _with_mirror(self, seen: Evidence, T_start: Array, prior: Array) -> Fit:
-        """The fit from the prediction, and that from its mirror image where both may be right: an axis nearly parallel to the
-        image looks the same tilted either way. They are merged by their likelihoods, so that the covariance covers both."""
-        first = self._fit(seen, T_start, T_start, prior)
+    def _with_mirror(self, seen: Evidence, first: Fit, T_start: Array, prior: Array) -> Fit:
+        """The first fit, from the prediction, and that from its mirror image where both may be right: an axis nearly parallel
+        to the image looks the same tilted either way. Merged by their likelihoods, so that the covariance covers both."""
         T_mirror = detect.mirrored(first.T_searched)[0]
         away = geometry.pose_error(T_mirror, T_start)
         if first.overlap < FITS or (first.misfit < GOOD and away @ prior @ away > GATE):
