@@ -26,6 +26,8 @@ GUARD_PX = 2
 DEPTH_MARGIN = 0.05
 """What lies further than this behind the target's furthest point [m] is behind it for certain: half a limb's thickness."""
 
+UNEXPLAINED_PX = 9
+"""A boundary of the mask is further than this [px] from where the prediction expects it only if that is not the target's."""
 FORESHORTENED = 0.4
 """A limb whose image is shorter than this share of its length has no side beyond its end in the picture."""
 
@@ -126,6 +128,14 @@ def cover_beyond(state: NDArray[np.uint8], T: NDArray[np.float64], start: float,
     rows, columns = np.arange(state.shape[0])[:, None], np.arange(state.shape[1])
     beyond = ((columns - u) * along[0] + (rows - v) * along[1]) / length < 0.0
     state[beyond & (state == TARGET)] = COVERED
+
+
+def cover_unexplained(state: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> None:
+    """Marks in place what lies in the predicted silhouette (h, w) and far from all of the target's pixels: if the prediction is
+    right something hides it there, though the mask says background."""
+    far = cv2.distanceTransform((state != TARGET).astype(np.uint8), cv2.DIST_L2, 3) > UNEXPLAINED_PX
+    around = cv2.dilate(predicted.astype(np.uint8), np.ones((UNEXPLAINED_PX, UNEXPLAINED_PX), np.uint8))
+    state[(state == FREE) & far & (around != 0)] = COVERED
 
 
 def gather(

@@ -148,6 +148,8 @@ class Search:
             if not tracked[1].sharp:
                 first = self._settled(seen, self._with_mirror(seen, first, T_start, prior), T_start, prior)
                 tracked = seen, self._closer(seen, first, T_start, prior, image)
+            if image is not None and not tracked[1].sharp and seen.seen_px >= detect.SMALLEST_PX:
+                tracked = self._behind_unknown(seen, mask.labels, T_start, prior, image) or tracked
             certain = tracked[1].sharp or (first.overlap >= FITS_WELL and first.misfit < WRONG)
             if certain or seen.seen_px < detect.SMALLEST_PX:
                 return self._judge(*tracked, image is not None, T_start, prior_covariance)
@@ -159,6 +161,17 @@ class Search:
         if tracked is None:
             return self._lost(T_start)
         return self._judge(*tracked, image is not None, T_start if T_prior is not None else None, prior_covariance)
+
+    def _behind_unknown(
+        self, seen: Evidence, labels: NDArray[np.uint8], T_start: Array, prior: Array, image: NDArray[np.uint8]
+    ) -> tuple[Evidence, Fit] | None:
+        """The pose if what hides the target is no occluder to the mask, where the image confirms it."""
+        state = seen.state.copy()
+        predicted = self._model.silhouette(T_start, seen.intrinsics, (0, 0, *state.shape[::-1]))
+        evidence.cover_unexplained(state, predicted)
+        less = evidence.gather(state, labels, seen.intrinsics, seen.x0, seen.y0, seen.scale)
+        closer = self._closer(less, self._fit(less, T_start, T_start, prior), T_start, prior, image)
+        return (less, closer) if closer.sharp else None
 
     def _closer(self, seen: Evidence, found: Fit, T_prior: Array, prior: Array, image: NDArray[np.uint8] | None) -> Fit:
         """A fit, or where the image shows edges at a pose near it, that pose."""
