@@ -26,6 +26,7 @@ SHM_BYTES = 128 << 20
 CORE = ("eclipse-zenoh", "msgpack", "numpy", "scipy", "pydantic", "pyyaml", "psutil", "rich")
 EXTRAS = {
     "torch": "segmentation",
+    "openvino": "segmentation",
     "numba": "search",
     "opencv-python-headless": "search",
     "trimesh": "mesh",
