@@ -115,7 +115,7 @@ class Result:
 
     @property
     def is_wrong(self) -> bool:
-        return self.position > LOST[0] or self.axis > LOST[1]
+        return bool(self.position > LOST[0] or self.axis > LOST[1])
 
 
 def perturbed(rng: np.random.Generator) -> Array:
