@@ -445,8 +445,8 @@ def judged(seed: int, plan: Plan) -> dict[str, Any]:
         }
     gone = list(gone_frames(seed, plan.gone, segmenter, plan.domain))
     return {
-        "lost_auc": None if area is None else round(area, 4),
-        "lost_auc_by_error_alone": None if by_error is None else round(by_error, 4),
+        "lost_auc": None if by_error is None else round(by_error, 4),
+        "lost_auc_giving_up_right": None if area is None else round(area, 4),
         "lost": kinds,
         "false_tracking": sum(state == "tracking" for _, state in gone),
         "hidden_frames": len(gone),
@@ -483,7 +483,7 @@ def show(result: dict[str, Any], console: Console) -> None:
     if "lost_auc" in result:
         console.print(
             f"wrong poses doubted: area under the ROC curve {result['lost_auc']} (goal {AUC_GOAL}); "
-            f"{result['lost_auc_by_error_alone']} if giving up is wrong wherever the start was right"
+            f"{result['lost_auc_giving_up_right']} if giving up on a mask of something else is right, whatever the start"
         )
         for kind, each in result["lost"].items():
             console.print(f"  {kind}: " + ", ".join(f"{value} {key}" for key, value in each.items()))
