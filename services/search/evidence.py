@@ -71,7 +71,7 @@ class Evidence:
 
     def field_of(self, silhouette: NDArray[np.bool_]) -> NDArray[np.float32]:
         """The field (h, w) of a mask that shows what a silhouette (h, w) shows, where something is known."""
-        shown = _blur((silhouette & (self.state != COVERED)).astype(np.float32))
+        shown = _blur(_uncovered(silhouette, self.state))
         return shown if self.known is None else _share(shown, self.known)
 
     def measurements(self, correlation: float) -> float:
@@ -166,8 +166,24 @@ def _boundary_px(state, field, guarded):
     return count
 
 
-def _share(shown: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.divide(shown, known, out=np.zeros_like(shown), where=known > 1e-3)
+@njit(cache=True, nogil=True)
+def _uncovered(silhouette, state):
+    out = np.zeros(state.shape, np.float32)
+    for y in range(state.shape[0]):
+        for x in range(state.shape[1]):
+            if silhouette[y, x] and state[y, x] != COVERED:
+                out[y, x] = 1.0
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _share(shown, known):
+    out = np.zeros_like(shown)
+    for y in range(shown.shape[0]):
+        for x in range(shown.shape[1]):
+            if known[y, x] > 1e-3:
+                out[y, x] = shown[y, x] / known[y, x]
+    return out
 
 
 def _blur(image: NDArray[np.float32]) -> NDArray[np.float32]:

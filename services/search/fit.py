@@ -64,7 +64,9 @@ class Limits:
 COARSE, FINE = (24.0, 5.0, 4), (8.0, 2.0, 8)
 """Reach of the walk [px], Huber's threshold [px], passes at most."""
 CONVERGED = 1e-3
-"""A pass that moves less than this [m], and four times it [rad], is the last of its stage."""
+"""Of a pass of which nothing finer follows [m]."""
+ROUGH = 4e-3
+"""Of a pass after which the image is asked [m]: a pixel or two."""
 MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
 """Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
 DAMPING = (1e-3, 10.0, 1e2)
@@ -118,8 +120,8 @@ class _Pass:
 
 
 class _Problem:
-    def __init__(self, model: Model, evidence: Evidence, noise: Noise, regular: Array):
-        self.model, self.evidence, self.noise, self.regular = model, evidence, noise, regular
+    def __init__(self, model: Model, evidence: Evidence, noise: Noise, regular: Array, converged: float):
+        self.model, self.evidence, self.noise, self.regular, self.converged = model, evidence, noise, regular, converged
 
     def at(self, T: Array, moved: Array, reach: float, huber: float) -> _Pass:
         evidence, k = self.evidence, self.evidence.intrinsics
@@ -148,7 +150,7 @@ class _Problem:
         for _ in range(passes):
             step = self.step(self.at(T, moved, reach, huber), 0.0)
             T, moved = geometry.perturb(T, step[:6]), moved + step
-            if _small(step):
+            if _small(step, self.converged):
                 break
         return T, moved
 
@@ -162,7 +164,7 @@ class _Problem:
                 here, damping = there, damping / DAMPING[1]
             else:
                 damping *= DAMPING[1]
-            if _small(step) or damping > DAMPING[2]:
+            if _small(step, self.converged) or damping > DAMPING[2]:
                 break
         return here
 
@@ -184,18 +186,20 @@ def fit(
     prior: Array | None = None,
     noise: Noise | None = None,
     limits: Limits | None = None,
+    converged: float = CONVERGED,
 ) -> Fit:
     """The pose T_camera_target whose contour lies on the mask's boundary, searched from T_start (4 x 4).
 
     `prior` (6, 6) is the information about T_prior (T_start where None) along the camera's axes. It keeps the solve near where
     the contour says little, and is taken out of the result again: `Fit.T` and `Fit.covariance` are the measurement's alone.
+    `converged`: a pass that moves less than this [m], and four times it [rad], is the last of its stage.
     """
     noise, limits = noise or Noise(), limits or Limits()
     weak = limits.information
     regular = np.zeros((7, 7))
     regular[:6, :6] = weak if prior is None else prior + weak
     regular[6, 6] = noise.dilation**-2
-    problem = _Problem(model, evidence, noise, regular)
+    problem = _Problem(model, evidence, noise, regular, converged)
 
     start = np.zeros(7)
     if T_prior is not None:
@@ -245,5 +249,5 @@ def with_prior(T: Array, covariance: Array, T_prior: Array, prior: Array) -> Arr
     return geometry.perturb(T_prior, np.linalg.solve(information + prior, information @ geometry.pose_error(T, T_prior)))
 
 
-def _small(step: Array) -> bool:
-    return bool(np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED)
+def _small(step: Array, converged: float) -> bool:
+    return bool(np.abs(step[:3]).max() < converged and np.abs(step[3:6]).max() < 4.0 * converged)

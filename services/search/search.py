@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from services.search import contour, detect, evidence, overlap
 from services.search.evidence import TARGET, Evidence, Intrinsics
-from services.search.fit import GOOD, MISFIT, Fit, Limits, Noise, fit, with_prior
+from services.search.fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
 from services.search.refine import refine
 from services.search.robots import RobotDepth
 from shared import body, geometry
@@ -143,7 +143,7 @@ class Search:
         if T_prior is not None:
             seen = self._gather(mask, T_start, joints, limb=T_start)
             prior = self._leaning(prior_covariance)
-            first = self._fit(seen, T_start, T_start, prior)
+            first = self._fit(seen, T_start, T_start, prior, CONVERGED if image is None else ROUGH)
             tracked = seen, self._closer(seen, first, T_start, prior, image)
             if not tracked[1].sharp:
                 first = self._settled(seen, self._with_mirror(seen, first, T_start, prior), T_start, prior)
@@ -298,8 +298,8 @@ class Search:
             best = max(best, fitted(T), key=lambda pair: pair[0])
         return best[1].T_searched
 
-    def _fit(self, seen: Evidence, T_start: Array, T_prior: Array, prior: Array) -> Fit:
-        return fit(self._model, T_start, seen, T_prior, prior, self._noise, self._limits)
+    def _fit(self, seen: Evidence, T_start: Array, T_prior: Array, prior: Array, converged: float = CONVERGED) -> Fit:
+        return fit(self._model, T_start, seen, T_prior, prior, self._noise, self._limits, converged)
 
     def _overlap(self, seen: Evidence, T: Array) -> float:
         h, w = seen.state.shape
