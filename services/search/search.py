@@ -36,6 +36,8 @@ GATE = 27.9
 RECOGNISED = 0.5
 """Up to this hidden share a shape is the target's; a smaller piece may be anything, and is believed only where a sure prediction
 expects it."""
+RECOGNISED_PX = 80.0
+"""Least contour of a shape [px] that nothing sure expects."""
 SURE = 0.05
 """Standard deviation of the position [m] along its worst direction up to which a prediction is sure."""
 EXPECTED = 10.6
@@ -321,7 +323,7 @@ class Search:
         amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
         hidden = float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0))
         explained = 1.0 - (best.both + best.free) / amodal  # covered, or outside the window
-        if hidden > (HIDDEN if expected else RECOGNISED) or best.length < SHORTEST_PX:
+        if hidden > (HIDDEN if expected else RECOGNISED) or best.length < (SHORTEST_PX if expected else RECOGNISED_PX):
             state: State = "occluded" if explained > 0.5 else "lost"
         else:
             state = "tracking" if best.overlap >= FITS and fits else "lost"
