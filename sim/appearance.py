@@ -122,9 +122,9 @@ def tabletop(rng: np.random.Generator) -> Texture:
     return Texture(hsv(hue, 0.06, value), hsv(hue, 0.1, value * 0.85), BLOTCHES, _period(rng, 0.02, 0.3), rng.uniform(0.1, 0.6))
 
 
-def occluder(rng: np.random.Generator) -> Texture:
-    """Boards, boxes and tools: any colour and pattern, one in sixteen that of skin."""
-    choice = rng.uniform()
+def occluder(rng: np.random.Generator, tidy: bool = False) -> Texture:
+    """Boards, boxes and tools: any colour and pattern, one in sixteen that of skin; `tidy`: strong colours."""
+    choice = rng.uniform() if not tidy else 1.0
     if choice < 0.06:
         return skin(rng)
     if choice < 0.2:
@@ -132,7 +132,8 @@ def occluder(rng: np.random.Generator) -> Texture:
     hue, value = rng.uniform(0.12, 0.97), rng.uniform(0.1, 0.95)
     accent = hsv(hue + rng.uniform(-0.15, 0.15), rng.uniform(0.0, 0.95), np.clip(value + rng.uniform(-0.4, 0.4), 0.1, 1.0))
     pattern = int(rng.choice([PLAIN, BLOTCHES, STRIPES, CHECKS], p=[0.4, 0.3, 0.15, 0.15]))
-    return Texture(hsv(hue, rng.uniform(0.0, 0.95), value), accent, pattern, _period(rng, 0.02, 0.2), rng.uniform(0.2, 1.0))
+    colour = hsv(hue, rng.uniform(0.35 if tidy else 0.0, 0.95), value)
+    return Texture(colour, accent, pattern, _period(rng, 0.02, 0.2), rng.uniform(0.2, 1.0))
 
 
 def picture(rng: np.random.Generator) -> Texture:
@@ -141,11 +142,12 @@ def picture(rng: np.random.Generator) -> Texture:
     return Texture(colours[0], colours[1], PICTURE, _period(rng, 0.03, 0.4), rng.uniform(0.4, 1.0))
 
 
-def person(rng: np.random.Generator) -> dict[Label, Appearance]:
-    """Skin, and clothes of one cloth: short sleeves, rolled up on the forearm, or down to the wrist; now and then gloves."""
+def person(rng: np.random.Generator, tidy: bool = False) -> dict[Label, Appearance]:
+    """Skin, and clothes of one cloth: short sleeves, rolled up on the forearm, or down to the wrist; now and then gloves. `tidy`:
+    short sleeves and bare hands."""
     bare, shirt = skin(rng), cloth(rng)
     gloss = rng.uniform(0.0, 0.06)
-    length, gloves = rng.uniform(), rng.uniform() < 0.15
+    length, gloves = (0.0, False) if tidy else (rng.uniform(), rng.uniform() < 0.15)
     glove, wrist = cloth(rng), rng.uniform(0.08, 0.14)
     if length < 0.55:  # short sleeves
         forearm = Appearance(glove, bare, wrist, gloss) if gloves else Appearance(bare, gloss=gloss)
@@ -159,10 +161,10 @@ def _dressed(forearm: Appearance, upper_arm: Appearance, shirt: Texture) -> dict
     return {Label.FOREARM: forearm, Label.UPPER_ARM: upper_arm, Label.TORSO: Appearance(shirt)}
 
 
-def background(rng: np.random.Generator) -> Appearance:
+def background(rng: np.random.Generator, tidy: bool = False) -> Appearance:
     """Walls and what stands before them, far away: half of them light and rather grey, with blotches or edges of low contrast;
-    the others of many colours, and a few all in colours of skin."""
-    choice = rng.uniform()
+    the others (not where `tidy`) of many colours, and a few all in colours of skin."""
+    choice = rng.uniform() if not tidy else 1.0
     if choice < 0.35:
         return Appearance(dataclasses.replace(picture(rng), period=_period(rng, 0.1, 1.0)), casts_shadow=False)
     if choice < 0.42:
@@ -174,20 +176,21 @@ def background(rng: np.random.Generator) -> Appearance:
     return Appearance(Texture(colour, accent, pattern, _period(rng, 0.2, 2.0), rng.uniform(0.2, 0.8)), casts_shadow=False)
 
 
-def look(rng: np.random.Generator, around: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Look:
-    """A lamp somewhere above `around` [m], ambient light, a background and a sensor."""
+def look(rng: np.random.Generator, around: tuple[float, float, float] = (0.0, 0.0, 0.0), tidy: bool = False) -> Look:
+    """A lamp somewhere above `around` [m], ambient light, a background and a sensor; `tidy`: well lit, and not compressed."""
     angle = rng.uniform(0, 2 * np.pi)
     distance, height = rng.uniform(0.2, 1.8), rng.uniform(1.4, 2.4)
     lamp = (around[0] + distance * np.cos(angle), around[1] + distance * np.sin(angle), around[2] + height)
-    warmth, strength, fill = rng.uniform(-0.12, 0.12), rng.uniform(0.35, 1.0), rng.uniform(0.18, 0.55)
+    warmth, strength = rng.uniform(-0.12, 0.12), rng.uniform(0.5 if tidy else 0.35, 1.0)
+    fill = rng.uniform(0.25 if tidy else 0.18, 0.55)
     tint = np.array([1 + warmth, 1.0, 1 - warmth])
     return Look(
         lamp=lamp,
         lamp_colour=tuple(strength * tint),
         ambient=tuple(fill * np.ones(3)),
-        background=background(rng),
+        background=background(rng, tidy),
         blur_px=rng.uniform(0.4, 1.1),
         noise=rng.uniform(0.004, 0.035),
         gain=tuple(rng.uniform(0.8, 1.15) * (1 + rng.uniform(-0.06, 0.06, 3))),
-        jpeg=int(rng.integers(50, 96)) if rng.uniform() < 0.3 else None,
+        jpeg=int(rng.integers(50, 96)) if not tidy and rng.uniform() < 0.3 else None,
     )

@@ -35,20 +35,21 @@ class View:
 
 
 class Cameras:
-    """The cell's cameras, and the light and colours of its things, drawn from a seed."""
+    """The cell's cameras, and the light and colours of its things, drawn from a seed: a tidy work cell, of all looks that the
+    training draws."""
 
     def __init__(self, cell: cells.Cell, seed: int):
         self._cell, self._seed = cell, seed
         self._renderers = {name: Renderer(camera) for name, camera in cell.cameras.items()}
         self._shapes: dict[str, Shape] = {}
         rng = np.random.default_rng([seed, 6])
-        person = appearance.person(rng)
+        person = appearance.person(rng, tidy=True)
         self._looks = {"target": person[Label.FOREARM], "upper_arm": person[Label.UPPER_ARM], "torso": person[Label.TORSO]}
-        self._looks["occluder"] = Appearance(appearance.occluder(rng))
+        self._looks["occluder"] = Appearance(appearance.occluder(rng, tidy=True))
         self._looks["table"] = Appearance(appearance.tabletop(rng), casts_shadow=False)
         self._looks["pad"] = Appearance(appearance.metal(rng), gloss=0.2)
         self._looks |= {robot: Appearance(appearance.metal(rng), gloss=rng.uniform(0.1, 0.4)) for robot in cell.robots}
-        self._light = appearance.look(rng, next(iter(cell.targets.values())).home.position)
+        self._light = appearance.look(rng, next(iter(cell.targets.values())).home.position, tidy=True)
 
     def view(self, camera: str, bodies: Mapping[str, tuple[Mesh, Array]], time_s: float) -> View:
         """The picture of things by name (`target` among them; ROBOT/LINK for robots), each with T_world_mesh. The sensor's noise

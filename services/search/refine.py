@@ -48,9 +48,9 @@ class Settings:
     spacing: float = 3.0
     pooling: float = 4.0
     floor: float = 3.0
-    clipped: float = 16.0
+    clipped: float = 25.0
     temperature: float = 2.0
-    mask: float = 1.2
+    mask: float = 1.6
     huber: float = 0.5
     edge: float = 0.2
     correlation: float = 9.0
