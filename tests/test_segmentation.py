@@ -191,9 +191,9 @@ def test_the_committed_weights_segment_new_scenes_as_well_as_their_card_says():
     scenes = [sequences.render(987_654, index) for index in range(24)]
     score = evaluate.held_out(net, card["calibration"]["target_logit_offset"], scenes)
     key = "hidden 0% to 33%"
-    # 24 scenes of a very wide domain: their mean differs from the card's by up to 0.1
-    assert score[key]["iou_mean"] > card["held_out"][key]["iou_mean"] - 0.12
-    assert score[key]["iou_median"] > 0.75
+    # 24 scenes of a very wide domain: their mean and median differ from the card's by up to 0.1
+    for value in ("iou_mean", "iou_median"):
+        assert score[key][value] > card["held_out"][key][value] - 0.12
 
 
 def test_a_segmenter_forgets_when_time_jumps_and_remembers_when_it_flows():
