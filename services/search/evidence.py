@@ -26,8 +26,8 @@ GUARD_PX = 2
 DEPTH_MARGIN = 0.05
 """What lies further than this behind the target's furthest point [m] is behind it for certain: half a limb's thickness."""
 
-UNEXPLAINED_PX = 9
-"""A boundary of the mask is further than this [px] from where the prediction expects it only if that is not the target's."""
+UNEXPLAINED_PX, PREDICTED_PX = 5, 10
+"""Within the first distance [px] of a mask its boundary may be the target's own; within the second the prediction may be off."""
 FORESHORTENED = 0.4
 """A limb whose image is shorter than this share of its length has no side beyond its end in the picture."""
 
@@ -134,7 +134,7 @@ def cover_unexplained(state: NDArray[np.uint8], predicted: NDArray[np.bool_]) ->
     """Marks in place what lies in the predicted silhouette (h, w) and far from all of the target's pixels: if the prediction is
     right something hides it there, though the mask says background."""
     far = cv2.distanceTransform((state != TARGET).astype(np.uint8), cv2.DIST_L2, 3) > UNEXPLAINED_PX
-    around = cv2.dilate(predicted.astype(np.uint8), np.ones((UNEXPLAINED_PX, UNEXPLAINED_PX), np.uint8))
+    around = cv2.dilate(predicted.astype(np.uint8), np.ones((2 * PREDICTED_PX + 1, 2 * PREDICTED_PX + 1), np.uint8))
     state[(state == FREE) & far & (around != 0)] = COVERED
 
 

@@ -143,17 +143,9 @@ class Search:
             return self._paper(self._gather(mask, T_start, joints), T_start)
         tracked: tuple[Evidence, Fit] | None = None
         if T_prior is not None:
-            seen = self._gather(mask, T_start, joints, limb=T_start)
-            prior = self._leaning(prior_covariance)
-            first = self._fit(seen, T_start, T_start, prior, CONVERGED if image is None else ROUGH)
-            tracked = seen, self._closer(seen, first, T_start, prior, image)
-            if not tracked[1].sharp:
-                first = self._settled(seen, self._with_mirror(seen, first, T_start, prior), T_start, prior)
-                tracked = seen, self._closer(seen, first, T_start, prior, image)
-            if image is not None and not tracked[1].sharp and seen.seen_px >= detect.SMALLEST_PX:
-                tracked = self._behind_unknown(seen, mask.labels, T_start, prior, image) or tracked
-            certain = tracked[1].sharp or (first.overlap >= FITS_WELL and first.misfit < WRONG)
-            if certain or seen.seen_px < detect.SMALLEST_PX:
+            seen, best, certain = self._track(mask, T_start, prior_covariance, joints, image)
+            tracked = seen, best
+            if certain:
                 return self._judge(*tracked, image is not None, T_start, prior_covariance)
         usable = tracked is not None and tracked[1].overlap >= FITS and tracked[1].misfit < WRONG
         due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost")
@@ -163,6 +155,28 @@ class Search:
         if tracked is None:
             return self._lost(T_start)
         return self._judge(*tracked, image is not None, T_start if T_prior is not None else None, prior_covariance)
+
+    def _track(
+        self,
+        mask: Mask,
+        T_start: Array,
+        prior_covariance: Array | None,
+        joints: Mapping[str, Array] | None,
+        image: NDArray[np.uint8] | None,
+    ) -> tuple[Evidence, Fit, bool]:
+        """The pose near the prediction, and whether no other need be looked for. The fit to the mask is rough where an image
+        comes after it; what the image does not confirm is tried again from mirror images, and behind an unknown occluder."""
+        seen = self._gather(mask, T_start, joints, limb=T_start)
+        prior = self._leaning(prior_covariance)
+        first = self._fit(seen, T_start, T_start, prior, CONVERGED if image is None else ROUGH)
+        best = self._closer(seen, first, T_start, prior, image)
+        if not best.sharp:
+            first = self._settled(seen, self._with_mirror(seen, first, T_start, prior), T_start, prior)
+            best = self._closer(seen, first, T_start, prior, image)
+        if image is not None and not best.sharp and seen.seen_px >= detect.SMALLEST_PX:
+            seen, best = self._behind_unknown(seen, mask.labels, T_start, prior, image) or (seen, best)
+        fits = best.sharp or (first.overlap >= FITS_WELL and first.misfit < WRONG)
+        return seen, best, fits or seen.seen_px < detect.SMALLEST_PX
 
     def _behind_unknown(
         self, seen: Evidence, labels: NDArray[np.uint8], T_start: Array, prior: Array, image: NDArray[np.uint8]
