@@ -206,6 +206,10 @@ def network_results(
     return out, pictures
 
 
+WIDTH = 230
+"""Characters of a line that the table needs, where it goes to a file."""
+
+
 def row(masks: str, view: tuple[int, int, float], hidden: float, method: str, results: list[Result], bounds: dict[str, float]):
     """A row of the table as JSON: medians, and the 90th percentiles and means beside them."""
     measured = {
@@ -218,6 +222,7 @@ def row(masks: str, view: tuple[int, int, float], hidden: float, method: str, re
     medians = {key: round(scale * float(np.median(values)), 4) for key, (scale, values) in measured.items()}
     p90 = {key: round(scale * float(np.quantile(values, 0.9)), 4) for key, (scale, values) in measured.items()}
     mean = round(100.0 * float(np.mean(measured["position_cm"][1])), 4)
+    tracked = [100.0 * r.position for r in results if r.estimate.state == "tracking"]
     width, height, distance_m = view
     return {
         "masks": masks,
@@ -232,6 +237,9 @@ def row(masks: str, view: tuple[int, int, float], hidden: float, method: str, re
         **bounds,
         "ms": round(float(np.median([r.ms for r in results])), 3),
         "searched_cm": round(100.0 * float(np.median([r.with_prior for r in results])), 4),
+        "tracked_cm": {"median": round(float(np.median(tracked)), 4), "mean": round(float(np.mean(tracked)), 4)}
+        if tracked
+        else None,
         "not_tracking": round(float(np.mean([r.estimate.state != "tracking" for r in results])), 4),
         "frames": len(results),
     }
@@ -546,7 +554,8 @@ def main(argv: list[str] | None = None) -> int:
     started = time.monotonic()
     result = measure(options.seed, plan, tuple(options.parts))
     result["wall_s"] = round(time.monotonic() - started, 1)
-    show(result, Console())
+    console = Console()
+    show(result, console if console.is_terminal else Console(width=max(console.width, WIDTH)))
     if options.json:
         options.json.write_text(json.dumps(result, indent=1))
     return 0
