@@ -1,8 +1,10 @@
-"""Finds the pose of the target in the segmentation mask of a camera.
+"""Finds the pose of the target in a camera's mask and image.
 
-In: masks, robot joints, and the fused pose as prediction. Out: the camera's pose with covariance, overlap, hidden share, state.
-`contour.py` is the default, a least-squares fit of the mesh's occluding contour to the mask's boundary that ignores what is
+In: masks, frames, robot joints, and the fused pose as prediction. Out: the camera's pose with covariance, overlap, hidden share,
+state. `fit.py` is a least-squares fit of the mesh's occluding contour (`contour.py`) to the mask's boundary that ignores what is
 hidden (after SRT3D, Stoiber et al. 2022, doi:10.1007/s11263-022-01579-8, with mask boundaries in place of colour statistics);
-`overlap.py` is the paper's gradient ascent on the overlap f_m. `evidence.py` says what each pixel tells about the target,
-`detect.py` finds the target without a prediction, and `search.py` puts them together.
+`refine.py` goes on from there on the image itself, by the colours on both sides of the contour; `overlap.py` is the paper's
+gradient ascent on the overlap f_m. `evidence.py` says what each pixel tells about the target, `detect.py` finds the target
+without a prediction, and `search.py` puts them together. `objects.py` does the same for any rigid mesh and mask files (`search
+refine`, `search track`; `tools.py` is their command line), from far starts by `basin.py`.
 """
