@@ -1,6 +1,8 @@
 """The `penumbra` command as a user meets it."""
 
+import functools
 import json
+import signal
 import subprocess
 import sys
 
@@ -127,7 +129,9 @@ def test_pose_loads_nothing_heavy(endpoint):
 
 def test_watch_prints_pose_after_pose_until_ctrl_c(endpoint):
     command = [sys.executable, "-m", "services.cli", "pose", "--watch", "--json", "--connect", endpoint]
-    watch = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    # a shell starts what runs in its background with Ctrl-C ignored: not so here, wherever the tests run
+    listening = functools.partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    watch = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=listening)
     try:
         stamps = [json.loads(watch.stdout.readline())["stamp_ns"] for _ in range(4)]
         assert stamps == sorted(set(stamps))
