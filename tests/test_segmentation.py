@@ -12,7 +12,7 @@ from services.segmentation.crop import Window, corners_of, extrapolate, shift_st
 from services.segmentation.prednet import PredNet, Settings
 from shared import body, cell, geometry
 from shared.classes import Label
-from sim import sequences
+from sim import sequences, shots
 
 SMALL = Settings(channels=(4, 4, 8), kernels=(3, 3, 3), decoder_channels=4)
 TINY = sequences.Variety(frames=4, size=64)
@@ -194,6 +194,21 @@ def test_the_committed_weights_segment_new_scenes_as_well_as_their_card_says():
     # 24 scenes of a very wide domain: their mean and median differ from the card's by up to 0.1
     for value in ("iou_mean", "iou_median"):
         assert score[key][value] > card["held_out"][key][value] - 0.12
+
+
+def test_the_committed_weights_know_a_bare_arm_before_a_plain_wall():
+    net, card = prednet.load(infer.WEIGHTS)
+    films = []
+    for index in range(16):
+        film = shots.clip(7200, index, domain="easy", frames=6)
+        last = film[-1]
+        window = window_around(last.camera, [(last.T_world_target, corners_of(last.mesh.vertices))])
+        assert window is not None and window.scale == 1
+        seen = np.s_[window.y0 : window.bottom, window.x0 : window.right]
+        images, labels = (np.stack([getattr(shot, name)[seen] for shot in film]) for name in ("image", "labels"))
+        films.append(sequences.Sequence(images, labels, np.array([shot.hidden for shot in film])))
+    score = evaluate.held_out(net, card["calibration"]["target_logit_offset"], films)
+    assert score["hidden 0% to 33%"]["iou_median"] > 0.75
 
 
 def test_a_segmenter_forgets_when_time_jumps_and_remembers_when_it_flows():
