@@ -85,39 +85,131 @@ class Robot(_Model):
     joints: tuple[str, ...]
 
 
-class Electrode(_Model):
-    """One measurement electrode: centroid [m] in the pad's frame (x right, y up, z out of the pad) and its relative gain."""
+class Nominal(_Model):
+    """An electrode's response law as designed, on its pad's gap d [m] to a forearm that lies across: a1 / (1 + a2 d^2) [V]."""
 
-    centroid: tuple[float, float]
-    gain: Positive = 1.0
+    a1: Positive
+    a2: Positive
+
+
+class Electrode(_Model):
+    """One measurement electrode in the pad's frame (x right, y up, z out of the pad), around `centre` [m]: a `disc` of this
+    radius [m], or an `arc` between two radii [m], `half_angle` [degrees] to both sides of the direction `towards` [degrees
+    from x]. `law`: its response as designed."""
+
+    centre: tuple[float, float] = (0.0, 0.0)
+    disc: Positive | None = None
+    arc: tuple[Positive, Positive] | None = None
+    towards: float = 0.0
+    half_angle: Annotated[float, Field(gt=0, le=180)] = 180.0
+    law: Nominal
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Electrode:
+        if (self.disc is None) == (self.arc is None):
+            raise ValueError("give either disc (a radius) or arc (two radii)")
+        if self.arc is not None and self.arc[0] >= self.arc[1]:
+            raise ValueError(f"arc: the inner radius first, got {self.arc}")
+        return self
+
+    @cached_property
+    def centroid(self) -> tuple[float, float]:
+        """Of its area [m]."""
+        if self.arc is None:
+            return self.centre
+        (inner, outer), half = self.arc, np.radians(self.half_angle)
+        radius = 2.0 / 3.0 * (outer**3 - inner**3) / (outer**2 - inner**2) * np.sin(half) / half
+        angle = np.radians(self.towards)
+        return (float(self.centre[0] + radius * np.cos(angle)), float(self.centre[1] + radius * np.sin(angle)))
+
+
+class Board(_Model):
+    """A printed board with its electrodes on the front: size and the ground pour on its back (x, y) [m], thickness [m],
+    relative permittivity."""
+
+    size: tuple[Positive, Positive]
+    ground: tuple[Positive, Positive]
+    thickness: Positive
+    permittivity: Annotated[float, Field(ge=1.0)] = 4.5
+
+
+class Ring(_Model):
+    """The excitation ring: inner and outer radius [m] around `centre` [m]."""
+
+    radii: tuple[Positive, Positive]
+    centre: tuple[float, float] = (0.0, 0.0)
+
+
+class Chain(_Model):
+    """From a change of capacitance to an amplitude: excitation [V], its frequency [Hz], the amplifier's feedback resistance
+    [ohm], the converter's bits and reference [V]. The amplifier works around half of the reference, so amplitudes end there."""
+
+    excitation_V: Positive
+    frequency_hz: Positive
+    feedback_ohm: Positive
+    adc_bits: Annotated[int, Field(ge=1, le=24)] = 12
+    adc_reference: Positive = 3.3
+
+    @cached_property
+    def sensitivity(self) -> float:
+        """Volts of amplitude per femtofarad."""
+        return self.excitation_V * 2.0 * np.pi * self.frequency_hz * self.feedback_ohm * 1e-15
+
+
+class Rest(_Model):
+    """An amplitude as designed, with nothing near: offset a3 [V]; whether it rises (1) or falls (-1) where something comes near;
+    variance of its noise [V^2] in a sample of one millisecond."""
+
+    a3: NotNegative
+    polarity: Literal[-1, 1] = 1
+    noise: NotNegative
 
 
 class Law(_Model):
-    """The paper's response law (eq. sensor_approx) v = a3 + polarity * a1 / (1 + a2 d^2), d the gap to the skin [m];
-    noise [V^2] is a variance."""
+    """An electrode's calibrated response, the paper's law (eq. sensor_approx): v = a3 + polarity * a1 / (1 + a2 d^2), d the gap
+    to the skin [m]; noise [V^2] is a variance."""
 
     a1: Positive
     a2: Positive
     a3: NotNegative
     polarity: Literal[-1, 1] = 1
     noise: NotNegative
-    adc_bits: Annotated[int, Field(ge=1, le=24)] = 12
-    adc_reference: Positive = 3.3
 
 
 class PadType(_Model):
+    """A design of pads. `board` and `ring` belong to the field model; `range` [m]: how far it feels."""
+
+    board: Board
+    ring: Ring
     electrodes: Annotated[dict[Name, Electrode], Field(min_length=1)]
-    law: Law
+    chain: Chain
+    rest: Rest
     range: Positive = 0.15
+
+    def law(self, electrode: str) -> Law:
+        """An electrode's law as designed."""
+        nominal = self.electrodes[electrode].law
+        return Law(a1=nominal.a1, a2=nominal.a2, a3=self.rest.a3, polarity=self.rest.polarity, noise=self.rest.noise)
+
+
+class Reader(_Model):
+    """A sensing board of a pad: the serial port that it is on, and which of its six channels measure which electrode."""
+
+    port: str | None = None
+    channels: Annotated[dict[Name, tuple[Annotated[int, Field(ge=0, le=5)], ...]], Field(min_length=1)]
 
 
 class Pad(_Model):
-    """A pad on `link` (`world`, or ROBOT/LINK), its frame's z axis pointing out of the skin."""
+    """A pad on `link` (`world`, or ROBOT/LINK), its frame's z axis pointing out of the skin. `backed`: whether the link is
+    grounded metal behind it that its field model includes. `calibration`: measured laws by electrode. `boards`: what reads it."""
 
     type: str
     link: str = "world"
     position: Vector3
     rpy: Vector3 = (0.0, 0.0, 0.0)
+    backed: bool = False
+    calibration: dict[Name, Law] = {}
+    boards: tuple[Reader, ...] = ()
 
     @cached_property
     def T_link_pad(self) -> geometry.Array:
@@ -209,6 +301,12 @@ class Cell(_Model):
         for name, pad in self.pads.items():
             if pad.type not in self.pad_types:
                 raise ValueError(f"pads.{name}.type: one of {sorted(self.pad_types)} expected, got {pad.type!r}")
+            electrodes = self.pad_types[pad.type].electrodes
+            named = {*pad.calibration, *(electrode for board in pad.boards for electrode in board.channels)}
+            if unknown := sorted(named - set(electrodes)):
+                raise ValueError(f"pads.{name}: electrodes {list(electrodes)} expected, got {', '.join(unknown)}")
+            if pad.backed and pad.link == "world":
+                raise ValueError(f"pads.{name}.backed: only a pad on a robot's link has the link behind it, this one is on world")
             robot, slash, _ = pad.link.partition("/")
             if robot + slash not in links:
                 raise ValueError(

@@ -1,6 +1,9 @@
-"""The capacitive skin as the cell describes it: where its electrodes are, and the paper's response law both ways.
+"""The capacitive skin as the cell describes it: where its electrodes are and how their amplitudes [V] come about.
 
-The law (paper, eq. sensor_approx): v = a3 + polarity * gain * a1 / (1 + a2 d^2), d the gap between electrode and skin [m].
+What comes near takes field lines away: the capacitance between ring and electrode falls by a `change` [fF], and the amplitude
+is v = a3 + polarity * gain * sensitivity * change. `gain` is what a calibration finds beside the design, about one. What a limb
+at a pose changes is the field model's part (`shared.response`); the paper's response law (eq. sensor_approx) stands for it where
+only the gap d to the skin is known: v = a3 + polarity * a1 / (1 + a2 d^2).
 """
 
 from __future__ import annotations
@@ -20,25 +23,13 @@ def electrode_positions(pad_type: cells.PadType) -> Array:
     return np.array([[*electrode.centroid, 0.0] for electrode in pad_type.electrodes.values()])
 
 
-def volts(law: cells.Law, gap: ArrayLike, gain: ArrayLike = 1.0) -> Array:
-    """Noise-free amplitude [V] at gaps [m]; a negative gap counts as contact. Shapes broadcast."""
-    d = np.maximum(gap, 0.0)
-    return law.a3 + law.polarity * np.asarray(gain) * law.a1 / (1.0 + law.a2 * d * d)
-
-
-def gap(law: cells.Law, amplitude: ArrayLike, gain: ArrayLike = 1.0, farthest: float = 1.0) -> Array:
-    """The gap [m] that gives an amplitude [V]: the law's inverse, within [0, farthest]. Shapes broadcast."""
-    peak = np.asarray(gain) * law.a1
-    signal = np.clip(law.polarity * (np.asarray(amplitude) - law.a3), peak / (1.0 + law.a2 * farthest**2), peak)
-    return np.sqrt(np.maximum(peak / signal - 1.0, 0.0) / law.a2)
-
-
 class Skin:
     """All electrodes of a cell's pads in one row, n in all, in the order of the cell file.
 
-    pads: names (p,); first (p + 1,): pad k holds electrodes first[k] to first[k + 1]; centroids (n, 3) in the frame of
-    each one's pad; peak (n,) = gain * a1 [V], a2, a3, polarity (n,): the law; noise (n,) [V^2]: variance of one sample
-    with the ADC's own rounding; reference (n,) [V]: where the ADC ends.
+    pads: names (p,); first (p + 1,): pad k holds electrodes first[k] to first[k + 1]; names (n,) as PAD/ELECTRODE; centroids
+    (n, 3) in the frame of each one's pad; peak (n,) = a1 [V], a2, a3, polarity (n,): the calibrated law, or where there is none
+    the designed one; gain (n,): a1 as a share of the designed one; sensitivity (n,) [V/fF]; noise (n,) [V^2]: variance of one
+    sample of a millisecond with the converter's own rounding; full_scale (n,) [V]: where amplitudes end.
     Raises ValueError where the cell has no pads.
     """
 
@@ -53,15 +44,20 @@ class Skin:
         self.first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.pad_of = np.repeat(np.arange(len(types)), counts)
         self.centroids = np.concatenate([electrode_positions(kind) for kind in types])
-        gain = np.concatenate([[e.gain for e in kind.electrodes.values()] for kind in types])
-
-        def spread(name: str) -> Array:
-            return np.repeat([float(getattr(kind.law, name)) for kind in types], counts)
-
-        self.peak, self.a2, self.a3, self.polarity = gain * spread("a1"), spread("a2"), spread("a3"), spread("polarity")
-        self.reference = spread("adc_reference")
-        self.lsb = self.reference / (2.0 ** spread("adc_bits") - 1.0)
-        self.noise = spread("noise") + self.lsb**2 / 12.0
+        self.names = tuple(f"{name}/{e}" for name, kind in zip(cell.pads, types, strict=True) for e in kind.electrodes)
+        laws = [
+            pad.calibration.get(electrode) or kind.law(electrode)
+            for pad, kind in zip(cell.pads.values(), types, strict=True)
+            for electrode in kind.electrodes
+        ]
+        self.peak, self.a2, self.a3, self.polarity, self.noise = (
+            np.array([float(getattr(law, name)) for law in laws]) for name in ("a1", "a2", "a3", "polarity", "noise")
+        )
+        self.gain = self.peak / np.concatenate([[e.law.a1 for e in kind.electrodes.values()] for kind in types])
+        self.sensitivity = np.repeat([kind.chain.sensitivity for kind in types], counts)
+        self.full_scale = np.repeat([kind.chain.adc_reference / 2.0 for kind in types], counts)
+        self.lsb = np.repeat([kind.chain.adc_reference / (2.0**kind.chain.adc_bits - 1.0) for kind in types], counts)
+        self.noise += self.lsb**2 / 12.0
         self.range = np.array([kind.range for kind in types])
 
     def __len__(self) -> int:
@@ -88,15 +84,15 @@ class Skin:
         """What the skin adds to an electrode's amplitude (..., n): polarity * (v - a3) [V], positive near a person."""
         return self.polarity * (np.asarray(amplitude) - self.a3)
 
+    def amplitude(self, change: ArrayLike) -> Array:
+        """Noise-free amplitudes (..., n) [V] for changes of capacitance (..., n) [fF], up to full scale."""
+        analog = self.a3 + self.polarity * self.gain * self.sensitivity * np.asarray(change)
+        return np.clip(analog, 0.0, self.full_scale)
+
     def volts(self, gaps: ArrayLike) -> Array:
-        """Noise-free amplitudes (..., n) [V] at gaps (..., n) [m]; a negative gap counts as contact."""
+        """Noise-free amplitudes (..., n) [V] that the response law has at gaps (..., n) [m]; a negative gap counts as contact."""
         d = np.maximum(gaps, 0.0)
         return self.a3 + self.polarity * self.peak / (1.0 + self.a2 * d * d)
-
-    def gaps(self, amplitude: ArrayLike, farthest: float = 1.0) -> Array:
-        """Gaps (..., n) [m] of amplitudes (..., n) [V]: the law's inverse, within [0, farthest]."""
-        signal = np.clip(self.signal(amplitude), self.peak / (1.0 + self.a2 * farthest**2), self.peak)
-        return np.sqrt(np.maximum(self.peak / signal - 1.0, 0.0) / self.a2)
 
 
 def link_names(robots: Mapping[str, Mapping[str, Array]]) -> dict[str, Array]:
