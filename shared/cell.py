@@ -334,14 +334,20 @@ class Cell(_Model):
         return str(name)
 
 
-def load(cell: str | Path) -> Cell:
-    """The cell of a built-in name (`table`, `arm`) or of a YAML file. Raises CellError with file, line and reason."""
+def source(cell: str | Path) -> Path:
+    """The YAML file of a built-in name (`table`, `arm`) or path. Raises CellError where there is none."""
     path = BUILT_IN / f"{cell}.yaml"
     if not path.is_file():
         path = Path(cell)
     if not path.is_file():
         built_in = ", ".join(sorted(p.stem for p in BUILT_IN.glob("*.yaml")))
         raise CellError(f"no cell {str(cell)!r}: give one of {built_in}, or the path of a YAML file")
+    return path
+
+
+def load(cell: str | Path) -> Cell:
+    """The cell of a built-in name (`table`, `arm`) or of a YAML file. Raises CellError with file, line and reason."""
+    path = source(cell)
     text = path.read_text()
     try:
         data = yaml.safe_load(text)
