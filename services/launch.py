@@ -51,6 +51,7 @@ PROCESSES = (
     Process("emulator", "emulator", needs="sim", flags=("seed",)),
     Process("segmentation", "segmentation", needs="cameras"),
     Process("search", "search", needs="cameras", flags=("method",)),
+    Process("skin", "skin", replicas=0, needs="pads"),  # belongs to a machine with boards, which name their ports
     Process("haptics", "haptics", needs="pads"),
     Process("fusion", "fusion", flags=("observer",)),
 )

@@ -1,0 +1,51 @@
+"""`penumbra skin decode`: one reply of a sensing board, in hex from standard input, as JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import numpy as np
+
+from services.arguments import Parser
+from shared import board
+
+
+def main(argv: list[str]) -> int:
+    """Prints the reply's contents: 0, or 2 for a text that is no reply."""
+    about = "Reads one reply packet in hex from standard input (spaces and line breaks do not matter) and prints it as JSON."
+    Parser(prog="penumbra skin decode", description=about).parse_args(argv)
+    try:
+        print(json.dumps(describe(from_hex(sys.stdin.buffer.read()))))
+    except board.PacketError as error:
+        print(f"penumbra skin decode: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def from_hex(text: bytes) -> bytes:
+    """The bytes that hex digits stand for. Raises PacketError with the first character that is none."""
+    digits = b"".join(text.split())
+    stranger = next((at for at, digit in enumerate(digits) if digit not in b"0123456789abcdefABCDEF"), None)
+    if stranger is not None:
+        came = digits[stranger : stranger + 1].decode("ascii", errors="backslashreplace")
+        raise board.PacketError(f"hex digits expected, {came!r} came as character {stranger + 1}")
+    if len(digits) % 2:
+        raise board.PacketError(f"two hex digits for each byte expected, {len(digits)} digits came")
+    return bytes.fromhex(digits.decode())
+
+
+def describe(packet: bytes) -> dict[str, Any]:
+    """A reply's contents, six channels each: cycles, sums, and the mean cycle's level and amplitude [steps of the converter] and
+    phase [degrees, above -180 to 180]. Raises PacketError for bytes that are no reply."""
+    reply = board.decode(packet)
+    dc, component = reply.fourier()
+    return {
+        "samples_per_cycle": reply.samples_per_cycle,
+        "counts": reply.counts.tolist(),
+        "sums": reply.sums.tolist(),
+        "dc": dc.tolist(),
+        "amplitude": np.abs(component).tolist(),
+        "phase_deg": (np.degrees(np.angle(component)) + 0.0).tolist(),
+    }
