@@ -126,15 +126,17 @@ def listen(cell: cells.Cell, connection: bus.Connection, seconds: float) -> dict
 
 
 def sim(argv: list[str]) -> int:
-    """`penumbra sim COMMAND [VALUE]`: what is possible is the emulator's to say."""
+    """`penumbra sim COMMAND [VALUE ...]`: what is possible is the emulator's to say."""
     parser = arguments.parser(
-        "sim", "Steers the emulator: occlude LEVEL|auto, motion on|off, pause, resume, speed FACTOR, state."
+        "sim",
+        "Steers the emulator: occlude LEVEL|auto, motion on|off, pause, resume, speed FACTOR, state, "
+        "skin PAD[/ELECTRODE] dead|saturated|drift|hum|gain|turned|mirrored|none [SIZE].",
     )
-    parser.add_argument("command", help="occlude, motion, pause, resume, speed or state")
-    parser.add_argument("value", nargs="?", help="of occlude, motion and speed")
+    parser.add_argument("command", help="occlude, motion, pause, resume, speed, skin or state")
+    parser.add_argument("value", nargs="*", help="of occlude, motion, speed and skin")
     options = parser.parse_args(argv)
     cell = cells.load(options.cell)
-    request = {"command": options.command} | ({} if options.value is None else {"value": options.value})
+    request = {"command": options.command} | ({"value": " ".join(options.value)} if options.value else {})
     with open_session(bus.connection(options)) as session:
         answers = bus.ask(session, topics.control(cell.name), payload=json.dumps(request).encode())
     if not answers:

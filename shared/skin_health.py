@@ -90,7 +90,8 @@ class Watch:
         self._even = reach.mean() / reach
         self.look: Look | None = None
         self._rows: list[Array] = []
-        self._forget()
+        self._count = self._due_ns = 0
+        self._tail = np.empty((0, len(self.names)))
         self._slow: dict[int, Fault] = {}
         self._quick: dict[int, Fault] = {}
         self._odd = np.zeros(len(self.names), np.int64)
@@ -121,8 +122,7 @@ class Watch:
     def _forget(self) -> None:
         self._rows.clear()
         self._count = 0
-        self._due_ns = 0
-        self._tail = np.empty((0, len(self.names)))
+        self._tail = self._tail[:0]
 
     def _see_ends(self) -> None:
         """Electrodes at an end of the converter, or without any noise, in the last BLOCK samples."""

@@ -57,15 +57,13 @@ class SkinFaults:
         if kind in ARRANGEMENTS:
             if where not in self._skin.pads:
                 raise ValueError(f"skin: {kind} is of a whole pad: one of {', '.join(self._skin.pads)} expected, {where!r} came")
-            self._pads[pads[0]] = kind
+            self._pads = {**self._pads, pads[0]: kind}
             return
-        for k in electrodes:
-            self._electrodes.pop(k, None)
-            if kind != "none":
-                self._electrodes[k] = _Fault(kind, size, time_s)
+        kept = {k: fault for k, fault in self._electrodes.items() if k not in electrodes}
+        # new dictionaries: another thread may be applying the old ones
+        self._electrodes = kept if kind == "none" else kept | dict.fromkeys(electrodes, _Fault(kind, size, time_s))
         if kind == "none":
-            for pad in pads:
-                self._pads.pop(pad, None)
+            self._pads = {pad: arrangement for pad, arrangement in self._pads.items() if pad not in pads}
 
     def describe(self) -> dict[str, str]:
         """What is wrong by pad or electrode, as it was commanded."""
@@ -77,13 +75,14 @@ class SkinFaults:
     def apply(self, pad: int, times_s: ArrayLike, volts: Array) -> Array:
         """What the pad at this place of the skin gives instead of clean voltages (s, e) [V] at times (s,)."""
         skin, own = self._skin, self._skin.of(pad)
-        faults = [(k - own.start, self._electrodes[k]) for k in range(own.start, own.stop) if k in self._electrodes]
-        if pad not in self._pads and not faults:
+        faults = [(k - own.start, fault) for k, fault in self._electrodes.items() if own.start <= k < own.stop]
+        arrangement = self._pads.get(pad)
+        if arrangement is None and not faults:
             return volts
         time = np.asarray(times_s, np.float64)
         out = np.array(volts, np.float64)
-        if pad in self._pads:
-            out = out[:, arrangements(skin.centroids[own])[ARRANGEMENTS[self._pads[pad]]]]
+        if arrangement is not None:
+            out = out[:, arrangements(skin.centroids[own])[ARRANGEMENTS[arrangement]]]
         for k, fault in faults:
             a3 = skin.a3[own][k]
             match fault.kind:

@@ -28,6 +28,7 @@ from sim.occluder import OcclusionSchedule, Panel
 from sim.person import Person
 from sim.scene import Cameras, View, furniture
 from sim.skin import SkinModel
+from sim.skin_faults import SkinFaults
 
 FAR = 10.0
 """What the truth calls the gap [m] where the cell has no pads."""
@@ -67,6 +68,7 @@ class World:
         self.person = Person(cell, cell.sim, self.target)
         self.robots = robot_models(cell)
         self.skin = SkinModel(cell) if cell.pads else None
+        self.skin_faults = SkinFaults(self.skin.skin) if self.skin else None
         self._furniture = furniture(cell, cell.sim)
         self._cameras = Cameras(cell, seed)
         self.clock, self.occlusion_clock = Clock(), Clock()
@@ -157,6 +159,12 @@ class World:
         self._speed = speed
         self._set_rates(time_s)
 
+    def break_skin(self, words: str, time_s: float) -> None:
+        """Put a fault into a pad or an electrode, or take it out: see `sim.skin_faults`."""
+        if self.skin_faults is None:
+            raise ValueError(f"skin: cell {self.cell.name} has no pads")
+        self.skin_faults.command(words, time_s)
+
     def describe(self, time_s: float) -> dict[str, Any]:
         """The commands in force, for people and programs."""
         occlusion = self.occlusion.commanded
@@ -167,6 +175,7 @@ class World:
             "paused": self._paused,
             "speed": self._speed,
             "scene_s": self.clock.at(time_s),
+            "skin": self.skin_faults.describe() if self.skin_faults else {},
             "seed": self.seed,
         }
 
@@ -213,14 +222,17 @@ class Sensors:
         state = world.state(k * TICK_NS * 1e-9)
         gaps = world.gaps(state)
         out: Stream = []
-        if world.skin is not None:
+        faults = world.skin_faults
+        if world.skin is not None and faults is not None:
             if self._gaps is None or self._gaps[0] != k - 1:
                 self._gaps = (k - 1, world.gaps(world.state((k - 1) * TICK_NS * 1e-9)))
             ratio = np.arange(1, BATCH + 1)[:, None] / BATCH
+            times_s = (k - 1 + ratio[:, 0]) * TICK_NS * 1e-9
             rng = np.random.default_rng([world.seed, 5, k])
             volts = world.skin.volts(self._gaps[1] + ratio * (gaps - self._gaps[1]), rng).astype(np.float32)
             for i, pad in enumerate(cell.pads):
                 samples = volts[:, world.skin.skin.of(i)]
+                samples = faults.apply(i, times_s, samples)
                 out.append((VOLTAGES, {"pad": pad}, Voltages(stamp_ns=stamp_ns, period_ns=SAMPLE_NS, volts=samples)))
             self._gaps = (k, gaps)
         out += [(JOINTS, {"robot": name}, Joints(stamp_ns=stamp_ns, position=q)) for name, q in state.joints.items()]

@@ -13,6 +13,7 @@ COMMANDS = {
     "pause": "everything stands still",
     "resume": "everything goes on",
     "speed": "how fast target and robot move: above 0, at most 4, 1 is as in the cell file",
+    "skin": "PAD[/ELECTRODE] FAULT [SIZE] or `all none`: dead, saturated, drift, hum, gain, turned, mirrored, none",
     "state": "what is in force now",
 }
 """Every command, and what its value means."""
@@ -40,6 +41,10 @@ def control(world: World, payload: bytes, time_s: float) -> dict[str, Any]:
         world.set_motion(value == "on", time_s)
     elif command == "speed":
         world.set_speed(_number(command, value), time_s)
+    elif command == "skin":
+        if not isinstance(value, str):
+            raise ValueError(f"skin: {COMMANDS['skin']} expected, {value!r} came")
+        world.break_skin(value, time_s)
     elif command in ("pause", "resume"):
         world.set_paused(command == "pause", time_s)
     elif command != "state":
