@@ -27,7 +27,7 @@ COMMANDS = {
     "fusion": "both poses to the one pose",
     "pose": "print the current pose",
     "topics": "list the topics, and with --hz what really arrives",
-    "sim": "steer the emulator: occlude, motion, pause, resume, speed, state",
+    "sim": "steer the emulator: occlude, motion, pause, resume, speed, skin, state",
     "snapshot": "write a picture of the cell and its pose",
     "bench": "run a benchmark",
     "doctor": "check this machine and say how to mend it",

@@ -97,7 +97,7 @@ class SkinFaults:
                 case "gain":
                     out[:, k] = a3 + fault.size * (out[:, k] - a3)
         lsb = skin.lsb[own]
-        return np.clip(np.round(out / lsb) * lsb, 0.0, skin.full_scale[own]).astype(volts.dtype)
+        return np.clip(np.round(out / lsb) * lsb, 0.0, skin.full_scale[own])
 
     def _parse(self, words: str) -> tuple[str, str, float]:
         parts = words.split()

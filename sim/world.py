@@ -229,10 +229,9 @@ class Sensors:
             ratio = np.arange(1, BATCH + 1)[:, None] / BATCH
             times_s = (k - 1 + ratio[:, 0]) * TICK_NS * 1e-9
             rng = np.random.default_rng([world.seed, 5, k])
-            volts = world.skin.volts(self._gaps[1] + ratio * (gaps - self._gaps[1]), rng).astype(np.float32)
+            volts = world.skin.volts(self._gaps[1] + ratio * (gaps - self._gaps[1]), rng)
             for i, pad in enumerate(cell.pads):
-                samples = volts[:, world.skin.skin.of(i)]
-                samples = faults.apply(i, times_s, samples)
+                samples = faults.apply(i, times_s, volts[:, world.skin.skin.of(i)]).astype(np.float32)
                 out.append((VOLTAGES, {"pad": pad}, Voltages(stamp_ns=stamp_ns, period_ns=SAMPLE_NS, volts=samples)))
             self._gaps = (k, gaps)
         out += [(JOINTS, {"robot": name}, Joints(stamp_ns=stamp_ns, position=q)) for name, q in state.joints.items()]
