@@ -63,6 +63,7 @@ class Node:
         self._published: dict[str, bus.Traffic] = {}
         self._publishers: dict[tuple[str, ...], tuple[zenoh.Publisher, bus.Traffic, zenoh.EntityGlobalId, itertools.count]] = {}
         self._faults: dict[str, int] = {}
+        self.report: dict[str, Callable[[], Any]] = {}
         self._replicas = frozenset({self.instance})
         self._owned: dict[str, bool] = {}
         self._process = psutil.Process()
@@ -311,7 +312,8 @@ class Node:
         self._spawn(watch, "replicas")
 
     def health(self) -> dict[str, Any]:
-        """What this instance is and how it fares, as JSON: CPU in cores, memory in MB, counters of every topic."""
+        """What this instance is and how it fares, as JSON: CPU in cores, memory in MB, counters of every topic, and what the
+        service tells of itself in `report`: JSON by name, from a function each."""
         now = self.now_ns()
         return {
             "service": self.service,
@@ -326,6 +328,7 @@ class Node:
             "published": {key: traffic.report(now) for key, traffic in sorted(self._published.items())},
             "stale": sorted(key for key, traffic in self._received.items() if traffic.is_stale(now)),
             "faults": dict(self._faults),
+            **({"report": {name: tell() for name, tell in self.report.items()}} if self.report else {}),
         }
 
     def fault(self, where: str, error: Exception) -> None:

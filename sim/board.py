@@ -220,12 +220,13 @@ class Board:
         jump = 2.0 * np.pi * (board.BLOCK % spc) / spc  # in one block
         if self._happens("slip"):
             self._slipped = (self._slipped + 1) % spc
-            return np.array([shift, shift + 2.0 * np.pi / spc]), 1.0, np.array([count - count // 2, count // 2])
+            return np.array([shift, shift + 2.0 * np.pi / spc]), 1.0, np.array([count - count // 2, count // 2], dtype=float)
         if not drift and not jump:
-            return np.array([shift]), 1.0, np.array([count])
+            return np.array([shift]), 1.0, np.array([float(count)])
         blocks = np.arange(count // size)
         share = float(np.sin(0.5 * size * drift) / (size * np.sin(0.5 * drift))) if drift else 1.0
-        return shift + blocks * (size * drift + jump) + 0.5 * (size - 1) * drift, share, np.full(len(blocks), size)
+        turns = shift + blocks * (size * drift + jump) + 0.5 * (size - 1) * drift
+        return turns.astype(float), share, np.full(len(blocks), float(size))
 
 
 def _converted(level: Array, sigma: float) -> tuple[Array, Array]:

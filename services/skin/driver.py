@@ -1,0 +1,382 @@
+"""The boards of one pad, asked at the same time, decoded, and brought back where they lost their place.
+
+A row of a pad, about 230 times a second:
+
+1. ask all boards one right after the other, so that they measure at the same time
+2. read every reply; it counts if it has its size, the cycles that were asked for, sums that are possible, and the phase it had
+3. amplitude of an electrode: mean over its channels of the first Fourier component's length; stamp: the middle of the integration
+4. a board that failed is brought back, and the row is left out
+
+Bringing back, the cheapest first: a reply that came damaged shows that the board hears us: wait until the line is quiet. One that
+did not come: end what the board believes to be reading, and find out by a stream of probes where its commands begin
+(`shared.board.realign_probes`). No answer: a BREAK, and the probes again. Still none: `BoardSilent`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared import board
+from shared.board import Command, Kind, PacketError
+
+Array = NDArray[np.float64]
+Components = NDArray[np.complex128]
+
+SWEEP_HZ = (80e3, 115e3, 1e3)
+"""First, last and step of the frequencies among which the resonance is looked for."""
+OVERHEAD_S = 0.5e-3
+"""What a board takes for an answer beside cycles and line."""
+PATIENCE_S = 8e-3
+"""How much later than possible an answer may come: a USB converter and the machine hold it up."""
+QUIET_S = 2e-3
+"""A line on which nothing comes for so long is quiet: USB hands over what came once a millisecond."""
+TURN = np.radians(2.0)
+"""A phase that jumps by more, and by more than six times its noise, has slipped."""
+FOLLOW = 0.1
+"""Weight of the newest reply in the phase that is expected next: it drifts with temperature."""
+BATCH_NS = 20_000_000
+"""Rows are handed on together, as the emulator does."""
+UNEVEN = 0.5
+"""Rows of a batch are evenly spaced, up to this share of their period."""
+
+
+class Port(Protocol):
+    """A serial line to a board. Raises OSError where it is gone."""
+
+    name: str
+
+    def now_ns(self) -> int:
+        """A clock that never goes back."""
+
+    def write(self, data: bytes) -> None:
+        """Hands bytes to the line and returns at once."""
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has come, at least one byte; nothing if none comes within the time."""
+
+    def send_break(self) -> None:
+        """Forgets what was not sent yet, and holds the line low for longer than a byte."""
+
+    def close(self) -> None:
+        """Gives the line back."""
+
+
+class BoardSilent(OSError):
+    """What is on this port is no board that measures, or is one no more: it has to be opened and tuned again."""
+
+
+@dataclass
+class Count:
+    """What happened on a line: replies, faults by kind, times that it was brought back, BREAKs that this took, and the longest
+    time [s] between two replies with a fault between them."""
+
+    replies: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    resyncs: int = 0
+    breaks: int = 0
+    longest_s: float = 0.0
+
+
+class Line:
+    """One board on its port. measures: cycles of a reply; noise: standard deviation of an amplitude over 100 cycles, in steps of
+    the converter. `electrode_hz` is what the board was last set to, `resonance_hz` what `tune` found."""
+
+    def __init__(self, port: Port, channels: Sequence[int], measures: int = 128, samples_per_cycle: int = 4, noise: float = 3.1):
+        self.port, self.channels, self.count = port, list(channels), Count()
+        self.samples_per_cycle = samples_per_cycle
+        self.cycles = board.cycles(measures, samples_per_cycle)
+        self._request = board.send_measures(self.cycles)
+        self._size = board.reply_bytes(samples_per_cycle)
+        self._noise = noise * np.sqrt(100.0 / self.cycles)
+        self.electrode_hz, self.resonance_hz = board.ELECTRODE_HZ, 0.0
+        self._phase: Components | None = None
+        self._slack: deque[int] = deque(maxlen=200)
+        self._asked_ns = self._answered_ns = port.now_ns()
+        self._fault, self._is_cut, self._is_tuned = "", False, False
+
+    # ---- replies
+
+    def ask(self) -> None:
+        """Begin a measurement."""
+        stray = self.port.read(0.0)
+        if stray:
+            self.count.faults["overrun" if board.OVERRUN in stray else "garbled"] += 1
+        self.port.write(self._request)
+        self._asked_ns = self.port.now_ns()
+
+    def answer(self) -> tuple[int, Components] | None:
+        """The middle of the integration on the port's clock [ns] and the Fourier components (6,) [steps] of what was asked for;
+        None after a fault, and then `recover` comes first."""
+        data = self._read(self._size, self._asked_ns, self._least_s() + PATIENCE_S)
+        came_ns = self.port.now_ns()
+        components, self._fault = self._judge(data)
+        if self._fault:
+            self.count.faults[self._fault] += 1
+            self._is_cut = True
+            return None
+        if self._is_cut:
+            self.count.longest_s = max(self.count.longest_s, (came_ns - self._answered_ns) * 1e-9)
+        self.count.replies += 1
+        self._answered_ns, self._is_cut = came_ns, False
+        return self._middle_ns(came_ns), components
+
+    def _judge(self, data: bytes) -> tuple[Components, str]:
+        """What a reply says, and which fault it has, if any."""
+        nothing = np.empty(0, complex)
+        if board.OVERRUN in data:  # samples are missing as well: nothing in this reply is sure
+            return nothing, "overrun"
+        if len(data) != self._size:
+            return nothing, "silent" if not data else "short" if len(data) < self._size else "garbled"
+        try:
+            reply = board.decode(data)
+            components = reply.fourier()[1]
+        except PacketError:
+            return nothing, "garbled"
+        if not reply.is_possible(self.cycles):
+            return nothing, "garbled"
+        return components, "slip" if self._has_slipped(components) else ""
+
+    def recover(self) -> None:
+        """Makes the board answer again after a fault. Raises BoardSilent where nothing helps."""
+        fault, self._fault = self._fault, ""
+        if fault in ("", "slip"):
+            return
+        if fault == "silent":
+            self._realign()
+        else:
+            self._wait_until_quiet(QUIET_S)
+        self.count.resyncs += 1
+
+    def _read(self, size: int, since_ns: int, within_s: float) -> bytes:
+        """So many bytes, and what came with them; fewer where they do not come within a time. The text of an overrun does not
+        count. What came while the machine did other things is not late."""
+        data = b""
+        while len(data) < size + (len(board.OVERRUN) if board.OVERRUN in data else 0):
+            left_s = within_s - (self.port.now_ns() - since_ns) * 1e-9
+            came = self.port.read(max(0.0, left_s))
+            if not came:
+                break
+            data += came
+        return data
+
+    def _least_s(self) -> float:
+        return board.reply_s(self.cycles, self.electrode_hz, self.samples_per_cycle) + OVERHEAD_S
+
+    def _middle_ns(self, came_ns: int) -> int:
+        """The middle of the integration: half of what is least left over beside line and cycles comes before it. What a reply
+        takes longer it waited here, or on its way."""
+        slack = came_ns - self._asked_ns - round(1e9 * board.reply_s(self.cycles, self.electrode_hz, self.samples_per_cycle))
+        self._slack.append(max(0, slack))
+        before_s = board.COMMAND_BYTES * board.BYTE_S + 0.5 * self.cycles / self.electrode_hz
+        return self._asked_ns + round(1e9 * before_s) + min(self._slack) // 2
+
+    def _has_slipped(self, components: Components) -> bool:
+        """Whether all channels have turned against the replies before: samples were lost, and the amplitude with them."""
+        used = components[self.channels]
+        now = used / np.maximum(np.abs(used), 1e-9)
+        if self._phase is None:
+            self._phase = now
+            return False
+        along = complex(np.sum(used * self._phase.conj()))
+        noise = self._noise * len(used) / max(abs(along), 1e-9)
+        if abs(np.angle(along)) > max(TURN, 6.0 * noise):
+            self._phase = now
+            return True
+        self._phase += FOLLOW * (now - self._phase)
+        self._phase /= np.maximum(np.abs(self._phase), 1e-9)
+        return False
+
+    # ---- frequency
+
+    def tune(self) -> None:
+        """Sets the excitation to where the amplitude is largest: the board's resonance. Where there is none, to the standard
+        frequency, and resonance_hz is 0. Raises BoardSilent."""
+        self._is_tuned = False
+        asked = np.arange(SWEEP_HZ[0], SWEEP_HZ[1] + 1.0, SWEEP_HZ[2])
+        found = np.array([self._amplitude_at(hz) for hz in asked])
+        self.resonance_hz = resonance(asked, found, 6.0 * self._noise)
+        self.set_frequency(self.resonance_hz or board.ELECTRODE_HZ)
+        self._is_tuned = True
+
+    def _amplitude_at(self, hz: float) -> float:
+        """Mean over the channels [steps]; zero where no reply can be had."""
+        self.set_frequency(hz)
+        for _ in range(3):
+            self.ask()
+            found = self.answer()
+            if found is not None:
+                return float(np.abs(found[1][self.channels]).mean())
+            self.recover()
+        return 0.0
+
+    def set_frequency(self, hz: float) -> None:
+        """Sets the excitation, and the converter with it. Raises BoardSilent."""
+        command = board.set_frequency(hz, self.samples_per_cycle)
+        actual_hz = board.actual_hz(hz, self.samples_per_cycle)
+        for _ in range(3):
+            self.port.write(command)
+            within_s = 2 * board.COMMAND_BYTES * board.BYTE_S + OVERHEAD_S + PATIENCE_S
+            answer = self._read(board.COMMAND_BYTES, self.port.now_ns(), within_s)
+            self._phase = None
+            if len(answer) == board.COMMAND_BYTES and _is_set(Command.unpack(answer), actual_hz, self.samples_per_cycle):
+                self.electrode_hz = actual_hz
+                return
+            self._fault = "silent" if not answer else "garbled"
+            self.count.faults[self._fault] += 1
+            self.recover()
+        raise BoardSilent(
+            f"{self.port.name}: a board that takes {hz:g} Hz expected, its answers are wrong: is it another device?"
+        )
+
+    # ---- place in the stream of commands
+
+    def _realign(self) -> None:
+        self.port.write(board.COMMAND_BYTES * board.FILLER)
+        self._wait_until_quiet(self._least_s() + QUIET_S)
+        found = self._probe()
+        if found is None:
+            self.count.breaks += 1
+            self.port.send_break()
+            found = self._probe()
+        if found is None:
+            raise BoardSilent(
+                f"{self.port.name}: no answer, also after a BREAK: is this the board's port, and has it its supply?"
+            )
+        if not _is_set(found, self.electrode_hz, self.samples_per_cycle) and self.resonance_hz:
+            self.count.faults["reset"] += 1
+            self.set_frequency(self.electrode_hz)
+
+    def _probe(self) -> Command | None:
+        """Finds where the board's commands begin, sets it right, and returns what it says of its frequencies."""
+        probes = board.realign_probes()
+        self.port.write(probes)
+        began_ns, data = self.port.now_ns(), b""
+        within_s = (len(probes) + board.COMMAND_BYTES) * board.BYTE_S + OVERHEAD_S + PATIENCE_S
+        while (left_s := within_s - (self.port.now_ns() - began_ns) * 1e-9) > 0.0:
+            data += self.port.read(left_s)
+            found = board.realign_answer(data)
+            if found is not None:
+                self.port.write(found[0] * board.FILLER)
+                return found[1]
+        return None
+
+    def _wait_until_quiet(self, quiet_s: float) -> None:
+        deadline_ns = self.port.now_ns() + round(1e9 * (self._least_s() + PATIENCE_S))
+        while self.port.read(quiet_s) and self.port.now_ns() < deadline_ns:
+            quiet_s = QUIET_S
+
+
+def _is_set(answer: Command, electrode_hz: float, samples_per_cycle: int) -> bool:
+    """Whether a board's answer says that it has these frequencies, up to the rounding of 32-bit numbers."""
+    sample_hz = electrode_hz * samples_per_cycle
+    known = answer.kind in (Kind.SET_FREQ, Kind.SET_FREQ_2)
+    return known and abs(answer.electrode_hz / electrode_hz - 1.0) < 1e-6 and abs(answer.sample_hz / sample_hz - 1.0) < 1e-6
+
+
+def resonance(hz: Array, amplitude: Array, least: float) -> float:
+    """The frequency [Hz] at which amplitudes (n,) over frequencies (n,) are largest; 0 where they have no such place.
+
+    Near a resonance 1 / amplitude^2 = a + b f^2 + c / f^2 with its minimum at (c / b)^(1/4): a linear least squares over what
+    is above half of the largest, weighted by how well the reciprocal squares are known. least: amplitudes below it are noise.
+    """
+    top = int(np.argmax(amplitude))
+    if not 0 < top < len(hz) - 1 or amplitude[top] < least:
+        return 0.0
+    near = amplitude > 0.5 * amplitude[top]
+    x, y = hz[near] / hz[top], (amplitude[top] / amplitude[near]) ** 2
+    if len(x) < 3:
+        return float(hz[top])
+    weight = y**-1.5
+    terms = np.stack([np.ones_like(x), x**2, x**-2], axis=1)
+    _, b, c = np.linalg.lstsq(weight[:, None] * terms, weight * y, rcond=None)[0]
+    if b <= 0.0 or c <= 0.0:
+        return 0.0
+    found = float(hz[top] * (c / b) ** 0.25)
+    return found if hz[0] < found < hz[-1] else 0.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """stamp_ns: the middle of the integration, on the ports' clock, in the mean over the boards; volts (e,) in the order of the
+    pad type; skew_ns: how far the boards' middles lie apart."""
+
+    stamp_ns: int
+    volts: Array
+    skew_ns: int
+
+
+class PadReader:
+    """The boards of a pad together. channels: by board, which channels measure which electrode; electrodes: their order in a row;
+    lsb [V]: a step of the converter. Raises ValueError for an electrode that no board measures."""
+
+    def __init__(
+        self, lines: Sequence[Line], channels: Sequence[Mapping[str, Sequence[int]]], electrodes: Sequence[str], lsb: float
+    ):
+        self.lines, self._lsb = list(lines), lsb
+        self._sources: list[tuple[int, list[int]]] = []
+        for name in electrodes:
+            found = [(k, list(of[name])) for k, of in enumerate(channels) if name in of]
+            if len(found) != 1:
+                raise ValueError(
+                    f"electrode {name}: one board that measures it expected, {len(found)} came: see `boards:` of the pad"
+                )
+            self._sources.append(found[0])
+
+    def read(self) -> Row | None:
+        """The next row; None where a board failed and was brought back. Raises BoardSilent, OSError for a port that is gone."""
+        for line in self.lines:
+            line.ask()
+        answers = [line.answer() for line in self.lines]
+        for line in self.lines:
+            line.recover()
+        whole = [answer for answer in answers if answer is not None]
+        if len(whole) < len(answers):
+            return None
+        stamps = [stamp_ns for stamp_ns, _ in whole]
+        amplitudes = np.abs(np.array([components for _, components in whole]))
+        volts = np.array([amplitudes[board_index, chosen].mean() for board_index, chosen in self._sources]) * self._lsb
+        return Row(sum(stamps) // len(stamps), volts, max(stamps) - min(stamps))
+
+
+class Batches:
+    """Gathers rows that are evenly spaced. A row that comes late ends the batch before it, so no stamp is made up."""
+
+    def __init__(self, length_ns: int = BATCH_NS):
+        self._length_ns = length_ns
+        self._rows: list[Row] = []
+        self.period_ns = 0
+
+    def add(self, row: Row) -> list[tuple[int, int, Array]]:
+        """Batches that are complete now, each (stamp of the last row [ns], period [ns], volts (rows, e))."""
+        out = []
+        if self._rows:
+            elapsed_ns = row.stamp_ns - self._rows[-1].stamp_ns
+            usual_ns = self._spacing_ns() or elapsed_ns
+            if abs(elapsed_ns - usual_ns) > UNEVEN * usual_ns:
+                out += self.flush()
+        self._rows.append(row)
+        spacing_ns = self._spacing_ns()
+        if spacing_ns and row.stamp_ns - self._rows[0].stamp_ns + spacing_ns >= self._length_ns:
+            out += self.flush()
+        return out
+
+    def flush(self) -> list[tuple[int, int, Array]]:
+        """What is there, as a batch; none where there is nothing. A single row has the period of the batch before."""
+        rows, self._rows = self._rows, []
+        if len(rows) > 1:
+            self.period_ns = round((rows[-1].stamp_ns - rows[0].stamp_ns) / (len(rows) - 1))
+        if not rows or not self.period_ns:
+            return []
+        return [(rows[-1].stamp_ns, self.period_ns, np.array([row.volts for row in rows]))]
+
+    def _spacing_ns(self) -> int:
+        """Between the rows that are there; of a single one, as in the batch before."""
+        if len(self._rows) < 2:
+            return self.period_ns
+        return (self._rows[-1].stamp_ns - self._rows[0].stamp_ns) // (len(self._rows) - 1)

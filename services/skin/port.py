@@ -1,0 +1,69 @@
+"""The serial port of a sensing board, by pyserial."""
+
+from __future__ import annotations
+
+import errno
+import select
+import termios
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import serial
+
+from shared import board
+
+BREAK_S = 1e-3
+"""Fifty bytes long: a receiver takes a low line for a BREAK from one byte on."""
+WRITE_S = 0.1
+"""A line without flow control takes everything at once; one that does not is gone."""
+
+
+class SerialPort:
+    """`driver.Port` on a device such as /dev/ttyUSB0, held by this process alone. Raises OSError with what to do about it."""
+
+    def __init__(self, device: str):
+        self.name = device
+        try:
+            self._serial = serial.Serial(device, board.BAUD, timeout=0, write_timeout=WRITE_S, exclusive=True)
+        except OSError as error:
+            raise OSError(_why(device, error)) from None
+        with suppress(OSError, ValueError, NotImplementedError):  # other converters have no such mode and no need of it
+            self._serial.set_low_latency_mode(True)  # an FTDI converter holds bytes back for 16 ms otherwise
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
+
+    def write(self, data: bytes) -> None:
+        self._serial.write(data)
+
+    def read(self, timeout_s: float) -> bytes:
+        if not select.select([self._serial.fileno()], [], [], timeout_s)[0]:
+            return b""
+        return self._serial.read(4096)
+
+    def send_break(self) -> None:
+        """A pseudo-terminal carries no BREAK: there the emptying of its queue, which comes first, stands for one."""
+        try:
+            self._serial.reset_output_buffer()
+            self._serial.break_condition = True
+            time.sleep(BREAK_S)
+            self._serial.break_condition = False
+            self._serial.reset_input_buffer()
+        except termios.error as error:
+            raise OSError(f"{self.name} is gone: {error}") from None
+
+    def close(self) -> None:
+        self._serial.close()
+
+
+def _why(device: str, error: OSError) -> str:
+    """What keeps a device from being opened, and what to do."""
+    if not Path(device).exists():
+        there = sorted(str(path) for pattern in ("ttyUSB*", "ttyACM*") for path in Path("/dev").glob(pattern))
+        return f"no device {device}: is the board plugged in? Serial devices now: {', '.join(there) or 'none'}"
+    if error.errno == errno.EACCES:
+        return f"{device} may not be opened by this user: add it to the group that owns the device (often dialout)"
+    if error.errno in (errno.EAGAIN, errno.EBUSY) or "lock" in str(error):
+        return f"{device} is in use by another process: end it, or give another port"
+    return f"{device} cannot be opened as a serial port: {error}"

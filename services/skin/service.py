@@ -1,0 +1,162 @@
+"""Reads the sensing boards of pads on serial ports and publishes the amplitudes of their electrodes.
+
+Three boards make one pad of five electrodes: give their ports in order with --port, or in the cell file under `boards:` of the
+pad. The cell file also says which channels measure which electrode; without it two electrodes a board in the order of the pad
+type, on channels 0 to 2 and 3 to 5: c and r on the first board, l and t on the second, b on the third.
+"""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack, suppress
+from functools import partial
+from typing import Any
+
+from services.skin.driver import Batches, Line, PadReader
+from services.skin.port import SerialPort
+from shared import board
+from shared import cell as cells
+from shared.messages import Voltages
+from shared.service import Node
+from shared.topics import VOLTAGES
+
+NAME = "skin"
+BACKOFF_S = (0.2, 5.0)
+"""Waiting before a board is opened again: at first, and at most."""
+TOLD_EVERY = 20
+"""Attempts after which a board that is still missing is told of again."""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """The service's own flags."""
+    ports = "a board's serial port; several times for a pad of several boards, in their order (default: those of the cell file)"
+    parser.add_argument("--port", action="append", metavar="DEVICE", help=ports)
+    parser.add_argument("--pad", metavar="NAME", help="the pad that --port belongs to (default: the cell's first)")
+    cycles = "cycles of the excitation in a reply: 128 give 231 a second, 32 give 298 with twice the noise (default: %(default)s)"
+    parser.add_argument("--cycles", type=int, default=128, metavar="N", help=cycles)
+
+
+def start(node: Node, options: argparse.Namespace) -> None:
+    """Each pad has a thread of its own: its boards are asked together."""
+    if not 0 < options.cycles <= 60_000:
+        raise cells.CellError(f"--cycles: 1 to 60000 expected, {options.cycles} came")
+    for pad, readers in pads(node.cell, options.port, options.pad).items():
+        session = Session(node, pad, readers, options.cycles)
+        node.report[pad] = session.describe
+        node.every(BACKOFF_S[0], partial(Session.run, session))
+
+
+def pads(cell: cells.Cell, ports: list[str] | None, pad: str | None) -> dict[str, tuple[cells.Reader, ...]]:
+    """The pads to be read, each with its boards on their ports. Raises CellError where the two do not fit."""
+    if ports is None:
+        named = {name: found for name, found in cell.pads.items() if pad in (None, name) and found.boards}
+        if pad is not None:
+            cell.one("pads", pad)
+        for name, found in named.items():
+            if any(reader.port is None for reader in found.boards):
+                raise cells.CellError(f"pads.{name}.boards: a port of every board expected: add it, or give --pad {name} --port")
+        if not named:
+            where = f"pad {pad}" if pad else "no pad"
+            raise cells.CellError(f"{where} of cell {cell.name} has boards: give --port DEVICE, or `boards:` in the cell file")
+        return {name: found.boards for name, found in named.items()}
+    name = cell.one("pads", pad)
+    kind = cell.pads[name].type
+    readers = board.readers(cell.pads[name], cell.pad_types[kind])
+    if len(ports) != len(readers):
+        needs = "; ".join(", ".join(reader.channels) for reader in readers)
+        raise cells.CellError(
+            f"pad {name} has {len(readers)} boards ({needs}), {len(ports)} came: give --port for each, in this order, "
+            "or change `boards:` of the pad in the cell file"
+        )
+    return {name: tuple(reader.model_copy(update={"port": port}) for reader, port in zip(readers, ports, strict=True))}
+
+
+class Session:
+    """One pad from opening its boards to losing them, again and again."""
+
+    def __init__(self, node: Node, pad: str, readers: tuple[cells.Reader, ...], cycles: int):
+        self._node, self._pad, self._readers, self._cycles = node, pad, readers, cycles
+        self._kind = node.cell.pad_types[node.cell.pads[pad].type]
+        self._lsb = self._kind.chain.adc_reference / board.FULL_SCALE
+        self._lines: list[Line] = []
+        self._batches = Batches()
+        self._skew_ns = 0
+        self._state = "starting"
+        self._opened = 0
+        self._delay_s, self._failures = BACKOFF_S[0], 0
+        channels = [reader.channels for reader in readers]
+        PadReader([], channels, list(self._kind.electrodes), self._lsb)  # refuses what does not fit together at once
+
+    def run(self) -> None:
+        """Until the node stops, or the boards are gone: then it returns after a while, to be called again."""
+        with ExitStack() as stack:
+            try:
+                reader = self._open(stack)
+                while not self._node.stopping.is_set():
+                    row = reader.read()
+                    for batch in self._batches.flush() if row is None else self._batches.add(row):
+                        self._publish(*batch)
+                    self._skew_ns = row.skew_ns if row else self._skew_ns
+            except OSError as error:
+                self._lost(error)
+        self._node.stopping.wait(self._delay_s)
+
+    def _open(self, stack: ExitStack) -> PadReader:
+        self._lines = []
+        for reader in self._readers:
+            port = SerialPort(str(reader.port))
+            stack.callback(_close, port)
+            used = [channel for chosen in reader.channels.values() for channel in chosen]
+            noise = float(self._kind.rest.noise) ** 0.5 / self._lsb
+            line = Line(port, used, self._cycles, noise=noise)
+            line.tune()
+            if not line.resonance_hz:
+                why = f"no resonance between 80 and 115 kHz: {line.electrode_hz:g} Hz is used; is the pad connected?"
+                self._node.log.warning(why, pad=self._pad, port=port.name)
+            self._lines.append(line)
+        self._batches = Batches()
+        self._opened += 1
+        self._state, self._delay_s, self._failures = "reading", BACKOFF_S[0], 0
+        frequencies = ", ".join(f"{1e-3 * line.electrode_hz:.2f}" for line in self._lines)
+        self._node.log.info("reading", pad=self._pad, boards=len(self._lines), kHz=frequencies)
+        return PadReader(self._lines, [reader.channels for reader in self._readers], list(self._kind.electrodes), self._lsb)
+
+    def _lost(self, error: OSError) -> None:
+        if not self._failures % TOLD_EVERY:
+            self._node.log.error(f"{error}; trying again", pad=self._pad)
+        self._state = str(error)
+        self._delay_s = min(BACKOFF_S[0] * 2.0**self._failures, BACKOFF_S[1])
+        self._failures += 1
+
+    def _publish(self, stamp_ns: int, period_ns: int, volts: Any) -> None:
+        stamp_ns += self._node.now_ns() - self._lines[0].port.now_ns()
+        self._node.publish(
+            VOLTAGES, Voltages(stamp_ns=stamp_ns, period_ns=period_ns, volts=volts.astype("float32")), pad=self._pad
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """For the health report: the pad's rate and skew, and each board's resonance and what happened on its line."""
+        return {
+            "state": self._state,
+            "opened": self._opened,
+            "rate_hz": round(1e9 / self._batches.period_ns, 1) if self._batches.period_ns else None,
+            "skew_us": round(1e-3 * self._skew_ns, 1),
+            "boards": [
+                {
+                    "port": line.port.name,
+                    "resonance_hz": round(line.resonance_hz, 1) or None,
+                    "electrode_hz": round(line.electrode_hz, 1),
+                    "replies": line.count.replies,
+                    "faults": dict(line.count.faults),
+                    "resyncs": line.count.resyncs,
+                    "breaks": line.count.breaks,
+                    "longest_gap_ms": round(1e3 * line.count.longest_s, 1),
+                }
+                for line in list(self._lines)
+            ],
+        }
+
+
+def _close(port: SerialPort) -> None:
+    with suppress(OSError):
+        port.close()
