@@ -162,8 +162,8 @@ def _pads(picture: NDArray[np.uint8], cell: cells.Cell, camera: cells.Camera, jo
         if points[:, 2].min() < raster.NEAR or T[:3, 2] @ T[:3, 3] > 0:
             continue
         outline = (points @ camera.K.T / points[:, 2:])[:, :2].round().astype(np.int32)
-        law = cell.pad_types[cell.pads[name].type].law
-        signal = float(np.max(law.polarity * (volts[name] - law.a3)))
+        own = skin.of(skin.pads.index(name))
+        signal = float(np.max(skin.polarity[own] * (volts[name] - skin.a3[own])))
         level = np.clip(np.log1p(max(signal, 0.0) / 0.003) / np.log1p(FULL_SIGNAL / 0.003), 0.0, 1.0)
         lit = picture.copy()
         cv2.fillPoly(lit, [outline], (int(60 + 195 * level), int(60 + 150 * level), int(90 * (1 - level))), cv2.LINE_AA)

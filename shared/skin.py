@@ -29,7 +29,7 @@ class Skin:
     pads: names (p,); first (p + 1,): pad k holds electrodes first[k] to first[k + 1]; names (n,) as PAD/ELECTRODE; centroids
     (n, 3) in the frame of each one's pad; peak (n,) = a1 [V], a2, a3, polarity (n,): the calibrated law, or where there is none
     the designed one; gain (n,): a1 as a share of the designed one; sensitivity (n,) [V/fF]; noise (n,) [V^2]: variance of one
-    sample of a millisecond with the converter's own rounding; full_scale (n,) [V]: where amplitudes end.
+    sample of a millisecond; lsb (n,) [V]: a step of the converter; full_scale (n,) [V]: where amplitudes end.
     Raises ValueError where the cell has no pads.
     """
 
@@ -57,7 +57,6 @@ class Skin:
         self.sensitivity = np.repeat([kind.chain.sensitivity for kind in types], counts)
         self.full_scale = np.repeat([kind.chain.adc_reference / 2.0 for kind in types], counts)
         self.lsb = np.repeat([kind.chain.adc_reference / (2.0**kind.chain.adc_bits - 1.0) for kind in types], counts)
-        self.noise += self.lsb**2 / 12.0
         self.range = np.array([kind.range for kind in types])
 
     def __len__(self) -> int:

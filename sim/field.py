@@ -12,15 +12,15 @@ at the body (Green's reciprocity): a change is computed as such, never as a diff
 
 from __future__ import annotations
 
+import itertools
 import math
-from functools import cached_property
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from shared import cell as cells
-from shared import geometry
 from shared.body import Mesh
 
 Array = NDArray[np.float64]
@@ -29,8 +29,10 @@ FEMTOFARAD = 4.0 * np.pi * 8.8541878128e-12 * 1e15
 """A unit of charge at one volt [fF]."""
 PERSON_PF = 150.0
 """A person's capacitance to ground [pF]; 100 to 200 are usual, and it hardly matters which."""
-SECTOR = math.radians(13.0)
-"""Widest angle of a panel on the board."""
+SECTOR = math.radians(11.0)
+"""Widest angle of a panel on the board …"""
+PARTS = 6
+"""… and how many lie side by side across a piece of copper: twice as many of both change a change of capacitance by 3 %."""
 NEAR = 2.5
 """A body's panel nearer to the pad than so many times its own size counts as nine points instead of one."""
 ACCURACY = 1e-5
@@ -110,13 +112,25 @@ class Body:
 def limb(mesh: Mesh, length: float = 1.0, girth: float = 1.0, stations: int = 34, around: int = 18) -> Body:
     """A person's limb from its closed mesh along x, scaled by `length` along x and `girth` across: what is outermost on rays from
     the middle of each section."""
-    vertices = np.asarray(mesh.vertices) * (length, girth, girth)
-    low, high = vertices[:, 0].min(), vertices[:, 0].max()
+    return Body(_loft((np.asarray(mesh.vertices) * (length, girth, girth))[mesh.faces], stations, around))
+
+
+def shell(vertices: Array, stations: int = 16, around: int = 14) -> Panels:
+    """The convex hull of points (n, 3) in panels of a few centimetres: a robot's link."""
+    middle = vertices.mean(axis=0)
+    axes = np.linalg.svd(vertices - middle, full_matrices=False)[2]
+    axes[2] = np.cross(axes[0], axes[1])
+    hull = ConvexHull((vertices - middle) @ axes.T)
+    return Panels(_loft(hull.points[hull.simplices], stations, around).corners @ axes + middle)
+
+
+def _loft(triangles: Array, stations: int, around: int) -> Panels:
+    """Closed panels around what triangles (n, 3, 3) enclose along x."""
+    low, high = triangles[:, :, 0].min(), triangles[:, :, 0].max()
     inset = 0.01 * (high - low)
     x = np.linspace(low + inset, high - inset, stations + 1)
     angles = np.arange(around) * 2.0 * np.pi / around
     rings, middles = np.empty((len(x), around, 3)), np.empty((len(x), 3))
-    triangles = vertices[mesh.faces]
     for k, at in enumerate(x):
         middles[k], rings[k] = _section(triangles, at, angles)
     i, j = np.arange(around), (np.arange(around) + 1) % around
@@ -124,12 +138,12 @@ def limb(mesh: Mesh, length: float = 1.0, girth: float = 1.0, stations: int = 34
     start, end = np.broadcast_to(middles[0], (around, 3)), np.broadcast_to(middles[-1], (around, 3))
     first = np.stack([start, rings[0, j], rings[0, i], rings[0, i]], axis=1)
     last = np.stack([end, rings[-1, i], rings[-1, j], rings[-1, j]], axis=1)
-    return Body(Panels(np.concatenate([sides, first, last])))
+    return Panels(np.concatenate([sides, first, last]))
 
 
 def _section(triangles: Array, at: float, angles: Array) -> tuple[Array, Array]:
     """Middle (3,) of the section of triangles (n, 3, 3) at x, and the outermost points (angles, 3) around it."""
-    cut = triangles[(triangles[:, :, 0].min(axis=1) < at) & (triangles[:, :, 0].max(axis=1) > at)]
+    cut = triangles[(triangles[:, :, 0].min(axis=1) <= at) & (triangles[:, :, 0].max(axis=1) > at)]
     side = cut[:, :, 0] > at
     alone = np.where(side.sum(axis=1) == 1, side.argmax(axis=1), (~side).argmax(axis=1))  # the corner on its own side
     n = np.arange(len(cut))
@@ -147,7 +161,7 @@ def _section(triangles: Array, at: float, angles: Array) -> tuple[Array, Array]:
     with np.errstate(divide="ignore", invalid="ignore"):
         s = (to[:, 0] * edge[:, 1] - to[:, 1] * edge[:, 0]) / cross
         t = (to[:, 0] * direction[:, 1:] - to[:, 1] * direction[:, :1]) / cross
-    radius = np.where((t >= 0.0) & (t <= 1.0) & (s > 0.0), s, 0.0).max(axis=1)
+    radius = np.where((t > -1e-6) & (t < 1.0 + 1e-6) & (s > 0.0), s, 0.0).max(axis=1)
     return np.append(at, middle), np.column_stack([np.full(len(angles), at), middle + radius[:, None] * direction])
 
 
@@ -200,7 +214,10 @@ class PadField:
 
 
 def _board(kind: cells.PadType) -> tuple[Panels, NDArray[np.int64]]:
-    """Panels of a board and the owner of each: copper on the front (z = 0), the ground pour on the back, bare dielectric."""
+    """Panels of a board and the owner of each: copper and bare dielectric on the front (z = 0), the ground pour on the back.
+
+    The charge bound on the rim and on the millimetre around the pour is left out: with it the conductors hold 2 % more together,
+    and what a body changes is 3 % less."""
     board, panels, owners = kind.board, [], []
 
     def add(corners: Array, owner: int) -> None:
@@ -234,17 +251,7 @@ def _board(kind: cells.PadType) -> tuple[Panels, NDArray[np.int64]]:
 
     gx, gy, z = board.ground[0] / 2.0, board.ground[1] / 2.0, -board.thickness
     xs, ys = _graded(-gx, gx, both=True, parts=12), _graded(-gy, gy, both=True, parts=12)
-    back = np.array([1.0, -1.0, 1.0])  # seen from behind
-    add(_grid(xs, ys, z) * back, GROUND)
-    for x0, x1, y in ((-half_x, -gx, ys), (gx, half_x, ys)):
-        add(_grid(np.array([x0, x1]), y, z) * back, BARE)
-    for y0, y1 in ((-half_y, -gy), (gy, half_y)):
-        add(_grid(np.array([-half_x, *xs, half_x]), np.array([y0, y1]), z) * back, BARE)
-    walls = np.array([[half_x, -half_y], [half_x, half_y], [-half_x, half_y], [-half_x, -half_y], [half_x, -half_y]])
-    for a, b in zip(walls[:-1], walls[1:], strict=True):
-        at = a + np.linspace(0.0, 1.0, 13)[:, None] * (b - a)
-        low, high = (np.column_stack([at, np.full(len(at), level)]) for level in (z, 0.0))
-        add(np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1), BARE)
+    add(_grid(xs, ys, z) * (1.0, -1.0, 1.0), GROUND)  # seen from behind
     return Panels(np.concatenate(panels)), np.concatenate(owners)
 
 
@@ -266,7 +273,7 @@ def _between_radii(points: Array, centre: tuple[float, float], inner: float, out
     return (radius >= inner) & (radius <= outer)
 
 
-def _graded(low: float, high: float, both: bool, parts: int = 5) -> Array:
+def _graded(low: float, high: float, both: bool, parts: int = PARTS) -> Array:
     """Edges from low to high that are closer at the upper end, or at both: charge crowds at the edge of copper."""
     s = np.linspace(0.0, 1.0, parts + 1)
     return low + (high - low) * (0.5 * (1.0 - np.cos(np.pi * s)) if both else np.sin(0.5 * np.pi * s))
@@ -274,16 +281,18 @@ def _graded(low: float, high: float, both: bool, parts: int = 5) -> Array:
 
 def _fine(angles: Array, widest: float) -> Array:
     """Angles with more between them, until no step is wider."""
-    parts = [np.linspace(a, b, math.ceil((b - a) / widest) + 1)[:-1] for a, b in zip(angles[:-1], angles[1:], strict=True) if b > a]
+    steps = [(a, b) for a, b in itertools.pairwise(angles) if b > a]
+    parts = [np.linspace(a, b, math.ceil((b - a) / widest) + 1)[:-1] for a, b in steps]
     return np.append(np.concatenate(parts), angles[-1])
 
 
 def _polar(radii: Array, angles: Array, centre: tuple[float, float]) -> Array:
-    """Quadrilaterals (n, 4, 3) between radii and angles; their corners stand a little farther out, to keep the area of the arc."""
+    """Quadrilaterals (n, 4, 3) between radii and angles, their corners a little farther out: they have the area of the arc."""
     step = np.diff(angles).mean()
     swell = math.sqrt(step / math.sin(step))
-    cells_ = [_between(np.full(len(angles), a * swell), np.full(len(angles), b * swell), angles) for a, b in zip(radii[:-1], radii[1:], strict=True)]
-    return np.concatenate(cells_) + (*centre, 0.0)
+    bands = itertools.pairwise(radii * swell)
+    panels = [_between(np.full(len(angles), inner), np.full(len(angles), outer), angles) for inner, outer in bands]
+    return np.concatenate(panels) + np.array([*centre, 0.0])
 
 
 def _between(inner: Array, outer: Array, angles: Array) -> Array:

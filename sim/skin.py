@@ -1,59 +1,37 @@
-"""What the pads read: gaps from electrodes to the person's skin, and their voltages with noise and ADC.
+"""What the pads read: how a limb changes the capacitance of their electrodes, and the amplitudes that come of it.
 
-Each electrode follows the paper's response law (eq. sensor_approx) on its own gap. Another physical model needs only
-these two calls, `gaps` and `volts`.
+The changes come from the networks that stand for the boundary-element field (`shared.response`): eight pads at 1 kHz take a few
+per cent of a core. The person's upper arm and torso, other pads and other links of the robot are not felt.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Protocol
-
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from shared import cell as cells
+from shared.geometry import inverse
+from shared.response import Response
 from shared.skin import Skin
-from shared.surface import Surface
 
 Array = NDArray[np.float64]
 
 
-class Mesh(Protocol):
-    """What is felt: vertices (n, 3) [m] and faces (m, 3), such as `shared.body.Mesh`."""
-
-    @property
-    def vertices(self) -> Array: ...
-    @property
-    def faces(self) -> NDArray[np.int32]: ...
-
-
 class SkinModel:
-    """The pads of a cell, n electrodes in all, in the order of `shared.skin.Skin` (`.skin`)."""
+    """The pads of a cell before one of its targets, n electrodes in all, in the order of `shared.skin.Skin` (`.skin`)."""
 
-    def __init__(self, cell: cells.Cell):
+    def __init__(self, cell: cells.Cell, target: str):
         self.skin = Skin(cell)
-        self._surfaces: dict[int, tuple[Mesh, Surface]] = {}  # by identity; the mesh is kept so that its id stays its own
+        self._response = Response(cell, target)
 
-    def gaps(self, electrodes: Array, bodies: Iterable[tuple[Mesh, Array]]) -> Array:
-        """Distance [m] (n,) of electrodes (n, 3) in the world to the nearest of the bodies' skins, each (mesh, T_world_mesh);
-        zero in contact. Meshes are prepared once and remembered: pass the same objects again."""
-        nearest = np.full(len(electrodes), np.inf)
-        for mesh, T_world_mesh in bodies:
-            local = (electrodes - T_world_mesh[:3, 3]) @ T_world_mesh[:3, :3]
-            np.minimum(nearest, self._surface(mesh).nearest(local)[0], out=nearest)
-        return np.maximum(nearest, 0.0)
+    def change(self, T_world_pads: Array, T_world_target: Array) -> Array:
+        """Changes of capacitance (n,) [fF] by the target, for pads (p, 4, 4)."""
+        T_pads_target = np.stack([inverse(T) for T in T_world_pads]) @ T_world_target
+        return self._response.change(T_pads_target)
 
-    def volts(self, gaps: Array, rng: np.random.Generator) -> Array:
-        """Amplitudes (..., n) [V] as the ADC gives them, for gaps (..., n) [m]: law, white noise of the law's variance,
-        rounding to steps, limits 0 and reference."""
+    def volts(self, change: ArrayLike, rng: np.random.Generator) -> Array:
+        """Amplitudes (..., n) [V] of samples of a millisecond, for changes (..., n) [fF]: signal chain, white noise of the
+        calibrated variance, end of the scale. The converter's steps are lost in the hundred cycles that a sample averages."""
         skin = self.skin
-        sigma = np.sqrt(skin.noise - skin.lsb**2 / 12.0)  # Skin counts the rounding as noise; here it happens
-        analog = skin.volts(gaps) + sigma * rng.standard_normal(np.shape(gaps))
-        return np.round(np.clip(analog, 0.0, skin.reference) / skin.lsb) * skin.lsb
-
-    def _surface(self, mesh: Mesh) -> Surface:
-        known = self._surfaces.get(id(mesh))
-        if known is None:
-            known = self._surfaces[id(mesh)] = (mesh, Surface(mesh.vertices, mesh.faces))
-        return known[1]
+        noisy = skin.amplitude(change) + np.sqrt(skin.noise) * rng.standard_normal(np.shape(change))
+        return np.clip(noisy, 0.0, skin.full_scale)

@@ -21,6 +21,7 @@ from shared.geometry import Array
 from shared.messages import Frame, Joints, Message, Truth, Voltages
 from shared.robot import robot_models
 from shared.skin import link_names
+from shared.surface import Surface
 from shared.topics import FRAME, JOINTS, TRUTH, VOLTAGES, Topic
 from sim.clearance import Clearance
 from sim.motion import Clock, LimbMotion, angular_velocity, joint_motions
@@ -67,7 +68,8 @@ class World:
         self.target_name, self.target = next(iter(cell.targets.items()))
         self.person = Person(cell, cell.sim, self.target)
         self.robots = robot_models(cell)
-        self.skin = SkinModel(cell) if cell.pads else None
+        self.skin = SkinModel(cell, self.target_name) if cell.pads else None
+        self._surface = Surface(self.person.meshes[0].vertices, self.person.meshes[0].faces)
         self.skin_faults = SkinFaults(self.skin.skin) if self.skin else None
         self._furniture = furniture(cell, cell.sim)
         self._cameras = Cameras(cell, seed)
@@ -108,7 +110,13 @@ class World:
         """Distance [m] (n,) from every electrode to the target's skin; empty where the cell has no pads."""
         if self.skin is None:
             return np.empty(0)
-        return self.skin.gaps(self.electrodes(state), [(self.person.meshes[0], state.T_world_target)])
+        local = geometry.apply(geometry.inverse(state.T_world_target), self.electrodes(state))
+        return np.maximum(self._surface.nearest(local)[0], 0.0)
+
+    def change(self, state: WorldState) -> Array:
+        """Changes of capacitance (n,) [fF] by the target."""
+        assert self.skin is not None
+        return self.skin.change(self.skin.skin.T_world_pads(link_names(state.links)), state.T_world_target)
 
     def view(self, camera: str, time_s: float) -> View:
         """What a camera sees at a time."""
@@ -200,7 +208,7 @@ class Sensors:
 
     def __init__(self, world: World, epoch_ns: int):
         self.world, self.epoch_ns = world, epoch_ns
-        self._gaps: tuple[int, Array] | None = None  # tick and its gaps, for the samples up to the next
+        self._logs: tuple[int, Array] | None = None  # tick and its log changes, for the samples up to the next
         self._hidden: deque[tuple[int, float]] = deque([(epoch_ns, 0.0)], maxlen=4)  # stamp of a frame and what was hidden in it
 
     def frame_stamp_ns(self, camera: str, k: int) -> int:
@@ -224,16 +232,17 @@ class Sensors:
         out: Stream = []
         faults = world.skin_faults
         if world.skin is not None and faults is not None:
-            if self._gaps is None or self._gaps[0] != k - 1:
-                self._gaps = (k - 1, world.gaps(world.state((k - 1) * TICK_NS * 1e-9)))
+            logs = np.log(world.change(state))
+            if self._logs is None or self._logs[0] != k - 1:
+                self._logs = (k - 1, np.log(world.change(world.state((k - 1) * TICK_NS * 1e-9))))
             ratio = np.arange(1, BATCH + 1)[:, None] / BATCH
             times_s = (k - 1 + ratio[:, 0]) * TICK_NS * 1e-9
             rng = np.random.default_rng([world.seed, 5, k])
-            volts = world.skin.volts(self._gaps[1] + ratio * (gaps - self._gaps[1]), rng)
+            volts = world.skin.volts(np.exp(self._logs[1] + ratio * (logs - self._logs[1])), rng)
             for i, pad in enumerate(cell.pads):
                 samples = faults.apply(i, times_s, volts[:, world.skin.skin.of(i)]).astype(np.float32)
                 out.append((VOLTAGES, {"pad": pad}, Voltages(stamp_ns=stamp_ns, period_ns=SAMPLE_NS, volts=samples)))
-            self._gaps = (k, gaps)
+            self._logs = (k, logs)
         out += [(JOINTS, {"robot": name}, Joints(stamp_ns=stamp_ns, position=q)) for name, q in state.joints.items()]
         truth = Truth(
             stamp_ns=stamp_ns,

@@ -1,0 +1,214 @@
+"""`penumbra bench skin`: the field model beside the measured and solved figures of the real pad, and its speed.
+
+What is compared: the capacitance of all conductors of the bare pad, what a forearm changes at the centre electrode, the response
+law fitted to it in log space, where its signal-to-noise ratio is 1 dB, lateral contrast, the influence of a grounded link; how a
+limb, a hand, a metal bar and a plastic block differ; and the networks that run live beside the boundary elements that they
+stand for, at poses and sizes that they were not fitted to. `--seed` draws those.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from rich.console import Console
+from rich.table import Table
+from scipy.optimize import brentq, least_squares
+
+from services.skin import train
+from shared import cell as cells
+from shared import geometry
+from shared.body import Mesh, target_mesh
+from shared.classes import Label
+from shared.response import Network, Response, networks
+from shared.surface import Surface
+from sim.field import Body, PadField, limb, shell
+
+Array = np.ndarray
+
+PLATE_PF = 2.448
+CENTRE_FF = {1: 103.0, 2: 32.8, 5: 4.96, 10: 1.28, 15: 0.60, 20: 0.35}
+LAW = {"a1": 2.66, "a2": 3.0e4, "log_r2": 0.9995}
+SNR_1DB_CM = 15.0
+CONTRAST = {2: 0.37, 5: 0.14, 10: 0.053, 15: 0.028}
+LINK_FACTOR = {10: 0.49, 15: 0.37}
+"""Figures of the published pad: boundary elements and the paper's."""
+CAPSENSE_MS = 100.0
+"""CapSense, an open simulator of capacitive sensors by finite elements, needs up to so long for a step of one sensor."""
+OFF_CENTRE_M = 0.02
+LINK_RADIUS_M, LINK_LENGTH_M, LINK_BEHIND_M = 0.07, 0.30, 0.005
+"""A robot's link: a grounded cylinder behind the pad's face."""
+GAPS_CM = (1, 2, 3, 5, 7.5, 10, 12.5, 15, 20)
+
+
+def forearm(cell: cells.Cell) -> Mesh:
+    """The median man's forearm, from elbow to wrist."""
+    return part(target_mesh(next(iter(cell.targets.values())), cell), Label.FOREARM)
+
+
+def part(mesh: Mesh, label: Label) -> Mesh:
+    """The faces of a mesh with one label."""
+    own = mesh.labels == label
+    used, faces = np.unique(mesh.faces[own], return_inverse=True)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), mesh.labels[own])
+
+
+def across(mesh: Mesh, gap: float, aside: float = 0.0) -> Array:
+    """T_pad_mesh (4, 4): its axis along the pad's y, `aside` [m] along x, its skin at this gap [m] above the middle of itself."""
+    T = geometry.from_rpy((aside, 0.0, 0.0), (0.0, 0.0, np.pi / 2))
+    T[1, 3] = -0.5 * (mesh.vertices[:, 0].min() + mesh.vertices[:, 0].max())
+    surface, under = Surface(mesh.vertices, mesh.faces), np.array([[aside, 0.0, 0.0]])
+
+    def excess(height: float) -> float:
+        T[2, 3] = height
+        return float(surface.nearest(geometry.apply(geometry.inverse(T), under))[0][0]) - gap
+
+    T[2, 3] = brentq(excess, gap, gap + 0.2)
+    return T
+
+
+def law(gaps: Array, volts: Array) -> dict[str, float]:
+    """The paper's law fitted to gaps [m] and signals [V], both (n,), in log space."""
+
+    def residual(p: Array) -> Array:
+        return p[0] - np.log1p(np.exp(p[1]) * gaps**2) - np.log(volts)
+
+    fit = least_squares(residual, (np.log(volts[0]), 10.0))
+    a1, a2 = np.exp(fit.x)
+    return {"a1": float(a1), "a2": float(a2), "log_r2": float(1.0 - fit.fun.var() / np.log(volts).var())}
+
+
+def figures(cell: cells.Cell) -> dict[str, Any]:
+    """What is compared with the real pad's figures, of the cell's first pad type without a link."""
+    kind = next(iter(cell.pad_types.values()))
+    pad, mesh = PadField(kind), forearm(cell)
+    body, volt = limb(mesh), kind.chain.sensitivity
+
+    def centre(gap: float) -> float:
+        return float(pad.change(body, across(mesh, gap))[0])
+
+    gaps = np.arange(1.0, 20.1, 0.5) / 100
+    changes = np.array([centre(gap) for gap in gaps])
+    fitted = law(gaps, volt * changes)
+    decibel = 10.0 * np.log10((volt * changes) ** 2 / (2.0 * kind.rest.noise))
+    contrast = {}
+    for gap in CONTRAST:
+        # the published centroids lie a quarter of a millimetre off the middle: the mean of both sides
+        right, left = (pad.change(body, across(mesh, gap / 100, side * OFF_CENTRE_M)) for side in (1, -1))
+        contrast[gap] = 0.5 * float((right[1] - right[2]) / (right[1] + right[2]) + (left[2] - left[1]) / (left[1] + left[2]))
+    cylinder = trimesh.creation.cylinder(LINK_RADIUS_M, LINK_LENGTH_M, sections=32)
+    x_axis = geometry.from_rpy((0.0, 0.0, -LINK_RADIUS_M - LINK_BEHIND_M), (0.0, np.pi / 2, 0.0))
+    backed = PadField(kind, shell(geometry.apply(x_axis, np.asarray(cylinder.vertices))))
+    factor = {gap: float(backed.change(body, across(mesh, gap / 100))[0]) / centre(gap / 100) for gap in LINK_FACTOR}
+    return {
+        "plate_pF": pad.plate_pF,
+        "centre_fF": {gap: centre(gap / 100) for gap in CENTRE_FF},
+        "law": fitted,
+        "snr_1db_cm": float(100.0 * np.interp(-1.0, -decibel, gaps)),
+        "lateral_contrast": contrast,
+        "link_factor": factor,
+        "bodies_fF": bodies(cell, pad),
+    }
+
+
+def bodies(cell: cells.Cell, pad: PadField) -> dict[str, dict[int, list[float]]]:
+    """What different bodies change [fF] at all electrodes, by name and gap [cm]."""
+    whole = target_mesh(next(iter(cell.targets.values())), cell)
+    arm, hand = part(whole, Label.FOREARM), part(whole, Label.HAND)
+    cylinder = trimesh.creation.cylinder(0.02, 0.3, sections=24, transform=geometry.from_rpy((0, 0, 0), (0, np.pi / 2, 0)))
+    bar = Mesh(np.asarray(cylinder.vertices), np.asarray(cylinder.faces, np.int32), np.zeros(len(cylinder.faces), np.uint8))
+    panels = limb(bar).panels
+    shown = {
+        "forearm": (arm, limb(arm)),
+        "hand": (hand, limb(hand)),
+        "metal bar, grounded": (bar, Body(panels, ground_pF=np.inf)),
+        "metal bar, floating": (bar, Body(panels, ground_pF=0.0)),
+        "plastic bar": (bar, Body(panels, permittivity=3.0)),
+    }
+    return {
+        name: {gap: pad.change(body, across(mesh, gap / 100)).round(4).tolist() for gap in (2, 5, 10)}
+        for name, (mesh, body) in shown.items()
+    }
+
+
+def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
+    """The networks of a cell beside the boundary elements: relative errors by gap, and time."""
+    target, aim = next(iter(cell.targets.items()))
+    mesh, known, response = target_mesh(aim, cell), networks(cell), Response(cell, target)
+    errors: dict[float, list[Array]] = {gap: [] for gap in GAPS_CM}
+    mountings = train.mountings(cell, target)
+    for number, mounting in enumerate(mountings):
+        network: Network = known[mounting.fingerprint]
+        for gap in GAPS_CM:
+            data = train.solve(mounting, mesh, max(1, poses // len(mountings)), seed * 100 + number, gap=gap / 100)
+            errors[gap].append(np.abs(train.predict(network, data) / data.change - 1.0).ravel())
+    pooled = {gap: np.concatenate(parts) for gap, parts in errors.items()}
+    T = np.tile(geometry.from_rpy((0.0, 0.0, 0.12), (0.1, 0.2, 0.3)), (len(cell.pads), 1, 1))
+    response.change(T)
+    blocks = []
+    for _ in range(9):
+        began = time.process_time()
+        for _ in range(300):
+            response.change(T)
+        blocks.append((time.process_time() - began) / 300)
+    return {
+        "pads": len(cell.pads),
+        "rate_hz": 1000,
+        "core_share": float(np.median(blocks) * 1000.0),
+        "error_median": {gap: float(np.median(e)) for gap, e in pooled.items()},
+        "error_p95": {gap: float(np.percentile(e, 95)) for gap, e in pooled.items()},
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="penumbra bench skin", description=__doc__)
+    parser.add_argument("--seed", type=int, default=1, help="draws the poses of the live comparison")
+    parser.add_argument("--poses", type=int, default=160, help="for each gap of the live comparison (default: %(default)s)")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file")
+    options = parser.parse_args(argv)
+    table, arm = cells.load("table"), cells.load("arm")
+    found = {"seed": options.seed, **figures(table), "live": live(table, options.seed, options.poses)}
+    found["live_hull"] = live(arm, options.seed, options.poses)
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    show(found, Console())
+    return 0
+
+
+def show(found: dict[str, Any], console: Console) -> None:
+    table = Table("figure", "ours", "the real pad", title="the pad near a forearm")
+    table.add_row("all conductors at 1 V, pF", f"{found['plate_pF']:.3f}", f"{PLATE_PF}")
+    for gap, value in found["centre_fF"].items():
+        table.add_row(f"change at the centre, {gap} cm, fF", f"{value:.3g}", f"{CENTRE_FF[gap]:.3g}")
+    for name, value in found["law"].items():
+        table.add_row(f"law, {name}", f"{value:.5g}", f"{LAW[name]:.5g}")
+    table.add_row("SNR of 1 dB at, cm", f"{found['snr_1db_cm']:.1f}", f"{SNR_1DB_CM:g}")
+    for gap, value in found["lateral_contrast"].items():
+        table.add_row(f"lateral contrast, {gap} cm", f"{value:.3f}", f"{CONTRAST[gap]}")
+    for gap, value in found["link_factor"].items():
+        table.add_row(f"with a grounded link, {gap} cm, times", f"{value:.2f}", f"{LINK_FACTOR[gap]}")
+    console.print(table)
+    table = Table("body", "2 cm", "5 cm", "10 cm", title="change at c r l t b, fF (loss of capacitance)")
+    for name, rows in found["bodies_fF"].items():
+        table.add_row(name, *(" ".join(f"{v:.3g}" for v in row) for row in rows.values()))
+    console.print(table)
+    for name, where in (("live", "bare pads (table)"), ("live_hull", "on the robot's links (arm)")):
+        one = found[name]
+        table = Table("gap, cm", "median error, %", "95 % below, %", title=f"networks beside boundary elements: {where}")
+        for gap, value in one["error_median"].items():
+            table.add_row(f"{gap}", f"{100 * value:.2f}", f"{100 * one['error_p95'][gap]:.2f}")
+        console.print(table)
+        each_us = 1000.0 * one["core_share"] / one["pads"]
+        console.print(
+            f"{one['pads']} pads at {one['rate_hz']} Hz: {100 * one['core_share']:.1f} % of a core, {each_us:.1f} us a pad"
+        )
+        console.print(f"and step, where CapSense needs up to {1000 * CAPSENSE_MS:.0f} us for a sensor")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
