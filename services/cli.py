@@ -41,7 +41,7 @@ TOOLS = {
     ("skin", "decode"): "services.skin.decode:main",
     ("skin", "calibrate"): "services.skin.calibrate:main",
     ("skin", "characterise"): "services.skin.characterise:main",
-    ("skin", "model"): "services.skin.model:main",
+    ("skin", "model"): "services.skin.train:main",
     ("haptics", "train"): "services.haptics.train:main",
 }
 """What a service's name can be followed by: `penumbra segmentation infer`."""
