@@ -130,10 +130,11 @@ def sim(argv: list[str]) -> int:
     parser = arguments.parser(
         "sim",
         "Steers the emulator: occlude LEVEL|auto, motion on|off, pause, resume, speed FACTOR, state, "
-        "skin PAD[/ELECTRODE] dead|saturated|drift|hum|gain|turned|mirrored|none [SIZE].",
+        "skin PAD[/ELECTRODE] dead|saturated|drift|hum|gain|turned|mirrored|none [SIZE], "
+        "board PAD-NUMBER error|lost|short|missing|slip.",
     )
-    parser.add_argument("command", help="occlude, motion, pause, resume, speed, skin or state")
-    parser.add_argument("value", nargs="*", help="of occlude, motion, speed and skin")
+    parser.add_argument("command", help="occlude, motion, pause, resume, speed, skin, board or state")
+    parser.add_argument("value", nargs="*", help="of occlude, motion, speed, skin and board")
     options = parser.parse_args(argv)
     cell = cells.load(options.cell)
     request = {"command": options.command} | ({"value": " ".join(options.value)} if options.value else {})

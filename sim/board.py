@@ -216,7 +216,7 @@ class Board:
         """
         spc, size = self.samples_per_cycle, board.step(self.samples_per_cycle)
         shift = 2.0 * np.pi * self._slipped / spc
-        drift = 2.0 * np.pi * (spc * self._sample_ticks / self._ticks - 1.0)  # in one cycle
+        drift = 2.0 * np.pi * ((spc * self._sample_ticks / self._ticks + 0.5) % 1.0 - 0.5)  # in one cycle
         jump = 2.0 * np.pi * (board.BLOCK % spc) / spc  # in one block
         if self._happens("slip"):
             self._slipped = (self._slipped + 1) % spc

@@ -1,4 +1,4 @@
-"""An emulated board on a port with a clock of its own: what the driver does takes the time that it would take on the real line."""
+"""An emulated board on a port with a clock of its own: what the driver does takes as long as on the real line."""
 
 from __future__ import annotations
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
+from sim.board import Board
 from sim.world import World
 
 COMMANDS = {
@@ -14,13 +17,15 @@ COMMANDS = {
     "resume": "everything goes on",
     "speed": "how fast target and robot move: above 0, at most 4, 1 is as in the cell file",
     "skin": "PAD[/ELECTRODE] FAULT [SIZE] or `all none`: dead, saturated, drift, hum, gain, turned, mirrored, none",
+    "board": "PAD-NUMBER error, lost, short, missing or slip: a fault of a board that --serial serves, such as p0-1 lost",
     "state": "what is in force now",
 }
 """Every command, and what its value means."""
 
 
-def control(world: World, payload: bytes, time_s: float) -> dict[str, Any]:
+def control(world: World, payload: bytes, time_s: float, boards: Mapping[str, Board] = MappingProxyType({})) -> dict[str, Any]:
     """Carry out `{"command": NAME, "value": VALUE}` from `time_s` on and answer what is in force then. The value may be a text.
+    boards: what is served on serial ports, by name.
 
     Raises ValueError with what is possible where the request is none of that.
     """
@@ -45,11 +50,24 @@ def control(world: World, payload: bytes, time_s: float) -> dict[str, Any]:
         if not isinstance(value, str):
             raise ValueError(f"skin: {COMMANDS['skin']} expected, {value!r} came")
         world.break_skin(value, time_s)
+    elif command == "board":
+        _break_board(boards, value)
     elif command in ("pause", "resume"):
         world.set_paused(command == "pause", time_s)
     elif command != "state":
         raise ValueError(_expected(command))
     return world.describe(time_s)
+
+
+def _break_board(boards: Mapping[str, Board], value: Any) -> None:
+    words = value.split() if isinstance(value, str) else []
+    if len(words) != 2:
+        raise ValueError(f"board: {COMMANDS['board']} expected, {value!r} came")
+    name, fault = words
+    if name not in boards:
+        known = ", ".join(boards) or "none: start the emulator with --serial"
+        raise ValueError(f"board: one of the served boards expected ({known}), {name!r} came")
+    boards[name].fault(fault)
 
 
 def _number(command: str, value: Any) -> float:

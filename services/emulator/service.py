@@ -1,4 +1,6 @@
-"""Wires the simulated world to the bus: control queries in, frames, joints, voltages and the truth out."""
+"""Wires the simulated world to the bus: control queries in, frames, joints, voltages and the truth out.
+
+With --serial the voltages of pads go the way of the real skin: as bytes of their boards, for `penumbra skin` to read."""
 
 from __future__ import annotations
 
@@ -6,11 +8,14 @@ import argparse
 import json
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from services.emulator.control import control
 from services.emulator.pace import Pacer
+from services.emulator.serial import SerialBoards, pad_boards
 from shared import topics
 from shared.service import Node
+from shared.topics import VOLTAGES
 from sim.world import TICK_NS, Sensors, Stream, World
 
 NAME = "emulator"
@@ -26,6 +31,10 @@ AGAIN_S = 0.001
 def arguments(parser: argparse.ArgumentParser) -> None:
     """The service's own flags."""
     parser.add_argument("--seed", type=int, default=0, help="draws motion, occlusion, colours and noise (default: 0)")
+    serial = "serve the boards of these pads (none named: of all) on pseudo-terminals instead of publishing their voltages"
+    parser.add_argument("--serial", nargs="*", metavar="PAD", help=serial)
+    folder = "where links to the pseudo-terminals are made, named p0-0 for the first board of pad p0"
+    parser.add_argument("--serial-folder", type=Path, metavar="DIR", help=folder)
     parser.add_argument("--occlude", default="auto", metavar="LEVEL|auto", help="share of the target to hide (default: auto)")
 
 
@@ -43,15 +52,24 @@ def start(node: Node, options: argparse.Namespace) -> None:
     def time_s() -> float:
         return (node.now_ns() - sensors.epoch_ns) * 1e-9
 
+    served = () if options.serial is None else tuple(options.serial or cell.pads)
+    boards = pad_boards(world, served)
+    if boards:
+        serial = SerialBoards(boards, options.serial_folder, time_s)
+        for name, device in serial.devices.items():
+            node.log.info("board on a pseudo-terminal", board=name, device=device)
+        node.every(AGAIN_S, partial(serial.serve, node.stopping))
+
     def answer(_: dict[str, str], payload: bytes) -> tuple[bytes, str]:
-        return json.dumps(control(world, payload, time_s() + AHEAD_S)).encode(), "application/json"
+        return json.dumps(control(world, payload, time_s() + AHEAD_S, boards)).encode(), "application/json"
 
     def turn(pacer: Pacer, prepare: Callable[[int], Stream]) -> None:
         k = pacer.next()
         messages = prepare(k)
         if not node.stopping.wait(pacer.ready()):
             for topic, names, message in messages:
-                node.publish(topic, message, **names)
+                if topic is not VOLTAGES or names["pad"] not in served:
+                    node.publish(topic, message, **names)
 
     def frame(camera: str, k: int) -> Stream:
         world.plan(time_s() + PLAN_S)

@@ -59,6 +59,8 @@ def pads(cell: cells.Cell, ports: list[str] | None, pad: str | None) -> dict[str
             where = f"pad {pad}" if pad else "no pad"
             raise cells.CellError(f"{where} of cell {cell.name} has boards: give --port DEVICE, or `boards:` in the cell file")
         return {name: found.boards for name, found in named.items()}
+    if twice := sorted({port for port in ports if ports.count(port) > 1}):
+        raise cells.CellError(f"--port: a port for each board expected, {', '.join(twice)} came twice")
     name = cell.one("pads", pad)
     kind = cell.pads[name].type
     readers = board.readers(cell.pads[name], cell.pad_types[kind])
@@ -84,8 +86,10 @@ class Session:
         self._state = "starting"
         self._opened = 0
         self._delay_s, self._failures = BACKOFF_S[0], 0
-        channels = [reader.channels for reader in readers]
-        PadReader([], channels, list(self._kind.electrodes), self._lsb)  # refuses what does not fit together at once
+        try:
+            self._reader()
+        except ValueError as error:
+            raise cells.CellError(f"pad {pad}: {error}") from None
 
     def run(self) -> None:
         """Until the node stops, or the boards are gone: then it returns after a while, to be called again."""
@@ -116,9 +120,12 @@ class Session:
             self._lines.append(line)
         self._batches = Batches()
         self._opened += 1
-        self._state, self._delay_s, self._failures = "reading", BACKOFF_S[0], 0
+        self._state = "reading"
         frequencies = ", ".join(f"{1e-3 * line.electrode_hz:.2f}" for line in self._lines)
         self._node.log.info("reading", pad=self._pad, boards=len(self._lines), kHz=frequencies)
+        return self._reader()
+
+    def _reader(self) -> PadReader:
         return PadReader(self._lines, [reader.channels for reader in self._readers], list(self._kind.electrodes), self._lsb)
 
     def _lost(self, error: OSError) -> None:
@@ -130,9 +137,9 @@ class Session:
 
     def _publish(self, stamp_ns: int, period_ns: int, volts: Any) -> None:
         stamp_ns += self._node.now_ns() - self._lines[0].port.now_ns()
-        self._node.publish(
-            VOLTAGES, Voltages(stamp_ns=stamp_ns, period_ns=period_ns, volts=volts.astype("float32")), pad=self._pad
-        )
+        message = Voltages(stamp_ns=stamp_ns, period_ns=period_ns, volts=volts.astype("float32"))
+        self._node.publish(VOLTAGES, message, pad=self._pad)
+        self._failures = 0
 
     def describe(self) -> dict[str, Any]:
         """For the health report: the pad's rate and skew, and each board's resonance and what happened on its line."""
