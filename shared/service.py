@@ -63,7 +63,6 @@ class Node:
         self._published: dict[str, bus.Traffic] = {}
         self._publishers: dict[tuple[str, ...], tuple[zenoh.Publisher, bus.Traffic, zenoh.EntityGlobalId, itertools.count]] = {}
         self._faults: dict[str, int] = {}
-        self.metrics: dict[str, float] = {}  # what a service tells of itself in its health, by name
         self.report: dict[str, Callable[[], Any]] = {}
         self._replicas = frozenset({self.instance})
         self._owned: dict[str, bool] = {}
@@ -329,7 +328,6 @@ class Node:
             "published": {key: traffic.report(now) for key, traffic in sorted(self._published.items())},
             "stale": sorted(key for key, traffic in self._received.items() if traffic.is_stale(now)),
             "faults": dict(self._faults),
-            "metrics": dict(self.metrics),
             **({"report": {name: tell() for name, tell in self.report.items()}} if self.report else {}),
         }
 
