@@ -154,7 +154,7 @@ class Watch:
 
     def _judge(self, look: Look, samples: int) -> dict[int, Fault]:
         """Faults by electrode, the gravest of each."""
-        quiet = (look.noise < QUIET * self._noise) & (self._noise > 2.0 * self._lsb**2 / 12.0)
+        quiet = look.noise < QUIET * self._noise
         noisy = look.noise > NOISY * self._noise + (RIPPLE * look.signal) ** 2
         hums = (look.hum > HUM_V) & (look.hum**2 > LINE * 6.0 * self._noise / samples)
         drifts = self._drifts(look.signal)

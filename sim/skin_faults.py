@@ -96,8 +96,7 @@ class SkinFaults:
                     out[:, k] += fault.size * np.sin(2.0 * np.pi * MAINS_HZ * time)
                 case "gain":
                     out[:, k] = a3 + fault.size * (out[:, k] - a3)
-        lsb = skin.lsb[own]
-        return np.clip(np.round(out / lsb) * lsb, 0.0, skin.full_scale[own])
+        return np.clip(out, 0.0, skin.full_scale[own])
 
     def _parse(self, words: str) -> tuple[str, str, float]:
         parts = words.split()

@@ -131,7 +131,7 @@ def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str
             "more, from 1 to 20 cm" + (", and turn the amplifier down" if clipped else "")
         )
     gap_, mean, error = (np.array(column) for column in zip(*rows, strict=True))
-    noise = max(float(np.median(variances)) - lsb**2 / 12.0, 0.0) if variances else None
+    noise = float(np.median(variances)) if variances else None
     return Readings(gap_, mean, error, noise, tuple(notes))
 
 
