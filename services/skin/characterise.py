@@ -298,7 +298,12 @@ def _plane(out: Path, part: str, scan: Places, names: list[str], noise: Array) -
         row.set_ylabel("across, cm")
     figure.suptitle(f"Plane {100 * scan.gap.mean():.3g} cm above the highest skin, {part.replace('_', ' ')}")
     figure.colorbar(
-        drawn, ax=axes, shrink=0.8, label="signal, mV", ticks=[v for v in (0, 5, 20, 50, 100, 200, 500, 1000) if v < top]
+        drawn,
+        ax=axes,
+        shrink=0.8,
+        label="signal, mV",
+        format="%g",
+        ticks=[v for v in (0, 5, 20, 50, 100, 200, 500, 1000) if v < top],
     )
     _save(figure, out / f"plane_{part}.png")
     return {"places": len(points), "largest_V": dict(zip(names, scan.signal.max(axis=0).tolist(), strict=True))}
