@@ -8,8 +8,9 @@ A row of a pad, about 230 times a second:
 4. a board that failed is brought back, and the row is left out
 
 Bringing back, the cheapest first: a reply that came damaged shows that the board hears us: wait until the line is quiet. One that
-did not come: end what the board believes to be reading, and find out by a stream of probes where its commands begin
-(`shared.board.realign_probes`). No answer: a BREAK, and the probes again. Still none: `BoardSilent`.
+did not come, or in which the phase has jumped: end what the board believes to be reading, and find out by a stream of probes
+where its commands begin and at which frequency it is (`shared.board.realign_probes`). No answer: a BREAK, and the probes again.
+Still none: `BoardSilent`.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ OVERHEAD_S = 0.5e-3
 """What a board takes for an answer beside cycles and line."""
 PATIENCE_S = 8e-3
 """How much later than possible an answer may come: a USB converter and the machine hold it up."""
+LAST_PATIENCE_S = 0.5
+"""The same, before a board is given up."""
 QUIET_S = 2e-3
 """A line on which nothing comes for so long is quiet: USB hands over what came once a millisecond."""
 TURN = np.radians(2.0)
@@ -145,9 +148,9 @@ class Line:
     def recover(self) -> None:
         """Makes the board answer again after a fault. Raises BoardSilent where nothing helps."""
         fault, self._fault = self._fault, ""
-        if fault in ("", "slip"):
+        if not fault:
             return
-        if fault == "silent":
+        if fault in ("silent", "slip"):  # a phase also jumps where the board began anew, at another frequency
             self._realign()
         else:
             self._wait_until_quiet(QUIET_S)
@@ -230,34 +233,31 @@ class Line:
             self._fault = "silent" if not answer else "garbled"
             self.count.faults[self._fault] += 1
             self.recover()
-        raise BoardSilent(
-            f"{self.port.name}: a board that takes {hz:g} Hz expected, its answers are wrong: is it another device?"
-        )
+        raise BoardSilent(f"a board that takes {hz:g} Hz expected, wrong answers came: is {self.port.name} another device?")
 
     # ---- place in the stream of commands
 
     def _realign(self) -> None:
         self.port.write(board.COMMAND_BYTES * board.FILLER)
         self._wait_until_quiet(self._least_s() + QUIET_S)
-        found = self._probe()
+        found = self._probe(PATIENCE_S)
+        for patience_s in (PATIENCE_S, LAST_PATIENCE_S):
+            if found is None:
+                self.count.breaks += 1
+                self.port.send_break()
+                found = self._probe(patience_s)
         if found is None:
-            self.count.breaks += 1
-            self.port.send_break()
-            found = self._probe()
-        if found is None:
-            raise BoardSilent(
-                f"{self.port.name}: no answer, also after a BREAK: is this the board's port, and has it its supply?"
-            )
-        if not _is_set(found, self.electrode_hz, self.samples_per_cycle) and self.resonance_hz:
+            raise BoardSilent(f"no answer on {self.port.name}, nor after a BREAK: is it the board's port, and has it power?")
+        if self._is_tuned and not _is_set(found, self.electrode_hz, self.samples_per_cycle):
             self.count.faults["reset"] += 1
-            self.set_frequency(self.electrode_hz)
+            raise BoardSilent(f"the board on {self.port.name} has lost its frequency: was its power off?")
 
-    def _probe(self) -> Command | None:
+    def _probe(self, patience_s: float) -> Command | None:
         """Finds where the board's commands begin, sets it right, and returns what it says of its frequencies."""
         probes = board.realign_probes()
         self.port.write(probes)
         began_ns, data = self.port.now_ns(), b""
-        within_s = (len(probes) + board.COMMAND_BYTES) * board.BYTE_S + OVERHEAD_S + PATIENCE_S
+        within_s = (len(probes) + board.COMMAND_BYTES) * board.BYTE_S + OVERHEAD_S + patience_s
         while (left_s := within_s - (self.port.now_ns() - began_ns) * 1e-9) > 0.0:
             data += self.port.read(left_s)
             found = board.realign_answer(data)
