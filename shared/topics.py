@@ -18,7 +18,8 @@ class QoS(Enum):
 @dataclass(frozen=True)
 class Topic:
     """`key` with its {names} to fill in; nominal `rate_hz`; `depth`: samples that a reader keeps while busy;
-    `stale_s`: the age after which a reader calls the topic stale; `publisher`: the service that may publish it."""
+    `stale_s`: the age after which a reader calls the topic stale; `publisher`: the service that may publish it, or
+    either of two."""
 
     name: str
     key: str
@@ -38,7 +39,7 @@ class Topic:
 
 FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, "emulator", "one RGB image")
 JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, "emulator", "joint angles [rad]")
-VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1, "emulator",
+VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1, "emulator or skin",
                  "electrode amplitudes [V], 1 kHz in batches")  # fmt: skip
 TRUTH = Topic(
     "truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 50, 16, 0.2, "emulator", "what the emulator knows"
