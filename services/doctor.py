@@ -1,4 +1,4 @@
-"""`penumbra doctor`: looks at this machine and says how to mend what is wrong."""
+"""`penumbra doctor`: looks at this machine and says how to mend what is wrong; with --skin at the pads of a running cell."""
 
 from __future__ import annotations
 
@@ -46,7 +46,17 @@ class Finding:
 
 def main(argv: list[str]) -> int:
     """Prints every finding; 1 if any failed."""
-    options = arguments.parser("doctor", "Looks at this machine and says how to mend what is wrong.").parse_args(argv)
+    parser = arguments.parser("doctor", "Looks at this machine and says how to mend what is wrong.")
+    parser.add_argument("--skin", action="store_true", help="look at the pads of the running cell instead, by their voltages")
+    parser.add_argument("--seconds", type=float, default=6.0, help="of --skin: how long to listen (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="of --skin: print what was found as JSON")
+    options = parser.parse_args(argv)
+    if options.skin:
+        from services import doctor_skin
+
+        if not 2.0 <= options.seconds <= 3600.0:
+            parser.error(f"--seconds: 2 to 3600 expected, {options.seconds:g} came")
+        return doctor_skin.main(cells.load(options.cell), bus.connection(options), options.seconds, options.json)
     console = Console(highlight=False, soft_wrap=True)
     failed = False
     for finding in findings(options.cell, bus.connection(options)):

@@ -238,37 +238,50 @@ class Suspicion:
 
 
 MISFIT = 4.0
-"""Mean squared residual, in variances, from which a pad does not fit."""
-EXPLAINED = 0.35
+"""Mean squared residual, in variances, from which a pad does not fit, whatever the reason …"""
+SUSPECT = 1.0
+"""… and from which it does not where there is a reason that explains it."""
+EXPLAINED = 0.4
 """What an explanation must leave of the misfit at most."""
-OTHER_GAIN = 0.08
-"""Gains that differ by less are the field model's own error."""
 MODEL_ERROR = 0.05
-"""What the predicted signals are wrong by, as a share: model and pose."""
+"""What the predicted signals are wrong by, as a share: the field model."""
+CONTRAST = 0.3
+"""Share of the pose's error that reaches the electrodes of a pad each in its own way."""
+LASTING = 0.5
+"""Share of the pose's error that stays over the moments, and looks like a gain."""
+SURE = 3.0
+"""Standard deviations at which a gain is another pad's."""
 
 
-def likely(predicted: Array, measured: Array, variance: Array, centroids: Array) -> Suspicion:
+def likely(predicted: Array, measured: Array, noise: Array, pose_error: Array, centroids: Array) -> Suspicion:
     """Which fault of a whole pad explains what it reads.
 
-    predicted, measured (k, e) [V]: signals at k moments with a body in reach, by the field model and by the electrodes;
-    variance (e,) [V^2] of a measured one; centroids (e, 2 or 3). Raises ValueError for other shapes or none.
+    predicted, measured (k, e) [V]: signals at k moments with a body in reach, by the field model and by the electrodes; noise
+    (k, e) or (e,) [V^2]: variance of a measured one; pose_error (k,): standard deviation of the predicted ones as a share, for
+    the error of the pose, which makes all electrodes of a pad read more or less alike; centroids (e, 2 or 3).
+    Raises ValueError for other shapes or none.
     """
     if predicted.shape != measured.shape or predicted.ndim != 2 or not len(predicted):
         raise ValueError(f"signals (k, e) of the same shape expected, {predicted.shape} and {measured.shape} came")
-    spread = variance + (MODEL_ERROR * np.maximum(np.abs(predicted), np.abs(measured))) ** 2
+    own = np.hypot(MODEL_ERROR, CONTRAST * pose_error)[:, None] * np.maximum(np.abs(predicted), np.abs(measured))
+    spread = noise + own**2
 
     def misfit(model: Array) -> float:
-        return float(np.mean((measured - model) ** 2 / spread))
+        """With a covariance of diag(spread) and (pose_error model)(pose_error model)^T (Sherman and Morrison 1950)."""
+        left = measured - model
+        alike = pose_error[:, None] * model / spread
+        removed = np.sum(alike * left, axis=1) ** 2 / (1.0 + np.sum(alike * pose_error[:, None] * model, axis=1))
+        return float(np.mean(np.sum(left**2 / spread, axis=1) - removed)) / predicted.shape[1]
 
     weighted = predicted / spread
-    gain = float(np.sum(weighted * measured) / max(np.sum(weighted * predicted), 1e-30))
-    guesses = {name: misfit(predicted[:, place]) for name, place in arrangements(centroids).items()}
-    if abs(gain - 1.0) > OTHER_GAIN:
-        guesses[f"calibrated for another pad: its signals are {gain:.2f} times what they should be"] = misfit(gain * predicted)
+    gain = max(float(np.sum(weighted * measured) / max(np.sum(weighted * predicted), 1e-30)), 1e-3)
     before = misfit(predicted)
+    guesses = {name: misfit(predicted[:, place]) for name, place in arrangements(centroids).items()}
     best = min(guesses, key=guesses.__getitem__, default=None)
-    if before < MISFIT:
-        return Suspicion(None, before, before, gain)
-    if best is None or guesses[best] > EXPLAINED * before:
-        return Suspicion("does not fit the pose, for no known reason", before, before, gain)
-    return Suspicion(best, before, guesses[best], gain)
+    if best is not None and before > SUSPECT and guesses[best] < EXPLAINED * before:
+        return Suspicion(best, before, guesses[best], gain)
+    left = misfit(gain * predicted)
+    if left < MISFIT and abs(np.log(gain)) > SURE * np.hypot(MODEL_ERROR, LASTING * float(np.median(pose_error))):
+        return Suspicion(f"calibrated as another pad: its signals are {gain:.2f} times what they should be", before, left, gain)
+    text = "does not fit the pose, for no known reason" if before > MISFIT else None
+    return Suspicion(text, before, before, gain)

@@ -100,7 +100,9 @@ def _characterise(argv: list[str]) -> None:
 
 
 def _options(argv: list[str]) -> argparse.Namespace:
-    parser = arguments.parser("skin characterise", "Distances, angles and plane scans of a pad: tables and pictures.")
+    about = "Distances, angles and plane scans of a pad: tables and pictures."
+    parser = arguments.Parser(prog="penumbra skin characterise", description=about)
+    arguments.add_cell(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="tables, pictures and summary.json go there")
     parser.add_argument("--data", type=Path, metavar="FILE",
                         help="a recording as of `skin calibrate`, with angle_deg, scan (distance or plane), object, x_m and y_m "
