@@ -132,9 +132,9 @@ class Board:
 
     def send(self, time_s: float) -> bytes:
         """What has arrived at the other end of the line until time_s and was not taken yet."""
-        while self._pending and (start_s := max(self._free_s, self._pending[0][0])) <= time_s:
-            command = self._pending.popleft()[1]
-            while self._pending and self._pending[0][0] <= start_s:  # only the last of several is answered
+        while self._pending and (begins := self._begins())[0] <= time_s:
+            start_s, number = begins
+            for _ in range(number):  # only the last of several is answered
                 command = self._pending.popleft()[1]
             self._carry_out(command, start_s)
         out = b""
@@ -145,8 +145,19 @@ class Board:
     def next_s(self) -> float:
         """When `send` has something to do: infinity where nothing is under way."""
         times = [self._sent[0][0]] if self._sent else []
-        times += [max(self._free_s, self._pending[0][0])] if self._pending else []
+        times += [self._begins()[0]] if self._pending else []
         return min(times, default=float("inf"))
+
+    def _begins(self) -> tuple[float, int]:
+        """When the next request is taken up, and how many of the pending ones have come by then: OVERHEAD_S after the firmware is
+        free, and after the last of a burst."""
+        start_s = max(self._free_s, self._pending[0][0]) + OVERHEAD_S
+        number = 0
+        for arrived_s, _ in self._pending:
+            if arrived_s > start_s:
+                break
+            start_s, number = max(start_s, arrived_s + OVERHEAD_S), number + 1
+        return start_s, number
 
     def _happens(self, kind: str) -> bool:
         happens = self._due[kind] > 0
@@ -156,7 +167,6 @@ class Board:
     def _carry_out(self, command: Command, start_s: float) -> None:
         if self._stopped or not command.is_answered(self.samples_per_cycle) or self._happens("missing"):
             return
-        start_s += OVERHEAD_S
         if command.kind == Kind.SEND_MEASURES:
             count = board.cycles(command.measures, self.samples_per_cycle)
             ends_s = start_s + count * self._ticks / board.CLOCK_HZ

@@ -191,7 +191,7 @@ def test_skin_decode_refuses_in_one_line_what_is_no_reply(text, error, monkeypat
 
 @pytest.mark.parametrize("before", range(16))
 def test_the_probes_show_where_commands_begin_whatever_came_before(before):
-    stream = before * board.FILLER + board.realign_probes()
+    stream = before * board.FILLER + b"".join(board.realign_probes())
     frames = [Command.unpack(stream[i : i + 16]) for i in range(0, len(stream) - 15, 16)]
     (probe,) = [frame for frame in frames if frame.is_answered(4)]
     number, answer = board.realign_answer(b"Error\r\n" + probe.pack() + b"\0")
@@ -277,12 +277,15 @@ def test_some_commands_are_never_answered_and_the_next_one_is(device, command):
 
 
 def test_only_the_last_of_several_pending_requests_is_answered(device):
-    sizes = []
-    device.receive(b"".join(board.send_measures(n) for n in (1024, 32, 64, 96)), 0.0)
-    while (due := device.next_s()) < math.inf:
-        packet = device.send(due)
-        sizes += [board.decode(packet).counts[0]] if packet else []
-    assert sizes == [1024, 96]  # the first was begun at once, 32 and 64 were overtaken while it went on
+    clock = [0.0]
+    burst = ask(device, clock, b"".join(board.send_measures(n) for n in (1024, 32, 64)))
+    assert len(burst) == 112 and board.decode(burst).counts[0] == 64
+    device.receive(board.send_measures(1024), clock[0])
+    while clock[0] + 1e-3 > (due := device.next_s()):
+        device.send(due)  # begins to measure
+    device.receive(board.send_measures(32) + board.send_measures(96), clock[0] + 2e-3)
+    both = ask(device, [clock[0] + 2e-3], b"")
+    assert [board.decode(packet).counts[0] for packet in (both[:112], both[112:])] == [1024, 96]
 
 
 def test_more_than_nine_samples_a_cycle_stop_the_firmware_until_its_power_is_off(device):

@@ -35,8 +35,12 @@ OVERHEAD_S = 0.5e-3
 """What a board takes for an answer beside cycles and line."""
 PATIENCE_S = 8e-3
 """How much later than possible an answer may come: a USB converter and the machine hold it up."""
+PACE_S = 0.8e-3
+"""Between probes: a board takes up a command half a millisecond after it came, if no other has come until then."""
+PROBE_S = 5e-3
+"""Waiting for the answer to the last probe …"""
 LAST_PATIENCE_S = 0.5
-"""The same, before a board is given up."""
+"""… and before a board is given up."""
 QUIET_S = 2e-3
 """A line on which nothing comes for so long is quiet: USB hands over what came once a millisecond."""
 TURN = np.radians(2.0)
@@ -221,15 +225,16 @@ class Line:
     def set_frequency(self, hz: float) -> None:
         """Sets the excitation, and the converter with it. Raises BoardSilent."""
         command = board.set_frequency(hz, self.samples_per_cycle)
-        actual_hz = board.actual_hz(hz, self.samples_per_cycle)
         for _ in range(3):
             self.port.write(command)
             within_s = 2 * board.COMMAND_BYTES * board.BYTE_S + OVERHEAD_S + PATIENCE_S
             answer = self._read(board.COMMAND_BYTES, self.port.now_ns(), within_s)
             self._phase = None
-            if len(answer) == board.COMMAND_BYTES and _is_set(Command.unpack(answer), actual_hz, self.samples_per_cycle):
-                self.electrode_hz = actual_hz
-                return
+            if len(answer) == board.COMMAND_BYTES:
+                taken = Command.unpack(answer)
+                if taken.kind == Kind.SET_FREQ_2 and _is_near(taken, hz, self.samples_per_cycle, 0.01):  # by whole ticks
+                    self.electrode_hz = taken.electrode_hz
+                    return
             self._fault = "silent" if not answer else "garbled"
             self.count.faults[self._fault] += 1
             self.recover()
@@ -240,31 +245,41 @@ class Line:
     def _realign(self) -> None:
         self.port.write(board.COMMAND_BYTES * board.FILLER)
         self._wait_until_quiet(self._least_s() + QUIET_S)
-        found = self._probe(PATIENCE_S)
-        for patience_s in (PATIENCE_S, LAST_PATIENCE_S):
+        found = self._probe(PROBE_S)
+        for patience_s in (PROBE_S, LAST_PATIENCE_S):
             if found is None:
                 self.count.breaks += 1
                 self.port.send_break()
                 found = self._probe(patience_s)
         if found is None:
             raise BoardSilent(f"no answer on {self.port.name}, nor after a BREAK: is it the board's port, and has it power?")
-        if self._is_tuned and not _is_set(found, self.electrode_hz, self.samples_per_cycle):
+        if self._is_tuned and not _is_near(found, self.electrode_hz, self.samples_per_cycle, 1e-6):
             self.count.faults["reset"] += 1
             raise BoardSilent(f"the board on {self.port.name} has lost its frequency: was its power off?")
 
     def _probe(self, patience_s: float) -> Command | None:
         """Finds where the board's commands begin, sets it right, and returns what it says of its frequencies."""
-        probes = board.realign_probes()
-        self.port.write(probes)
-        began_ns, data = self.port.now_ns(), b""
-        within_s = (len(probes) + board.COMMAND_BYTES) * board.BYTE_S + OVERHEAD_S + patience_s
-        while (left_s := within_s - (self.port.now_ns() - began_ns) * 1e-9) > 0.0:
-            data += self.port.read(left_s)
-            found = board.realign_answer(data)
+        data, sent = b"", 0
+        for probe in board.realign_probes():
+            self.port.write(probe)
+            sent += 1
+            data, found = self._await_probe(data, PACE_S)
             if found is not None:
-                self.port.write(found[0] * board.FILLER)
-                return found[1]
-        return None
+                break
+        else:
+            data, found = self._await_probe(data, patience_s)
+        if found is None:
+            return None
+        number, answer = found
+        self.port.write((number - sent) % board.COMMAND_BYTES * board.FILLER)
+        return answer
+
+    def _await_probe(self, data: bytes, within_s: float) -> tuple[bytes, tuple[int, Command] | None]:
+        """What has come of an answer, beside `data` from before, and the answer when it is whole."""
+        ends_ns = self.port.now_ns() + round(1e9 * within_s)
+        while (found := board.realign_answer(data)) is None and (left_ns := ends_ns - self.port.now_ns()) > 0:
+            data += self.port.read(left_ns * 1e-9)
+        return data, found
 
     def _wait_until_quiet(self, quiet_s: float) -> None:
         deadline_ns = self.port.now_ns() + round(1e9 * (self._least_s() + PATIENCE_S))
@@ -272,11 +287,10 @@ class Line:
             quiet_s = QUIET_S
 
 
-def _is_set(answer: Command, electrode_hz: float, samples_per_cycle: int) -> bool:
-    """Whether a board's answer says that it has these frequencies, up to the rounding of 32-bit numbers."""
-    sample_hz = electrode_hz * samples_per_cycle
-    known = answer.kind in (Kind.SET_FREQ, Kind.SET_FREQ_2)
-    return known and abs(answer.electrode_hz / electrode_hz - 1.0) < 1e-6 and abs(answer.sample_hz / sample_hz - 1.0) < 1e-6
+def _is_near(answer: Command, electrode_hz: float, samples_per_cycle: int, tolerance: float) -> bool:
+    """Whether a board's answer says that it has these frequencies, up to a share of them."""
+    samples_hz = electrode_hz * samples_per_cycle
+    return abs(answer.electrode_hz / electrode_hz - 1.0) < tolerance and abs(answer.sample_hz / samples_hz - 1.0) < tolerance
 
 
 def resonance(hz: Array, amplitude: Array, least: float) -> float:
@@ -313,20 +327,19 @@ class Row:
 
 class PadReader:
     """The boards of a pad together. channels: by board, which channels measure which electrode; electrodes: their order in a row;
-    lsb [V]: a step of the converter. Raises ValueError for an electrode that no board measures."""
+    lsb [V]: a step of the converter. An electrode that no board measures reads 0 V, as a dead one does. Raises ValueError for
+    one that several measure."""
 
     def __init__(
         self, lines: Sequence[Line], channels: Sequence[Mapping[str, Sequence[int]]], electrodes: Sequence[str], lsb: float
     ):
         self.lines, self._lsb = list(lines), lsb
-        self._sources: list[tuple[int, list[int]]] = []
+        self._sources: list[tuple[int, list[int]] | None] = []
         for name in electrodes:
             found = [(k, list(of[name])) for k, of in enumerate(channels) if name in of]
-            if len(found) != 1:
-                raise ValueError(
-                    f"electrode {name}: one board that measures it expected, {len(found)} came: see `boards:` of the pad"
-                )
-            self._sources.append(found[0])
+            if len(found) > 1:
+                raise ValueError(f"electrode {name}: one board that measures it expected, {len(found)} came: see `boards:`")
+            self._sources.append(found[0] if found else None)
 
     def read(self) -> Row | None:
         """The next row; None where a board failed and was brought back. Raises BoardSilent, OSError for a port that is gone."""
@@ -340,7 +353,7 @@ class PadReader:
             return None
         stamps = [stamp_ns for stamp_ns, _ in whole]
         amplitudes = np.abs(np.array([components for _, components in whole]))
-        volts = np.array([amplitudes[board_index, chosen].mean() for board_index, chosen in self._sources]) * self._lsb
+        volts = np.array([0.0 if at is None else amplitudes[at[0], at[1]].mean() for at in self._sources]) * self._lsb
         return Row(sum(stamps) // len(stamps), volts, max(stamps) - min(stamps))
 
 

@@ -64,13 +64,13 @@ def pads(cell: cells.Cell, ports: list[str] | None, pad: str | None) -> dict[str
     name = cell.one("pads", pad)
     kind = cell.pads[name].type
     readers = board.readers(cell.pads[name], cell.pad_types[kind])
-    if len(ports) != len(readers):
+    if len(ports) > len(readers):
         needs = "; ".join(", ".join(reader.channels) for reader in readers)
         raise cells.CellError(
-            f"pad {name} has {len(readers)} boards ({needs}), {len(ports)} came: give --port for each, in this order, "
+            f"pad {name} has {len(readers)} boards ({needs}), {len(ports)} ports came: give --port for each, in this order, "
             "or change `boards:` of the pad in the cell file"
         )
-    return {name: tuple(reader.model_copy(update={"port": port}) for reader, port in zip(readers, ports, strict=True))}
+    return {name: tuple(reader.model_copy(update={"port": port}) for reader, port in zip(readers, ports, strict=False))}
 
 
 class Session:
@@ -86,6 +86,10 @@ class Session:
         self._state = "starting"
         self._opened = 0
         self._delay_s, self._failures = BACKOFF_S[0], 0
+        read = {name for reader in readers for name in reader.channels}
+        if missing := [name for name in self._kind.electrodes if name not in read]:
+            why = "these electrodes have no board: they read 0 V, as dead ones do"
+            node.log.warning(why, pad=pad, electrodes=", ".join(missing))
         try:
             self._reader()
         except ValueError as error:
