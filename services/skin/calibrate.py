@@ -190,7 +190,7 @@ def guided(
     if not gap_rows:
         raise InputError("nothing was recorded: press Enter at each gap")
     s = sum(map(len, gap_rows))
-    labels = {name: np.full(s, pad if name == "pad" else "", dtype=np.str_) for name in recording.LABELS}
+    labels = {name: np.full(s, pad if name == "pad" else "") for name in recording.LABELS}
     numbers = {name: np.zeros(s) for name in recording.NUMBERS}
     return Recording(np.concatenate(gap_rows), np.concatenate(volts_rows), electrodes, labels, numbers)
 
