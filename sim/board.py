@@ -121,7 +121,9 @@ class Board:
             self._partial, data = self._partial + data[:taken], data[taken:]
             self._line_s += taken * board.BYTE_S
             if len(self._partial) == board.COMMAND_BYTES:
-                self._pending.append((self._line_s, Command.unpack(self._partial)))
+                command = Command.unpack(self._partial)
+                if command.is_answered(self.samples_per_cycle):  # what is not has no part in who comes last
+                    self._pending.append((self._line_s, command))
                 self._partial = b""
 
     def receive_break(self, time_s: float) -> None:
@@ -165,7 +167,7 @@ class Board:
         return happens
 
     def _carry_out(self, command: Command, start_s: float) -> None:
-        if self._stopped or not command.is_answered(self.samples_per_cycle) or self._happens("missing"):
+        if self._stopped or self._happens("missing"):
             return
         if command.kind == Kind.SEND_MEASURES:
             count = board.cycles(command.measures, self.samples_per_cycle)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services import cli
-from services.emulator.serial import SerialBoards
+from services.emulator.serial import Terminals
 from services.skin import service
 from services.skin.driver import Batches, BoardSilent, Line, PadReader, Row, resonance
 from services.skin.port import SerialPort
@@ -217,11 +217,17 @@ def test_slow_rows_are_handed_on_at_once_when_their_period_is_known():
 
 
 @contextmanager
-def served(devices, folder=None):
-    """Boards on pseudo-terminals of this process: (their SerialBoards, a function that pulls the plug)."""
+def served(devices):
+    """Boards on pseudo-terminals of this process: (the paths of their devices, a function that pulls the plug)."""
     stopping = threading.Event()
-    boards = SerialBoards({f"p0-{k}": device for k, device in enumerate(devices)}, folder, time.monotonic)
-    thread = threading.Thread(target=boards.serve, args=(stopping,), daemon=True)
+    terminals = Terminals({f"p0-{k}": device for k, device in enumerate(devices)}, time.monotonic)
+
+    def serve():
+        while not stopping.is_set():
+            terminals.turn()
+        terminals.close()
+
+    thread = threading.Thread(target=serve, daemon=True)
     thread.start()
 
     def unplug():
@@ -229,15 +235,15 @@ def served(devices, folder=None):
         thread.join(10)
 
     try:
-        yield boards, unplug
+        yield list(terminals.devices.values()), unplug
     finally:
         unplug()
 
 
-def test_a_pad_is_read_on_pseudo_terminals_and_survives_every_fault(tmp_path):
+def test_a_pad_is_read_on_pseudo_terminals_and_survives_every_fault():
     devices = emulated()
-    with served(devices, tmp_path / "boards") as (boards, _):
-        ports = [SerialPort(str(tmp_path / "boards" / name)) for name in boards.boards]
+    with served(devices) as (names, _):
+        ports = [SerialPort(name) for name in names]
         lines = lines_on(ports)
         for line, device in zip(lines, devices, strict=True):
             line.tune()
@@ -252,13 +258,12 @@ def test_a_pad_is_read_on_pseudo_terminals_and_survives_every_fault(tmp_path):
             np.testing.assert_allclose(good, np.tile(list(REST.values()), (len(good), 1)), atol=6.0 * SIGMA)
         for port in ports:
             port.close()
-    assert not list((tmp_path / "boards").iterdir())
 
 
 def test_a_break_reaches_a_board_on_a_pseudo_terminal():
     device = emulated()[0]
-    with served([device]) as (boards, _):
-        port = SerialPort(boards.devices["p0-0"])
+    with served([device]) as (names, _):
+        port = SerialPort(names[0])
         port.write(board.send_measures(128)[:9])
         wait_for(lambda: device._partial, 10, "the half command")
         port.send_break()
@@ -279,10 +284,10 @@ def test_a_port_that_cannot_be_used_is_told_with_what_to_do(device, text):
 
 
 def test_a_port_in_use_is_told():
-    with served(emulated()[:1]) as (boards, _):
-        first = SerialPort(boards.devices["p0-0"])
+    with served(emulated()[:1]) as (names, _):
+        first = SerialPort(names[0])
         with pytest.raises(OSError, match="is in use by another process: end it, or give another port"):
-            SerialPort(boards.devices["p0-0"])
+            SerialPort(names[0])
         first.close()
 
 
@@ -313,9 +318,9 @@ def heard():
 
 def test_the_service_publishes_voltages_of_its_pad_with_the_times_of_the_measurements(heard):
     start, messages = heard
-    with served(emulated()) as (boards, _):
+    with served(emulated()) as (names, _):
         before_ns = time.time_ns()
-        node = start(list(boards.devices.values()))
+        node = start(names)
         wait_for(lambda: len(messages) >= 20, 30, "20 messages")
         report = node.health()["report"]["p3"]
     after_ns = time.time_ns()
@@ -334,19 +339,26 @@ def test_the_service_publishes_voltages_of_its_pad_with_the_times_of_the_measure
 
 def test_a_board_that_is_pulled_out_is_told_and_read_again_when_it_is_back(heard, tmp_path):
     start, messages = heard
-    ports = [str(tmp_path / f"p0-{k}") for k in range(3)]
-    node = start(ports)
+    ports = [tmp_path / f"p0-{k}" for k in range(3)]
+    node = start([str(port) for port in ports])
+
+    def plug_in(devices):
+        for port, device in zip(ports, devices, strict=True):
+            port.unlink(missing_ok=True)
+            port.symlink_to(device)
 
     def state():
         return node.health()["report"]["p3"]["state"]
 
     wait_for(lambda: "is the board plugged in?" in state(), 10, "the missing board to be told")
-    with served(emulated(), tmp_path) as (_, unplug):
+    with served(emulated()) as (names, unplug):
+        plug_in(names)
         wait_for(lambda: messages, 30, "the first message")
         unplug()
         wait_for(lambda: state() != "reading", 10, "the lost board to be told")
     messages.clear()
-    with served(emulated(), tmp_path):
+    with served(emulated()) as (names, _):
+        plug_in(names)
         wait_for(lambda: messages, 30, "a message from the board that is back")
         assert state() == "reading"
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
-from sim.board import Board
+from services.emulator.serial import SerialBoards
 from sim.world import World
 
 COMMANDS = {
@@ -23,9 +21,9 @@ COMMANDS = {
 """Every command, and what its value means."""
 
 
-def control(world: World, payload: bytes, time_s: float, boards: Mapping[str, Board] = MappingProxyType({})) -> dict[str, Any]:
+def control(world: World, payload: bytes, time_s: float, serial: SerialBoards | None = None) -> dict[str, Any]:
     """Carry out `{"command": NAME, "value": VALUE}` from `time_s` on and answer what is in force then. The value may be a text.
-    boards: what is served on serial ports, by name.
+    serial: the boards that are served on serial ports.
 
     Raises ValueError with what is possible where the request is none of that.
     """
@@ -51,23 +49,14 @@ def control(world: World, payload: bytes, time_s: float, boards: Mapping[str, Bo
             raise ValueError(f"skin: {COMMANDS['skin']} expected, {value!r} came")
         world.break_skin(value, time_s)
     elif command == "board":
-        _break_board(boards, value)
+        if serial is None:
+            raise ValueError("board: no boards are served: start the emulator with --serial")
+        serial.fault(str(value))
     elif command in ("pause", "resume"):
         world.set_paused(command == "pause", time_s)
     elif command != "state":
         raise ValueError(_expected(command))
     return world.describe(time_s)
-
-
-def _break_board(boards: Mapping[str, Board], value: Any) -> None:
-    words = value.split() if isinstance(value, str) else []
-    if len(words) != 2:
-        raise ValueError(f"board: {COMMANDS['board']} expected, {value!r} came")
-    name, fault = words
-    if name not in boards:
-        known = ", ".join(boards) or "none: start the emulator with --serial"
-        raise ValueError(f"board: one of the served boards expected ({known}), {name!r} came")
-    boards[name].fault(fault)
 
 
 def _number(command: str, value: Any) -> float:

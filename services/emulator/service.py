@@ -12,7 +12,7 @@ from pathlib import Path
 
 from services.emulator.control import control
 from services.emulator.pace import Pacer
-from services.emulator.serial import SerialBoards, pad_boards
+from services.emulator.serial import SerialBoards
 from shared import topics
 from shared.service import Node
 from shared.topics import VOLTAGES
@@ -52,16 +52,17 @@ def start(node: Node, options: argparse.Namespace) -> None:
     def time_s() -> float:
         return (node.now_ns() - sensors.epoch_ns) * 1e-9
 
-    served = () if options.serial is None else tuple(options.serial or cell.pads)
-    boards = pad_boards(world, served)
-    if boards:
-        serial = SerialBoards(boards, options.serial_folder, time_s)
+    serial = None
+    if options.serial is not None:
+        pads = options.serial or list(cell.pads)
+        serial = SerialBoards(world, pads, options.serial_folder, sensors.epoch_ns, TICK_NS * 1e-9, AHEAD_S)
         for name, device in serial.devices.items():
             node.log.info("board on a pseudo-terminal", board=name, device=device)
         node.every(AGAIN_S, partial(serial.serve, node.stopping))
+    served = serial.pads if serial else ()
 
     def answer(_: dict[str, str], payload: bytes) -> tuple[bytes, str]:
-        return json.dumps(control(world, payload, time_s() + AHEAD_S, boards)).encode(), "application/json"
+        return json.dumps(control(world, payload, time_s() + AHEAD_S, serial)).encode(), "application/json"
 
     def turn(pacer: Pacer, prepare: Callable[[int], Stream]) -> None:
         k = pacer.next()

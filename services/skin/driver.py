@@ -33,14 +33,14 @@ SWEEP_HZ = (80e3, 115e3, 1e3)
 """First, last and step of the frequencies among which the resonance is looked for."""
 OVERHEAD_S = 0.5e-3
 """What a board takes for an answer beside cycles and line."""
-PATIENCE_S = 8e-3
+PATIENCE_S = 14e-3
 """How much later than possible an answer may come: a USB converter and the machine hold it up."""
-PACE_S = 0.8e-3
+PACE_S = 0.7e-3
 """Between probes: a board takes up a command half a millisecond after it came, if no other has come until then."""
-PROBE_S = 5e-3
+PROBE_S = 3e-3
 """Waiting for the answer to the last probe …"""
-LAST_PATIENCE_S = 0.5
-"""… and before a board is given up."""
+LAST_PACE_S = 0.04
+"""… and to every one before a board is given up."""
 QUIET_S = 2e-3
 """A line on which nothing comes for so long is quiet: USB hands over what came once a millisecond."""
 TURN = np.radians(2.0)
@@ -245,25 +245,25 @@ class Line:
     def _realign(self) -> None:
         self.port.write(board.COMMAND_BYTES * board.FILLER)
         self._wait_until_quiet(self._least_s() + QUIET_S)
-        found = self._probe(PROBE_S)
-        for patience_s in (PROBE_S, LAST_PATIENCE_S):
+        found = self._probe(PACE_S, PROBE_S)
+        for pace_s, patience_s in ((PACE_S, PROBE_S), (LAST_PACE_S, LAST_PACE_S)):
             if found is None:
                 self.count.breaks += 1
                 self.port.send_break()
-                found = self._probe(patience_s)
+                found = self._probe(pace_s, patience_s)
         if found is None:
             raise BoardSilent(f"no answer on {self.port.name}, nor after a BREAK: is it the board's port, and has it power?")
         if self._is_tuned and not _is_near(found, self.electrode_hz, self.samples_per_cycle, 1e-6):
             self.count.faults["reset"] += 1
             raise BoardSilent(f"the board on {self.port.name} has lost its frequency: was its power off?")
 
-    def _probe(self, patience_s: float) -> Command | None:
+    def _probe(self, pace_s: float, patience_s: float) -> Command | None:
         """Finds where the board's commands begin, sets it right, and returns what it says of its frequencies."""
         data, sent = b"", 0
         for probe in board.realign_probes():
             self.port.write(probe)
             sent += 1
-            data, found = self._await_probe(data, PACE_S)
+            data, found = self._await_probe(data, pace_s)
             if found is not None:
                 break
         else:
