@@ -27,7 +27,9 @@ ANGLES_DEG = np.arange(10) * 10.0
 PLANE_M = 0.01
 """How far the plane lies above what is scanned."""
 MARGIN_M = (0.06, 0.08)
-"""How far a scan goes on beyond its part, along the limb and across."""
+"""How far a scan goes on beyond its part, along the limb and across …"""
+OVER_M = 0.03
+"""… and over the part before it, nearer to the elbow."""
 ALONG = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """R_limb_pad: the pad above the limb looks down on it, which lies along its y."""
 EMPTY_SAMPLES = 1000
@@ -67,17 +69,17 @@ def poses(cell: cells.Cell, target: str, pad_type: str, step: float) -> list[Pos
                 T[2, 3] += gap - surface.nearest(board @ T[:3, :3].T + T[:3, 3])[0].min()
             out.append(Pose("distance", Label(mesh.labels[0]).name.lower(), float(gap), float(angle), T[0, 3], T[1, 3], T))
     for label in np.unique(mesh.labels):
-        (x0, y0, _), (x1, y1, _) = _part(mesh.vertices, mesh.faces[mesh.labels == label])
-        xs = np.arange(x0 - MARGIN_M[0], x1 + MARGIN_M[0] + step / 2, step)
-        ys = np.arange(y0 - MARGIN_M[1], y1 + MARGIN_M[1] + step / 2, step)
-        under = mesh.vertices[(mesh.vertices[:, 0] > x0 - 0.03) & (mesh.vertices[:, 0] < x1 + 0.03)]
-        height = under[:, 2].max() + PLANE_M
-        reach = (mesh.vertices[:, 0].min() - MARGIN_M[0], mesh.vertices[:, 0].max() + MARGIN_M[0])
-        for x in xs[(xs >= max(x0 - 0.03, reach[0])) & (xs <= min(x1 + MARGIN_M[0], reach[1]))]:
-            for y in ys:
-                T = np.eye(4)
-                T[:3, :3], T[:3, 3] = ALONG, (x, y, height)
-                out.append(Pose("plane", Label(label).name.lower(), PLANE_M, 0.0, float(x), float(y), T))
+        low, high = _part(mesh.vertices, mesh.faces[mesh.labels == label])
+        xs = np.arange(low[0] - (OVER_M if low[0] > mesh.vertices[:, 0].min() else MARGIN_M[0]), high[0] + MARGIN_M[0], step)
+        ys = np.arange(low[1] - MARGIN_M[1], high[1] + MARGIN_M[1], step)
+        held = np.array([(x, y, high[2]) for x in xs for y in ys])
+        for _ in range(10):  # from below, until the pad is clear of the limb at every place
+            points = (board[::2] @ ALONG.T)[None] + held[:, None]
+            held[:, 2] += max(PLANE_M - surface.nearest(points.reshape(-1, 3))[0].min(), 0.0)
+        for position in held:
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = ALONG, position
+            out.append(Pose("plane", Label(label).name.lower(), PLANE_M, 0.0, float(position[0]), float(position[1]), T))
     return out
 
 

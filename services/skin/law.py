@@ -107,7 +107,7 @@ def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str
     missing = ~np.isfinite(volts)
     if missing.any():
         notes.append(f"{missing.sum()} of {len(volts)} samples are missing or not a number: left out")
-    if missing.mean() > 0.5:
+    if 2 * missing.sum() > len(volts):
         raise InputError(f"electrode {name}: {missing.sum()} of {len(volts)} samples are not numbers: record them again")
     gaps, volts = gaps[~missing], volts[~missing]
     rows: list[tuple[float, float, float]] = []
