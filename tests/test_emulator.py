@@ -44,6 +44,8 @@ def test_every_command_answers_with_what_is_in_force(world):
     assert ask(world, "resume")["paused"] is False
     assert ask(world, "speed", "2.5")["speed"] == 2.5
     assert world.clock.rate(5.0) == 2.5
+    assert ask(world, "skin", "p0/r hum 0.02")["skin"] == {"p0/r": "hum 0.02"}
+    assert ask(world, "skin", "all none")["skin"] == {}
 
 
 @pytest.mark.parametrize(
@@ -65,6 +67,8 @@ def test_every_command_answers_with_what_is_in_force(world):
         (b'{"command": "motion", "value": [1]}', "motion: on or off"),
         (b'{"command": "speed", "value": -1}', "speed: a factor above 0 and at most 4 expected, -1 came"),
         (b'{"command": "pause", "value": 3}', "pause takes no value, 3 came"),
+        (b'{"command": "skin", "value": 3}', r"skin: PAD\[/ELECTRODE\] FAULT .* expected, 3 came"),
+        (b'{"command": "skin", "value": "p0/r torn"}', "'p0/r torn' came. Faults: dead: a broken wire"),
     ],
 )
 def test_a_bad_command_is_refused_with_what_is_possible_and_changes_nothing(world, payload, text):
