@@ -219,22 +219,23 @@ FILLER = b"\xff"
 """A byte that is the start of no command. 16 of them end whatever command a board believes to be reading."""
 
 
-def realign_probes() -> list[bytes]:
+def realign_probes(attempt: int = 0) -> list[bytes]:
     """16 pieces of a stream in which a board finds exactly one command, wherever in a command it believes to be: each is one byte
-    longer than a command. Each asks to keep the frequencies, and carries its number in `measures`, which the board's answer
-    repeats. All else in the stream is unknown to a board. Between the pieces a board needs time to answer."""
-    return [_probe(number).pack() + FILLER for number in range(COMMAND_BYTES)]
+    longer than a command. Each asks to keep the frequencies, and carries its number and that of the attempt (modulo 8) in
+    `measures`, which the board's answer repeats. All else in the stream is unknown to a board. Between the pieces a board needs
+    time to answer."""
+    return [_probe(attempt, number).pack() + FILLER for number in range(COMMAND_BYTES)]
 
 
-def realign_answer(data: bytes) -> tuple[int, Command] | None:
-    """The first answer to `realign_probes` in what came: the number of the piece that the board has understood, and the answer;
-    None without. When `sent` pieces were sent, (number - sent) % 16 fillers set the board right."""
-    answers = {_probe(number).pack()[:8]: number for number in range(COMMAND_BYTES)}
+def realign_answer(data: bytes, attempt: int = 0) -> tuple[int, Command] | None:
+    """The first answer to `realign_probes` of this attempt in what came: the number of the piece that the board has understood,
+    and the answer; None without. When `sent` pieces were sent, (number - sent) % 16 fillers set the board right."""
+    answers = {_probe(attempt, number).pack()[:8]: number for number in range(COMMAND_BYTES)}
     for at in range(len(data) - COMMAND_BYTES + 1):
         if (number := answers.get(data[at : at + 8])) is not None:
             return number, Command.unpack(data[at : at + COMMAND_BYTES])
     return None
 
 
-def _probe(number: int) -> Command:
-    return Command(Kind.SET_FREQ, 0xFFFF_FF80 | number)
+def _probe(attempt: int, number: int) -> Command:
+    return Command(Kind.SET_FREQ, 0xFFFF_FF80 | attempt % 8 << 4 | number)

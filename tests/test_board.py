@@ -196,6 +196,7 @@ def test_the_probes_show_where_commands_begin_whatever_came_before(before):
     (probe,) = [frame for frame in frames if frame.is_answered(4)]
     number, answer = board.realign_answer(b"Error\r\n" + probe.pack() + b"\0")
     assert (before + number) % 16 == 0 and answer == probe
+    assert board.realign_answer(probe.pack(), 1) is None  # an answer that comes late is of another attempt
 
 
 def test_half_a_command_followed_by_another_asks_for_nothing():

@@ -39,7 +39,7 @@ PACE_S = 0.7e-3
 """Between probes: a board takes up a command half a millisecond after it came, if no other has come until then."""
 PROBE_S = 3e-3
 """Waiting for the answer to the last probe …"""
-LAST_PACE_S = 0.04
+LAST_PACE_S = 0.015
 """… and to every one before a board is given up."""
 QUIET_S = 2e-3
 """A line on which nothing comes for so long is quiet: USB hands over what came once a millisecond."""
@@ -106,6 +106,7 @@ class Line:
         self._slack: deque[int] = deque(maxlen=200)
         self._asked_ns = self._answered_ns = port.now_ns()
         self._fault, self._is_cut, self._is_tuned = "", False, False
+        self._attempt = 0  # an answer to an earlier one may come late
 
     # ---- replies
 
@@ -260,7 +261,8 @@ class Line:
     def _probe(self, pace_s: float, patience_s: float) -> Command | None:
         """Finds where the board's commands begin, sets it right, and returns what it says of its frequencies."""
         data, sent = b"", 0
-        for probe in board.realign_probes():
+        self._attempt += 1
+        for probe in board.realign_probes(self._attempt):
             self.port.write(probe)
             sent += 1
             data, found = self._await_probe(data, pace_s)
@@ -277,7 +279,7 @@ class Line:
     def _await_probe(self, data: bytes, within_s: float) -> tuple[bytes, tuple[int, Command] | None]:
         """What has come of an answer, beside `data` from before, and the answer when it is whole."""
         ends_ns = self.port.now_ns() + round(1e9 * within_s)
-        while (found := board.realign_answer(data)) is None and (left_ns := ends_ns - self.port.now_ns()) > 0:
+        while (found := board.realign_answer(data, self._attempt)) is None and (left_ns := ends_ns - self.port.now_ns()) > 0:
             data += self.port.read(left_ns * 1e-9)
         return data, found
 
