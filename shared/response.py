@@ -1,8 +1,9 @@
 """What a limb at a pose changes at the electrodes: small networks, fitted to the boundary-element field of a cell's pads.
 
-One network serves one mounting: a pad type, with or without the robot's link behind it, and one limb. It sees the limb's axis
-from the pad (how far its skin is, in which direction, how it runs, which part of it, from which side) and gives the logarithm of
-the change of capacitance [fF] of every electrode, whose sign is the same for every limb: what is grounded takes field lines away.
+One network serves one mounting: a pad type, with or without the robot's link behind it, and one limb. It sees how the limb's skin
+lies before the pad (sums over pieces of it, weighted by powers of their nearness, with their first and second moments) and which
+part of the limb that is, and gives the logarithm of the change of capacitance [fF] of every electrode, whose sign is the same for
+every limb: what is grounded takes field lines away.
 `penumbra skin model` fits the networks; a mounting is known by its fingerprint wherever the files come from.
 
 The limb's size is two logarithms, of the factors by which the target's mesh is stretched along its axis and across it.
@@ -21,76 +22,77 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from shared import cell as cells
-from shared.body import Mesh
 
 Array = NDArray[np.float64]
 
 FOLDER = "skin"
 """Beside a cell file: where its fitted networks are."""
-FEATURES = 16
-CONTACT = 0.004
-"""Added to the gap [m] before its logarithm: in contact nothing becomes infinite."""
+FEATURES = 32
+CORE = 0.01
+"""Added to distances from the pad's middle [m]: in contact nothing becomes infinite."""
 ROUND = 0.02
 """The side from which the limb is seen fades out this near [m] to its axis, where it has no meaning."""
-STEP = 1e-6
-"""Step [m, rad] of the features' numerical derivatives."""
+STEPS = np.array([3e-4, 3e-4, 3e-4, 2e-3, 2e-3, 2e-3, 5e-3, 5e-3])
+"""Steps [m, rad, -] of the features' numerical derivatives: single precision carries them."""
 
 
 @dataclass(frozen=True)
-class Axis:
-    """A limb's axis: from x0 to x1 [m] along x, centre (k, 2) in y and z and mean radius (k,) [m] at k even places."""
+class Rest:
+    """What the other links of the robot change at a mounting's electrodes: coefficients (e, terms) of a second-degree polynomial
+    for the logarithm [fF], in joint angles that run from -1 to 1 within middle -+ half (j,) [rad]."""
 
-    x0: float
-    x1: float
-    nodes: Array  # (k, 3): y, z, radius
+    coefficients: Array
+    middle: Array
+    half: Array
 
-    @staticmethod
-    def of(mesh: Mesh, places: int = 24) -> Axis:
-        """The axis of a closed mesh along x, smoothed so that it has no kinks."""
-        u, v = (w.ravel() for w in np.meshgrid(np.arange(0.5, 12.0), np.arange(0.5, 12.0)))
-        u, v = (w[u + v < 12.0, None, None] / 12.0 for w in (u, v))
-        a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-        points = (a + u * (b - a) + v * (c - a)).reshape(-1, 3)
-        weight = np.tile(np.linalg.norm(np.cross(b - a, c - a), axis=1), len(u))
-        low, high = float(points[:, 0].min()), float(points[:, 0].max())
+    def change(self, joints: ArrayLike) -> Array:
+        """Changes (..., e) [fF] at joint angles (..., j); beyond the range as at its end."""
+        return np.exp(self.terms(np.asarray(joints)) @ self.coefficients.T)
 
-        def section(at: float) -> tuple[float, float, float]:
-            near = weight * np.exp(-0.5 * ((points[:, 0] - at) / (0.03 * (high - low))) ** 2)
-            y, z = near @ points[:, 1:] / near.sum()
-            return float(y), float(z), float(near @ np.hypot(points[:, 1] - y, points[:, 2] - z) / near.sum())
-
-        x0, x1 = low + section(low)[2], high - section(high)[2]  # the skin ends a radius beyond the axis
-        return Axis(x0, x1, np.array([section(at) for at in np.linspace(x0, x1, places)]))
+    def terms(self, joints: Array) -> Array:
+        """The polynomial's terms (..., terms)."""
+        z = np.clip((joints - self.middle) / self.half, -1.0, 1.0)
+        i, k = np.triu_indices(z.shape[-1])
+        return np.concatenate([np.ones((*z.shape[:-1], 1)), z, z[..., i] * z[..., k]], axis=-1)
 
 
 @dataclass(frozen=True)
 class Network:
-    """The response of one mounting: input mean and scale (FEATURES,), three weight matrices (rows are outputs) with biases, and
-    a linear skip (e, FEATURES)."""
+    """The response of one mounting. points (7, k): the limb's skin in pieces, in its own frame: centre [m], normal, area [m^2];
+    mean and scale (FEATURES,) of the input; three weight matrices (rows are outputs) with biases; a linear skip (e, FEATURES);
+    rest: the robot's own share, where the pad sits on one."""
 
-    axis: Axis
+    points: NDArray[np.float32]
     mean: Array
     scale: Array
     weights: tuple[Array, Array, Array]
     biases: tuple[Array, Array, Array]
     skip: Array
+    rest: Rest | None = None
+
+    @property
+    def ends(self) -> Array:
+        """Where the limb begins and ends along its axis (2,) [m]."""
+        return np.array([self.points[0].min(), self.points[0].max()], dtype=float)
 
     def arrays(self) -> dict[str, Array]:
         """Everything under names, to be stored."""
-        out = {"axis": np.array([self.axis.x0, self.axis.x1]), "nodes": self.axis.nodes, "mean": self.mean, "scale": self.scale}
+        out = {"points": self.points, "mean": self.mean, "scale": self.scale}
         out |= {f"weight{i}": w for i, w in enumerate(self.weights)} | {f"bias{i}": b for i, b in enumerate(self.biases)}
+        if self.rest is not None:
+            out |= {"rest": self.rest.coefficients, "rest_middle": self.rest.middle, "rest_half": self.rest.half}
         return {**out, "skip": self.skip}
 
     @staticmethod
     def of(data) -> Network:  # type: ignore[no-untyped-def]
         """From what `arrays` gave."""
-        x0, x1 = map(float, data["axis"])
-        axis = Axis(x0, x1, np.ascontiguousarray(data["nodes"], dtype=float))
+        points = np.ascontiguousarray(data["points"], dtype=np.float32)
         weights, biases = (
             tuple(np.ascontiguousarray(data[f"{kind}{i}"], dtype=float) for i in range(3)) for kind in ("weight", "bias")
         )
         mean, scale, skip = (np.ascontiguousarray(data[name], dtype=float) for name in ("mean", "scale", "skip"))
-        return Network(axis, mean, scale, weights, biases, skip)  # type: ignore[arg-type]
+        rest = Rest(*(data[name].astype(float) for name in ("rest", "rest_middle", "rest_half"))) if "rest" in data else None
+        return Network(points, mean, scale, weights, biases, skip, rest)  # type: ignore[arg-type]
 
 
 class Response:
@@ -114,13 +116,13 @@ class Response:
         if len(sizes) > 1:
             raise cells.CellError(f"cell {cell.name}: pads with equally many electrodes expected, {sorted(sizes)} came")
         self.electrodes = sizes.pop()
+        self._rest = [known[each].rest for each in prints]
         self.index = np.array([different.index(each) for each in prints])
-        self.axes = np.array([[each.axis.x0, each.axis.x1] for each in own])
-        self.nodes = np.stack([each.axis.nodes for each in own])
-        self.mean, self.scale = np.stack([each.mean for each in own]), np.stack([each.scale for each in own])
+        points, ends = np.stack([each.points for each in own]), np.stack([each.ends for each in own])
+        mean, scale = np.stack([each.mean for each in own]), np.stack([each.scale for each in own])
         first, second, third = (np.stack([each.weights[i] for each in own]) for i in range(3))
         biases = tuple(np.stack([each.biases[i] for each in own]) for i in range(3))
-        self.arrays = (self.index, self.axes, self.nodes, self.mean, self.scale, first, biases[0], second, biases[1], third,
+        self.arrays = (self.index, points, ends, mean, scale, first, biases[0], second, biases[1], third,
                        biases[2], np.stack([each.skip for each in own]))  # fmt: skip
 
     def change(self, T_pads_target: Array, size: ArrayLike = (0.0, 0.0)) -> Array:
@@ -128,6 +130,11 @@ class Response:
         out = np.empty(len(self.index) * self.electrodes)
         values(*self.arrays, np.ascontiguousarray(T_pads_target), np.asarray(size, dtype=float), out)
         return np.exp(out)
+
+    def rest(self, joints: ArrayLike) -> Array:
+        """Changes (n,) [fF] by the robot's other links at all joint angles (j,) of the cell: there also without a limb."""
+        none = np.zeros(self.electrodes)
+        return np.concatenate([none if each is None else each.change(joints) for each in self._rest])
 
     def logs(self, T_pads_target: Array, size: ArrayLike = (0.0, 0.0)) -> tuple[Array, Array]:
         """Log changes (n,) and their derivatives (n, 8) by the target's pose, as `geometry.perturb` moves it but along the axes
@@ -171,12 +178,12 @@ def save(path: Path, network: Network, own: str) -> None:
     np.savez_compressed(path, fingerprint=np.array(own), **arrays)  # type: ignore[arg-type]
 
 
-def features(axis: Axis, T_pad_limb: Array, size: Array) -> Array:
-    """Input (n, FEATURES) of a network for limbs at T_pad_limb (n, 4, 4) of sizes (n, 2)."""
+def features(points: NDArray[np.float32], T_pad_limb: Array, size: Array) -> Array:
+    """Input (n, FEATURES) of a network for limbs of these points at T_pad_limb (n, 4, 4), of sizes (n, 2)."""
     out = np.empty((len(T_pad_limb), FEATURES))
-    ends = np.array([axis.x0, axis.x1])
+    ends = np.array([points[0].min(), points[0].max()], dtype=float)
     for k in range(len(out)):
-        _features(ends, axis.nodes, np.ascontiguousarray(T_pad_limb[k, :3, :3]), T_pad_limb[k, :3, 3].copy(), size[k], out[k])
+        _features(points, ends, np.ascontiguousarray(T_pad_limb[k, :3, :3]), T_pad_limb[k, :3, 3].copy(), size[k], out[k])
     return out
 
 
@@ -184,60 +191,100 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
 
 
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # a division that may raise is not vectorised
+def _sums(px, py, pz, nx, ny, nz, area, R, t, along, across, core, out):  # type: ignore[no-untyped-def]
+    """Sums over the skin before a pad, into out (16,): for each of three powers of nearness the weight and its first moments
+    along the pad's axes, and for the middle one the second moments xx, yy, xy, zz. All in single precision, in one loop."""
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = s11 = s12 = s13 = s14 = s15 = np.float32(0.0)
+    half, one = np.float32(0.5), np.float32(1.0)
+    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
+    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
+    t0, t1, t2 = t[0], t[1], t[2]
+    for k in range(px.shape[0]):
+        a, b, c = px[k] * along, py[k] * across, pz[k] * across
+        x = r00 * a + r01 * b + r02 * c + t0
+        y = r10 * a + r11 * b + r12 * c + t1
+        z = r20 * a + r21 * b + r22 * c + t2
+        lx, ly, lz = r00 * x + r10 * y + r20 * z, r01 * x + r11 * y + r21 * z, r02 * x + r12 * y + r22 * z
+        facing = lx * nx[k] + ly * ny[k] + lz * nz[k]
+        near = one / (x * x + y * y + z * z + core)
+        w0 = area[k] * (half - half * facing * math.sqrt(near)) * near * near
+        w1 = w0 * near
+        w2 = w1 * near * near
+        s0 += w0
+        s1 += w0 * x
+        s2 += w0 * y
+        s3 += w0 * z
+        s4 += w1
+        s5 += w1 * x
+        s6 += w1 * y
+        s7 += w1 * z
+        s8 += w2
+        s9 += w2 * x
+        s10 += w2 * y
+        s11 += w2 * z
+        s12 += w1 * x * x
+        s13 += w1 * y * y
+        s14 += w1 * x * y
+        s15 += w1 * z * z
+    out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = s0, s1, s2, s3, s4, s5, s6, s7
+    out[8], out[9], out[10], out[11], out[12], out[13], out[14], out[15] = s8, s9, s10, s11, s12, s13, s14, s15
+
+
 @njit(cache=True, nogil=True)
-def _features(ends, nodes, R, t, size, out):  # type: ignore[no-untyped-def]
+def _features(points, ends, R, t, size, out):  # type: ignore[no-untyped-def]
     length, girth = math.exp(size[0]), math.exp(size[1])
-    # the pad's origin in the limb's frame
-    px = -(R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2])
-    py = -(R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2])
-    pz = -(R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2])
+    along, across, core = np.float32(length), np.float32(girth), np.float32(CORE * CORE)
+    single = R.astype(np.float32), t.astype(np.float32)
+    rows = (
+        points[0],
+        points[1],
+        points[2],
+        points[3],
+        points[4],
+        points[5],
+        points[6],
+    )  # each contiguous, or nothing is vectorised
+    _sums(*rows, *single, along, across, core, out)
+    xx, yy, xy, zz = out[12], out[13], out[14], out[15]
+    for first in (0, 4, 8):
+        weight = out[first]
+        x, y, z = out[first + 1] / weight, out[first + 2] / weight, out[first + 3] / weight
+        if first == 4:
+            spread = (xx + yy + zz) / weight
+            out[12], out[13] = (xx / weight - x * x) / spread, (yy / weight - y * y) / spread
+            out[14], out[15] = (xy / weight - x * y) / spread, (zz / weight - z * z) / spread
+        away = math.sqrt(x * x + y * y + z * z) + CORE
+        out[first] = math.log(weight)
+        out[first + 1], out[first + 2], out[first + 3] = x / away, y / away, z / away
+    out[16], out[17] = size[0], size[1]
+    out[18], out[19] = out[4] * out[7], out[4] * out[0]
+    for row in range(3):  # the limb's axis, and its way round, in the pad's frame
+        out[20 + row] = R[row, 0]
+        out[23 + row] = R[row, 1]
+    # the pad's origin in the limb's frame: which part of the limb it sees, and from which side
+    x = -(R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2])
+    y = -(R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2])
+    z = -(R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2])
     low, high = ends[0] * length, ends[1] * length
-    foot = min(max(px, low), high)
-    place = (foot - low) / (high - low)
-    # axis and radius there: a Catmull-Rom spline through the nodes
-    k = len(nodes)
-    f = place * (k - 1)
-    i = min(int(f), k - 2)
-    u = f - i
-    cy, cz, radius = 0.0, 0.0, 0.0
-    for step in range(-1, 3):
-        if step == -1:
-            w = ((-0.5 * u + 1.0) * u - 0.5) * u
-        elif step == 0:
-            w = (1.5 * u - 2.5) * u * u + 1.0
-        elif step == 1:
-            w = ((-1.5 * u + 2.0) * u + 0.5) * u
-        else:
-            w = (0.5 * u - 0.5) * u * u
-        node = nodes[min(max(i + step, 0), k - 1)]
-        cy, cz, radius = cy + w * node[0], cz + w * node[1], radius + w * node[2]
-    cy, cz, radius = cy * girth, cz * girth, radius * girth
-    dx, dy, dz = foot - px, cy - py, cz - pz  # from the pad to the axis, in the limb's frame
-    distance = math.sqrt(dx * dx + dy * dy + dz * dz) + 1e-9
-    gap = math.log(max(distance - radius, 0.0) + CONTACT)
-    across = math.sqrt(dy * dy + dz * dz + ROUND * ROUND)
-    sy, sz = -dy / across, -dz / across
-    beyond = (px - foot) / distance
-    out[0] = gap
-    for row in range(3):  # direction of the axis point, and of the axis, in the pad's frame
-        out[1 + row] = (R[row, 0] * dx + R[row, 1] * dy + R[row, 2] * dz) / distance
-        out[4 + row] = R[row, 0]
-    out[7] = place
-    out[8] = beyond
-    out[9], out[10] = sy, sz
-    out[11], out[12] = sy * sy - sz * sz, 2.0 * sy * sz
-    out[13], out[14] = size[0], size[1]
-    out[15] = gap * out[3]
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    out[26] = math.tanh((x - middle) / half)
+    away = math.sqrt(y * y + z * z + ROUND * ROUND)
+    c, s = y / away, z / away
+    out[27], out[28] = c, s
+    out[29], out[30] = c * c - s * s, 2.0 * c * s
+    out[31] = out[4] * out[26]
 
 
 @njit(cache=True, nogil=True)
-def values(index, ends, nodes, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, size, out):  # type: ignore[no-untyped-def]
+def values(index, points, ends, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, size, out):  # type: ignore[no-untyped-def]
     """Log changes of all electrodes, into out (n,). Arguments: `Response.arrays`, T_pads_target (p, 4, 4), size (2,)."""
     e = skip.shape[1]
     x = np.empty(FEATURES)
     for p in range(len(index)):
         m = index[p]
-        _features(ends[m], nodes[m], T[p, :3, :3], T[p, :3, 3], size, x)
+        _features(points[m], ends[m], T[p, :3, :3], T[p, :3, 3], size, x)
         x -= mean[m]
         x /= scale[m]
         first = np.tanh(np.dot(w0[m], x) + b0[m])
@@ -246,7 +293,7 @@ def values(index, ends, nodes, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, siz
 
 
 @njit(cache=True, nogil=True)
-def derivatives(index, ends, nodes, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, size, out, jacobian):  # type: ignore[no-untyped-def]
+def derivatives(index, points, ends, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, size, out, jacobian):  # type: ignore[no-untyped-def]
     """The same with derivatives, into jacobian (n, 8): see `Response.logs`."""
     e = skip.shape[1]
     x, high, low = np.empty(FEATURES), np.empty(FEATURES), np.empty(FEATURES)
@@ -254,10 +301,10 @@ def derivatives(index, ends, nodes, mean, scale, w0, b0, w1, b1, w2, b2, skip, T
     R, t, other = np.empty((3, 3)), np.empty(3), np.empty(2)
     for p in range(len(index)):
         m = index[p]
-        _features(ends[m], nodes[m], T[p, :3, :3], T[p, :3, 3], size, x)
+        _features(points[m], ends[m], T[p, :3, :3], T[p, :3, 3], size, x)
         for k in range(8):
             for side in (1, -1):
-                step = side * STEP
+                step = side * STEPS[k]
                 R[:], t[:], other[:] = T[p, :3, :3], T[p, :3, 3], size
                 if k < 3:
                     t[k] += step
@@ -268,9 +315,9 @@ def derivatives(index, ends, nodes, mean, scale, w0, b0, w1, b1, w2, b2, skip, T
                         R[a, column], R[b, column] = va - step * vb, vb + step * va
                 else:
                     other[k - 6] += step
-                _features(ends[m], nodes[m], R, t, other, high if side > 0 else low)
+                _features(points[m], ends[m], R, t, other, high if side > 0 else low)
             for i in range(FEATURES):
-                by[i, k] = (high[i] - low[i]) / (2.0 * STEP * scale[m, i])
+                by[i, k] = (high[i] - low[i]) / (2.0 * STEPS[k] * scale[m, i])
         x -= mean[m]
         x /= scale[m]
         first = np.tanh(np.dot(w0[m], x) + b0[m])

@@ -109,7 +109,7 @@ class Body:
         return induced - self._even * (induced.sum() / (self._even.sum() + self.ground))
 
 
-def limb(mesh: Mesh, length: float = 1.0, girth: float = 1.0, stations: int = 34, around: int = 18) -> Body:
+def limb(mesh: Mesh, length: float = 1.0, girth: float = 1.0, stations: int = 46, around: int = 22) -> Body:
     """A person's limb from its closed mesh along x, scaled by `length` along x and `girth` across: what is outermost on rays from
     the middle of each section."""
     return Body(_loft((np.asarray(mesh.vertices) * (length, girth, girth))[mesh.faces], stations, around))
@@ -192,25 +192,36 @@ class PadField:
 
     def change(self, body: Body, T_pad_body: Array) -> Array:
         """By how much [fF] a body at T_pad_body (4, 4) lowers the capacitance between the ring and each electrode (e,)."""
-        R, t = np.ascontiguousarray(T_pad_body[:3, :3]), np.ascontiguousarray(T_pad_body[:3, 3])
-        panels, n = self.panels, len(body.panels)
-        points, normals = body.points @ R.T + t, body.panels.normals @ R.T
-        potential = np.empty((n, len(panels)))  # at the body's panels of the pad's charges, and by symmetry the other way
-        field = np.empty((len(self._bare), n))  # at bare board of the body's charges, along its normal
-        onto = np.empty((0 if body.conductor else n, len(panels)))  # at the body's panels of the pad's charges, along theirs
-        _couple(points, normals, body.size, panels.centroids, panels.normals, self._bare, potential, field, onto)
-        seen = potential if body.conductor else onto
-        outside = seen @ self._unit[:, 0]
-        charges = body.charges(outside)
-        step = charges
+        R, t = T_pad_body[:3, :3], T_pad_body[:3, 3]
+        at_body, along_body, at_pad = self._coupling(body.points @ R.T + t, body.panels.normals @ R.T, body.size)
+        seen = at_body if body.conductor else along_body
+        charges = step = body.charges(seen @ self._unit[:, 0])
         for _ in range(60):  # what the body's charges induce on the pad acts back on the body
-            reaction = -(potential.T @ step)
-            reaction[self._bare] = field @ step
-            step = body.charges(seen @ (self._inverse @ reaction))
+            step = body.charges(seen @ (self._inverse @ -(at_pad @ step)))
             charges = charges + step
             if np.abs(step).sum() < ACCURACY * np.abs(charges).sum():
                 break
-        return -FEMTOFARAD * ((potential @ self._unit[:, 1:]).T @ charges)
+        return self._lost(at_body, charges)
+
+    def change_of_links(self, panels: Panels) -> Array:
+        """The same (e,) for grounded panels in the pad's frame, which may come near or touch what is behind the pad."""
+        at_body, _, at_pad = self._coupling(panels.points(), panels.normals, np.sqrt(panels.areas))
+        system = panels.matrices()[0] - at_body @ (self._inverse @ at_pad)
+        return self._lost(at_body, -np.linalg.solve(system, at_body @ self._unit[:, 0]))
+
+    def _coupling(self, points: Array, normals: Array, size: Array) -> tuple[Array, Array, Array]:
+        """Between a body's panels (points (n, 9, 3), normals (n, 3) and sizes (n,) in the pad's frame) and the pad's: potential and
+        normal field (n, pad) at the body of unit charges on the pad, and what unit charges on the body add to the pad's equations
+        (pad, n)."""
+        n, pad = len(points), len(self.panels)
+        at_body, along_body, bare = np.empty((n, pad)), np.empty((n, pad)), np.empty((len(self._bare), n))
+        _couple(points, normals, size, self.panels.centroids, self.panels.normals, self._bare, at_body, bare, along_body)
+        at_pad = at_body.T.copy()
+        at_pad[self._bare] = -bare
+        return at_body, along_body, at_pad
+
+    def _lost(self, at_body: Array, charges: Array) -> Array:
+        return np.asarray(-FEMTOFARAD * ((at_body @ self._unit[:, 1:]).T @ charges))
 
 
 def _board(kind: cells.PadType) -> tuple[Panels, NDArray[np.int64]]:
@@ -370,5 +381,4 @@ def _couple(points, normals, size, pad, pad_normals, bare, potential, field, ont
             potential[i, j] = total * share
             if bare_row[j] >= 0:
                 field[bare_row[j], i] = share * (fx * pad_normals[j, 0] + fy * pad_normals[j, 1] + fz * pad_normals[j, 2])
-            if len(onto):
-                onto[i, j] = -share * (fx * normals[i, 0] + fy * normals[i, 1] + fz * normals[i, 2])
+            onto[i, j] = -share * (fx * normals[i, 0] + fy * normals[i, 1] + fz * normals[i, 2])

@@ -10,18 +10,19 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 
 import numpy as np
 import torch
 from rich.progress import Progress
+from scipy.spatial import ConvexHull
 
 from services import arguments
 from shared import cell as cells
 from shared import geometry
 from shared.body import Mesh, target_mesh
-from shared.response import FEATURES, FOLDER, Axis, Network, features, fingerprint, networks, save
+from shared.response import FEATURES, FOLDER, Network, Rest, features, fingerprint, networks, save
 from shared.robot import robot_models
 from shared.surface import Surface
 from sim.field import Body, PadField, Panels, limb, shell
@@ -30,14 +31,28 @@ Array = np.ndarray
 
 POSES, POSES_BACKED = 36_000, 9_000
 """Fields solved for a bare pad, and for one more mounting."""
+POSTURES = 160
+"""Of the robot, for what its other links change at a pad …"""
+LINK_PANELS = (8, 8)
+"""… each in so many rows and columns of panels …"""
+JOINED = 0.005
+"""… without what lies in the pad's own link or nearer to it than this [m]."""
 LIMBS = 32
 """Sizes of limbs: each must be prepared, so poses share them."""
 LENGTH, GIRTH = (-0.12, 0.10), (-0.31, 0.15)
 """Bounds of the log factors: from the 5th percentile of women to the 95th of men (ANSUR II), and a little beyond."""
-GAPS = (0.003, 0.5)
-"""From what gap [m] between pad and skin to what."""
-BEHIND = -0.35
+GAPS = (0.004, 0.08, 0.5)
+"""Half of the limbs are within the first two gaps [m] of the pad, the others within the first and the last."""
+CLEAR = 0.003
+"""No limb comes nearer [m] to the board or the link."""
+BEHIND = -0.15
 """A limb may be as far behind the pad's plane as this cosine of its direction."""
+TILT = 0.6
+"""Largest angle [rad] between the limb's axis and the plane across the direction in which it is."""
+OVERHANG = 0.05
+"""How far [m] beside the limb's ends a pad may be."""
+PIECES = (40, 18)
+"""Rows and columns of the limb's pieces."""
 HIDDEN = 80
 STEPS, BATCH = 24_000, 512
 HELD_OUT_SEED = 1_000_003
@@ -47,9 +62,10 @@ BANDS = (0.005, 0.015, 0.03, 0.06, 0.12, 0.17, 0.25, 0.5)
 
 @dataclass(frozen=True)
 class Mounting:
-    """What a network is fitted for: name of its file, its fingerprint and that of the same pad without
+    """What a network is fitted for: a pad that has it, name of its file, its fingerprint and that of the same pad without
     a link, the pad type and the link behind it."""
 
+    pad: str
     name: str
     fingerprint: str
     bare: str
@@ -73,7 +89,7 @@ def mountings(cell: cells.Cell, target: str) -> list[Mounting]:
                 shell(geometry.apply(geometry.inverse(pad.T_link_pad), mesh.vertices)),
                 f"{cell.name}-{name}-{target}",
             )
-        out[own] = Mounting(label, own, fingerprint(cell, name, target, bare=True), cell.pad_types[pad.type], backing)
+        out[own] = Mounting(name, label, own, fingerprint(cell, name, target, bare=True), cell.pad_types[pad.type], backing)
     return list(out.values())
 
 
@@ -90,8 +106,8 @@ class Poses:
         sizes = np.random.default_rng([seed, 42]).permuted(np.tile((np.arange(LIMBS) + 0.5) / LIMBS, (2, 1)), axis=1).T
         self.sizes = np.array([LENGTH[0], GIRTH[0]]) + sizes * (LENGTH[1] - LENGTH[0], GIRTH[1] - GIRTH[0])
 
-    def draw(self, gap: float | None = None) -> tuple[Array, int]:
-        """T_pad_limb (4, 4) and the number of the limb, at this gap [m] within 2 %, or at any."""
+    def draw(self, gap: float | None = None) -> tuple[Array, int, float]:
+        """T_pad_limb (4, 4), the number of the limb, and its gap [m]: this one within 2 %, or any."""
         rng = self.rng
         while True:
             which = int(rng.integers(LIMBS))
@@ -99,14 +115,15 @@ class Poses:
             up = BEHIND + (1.0 - BEHIND) * rng.uniform() ** 0.6
             turn = rng.uniform(0, 2 * np.pi)
             toward = np.array([*(np.sqrt(1 - up * up) * np.array([np.cos(turn), np.sin(turn)])), up])
-            x = np.cross(toward, rng.standard_normal(3)) + toward * np.tan(rng.normal(0.0, 0.45)) * rng.uniform(0, 1)
+            x = np.cross(toward, rng.standard_normal(3))
+            x = x / np.linalg.norm(x) + np.tan(rng.uniform(-TILT, TILT)) * toward
             x /= np.linalg.norm(x)
             y = np.cross(rng.standard_normal(3), x)
             y /= np.linalg.norm(y)
             R = np.column_stack([x, y, np.cross(x, y)])
-            along = rng.uniform(self.ends[0] - 0.06, self.ends[1] + 0.06) * factors[0]
+            along = rng.uniform(self.ends[0] - OVERHANG, self.ends[1] + OVERHANG) * factors[0]
             # slide it away along `toward` until the pad's middle has the wanted gap
-            wanted = gap or np.exp(rng.uniform(*np.log(GAPS)))
+            wanted = gap or float(np.exp(rng.uniform(np.log(GAPS[0]), np.log(GAPS[rng.integers(1, 3)]))))
             far = wanted + 0.05
             for _ in range(12):
                 t = toward * far - along * x
@@ -114,10 +131,10 @@ class Poses:
                 if abs(short) < 0.02 * wanted:
                     break
                 far += short
-            if far > 0.0 and abs(short) < 0.02 * wanted and self._gap(self.solid, R, t, factors) > GAPS[0]:
+            if far > 0.0 and abs(short) < 0.02 * wanted and self._gap(self.solid, R, t, factors) > CLEAR:
                 T = np.eye(4)
                 T[:3, :3], T[:3, 3] = R, t
-                return T, which
+                return T, which, wanted - short
 
     def _gap(self, points: Array, R: Array, t: Array, factors: Array) -> float:
         """About the distance [m] of points (n, 3) to the limb: exact in the mesh's own size."""
@@ -128,10 +145,11 @@ class Poses:
 
 @dataclass(frozen=True)
 class Solved:
-    """Fields: poses (n, 4, 4) of the limb in the pad's frame, sizes (n, 2) of it, changes (n, e) [fF]."""
+    """Fields: poses (n, 4, 4) of the limb in the pad's frame, its sizes (n, 2) and gaps (n,) [m], changes (n, e) [fF]."""
 
     T: Array
     size: Array
+    gap: Array
     change: Array
 
 
@@ -141,10 +159,11 @@ def solve(
     """So many random fields, at one gap [m] or at all."""
     field, poses = PadField(mounting.kind, mounting.backing), Poses(mesh, mounting.backing, seed)
     limbs: dict[int, Body] = {}
-    T, size, change = np.empty((count, 4, 4)), np.empty((count, 2)), np.empty((count, len(mounting.kind.electrodes)))
+    T, size, gaps = np.empty((count, 4, 4)), np.empty((count, 2)), np.empty(count)
+    change = np.empty((count, len(mounting.kind.electrodes)))
     task = progress.add_task(f"{mounting.name}: fields", total=count) if progress else None
     for k in range(count):
-        T[k], which = poses.draw(gap)
+        T[k], which, gaps[k] = poses.draw(gap)
         size[k] = poses.sizes[which]
         if which not in limbs:
             limbs[which] = limb(mesh, *np.exp(size[k]))
@@ -153,7 +172,59 @@ def solve(
             progress.update(task, completed=k)
     if progress and task is not None:
         progress.remove_task(task)
-    return Solved(T, size, change)
+    return Solved(T, size, gaps, change)
+
+
+def pieces(mesh: Mesh) -> Array:
+    """The limb's skin in pieces (7, k): see `shared.response.Network`."""
+    panels = limb(mesh, stations=PIECES[0], around=PIECES[1]).panels
+    return np.ascontiguousarray(np.column_stack([panels.centroids, panels.normals, panels.areas]).T, dtype=np.float32)
+
+
+def links(cell: cells.Cell, mounting: Mounting, count: int, seed: int) -> tuple[Array, Array]:
+    """Joint angles (count, j) of the cell's robots, and what all links but the pad's own change there (count, e) [fF]."""
+    rng, models, own = np.random.default_rng([seed, 44]), robot_models(cell), cell.pads[mounting.pad]
+    low, high = joint_range(cell)
+    field = PadField(mounting.kind, mounting.backing)
+    robot, _, carrier = own.link.partition("/")
+    others = {
+        (name, link): shell(mesh.vertices, *LINK_PANELS).corners
+        for name, model in models.items()
+        for link, mesh in model.meshes.items()
+        if (name, link) != (robot, carrier)
+    }
+    behind = ConvexHull(geometry.apply(geometry.inverse(own.T_link_pad), models[robot].meshes[carrier].vertices))
+    joints, change = rng.uniform(low, high, (count, len(low))), np.empty((count, len(mounting.kind.electrodes)))
+    for k, q in enumerate(joints):
+        poses, first = {}, 0
+        for name, model in models.items():
+            poses[name] = model.link_transforms(q[first : first + len(model.joints)])
+            first += len(model.joints)
+        T_pad_world = geometry.inverse(poses[robot][carrier] @ own.T_link_pad)
+        corners = np.concatenate([geometry.apply(T_pad_world @ poses[name][link], c) for (name, link), c in others.items()])
+        away = (corners.mean(axis=1) @ behind.equations[:, :3].T + behind.equations[:, 3]).max(axis=1) > JOINED
+        change[k] = field.change_of_links(Panels(corners[away]))
+    return joints, change
+
+
+def joint_range(cell: cells.Cell) -> tuple[Array, Array]:
+    """Bounds (j,) [rad] of all joints: the cell's own for the emulator, or those of the robots."""
+    if cell.sim is not None and cell.sim.joints_low:
+        return np.array(cell.sim.joints_low), np.array(cell.sim.joints_high)
+    models = robot_models(cell).values()
+    return np.concatenate([m.lower for m in models]), np.concatenate([m.upper for m in models])
+
+
+def fit_rest(cell: cells.Cell, mounting: Mounting, seed: int) -> tuple[Rest, float]:
+    """The polynomial for the other links of a pad's robot, and the 95th percentile of its relative error on others."""
+    low, high = joint_range(cell)
+    joints, change = links(cell, mounting, POSTURES, seed)
+    middle, half = 0.5 * (low + high), 0.5 * np.maximum(high - low, 1e-6)
+    empty = Rest(np.zeros((change.shape[1], 1)), middle, half)
+    coefficients = np.linalg.lstsq(empty.terms(joints), np.log(change), rcond=None)[0].T
+    rest = Rest(coefficients, middle, half)
+    joints, change = links(cell, mounting, POSTURES // 5, HELD_OUT_SEED)
+    return rest, float(np.percentile(np.abs(rest.change(joints) / change - 1.0), 95))
 
 
 class _Fit(torch.nn.Module):
@@ -171,13 +242,13 @@ class _Fit(torch.nn.Module):
 
 
 def fit(
-    axis: Axis, data: Solved, seed: int, steps: int, start: Network | None = None, progress: Progress | None = None
+    points: Array, data: Solved, seed: int, steps: int, start: Network | None = None, progress: Progress | None = None
 ) -> Network:
     """The network that has the logarithms of the changes; robust against the few poses that it cannot follow."""
     torch.manual_seed(seed)
     rng = np.random.default_rng([seed, 43])
     usable = (data.change > 1e-6).all(axis=1)
-    inputs, wanted = features(axis, data.T, data.size)[usable], np.log(data.change[usable])
+    inputs, wanted = features(points, data.T, data.size)[usable], np.log(data.change[usable])
     mean, scale = (start.mean, start.scale) if start else (inputs.mean(axis=0), inputs.std(axis=0) + 1e-9)
     x = torch.from_numpy(((inputs - mean) / scale).astype(np.float32))
     y = torch.from_numpy(wanted.astype(np.float32))
@@ -208,12 +279,12 @@ def fit(
     with torch.no_grad():
         weights = tuple(layer.weight.numpy().astype(float) for layer in model.layers)
         biases = tuple(layer.bias.numpy().astype(float) for layer in model.layers)
-        return Network(axis, mean, scale, weights, biases, model.skip.weight.numpy().astype(float))  # type: ignore[arg-type]
+        return Network(points, mean, scale, weights, biases, model.skip.weight.numpy().astype(float))  # type: ignore[arg-type]
 
 
 def predict(network: Network, data: Solved) -> Array:
     """Changes (n, e) [fF] of a network."""
-    x = (features(network.axis, data.T, data.size) - network.mean) / network.scale
+    x = (features(network.points, data.T, data.size) - network.mean) / network.scale
     first = np.tanh(x @ network.weights[0].T + network.biases[0])
     second = np.tanh(first @ network.weights[1].T + network.biases[1])
     return np.exp(second @ network.weights[2].T + network.biases[2] + x @ network.skip.T)
@@ -222,10 +293,9 @@ def predict(network: Network, data: Solved) -> Array:
 def score(network: Network, data: Solved) -> dict[str, dict[str, float]]:
     """Median and 95th percentile of the relative error of all electrodes [%] per band of the gap [cm]."""
     error = 100.0 * np.abs(predict(network, data) / data.change - 1.0)
-    gap = np.exp(features(network.axis, data.T, data.size)[:, 0])
     out = {}
     for low, high in itertools.pairwise(BANDS):
-        own = error[(gap >= low) & (gap < high)]
+        own = error[(data.gap >= low) & (data.gap < high)]
         if len(own):
             out[f"{100 * low:g}-{100 * high:g} cm"] = {
                 "poses": len(own),
@@ -255,7 +325,7 @@ def main(argv: list[str]) -> int:
     torch.set_num_threads(1)
     target = cell.one("targets", options.target)
     mesh = target_mesh(cell.targets[target], cell)
-    axis = Axis.of(mesh)
+    points = pieces(mesh)
     with Progress() as progress:
         for mounting in mountings(cell, target):
             known = networks(cell)
@@ -265,10 +335,11 @@ def main(argv: list[str]) -> int:
             began = time.monotonic()
             start = known.get(mounting.bare) if mounting.backing is not None else None
             poses = options.poses or (POSES if start is None else POSES_BACKED)
-            network = fit(
-                axis, solve(mounting, mesh, poses, options.seed, progress), options.seed, options.steps, start, progress
-            )
+            data = solve(mounting, mesh, poses, options.seed, progress)
+            network = fit(points, data, options.seed, options.steps, start, progress)
             held_out = score(network, solve(mounting, mesh, max(poses // 12, 50), HELD_OUT_SEED, progress))
+            rest, rest_error = fit_rest(cell, mounting, options.seed) if mounting.backing is not None else (None, None)
+            network = replace(network, rest=rest)
             path = cell.folder / FOLDER / f"{mounting.name}.npz"
             save(path, network, mounting.fingerprint)
             card = {
@@ -280,6 +351,7 @@ def main(argv: list[str]) -> int:
                 "minutes": round((time.monotonic() - began) / 60.0, 1),
                 "held_out_seed": HELD_OUT_SEED,
                 "held_out": held_out,
+                **({"other_links_p95_percent": round(100.0 * rest_error, 2)} if rest_error is not None else {}),
             }
             path.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n")
             progress.console.print(f"{mounting.name}: {path}")
