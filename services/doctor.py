@@ -31,6 +31,7 @@ EXTRAS = {
     "opencv-python-headless": "search",
     "trimesh": "mesh",
     "pybullet": "robot",
+    "pyserial": "skin",
 }
 STYLES = {"ok": "green", "warn": "yellow", "fail": "red"}
 

@@ -12,6 +12,8 @@ import pytest
 
 from services.emulator.control import COMMANDS, control
 from services.emulator.pace import Pacer
+from services.skin.driver import Line
+from services.skin.port import SerialPort
 from shared import bus, topics
 from shared import cell as cells
 from shared.service import Node
@@ -66,6 +68,7 @@ def test_every_command_answers_with_what_is_in_force(world):
         (b'{"command": "motion", "value": "fast"}', "motion: on or off.* expected, 'fast' came"),
         (b'{"command": "motion", "value": [1]}', "motion: on or off"),
         (b'{"command": "speed", "value": -1}', "speed: a factor above 0 and at most 4 expected, -1 came"),
+        (b'{"command": "board", "value": "p0-0 error"}', "no boards are served: start the emulator with --serial"),
         (b'{"command": "pause", "value": 3}', "pause takes no value, 3 came"),
         (b'{"command": "skin", "value": 3}', r"skin: PAD\[/ELECTRODE\] FAULT .* expected, 3 came"),
         (b'{"command": "skin", "value": "p0/r torn"}', "'p0/r torn' came. Faults: dead: a broken wire"),
@@ -119,11 +122,18 @@ def test_a_stream_that_takes_longer_than_its_period_becomes_thinner_and_not_late
 
 
 @pytest.fixture(scope="module")
-def emulator():
+def ports(tmp_path_factory):
+    """Where the emulator makes links to the boards of p7."""
+    return tmp_path_factory.mktemp("ports")
+
+
+@pytest.fixture(scope="module")
+def emulator(ports):
     """A router in this process, a real emulator beside it, and a node that hears it: (node, what it heard)."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)
     command = [sys.executable, "-m", "services.cli", "emulator", "--cell", "arm", "--seed", "2", "--connect", endpoint]
+    command += ["--serial", "p7", "--serial-folder", str(ports)]
     process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"})
     node, heard = Node("listener", cells.load("arm"), bus.Connection("client", (endpoint,))), {}
     for topic in (topics.FRAME, topics.JOINTS, topics.VOLTAGES, topics.TRUTH):
@@ -137,12 +147,12 @@ def emulator():
         process.terminate()
         code = process.wait(5)
         router.close()
-    assert code == 0
+    assert code == 0 and not list(ports.iterdir())
 
 
 def test_the_emulator_publishes_every_stream_of_the_cell_on_its_beat_and_in_time(emulator):
     _, heard = emulator
-    streams = {("frame", "side"), ("joints", "panda"), ("truth", "forearm"), *(("voltages", f"p{i}") for i in range(8))}
+    streams = {("frame", "side"), ("joints", "panda"), ("truth", "forearm"), *(("voltages", f"p{i}") for i in range(7))}
     wait_for(lambda: set(heard) == streams, 60.0, "all streams")  # the first run compiles
     heard.clear()
 
@@ -175,5 +185,45 @@ def test_the_emulator_obeys_control_queries_and_refuses_others(emulator):
     wait_for(lambda: not heard[("truth", "forearm")][-1][1].velocity.any(), 5.0, "stillness")
     with pytest.raises(bus.Refused, match=r"'dance' came. Commands:"):
         ask("dance")
+    with pytest.raises(bus.Refused, match=r"one of p7-0, p7-1, p7-2 and one of error, .*, 'p6-0 error' came"):
+        ask("board", "p6-0 error")
     assert ask("resume")["paused"] is False
     wait_for(lambda: heard[("truth", "forearm")][-1][1].velocity.any(), 5.0, "motion")
+
+
+def test_the_boards_of_a_pad_on_serial_ports_feel_what_the_world_and_its_faults_make_of_it(emulator, ports):
+    node, heard = emulator
+    wait_for(lambda: len(heard.get(("truth", "forearm"), ())) > 0, 60.0, "the truth")
+
+    def ask(command, value=None):
+        return json.loads(node.query(topics.control("arm"), payload=json.dumps({"command": command, "value": value}).encode())[0])
+
+    scene_s = ask("pause")["scene_s"]
+    ask("skin", "p7/l saturated")
+    cell = cells.load("arm")
+    world = World(cell, 2)
+    skin = world.skin.skin
+    own = skin.of(skin.pads.index("p7"))
+    expected = skin.amplitude(world.change(world.state(scene_s)))[own]
+    line = Line(SerialPort(str(ports / "p7-0")), range(6))
+    line.tune()
+
+    def amplitudes():
+        line.recover()
+        line.ask()
+        found = line.answer()
+        return None if found is None else list(np.abs(found[1]) * skin.lsb[own][0])
+
+    c, r = expected[:2]
+    found = wait_for(amplitudes, 10.0, "a reply")
+    sigma = np.sqrt(skin.noise[own][0] * 100 / 128)
+    np.testing.assert_allclose(found, [c, c, c, r, r, r], rtol=3e-3, atol=5.0 * sigma)
+    assert ask("board", "p7-0 error")["paused"] is True
+    wait_for(lambda: amplitudes() is None and line.count.faults["overrun"], 10.0, "the fault")
+    line.port.close()
+    line = Line(SerialPort(str(ports / "p7-1")), range(6))
+    line.tune()
+    assert wait_for(amplitudes, 10.0, "a reply")[0] > 0.8 * skin.full_scale[own][2]  # l: cut off by the converter, where noisy
+    line.port.close()
+    ask("skin", "p7 none")
+    ask("resume")
