@@ -367,7 +367,7 @@ def test_a_board_that_is_pulled_out_is_told_and_read_again_when_it_is_back(heard
     ("argv", "text"),
     [
         ([], "no pad of cell table has boards: give --port DEVICE, or `boards:` in the cell file"),
-        (["--pad", "p1"], "pad p1 of cell table has boards: give --port"),
+        (["--pad", "p1"], "pad p1 of cell table has no boards: give --port"),
         (["--pad", "p9"], "cell table has no pad 'p9'"),
         (["--port", "/dev/a"] * 4, "--port: a port for each board expected, /dev/a came twice"),
         (

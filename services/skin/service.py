@@ -56,8 +56,8 @@ def pads(cell: cells.Cell, ports: list[str] | None, pad: str | None) -> dict[str
             if any(reader.port is None for reader in found.boards):
                 raise cells.CellError(f"pads.{name}.boards: a port of every board expected: add it, or give --pad {name} --port")
         if not named:
-            where = f"pad {pad}" if pad else "no pad"
-            raise cells.CellError(f"{where} of cell {cell.name} has boards: give --port DEVICE, or `boards:` in the cell file")
+            what = f"pad {pad} of cell {cell.name} has no boards" if pad else f"no pad of cell {cell.name} has boards"
+            raise cells.CellError(f"{what}: give --port DEVICE, or `boards:` in the cell file")
         return {name: found.boards for name, found in named.items()}
     if twice := sorted({port for port in ports if ports.count(port) > 1}):
         raise cells.CellError(f"--port: a port for each board expected, {', '.join(twice)} came twice")
