@@ -38,8 +38,12 @@ IN_REACH_V = (0.008, 0.4)
 errors."""
 SLOPE = 3.0
 """A signal falls at most with this power of the gap: so many times the pose's relative error is the signal's."""
-LEAST = 10
-"""Batches in reach that a comparison takes."""
+TOGETHER = 25
+"""Moments whose mean is compared: half a second, so that noise hides no contrast."""
+LEAST = 4
+"""Such means in reach that a comparison takes."""
+LEAST_EMPTY = 25
+"""Moments with nothing near from which an offset is told."""
 NOTHING_V = 5e-4
 """Predicted signals [V] below this count as an empty scene …"""
 OFFSET_V = 3e-3
@@ -129,12 +133,16 @@ class Examination:
         return {"cell": self.cell.name, "wrong": wrong, "compared": sorted(gains), "pads": pads, "notes": self.notes}
 
     def _suspect(self, name: str, pad: Pad, common: float) -> Any:
-        near = [moment for moment in pad.moments if IN_REACH_V[0] < moment[0].max() < IN_REACH_V[1]]
-        if len(near) < LEAST or pad.faults:
+        count = len(pad.moments) // TOGETHER
+        if not count or pad.faults:
             return None
-        predicted, measured, noise, error = (np.stack(column) for column in zip(*near, strict=True))
+        columns = (np.stack(column)[-count * TOGETHER :] for column in zip(*pad.moments, strict=True))
+        predicted, measured, noise, error = (c.reshape(count, TOGETHER, *c.shape[1:]).mean(axis=1) for c in columns)
+        near = (predicted.max(axis=1) > IN_REACH_V[0]) & (predicted.max(axis=1) < IN_REACH_V[1])
+        if near.sum() < LEAST:
+            return None
         own = self.skin.of(self.skin.pads.index(name))
-        return likely(common * predicted, measured, noise, error, self.skin.centroids[own])
+        return likely(common * predicted[near], measured[near], noise[near] / TOGETHER, error[near], self.skin.centroids[own])
 
     def _verdict(self, name: str, pad: Pad, common: float, misfit: float | None) -> dict[str, Any]:
         own = self.skin.of(self.skin.pads.index(name))
@@ -173,7 +181,7 @@ class Examination:
     def _offsets(self, pad: Pad) -> dict[str, Fault]:
         """Electrodes that read something while the pose says that nothing is near."""
         empty = [moment for moment in pad.moments if moment[0].max() < NOTHING_V]
-        if len(empty) < LEAST:
+        if len(empty) < LEAST_EMPTY:
             return {}
         offset = np.mean([measured - predicted for predicted, measured, *_ in empty], axis=0)
         return {

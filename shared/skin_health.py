@@ -239,7 +239,7 @@ class Suspicion:
 
 MISFIT = 4.0
 """Mean squared residual, in variances, from which a pad does not fit, whatever the reason …"""
-SUSPECT = 1.0
+SUSPECT = 0.5
 """… and from which it does not where there is a reason that explains it."""
 EXPLAINED = 0.4
 """What an explanation must leave of the misfit at most."""
