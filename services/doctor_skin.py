@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 PATIENCE_S = 1.0
 NEAR_NS = 15_000_000
 """Pose and joints belong to a batch of voltages when their stamps are no farther apart."""
-IN_REACH_V = (0.008, 0.4)
+IN_REACH_V = (0.005, 0.4)
 """A pad's largest predicted signal [V] at which it is compared with the pose: less says little, more is too close for its
 errors."""
 SLOPE = 3.0
