@@ -27,7 +27,9 @@ Array = NDArray[np.float64]
 
 FOLDER = "skin"
 """Beside a cell file: where its fitted networks are."""
-FEATURES = 32
+FEATURES = 36
+RIM = 0.024
+"""The limb's nearness is also seen from four points so far [m] from the pad's middle, where outer electrodes are."""
 CORE = 0.01
 """Added to distances from the pad's middle [m]: in contact nothing becomes infinite."""
 ROUND = 0.02
@@ -108,7 +110,7 @@ class Response:
         if missing:
             raise cells.CellError(
                 f"cell {cell.name}: no field model for target {target} on the pads {', '.join(missing)}: their design, their "
-                f"mounting or the limb is new. Fit it once: penumbra skin model --cell {cell.file or cell.name}"
+                f"mounting or the limb is new. Fit it once: penumbra skin model --cell FILE"
             )
         different = sorted(set(prints))
         own = [known[each] for each in different]
@@ -193,9 +195,12 @@ def _digest(data: bytes) -> str:
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # a division that may raise is not vectorised
 def _sums(px, py, pz, nx, ny, nz, area, R, t, along, across, core, out):  # type: ignore[no-untyped-def]
-    """Sums over the skin before a pad, into out (16,): for each of three powers of nearness the weight and its first moments
-    along the pad's axes, and for the middle one the second moments xx, yy, xy, zz. All in single precision, in one loop."""
+    """Sums over the skin before a pad, into out: for each of three powers of nearness the weight and its first moments along the
+    pad's axes (12), for the middle one the second moments xx, yy, xy, zz, and from 32 on the weight as seen from right, left, top
+    and bottom of the pad. All in single precision, in one loop."""
     s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = s11 = s12 = s13 = s14 = s15 = np.float32(0.0)
+    s16 = s17 = s18 = s19 = np.float32(0.0)
+    twice, square = np.float32(2.0 * RIM), np.float32(RIM * RIM)
     half, one = np.float32(0.5), np.float32(1.0)
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
@@ -208,8 +213,10 @@ def _sums(px, py, pz, nx, ny, nz, area, R, t, along, across, core, out):  # type
         z = r20 * a + r21 * b + r22 * c + t2
         lx, ly, lz = r00 * x + r10 * y + r20 * z, r01 * x + r11 * y + r21 * z, r02 * x + r12 * y + r22 * z
         facing = lx * nx[k] + ly * ny[k] + lz * nz[k]
-        near = one / (x * x + y * y + z * z + core)
-        w0 = area[k] * (half - half * facing * math.sqrt(near)) * near * near
+        far = x * x + y * y + z * z + core
+        near = one / far
+        seen = area[k] * (half - half * facing * math.sqrt(near))
+        w0 = seen * near * near
         w1 = w0 * near
         w2 = w1 * near * near
         s0 += w0
@@ -228,8 +235,16 @@ def _sums(px, py, pz, nx, ny, nz, area, R, t, along, across, core, out):  # type
         s13 += w1 * y * y
         s14 += w1 * x * y
         s15 += w1 * z * z
+        far += square
+        right, left = one / (far - twice * x), one / (far + twice * x)
+        top, bottom = one / (far - twice * y), one / (far + twice * y)
+        s16 += seen * right * right * right
+        s17 += seen * left * left * left
+        s18 += seen * top * top * top
+        s19 += seen * bottom * bottom * bottom
     out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = s0, s1, s2, s3, s4, s5, s6, s7
     out[8], out[9], out[10], out[11], out[12], out[13], out[14], out[15] = s8, s9, s10, s11, s12, s13, s14, s15
+    out[32], out[33], out[34], out[35] = s16, s17, s18, s19
 
 
 @njit(cache=True, nogil=True)
@@ -275,6 +290,8 @@ def _features(points, ends, R, t, size, out):  # type: ignore[no-untyped-def]
     out[27], out[28] = c, s
     out[29], out[30] = c * c - s * s, 2.0 * c * s
     out[31] = out[4] * out[26]
+    for side in range(32, 36):
+        out[side] = math.log(out[side]) - out[4]
 
 
 @njit(cache=True, nogil=True)

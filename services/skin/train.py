@@ -29,7 +29,7 @@ from sim.field import Body, PadField, Panels, limb, shell
 
 Array = np.ndarray
 
-POSES, POSES_BACKED = 36_000, 9_000
+POSES, POSES_BACKED = 45_000, 3_000
 """Fields solved for a bare pad, and for one more mounting."""
 POSTURES = 160
 """Of the robot, for what its other links change at a pad …"""
@@ -41,8 +41,8 @@ LIMBS = 32
 """Sizes of limbs: each must be prepared, so poses share them."""
 LENGTH, GIRTH = (-0.12, 0.10), (-0.31, 0.15)
 """Bounds of the log factors: from the 5th percentile of women to the 95th of men (ANSUR II), and a little beyond."""
-GAPS = (0.004, 0.08, 0.5)
-"""Half of the limbs are within the first two gaps [m] of the pad, the others within the first and the last."""
+GAPS = (0.004, 0.04, 0.12, 0.5)
+"""A third of the limbs is within the first two gaps [m] of the pad, a third within the first and the third, and so on."""
 CLEAR = 0.003
 """No limb comes nearer [m] to the board or the link."""
 BEHIND = -0.15
@@ -53,7 +53,7 @@ OVERHANG = 0.05
 """How far [m] beside the limb's ends a pad may be."""
 PIECES = (40, 18)
 """Rows and columns of the limb's pieces."""
-HIDDEN = 80
+HIDDEN = 96
 STEPS, BATCH = 24_000, 512
 HELD_OUT_SEED = 1_000_003
 BANDS = (0.005, 0.015, 0.03, 0.06, 0.12, 0.17, 0.25, 0.5)
@@ -123,7 +123,7 @@ class Poses:
             R = np.column_stack([x, y, np.cross(x, y)])
             along = rng.uniform(self.ends[0] - OVERHANG, self.ends[1] + OVERHANG) * factors[0]
             # slide it away along `toward` until the pad's middle has the wanted gap
-            wanted = gap or float(np.exp(rng.uniform(np.log(GAPS[0]), np.log(GAPS[rng.integers(1, 3)]))))
+            wanted = gap or float(np.exp(rng.uniform(np.log(GAPS[0]), np.log(GAPS[rng.integers(1, 4)]))))
             far = wanted + 0.05
             for _ in range(12):
                 t = toward * far - along * x
