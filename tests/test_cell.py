@@ -34,7 +34,7 @@ def test_the_camera_sees_the_target_s_home_near_the_middle_of_its_image():
 @pytest.mark.parametrize(
     ("old", "new", "place", "reason"),
     [
-        ("noise: 6.2e-6", "noise: -1", "pad_types.five.law.noise", "greater than or equal to 0, got -1"),
+        ("noise: 6.2e-6", "noise: -1", "pad_types.five.rest.noise", "greater than or equal to 0, got -1"),
         ("rate_hz: 20", "rate: 20", "cameras.front.rate", "not permitted, got 20"),
         ("width: 640", "width: wide", "cameras.front.width", "valid integer"),
         ("p0: {type: five", "p0: {type: six", "pads.p0.type", "one of ['five'] expected, got 'six'"),

@@ -223,7 +223,7 @@ def test_a_recording_is_what_the_emulator_publishes_in_order_and_again_the_same(
             np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
 
 
-def test_recorded_voltages_are_the_laws_on_the_true_gaps():
+def test_recorded_voltages_are_the_fields_at_the_true_pose():
     cell = CELLS["table"]
     world, epoch = World(cell, 3), 10**18
     stream = list(record(cell, 3, 8.0, frames=False, epoch_ns=epoch))
@@ -240,8 +240,8 @@ def test_recorded_voltages_are_the_laws_on_the_true_gaps():
         assert m.gap == gaps.min()
         np.testing.assert_allclose(m.position, state.T_world_target[:3, 3])
         np.testing.assert_allclose(geometry.transform(m.position, m.orientation), state.T_world_target, atol=1e-12)
-        noise = np.concatenate(volts[m.stamp_ns]) - world.skin.skin.volts(gaps)
+        noise = np.concatenate(volts[m.stamp_ns]) - world.skin.skin.amplitude(world.change(state))
         assert np.abs(noise).max() < 6 * np.sqrt(6.2e-6)
         signals.append(noise)
-    assert np.var(signals) == pytest.approx(6.2e-6, rel=0.25)  # 1360 samples: 10 % at two sigma, and the ADC's steps
+    assert np.var(signals) == pytest.approx(6.2e-6, rel=0.25)  # 1360 samples: 10 % at two sigma
     assert [b.stamp_ns - a.stamp_ns for a, b in itertools.pairwise(truth)] == [TICK_NS] * (len(truth) - 1)
