@@ -1,16 +1,16 @@
 """One pose per window of voltages, from all pads together.
 
-Each window is estimated from its own samples; what is handed on is its likelihood, so consecutive estimates have
-independent noise. Earlier windows enter only as the point and spread where the solve looks:
+Each window is estimated from its own samples; what is handed on is its likelihood. Earlier windows enter as the point and spread
+where the solve looks, and through what changes slowly (`slow.py`):
 
 1. predict: the last pose drifts back to its home as an Ornstein-Uhlenbeck process, so its spread never exceeds home's
-2. solve from there (`solve.py`); close to the pads from three rolls, because a hand that is turned either way can be felt alike
-3. if that does not explain the voltages, nothing is tracked, or some time has passed, solve from scratch: from the
-   network's pose with three rolls and from the track, with home's spread; this replaces the track where it explains the
-   voltages clearly better
-4. merge what fits about equally well into one Gaussian, and take the prior's share out again
-5. marginalise the roll about the limb's axis: only the hand's flatness shows it, with several solutions that look equally
-   certain, so it is solved for and never published
+2. solve from there (`solve.py`), with the limb's size as it is known by now
+3. if that does not explain the voltages, nothing is tracked, or some time has passed, solve from scratch: from home, from the
+   network's pose, turned about the limb; this replaces the track where it explains the voltages clearly better
+4. learn the size close to the pads, the electrodes' rests while nothing is near
+5. hand on the likelihood: size and roll marginalised, the model's error counted as what it is, nearly the same in several windows
+
+Voltages that no limb explains (a metal part, a block) are reported as out of range.
 """
 
 from __future__ import annotations
@@ -19,31 +19,51 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
-from services.haptics.network import PoseNetwork, features
-from services.haptics.solve import LEVER, MODEL_ERROR, Solution, peak, solve
-from shared.geometry import Array, from_rpy, perturb, pose_error
+from services.haptics.network import PoseNetwork, Relative, features
+from services.haptics.slow import PERSON_S, SIZE_GAP, SIZE_LASTING, Size, Tare
+from services.haptics.solve import LEVER, MODEL_ERROR, Prior, Solution, Solver, Window, marginal, peak
+from shared.geometry import Array, perturb, pose_error
+from shared.response import Response
 from shared.skin import Skin
 from shared.surface import Surface
 
 MEMORY_S = 10.0
 """Time in which a pose is forgotten: with a home known to 12 cm, 5 mm a window, twice what a limb moves."""
 MISFIT = 2.5
-"""Mean squared residual above which the voltages are not explained, and the solve starts afresh."""
-CHECK_EVERY = 10
-"""Windows between solves from scratch beside the track: a limb can be felt alike at two places along it."""
+"""Misfit above which the voltages are not explained, and the solve starts afresh."""
+NO_LIMB = 2.2
+"""Misfit, smoothed over windows, above which what is felt is no limb …"""
+MISFIT_SHARE, WORST = 0.2, 6.0
+"""… with so large a share of the newest window, and one of them counting at most so much."""
+PAD_MISFIT = 4.0
+"""Mean squared residual of a pad, in variances, from which its electrodes lose weight as its square: it is turned, or has another
+pad's calibration …"""
+PAD_SHARE, PAD_WORST = 0.03, 100.0
+"""… smoothed over windows with this share of the newest, and a squared residual counting at most so much."""
+STRANGE = 3.5
+"""No limb has a size so many standard deviations from the mean one: a metal bar feels like a thin arm."""
+FOREIGN = "what is felt is no limb: something else is near"
+AGAIN = 3
+"""Of so many windows that nothing explains, one is solved from scratch: a search takes some milliseconds."""
+GROWN = 8
+"""Windows in which another solution grows beside the track before the two are compared."""
 CONVINCING = 8.0
 """A solve from scratch replaces the track when doubt has summed up to this: the log of how much more probable it is, less one,
 window after window, never below zero (Page's cumulative sum, DOI 10.2307/2333009) …"""
 CLEAR = 4.0
 """… of which one window can give no more than this, lest one burst of noise carries the track away."""
-ROLL_GAP = 0.10
-"""Nearer than this [m] the roll can be felt, and has several solutions."""
+LASTING = 8.0
+"""Windows in which the model's error is about the same. Whoever fuses poses takes their errors for independent, so it is
+published with so many times its variance."""
 ROLL_MEMORY_S = 0.1
-"""The same for the roll about the limb's axis. Short: a wrong roll that was once believed must not be kept for seconds."""
-ROLLS = (-0.45, 0.45)
-"""Rolls about home [rad] from which the solve starts as well, near the pads."""
+"""MEMORY_S of the roll about the limb's axis. Short: a wrong roll that was once believed must not be kept for seconds."""
+SLIDES = (0.0, -0.08, 0.08, -0.16, 0.16)
+"""From scratch the solve starts from home moved so far along the limb [m]: thick and thin parts are felt alike …"""
+CLEARANCE = 0.05
+"""… and with a gap of at least this [m]: from inside a pad nothing leads out."""
+UNSURE = 5.0
+"""Solutions from scratch whose costs differ by less are all possible."""
 FARTHEST = 1.0
 """The gap [m] that stands for everything beyond."""
 REACH = 4.0 / 3.0
@@ -55,12 +75,15 @@ WORTH = 0.03
 @dataclass(frozen=True)
 class Estimate:
     """T_world_target (4, 4) and information (6, 6) of the voltages alone, zero along what they do not show; gap [m]: the
-    smallest from an electrode to the skin, at most FARTHEST; in_range: worth using."""
+    smallest from an electrode to the skin, at most FARTHEST; in_range: worth using; why: the reason where it is not; residuals
+    (n,): what the limb leaves unexplained, in standard deviations."""
 
     T: Array
     information: Array
     gap: float
     in_range: bool
+    why: str
+    residuals: Array
 
 
 class Estimator:
@@ -68,31 +91,46 @@ class Estimator:
     from home); method: `solve`, or `paper` for the network alone. Raises ValueError for `paper` without a network."""
 
     def __init__(
-        self, skin: Skin, surface: Surface, home: Array, spread: Array, network: PoseNetwork | None, method: str = "solve"
+        self,
+        skin: Skin,
+        response: Response,
+        surface: Surface,
+        home: Array,
+        spread: Array,
+        network: PoseNetwork | None = None,
+        method: str = "solve",
     ):
         if method not in ("solve", "paper"):
             raise ValueError(f"method: solve or paper expected, {method!r} came")
         if method == "paper" and network is None:
             raise ValueError("method paper needs the network's weights: run `penumbra haptics train` for this cell, or use solve")
         self.skin, self.surface, self.home, self.network, self.method = skin, surface, home, network, method
+        self.size, self.tare = Size(), Tare(skin.noise)
+        self._response, self._solver = response, Solver(skin, response)
         self._home_covariance = np.diag(np.asarray(spread, dtype=float) ** 2)
+        self._home_information = np.linalg.inv(self._home_covariance)
         self.reset()
 
     def reset(self) -> None:
         """Forget the past."""
-        self._T, self._covariance, self._stamp_ns, self._tracking, self._gap = self.home, self._home_covariance, 0, False, np.inf
-        self._since_check, self._doubt = 0, 0.0
+        self._T, self._covariance, self._stamp_ns, self._tracking = self.home, self._home_covariance, 0, False
+        self._waited, self._away_s, self._misfit = -1, 0.0, 1.0
+        self._pad_misfit = np.ones(len(self.skin.pads))
+        self._other: tuple[Array, Array] | None = None
+        self._doubt, self._turn, self._age, self._idle = 0.0, 0, 0, False
+        self.size.forget()
+        self.tare.forget()
 
-    def nothing(self) -> Estimate:
+    def nothing(self, why: str) -> Estimate:
         """The estimate when nothing can be felt: home, without information."""
-        return Estimate(self.home, np.zeros((6, 6)), FARTHEST, False)
+        return Estimate(self.home, np.zeros((6, 6)), FARTHEST, False, why, np.zeros(len(self.skin)))
 
     def warm_up(self, joints: int) -> None:
         """Compile and touch everything once, so that the first real window takes no longer than the others."""
-        p = len(self.skin.pads)
+        pads = np.tile(np.eye(4), (len(self.skin.pads), 1, 1))
+        amplitude = self.skin.volts(0.1)
         for stamp_ns in (1, 2, 3):
-            pads = np.tile(np.eye(4), (p, 1, 1))
-            self.update(stamp_ns, self.skin.volts(0.1), np.full(len(self.skin), 10), np.ones(p, bool), pads, np.zeros(joints))
+            self.update(stamp_ns, amplitude, np.full(len(self.skin), 10), pads, np.zeros(joints))
         self.reset()
 
     @property
@@ -101,144 +139,222 @@ class Estimator:
         return self._T
 
     def update(
-        self,
-        stamp_ns: int,
-        amplitude: Array,
-        samples: NDArray[np.integer],
-        alive: NDArray[np.bool_],
-        T_world_pads: Array,
-        joints: ArrayLike = (),
+        self, stamp_ns: int, amplitude: Array, samples: NDArray[np.integer], T_world_pads: Array, joints: ArrayLike = ()
     ) -> Estimate:
-        """The estimate at stamp_ns of mean voltages (n,) over so many samples (n,), pads alive (p,) at T_world_pads (p, 4, 4)."""
-        skin = self.skin
-        felt = alive[skin.pad_of] & (samples > 0)
-        if not felt.any():
-            return self.nothing()
-        variance = np.where(felt, skin.noise / np.maximum(samples, 1), np.inf)
-        electrodes = skin.positions(T_world_pads)
-        if self.method == "paper":
-            assert self.network is not None
-            T, information = self.network.likelihood(self._features(amplitude, variance, alive, T_world_pads, joints))
-            gap = float(self.surface.nearest((electrodes - T[:3, 3]) @ T[:3, :3])[0][felt].min())
-            return self._estimate(T, information, max(gap, 0.0))
+        """The estimate at stamp_ns of mean voltages (n,) over so many samples (n,), none for electrodes to leave out, with the
+        pads at T_world_pads (p, 4, 4)."""
+        samples = np.asarray(samples)
+        if not (samples > 0).any():
+            return self.nothing("no electrode can be believed")
+        elapsed_s = self._predict(stamp_ns)
+        own = self.skin.gain * self.skin.sensitivity * self._response.rest(joints)  # what the robot's other links change
+        signal = np.where(samples > 0, self.skin.signal(amplitude) - own - self.tare.offset, 0.0)
+        variance = np.where(samples > 0, self.skin.noise / np.maximum(samples, 1), np.inf)
+        distrust = np.maximum(1.0, self._pad_misfit / PAD_MISFIT) ** 2
+        window = Window(signal, variance, T_world_pads, distrust[self.skin.pad_of])
+        estimate = self._by_network(window, joints) if self.method == "paper" else self._by_solve(window, joints)
+        self.tare.update(signal, samples, elapsed_s, estimate.in_range)
+        self._away_s = 0.0 if estimate.in_range else self._away_s + elapsed_s
+        if self._away_s > PERSON_S:
+            self.size.forget()
+        return estimate
 
-        self._predict(stamp_ns)
-        tracked: list[Solution] = []
-        if self._tracking:
-            tracked = self._solutions(electrodes, amplitude, variance, self._starts(), coarse=0, fine=2)
-        found, self._since_check = tracked, self._since_check + 1
-        if not tracked or tracked[0].misfit > MISFIT or self._since_check >= CHECK_EVERY:
-            self._since_check = 0
-            kept = self._T, self._covariance
-            self._T, self._covariance = self.home, self._home_covariance
-            start = self.home
-            if self.network is not None:
-                start = self.network.posterior(self._features(amplitude, variance, alive, T_world_pads, joints))
-            starts = [start, *(_turned(start, roll - self._roll(start)) for roll in ROLLS)]
-            found = self._solutions(electrodes, amplitude, variance, starts, coarse=3, fine=3)
-            # The track is judged with the same freedom: from its pose, but with home's spread.
-            (same,) = self._solutions(electrodes, amplitude, variance, [kept[0]], coarse=0 if tracked else 3, fine=3)
-            advantage = CLEAR if same.misfit > MISFIT else same.cost - found[0].cost
-            self._doubt = max(0.0, self._doubt + min(advantage, CLEAR) - 1.0)
-            if tracked and self._doubt < CONVINCING:
-                found, (self._T, self._covariance) = tracked, kept
-                self._since_check = CHECK_EVERY if self._doubt else 0  # a doubt is settled by the next windows
-            else:
-                found, self._doubt = sorted([*found, same], key=lambda solution: solution.cost), 0.0
-        T, information, gradient = self._merge(found)
-        information, gradient = without_roll(T, information, gradient)
-        # Voltages that the model explains badly say less than their noise promises.
-        trust = 1.0 / max(1.0, found[0].misfit)
-        best, known = peak(T, trust * information, trust * gradient)
-        return self._estimate(best, known, found[0].gap)
-
-    def _features(self, amplitude: Array, variance: Array, alive: NDArray[np.bool_], pads: Array, joints: ArrayLike) -> NDArray:
+    def _by_network(self, window: Window, joints: ArrayLike) -> Estimate:
         assert self.network is not None
-        total = variance + (MODEL_ERROR * np.maximum(self.skin.signal(amplitude), 0.0)) ** 2
-        return features(self.skin, self.network.home, amplitude, total, alive, pads, joints)
+        x = self._features(window, joints)
+        self._T = self.network.posterior(x)
+        relative = Relative.of(self.skin, self.surface, window.T_world_pads, np.isfinite(window.variance), self._T)
+        T, information = self.network.likelihood(x, relative)
+        return self._estimate(T, information, self._gap(window, T, self.size.mean), "", np.zeros(len(self.skin)))
 
-    def _predict(self, stamp_ns: int) -> None:
+    def _by_solve(self, window: Window, joints: ArrayLike) -> Estimate:
+        solution, mean, scatter = self._tracked(window, joints)
+        T, size = solution.T, solution.size
+        gap = self._gap(window, T, size)
+        information, gradient = self._solver.likelihood(window, solution)
+        total = _size_known(information, gradient, size, self.size, 1.0)[0] + np.linalg.inv(self._covariance)
+        self._T, self._covariance = perturb(T, mean), np.linalg.inv(total) + scatter
+        self._tracking = solution.misfit <= MISFIT
+        squares = np.minimum(solution.residuals**2, PAD_WORST)
+        used = np.maximum(np.add.reduceat(np.isfinite(window.variance).astype(float), self.skin.first[:-1]), 1.0)
+        self._pad_misfit += PAD_SHARE * (np.add.reduceat(squares, self.skin.first[:-1]) / used - self._pad_misfit)
+        if gap < SIZE_GAP and self._tracking:
+            self.size.learn(size, *self._solver.likelihood(window, solution, SIZE_LASTING), self._home_information)
+        self._misfit += MISFIT_SHARE * (min(solution.misfit, WORST) - self._misfit)
+        if self._misfit > NO_LIMB or self.size.strangeness > STRANGE:
+            return self._estimate(T, np.zeros((6, 6)), gap, FOREIGN, solution.residuals)
+        information, gradient = _size_known(*self._solver.likelihood(window, solution, LASTING), size, self.size, LASTING)
+        information, gradient = self._without_roll(T, information, gradient)
+        if scatter.any():
+            keep = np.linalg.inv(np.eye(6) + information @ scatter)
+            information, gradient = keep @ information, keep @ gradient
+        trust = 1.0 / max(1.0, solution.misfit)  # voltages that are explained badly say less than their noise promises
+        best, known = peak(T, trust * information, trust * gradient)
+        turn = np.eye(6)
+        turn[3:, 3:] = best[:3, :3] @ T[:3, :3].T  # what is unknown about T's axis is so about the published one
+        known = turn @ known @ turn.T
+        return self._estimate(best, 0.5 * (known + known.T), gap, "", solution.residuals)
+
+    def _tracked(self, window: Window, joints: ArrayLike) -> tuple[Solution, Array, Array]:
+        """The solution near the track, or one from scratch that is clearly better; where several are possible, also their mean
+        (6,) as a pose error from it, and their scatter (6, 6)."""
+        certain = np.zeros(6), np.zeros((6, 6))
+        if not self._tracking:
+            self._waited += 1
+            if self._waited % AGAIN:
+                return self._solve(window, self._prior(self._T, self._covariance), self._T), *certain
+            return self._from_scratch(window, joints)
+        tracked = self._solve(window, self._prior(self._T, self._covariance), self._T, coarse=0)
+        if tracked.misfit > MISFIT:
+            self._waited = 0
+            return self._from_scratch(window, joints)
+        self._idle = not self._idle
+        if self._idle:
+            return tracked, *certain
+        # Beside the track another solution grows from scratch, a step or two in every second window.
+        home = self._prior(self.home, self._home_covariance)
+        if self._other is None:
+            self._turn += 1
+            start = self._start(self._turn % (len(SLIDES) + 1), window, joints)
+            self._other, self._age = (start, self.size.mean), 0
+        self._age += 1
+        grown = self._age > GROWN
+        other = self._solver.solve(window, home, *self._other, *((0, 2) if grown else (1, 0)))
+        self._other = other.T, other.size
+        if not grown:
+            return tracked, *certain
+        # The track is judged with the same freedom: from its pose, but with home's spread.
+        same = self._solver.solve(window, home, tracked.T, tracked.size, 0, 2)
+        self._doubt = max(0.0, self._doubt + min(same.cost - other.cost, CLEAR) - 1.0)
+        if self._doubt == 0.0:
+            self._other = None
+        if self._doubt < CONVINCING:
+            return tracked, *certain
+        return self._from_scratch(window, joints, [other.T])
+
+    def _from_scratch(
+        self, window: Window, joints: ArrayLike, starts: list[Array] | None = None
+    ) -> tuple[Solution, Array, Array]:
+        """The best solution from these starts, or from everywhere, and from the track."""
+        home = self._prior(self.home, self._home_covariance)
+        starts = starts or [self._start(which, window, joints) for which in range(len(SLIDES) + 1)]
+        found = [self._solve(window, home, start) for start in [self._T, *starts]]
+        found.sort(key=lambda solution: solution.cost)
+        self._doubt, self._other, self._covariance = 0.0, None, self._home_covariance
+        return found[0], *self._possible(window, found)
+
+    def _possible(self, window: Window, found: list[Solution]) -> tuple[Array, Array]:
+        """Mean (6,), as a pose error from the best one, and scatter (6, 6) of the solutions (best first) that are possible."""
+        best = found[0]
+        offsets: list[Array] = []
+        covariances: list[Array] = []
+        logs: list[float] = []
+        for other in found:
+            if other.cost - best.cost > UNSURE:
+                break
+            information, gradient = self._solver.likelihood(window, other)
+            information, _ = _size_known(information, gradient, other.size, self.size, 1.0)
+            covariance = np.asarray(np.linalg.inv(information + self._home_information), np.float64)
+            offset = pose_error(other.T, best.T)
+            apart = [(offset - o) @ np.linalg.solve(P, offset - o) for o, P in zip(offsets, covariances, strict=True)]
+            if apart and min(apart) < 1.0:
+                continue  # the same one
+            offsets.append(offset)
+            covariances.append(covariance)
+            logs.append(best.cost - other.cost + 0.5 * float(np.linalg.slogdet(covariance)[1]))
+        share = np.exp(np.array(logs) - max(logs))
+        share /= share.sum()
+        mean = share @ np.array(offsets)
+        away = np.array(offsets) - mean
+        return mean, np.einsum("m,mi,mj->ij", share, away, away)
+
+    def _start(self, which: int, window: Window, joints: ArrayLike) -> Array:
+        """Where a solve from scratch begins: home with one of its slides, no nearer to the pads than CLEARANCE, or the network's
+        pose."""
+        if which == len(SLIDES):
+            return self.home if self.network is None else self.network.posterior(self._features(window, joints))
+        T = self.home.copy()
+        T[:3, 3] += SLIDES[which] * T[:3, 0]
+        normal = window.T_world_pads[:, :3, 2].mean(axis=0)
+        normal /= np.linalg.norm(normal) + 1e-9
+        for _ in range(3):
+            short = CLEARANCE - self._gap(window, T, self.size.mean)
+            if short < 0.005:
+                break
+            T[:3, 3] += short * normal
+        return T
+
+    def _solve(self, window: Window, prior: Prior, start: Array, coarse: int = 12) -> Solution:
+        return self._solver.solve(window, prior, start, self.size.mean, coarse=coarse)
+
+    def _prior(self, T: Array, covariance: Array) -> Prior:
+        return Prior(T, np.asarray(np.linalg.inv(covariance), np.float64), self.size.mean, self.size.information)
+
+    def _features(self, window: Window, joints: ArrayLike) -> NDArray:
+        assert self.network is not None
+        variance = window.variance + (MODEL_ERROR * np.maximum(window.signal, 0.0)) ** 2
+        return features(self.skin, self.network.home, window.signal, variance, window.T_world_pads, joints)
+
+    def _predict(self, stamp_ns: int) -> float:
+        """Takes the track to a window's stamp; returns the seconds since the last one."""
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
         if not 0.0 <= elapsed_s < MEMORY_S:
             self.reset()
+            elapsed_s = 0.0
         self._stamp_ns = stamp_ns
-        keep = np.exp(-elapsed_s / MEMORY_S) if 0.0 <= elapsed_s < MEMORY_S else 0.0
+        self.size.predict(elapsed_s)
+        keep = np.exp(-elapsed_s / MEMORY_S)
         self._T = perturb(self.home, keep * pose_error(self._T, self.home))
         self._covariance = keep**2 * self._covariance + (1.0 - keep**2) * self._home_covariance
-        forgotten = 1.0 - np.exp(-elapsed_s / ROLL_MEMORY_S) if keep else 1.0
+        forgotten = 1.0 - np.exp(-elapsed_s / ROLL_MEMORY_S)
         self._T = _turned(self._T, -forgotten * self._roll(self._T))
-        axis = np.concatenate([np.zeros(3), self._T[:3, 0]])
+        axis = _roll_axis(self._T)
         spread = float(axis @ self._home_covariance @ axis) - float(axis @ self._covariance @ axis)
         self._covariance += max(0.0, (1.0 - (1.0 - forgotten) ** 2) * spread) * np.outer(axis, axis)
+        return elapsed_s
 
     def _roll(self, T: Array) -> float:
         """The turn about the limb's axis [rad] from home: the twist of the rotation between them."""
-        x, _, _, w = Rotation.from_matrix(self.home[:3, :3].T @ T[:3, :3]).as_quat(canonical=True)
-        return float(2.0 * np.arctan2(x, w))
+        R = self.home[:3, :3].T @ T[:3, :3]
+        return float(2.0 * np.arctan2(R[2, 1] - R[1, 2], 1.0 + np.trace(R)))
 
-    def _starts(self) -> list[Array]:
-        turns = [roll - self._roll(self._T) for roll in ROLLS] if self._gap < ROLL_GAP else []
-        return [self._T, *(_turned(self._T, turn) for turn in turns)]
+    def _without_roll(self, T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
+        """Information (6, 6) and gradient (6,) after the roll about the limb's axis, known as well as at home, was marginalised:
+        only the flatness of wrist and hand shows it, with several solutions that look equally certain."""
+        axis = _roll_axis(T)
+        known = float(axis @ self._home_information @ axis)
+        gradient = gradient + axis * (known * float(axis @ pose_error(self.home, T)))
+        return marginal(information + known * np.outer(axis, axis), gradient, axis[:, None])
 
-    def _solutions(
-        self, electrodes: Array, amplitude: Array, variance: Array, starts: list[Array], coarse: int, fine: int
-    ) -> list[Solution]:
-        prior = np.linalg.inv(self._covariance)
-        found = [
-            solve(self.skin, self.surface, electrodes, amplitude, variance, start, self._T, prior, coarse, fine)
-            for start in starts
-        ]
-        return sorted(found, key=lambda solution: solution.cost)
+    def _gap(self, window: Window, T: Array, size: Array) -> float:
+        """Smallest gap [m] from an electrode in use to the skin of a limb at T of this size; negative inside."""
+        scale = np.exp(size[[0, 1, 1]])
+        local = (self.skin.positions(window.T_world_pads)[np.isfinite(window.variance)] - T[:3, 3]) @ T[:3, :3] / scale
+        distance, _, gradient = self.surface.nearest(local)
+        return float((distance / np.linalg.norm(gradient / scale, axis=1)).min())
 
-    def _merge(self, found: list[Solution]) -> tuple[Array, Array, Array]:
-        """One Gaussian of the solutions (best first) by their moments; sets the track to it and returns its pose, and the
-        likelihood's information and gradient there."""
-        prior = np.linalg.inv(self._covariance)
-        best = found[0]
-        offsets, covariances, logs = [np.zeros(6)], [np.linalg.inv(best.information + prior)], [0.0]
-        for other in found[1:]:
-            offset = pose_error(other.T, best.T)
-            apart = min((offset - o) @ np.linalg.solve(P, offset - o) for o, P in zip(offsets, covariances, strict=True))
-            if other.cost - best.cost < 5.0 and apart > 1.0:
-                offsets.append(offset)
-                covariances.append(np.linalg.inv(other.information + prior))
-                logs.append(best.cost - other.cost + 0.5 * (_log_det(covariances[-1]) - _log_det(covariances[0])))
-        T_prior = self._T
-        if len(offsets) == 1:
-            T, covariance, information, gradient = best.T, covariances[0], best.information, best.gradient
-        else:
-            share = np.exp(np.array(logs) - max(logs))
-            share /= share.sum()
-            mean = share @ np.array(offsets)
-            away = np.array(offsets) - mean
-            covariance = np.einsum("m,mij->ij", share, np.array(covariances)) + np.einsum("m,mi,mj->ij", share, away, away)
-            T = perturb(best.T, mean)
-            information = np.linalg.inv(covariance) - prior
-            gradient = prior @ pose_error(T, T_prior)
-        self._T, self._covariance, self._gap = T, covariance, best.gap
-        self._tracking = best.misfit <= MISFIT
-        return T, information, gradient
-
-    def _estimate(self, T: Array, information: Array, gap: float) -> Estimate:
+    def _estimate(self, T: Array, information: Array, gap: float, why: str, residuals: Array) -> Estimate:
         scale = np.array([1.0, 1.0, 1.0, 1.0 / LEVER, 1.0 / LEVER, 1.0 / LEVER])
         strongest = float(np.linalg.eigvalsh(information * np.outer(scale, scale))[-1])
-        in_range = gap < REACH * float(self.skin.range.max()) and strongest > 1.0 / WORTH**2
-        return Estimate(T, information if in_range else np.zeros((6, 6)), min(gap, FARTHEST), in_range)
+        if not why and (gap >= REACH * float(self.skin.range.max()) or strongest <= 1.0 / WORTH**2):
+            why = "nothing near"
+        return Estimate(T, np.zeros((6, 6)) if why else information, min(max(gap, 0.0), FARTHEST), not why, why, residuals)
 
 
-def without_roll(T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
-    """Information (6, 6) and gradient (6,) of a likelihood at T after its roll about the limb's axis was marginalised."""
-    roll = np.concatenate([np.zeros(3), T[:3, 0]])
-    along = information @ roll
-    strength = float(roll @ along)
-    if strength < 1e-6:
-        return information, gradient
-    return information - np.outer(along, along) / strength, gradient - along * float(roll @ gradient) / strength
+def _size_known(information: Array, gradient: Array, size: Array, known: Size, lasting: float) -> tuple[Array, Array]:
+    """Information (6, 6) and gradient (6,) of the pose after the size was marginalised that is known so well. Its error lasts as
+    well: lasting is the factor on its covariance."""
+    information, gradient = information.copy(), gradient.copy()
+    information[6:, 6:] += known.information / lasting
+    gradient[6:] += known.information @ (known.mean - size) / lasting
+    information, gradient = marginal(information, gradient, np.eye(8)[:, 6:])
+    return information[:6, :6], gradient[:6]
 
 
 def _turned(T: Array, roll: float) -> Array:
-    return T @ from_rpy((0.0, 0.0, 0.0), (roll, 0.0, 0.0))
+    return perturb(T, roll * _roll_axis(T))
 
 
-def _log_det(covariance: NDArray[np.floating]) -> float:
-    return float(np.linalg.slogdet(covariance)[1])
+def _roll_axis(T: Array) -> Array:
+    """The pose error (6,) of a turn by one radian about the limb's axis."""
+    return np.concatenate([np.zeros(3), T[:3, 0]])

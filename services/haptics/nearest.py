@@ -30,15 +30,16 @@ EXPECTED_TILT = 0.4
 ITERATIONS = 6
 
 
-def nearest_points(skin: Skin, amplitude: Array, variance: Array, alive: NDArray[np.bool_]) -> tuple[Array, Array]:
+def nearest_points(skin: Skin, signal: Array, variance: Array) -> tuple[Array, Array]:
     """The nearest surface point per pad, in the pad's frame.
 
-    amplitude, variance: mean voltage [V] and its variance [V^2] per electrode (..., n); alive (..., p): pads to use.
-    Returns points (..., p, 3) [m] and their covariances (..., p, 3, 3) [m^2]; a pad that is not alive has the expectation.
+    signal, variance: mean voltage less its rest [V] and its variance [V^2] per electrode (..., n), infinite for electrodes to
+    leave out. Returns points (..., p, 3) [m] and their covariances (..., p, 3, 3) [m^2]; a pad without electrodes has the
+    expectation.
     """
-    shape, pads = np.shape(amplitude)[:-1], len(skin.pads)
-    signal = np.ascontiguousarray(skin.signal(amplitude), dtype=np.float64).reshape(-1, len(skin))
-    precision = np.where(np.asarray(alive)[..., skin.pad_of], 1.0 / np.asarray(variance), 0.0).reshape(-1, len(skin))
+    shape, pads = np.shape(signal)[:-1], len(skin.pads)
+    signal = np.ascontiguousarray(signal, dtype=np.float64).reshape(-1, len(skin))
+    precision = 1.0 / np.broadcast_to(np.asarray(variance, dtype=np.float64), signal.shape)
     points, covariances = np.empty((len(signal), pads, 3)), np.empty((len(signal), pads, 3, 3))
     _fit(signal, np.ascontiguousarray(precision), skin.first, skin.centroids, skin.peak, skin.a2, points, covariances)
     return points.reshape(*shape, pads, 3), covariances.reshape(*shape, pads, 3, 3)

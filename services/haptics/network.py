@@ -1,10 +1,10 @@
 """The paper's network (section "Haptic-based Pose Estimation"): joint angles and the pads' measures in, four fully connected
 layers of 256 ReLU units, the target's pose out. Inference on numpy alone.
 
-Where the paper's network gives a pose, this one gives a Gaussian: mean and Cholesky factor of the precision, trained by its
-likelihood, so that it can say which directions the skin does not show. It answers for the poses it was trained on, a known
-broad Gaussian over the cell. What is published is the evidence of the voltages alone: that prior's information
-is subtracted again, and directions where nothing remains are unknown.
+How far the pose is off is a function of the pose itself, as in the paper: R_c = f_c(x, theta), found by Gaussian-process
+regression over the limb's pose relative to the nearest pad. The network answers for the poses it was trained on, a known broad
+Gaussian over the cell. What is published is the evidence of the voltages alone: that prior's information is subtracted again,
+and directions where nothing remains are unknown.
 """
 
 from __future__ import annotations
@@ -20,66 +20,113 @@ from numpy.typing import ArrayLike, NDArray
 from services.haptics.nearest import nearest_points
 from services.haptics.solve import peak
 from shared import cell as cells
+from shared import response
 from shared.geometry import Array, perturb
 from shared.skin import Skin
-
-OUTPUTS = 6 + 21
-_ROWS, _COLUMNS = np.tril_indices(6)
-_DIAGONAL = _ROWS == _COLUMNS
-LOG_LIMIT = 8.0
-"""Largest log of a precision factor in units of the prior: 3000 times better than beforehand."""
+from shared.surface import Surface
 
 
 def features(
-    skin: Skin, home: Array, amplitude: Array, variance: Array, alive: NDArray[np.bool_], T_world_pads: Array, joints: ArrayLike
+    skin: Skin, home: Array, signal: Array, variance: Array, T_world_pads: Array, joints: ArrayLike
 ) -> NDArray[np.float32]:
     """The network's input (..., f): per pad the nearest surface point, placed in the world by the robot's kinematics and
-    relative to the middle of the training's poses [dm], and whether it is alive; per electrode the compressed
+    relative to the middle of the training's poses [dm], and whether it feels anything at all; per electrode the compressed
     signal-to-noise ratio; sine and cosine per joint.
 
-    amplitude, variance (..., n); alive (..., p); T_world_pads (..., p, 4, 4); joints (..., j) [rad].
+    signal, variance (..., n), infinite variance for electrodes to leave out; T_world_pads (..., p, 4, 4); joints (..., j) [rad].
     """
-    points, _ = nearest_points(skin, amplitude, variance, alive)
+    points, _ = nearest_points(skin, signal, variance)
     placed = np.einsum("...pij,...pj->...pi", T_world_pads[..., :3, :3], points) + T_world_pads[..., :3, 3] - home[:3, 3]
-    ratio = np.where(alive[..., skin.pad_of], skin.signal(amplitude) / np.sqrt(variance), 0.0)
+    alive = np.maximum.reduceat(np.isfinite(variance), skin.first[:-1], axis=-1)
     joints = np.asarray(joints, dtype=float)
-    shape = amplitude.shape[:-1]
-    parts = [10.0 * placed.reshape(*shape, -1), alive, np.arcsinh(ratio) / 2.0, np.sin(joints), np.cos(joints)]
-    return np.concatenate([np.asarray(part, dtype=np.float32).reshape(*shape, -1) for part in parts], axis=-1)
+    ratio = np.arcsinh(signal / np.sqrt(variance)) / 2.0
+    parts = [10.0 * placed.reshape(*signal.shape[:-1], -1), alive, ratio, np.sin(joints), np.cos(joints)]
+    return np.concatenate([np.asarray(part, dtype=np.float32).reshape(*signal.shape[:-1], -1) for part in parts], axis=-1)
+
+
+@dataclass(frozen=True)
+class Relative:
+    """Where a limb is, seen from the nearest pad. pose (4,): log gap [m], place along the limb [m], how far beside the electrode
+    the limb is (zero straight above it, one sideways), and the slope of its axis against the pad; frame (3, 3): unit vectors
+    along the limb, across it, and away from the pad, one a row, in the world."""
+
+    pose: Array
+    frame: Array
+
+    @staticmethod
+    def of(skin: Skin, surface: Surface, T_world_pads: Array, used: NDArray[np.bool_], T: Array) -> Relative:
+        """For electrodes in use (n,) and a target at T (4, 4)."""
+        electrodes = skin.positions(T_world_pads)[used]
+        distance, nearest, gradient = surface.nearest((electrodes - T[:3, 3]) @ T[:3, :3])
+        k = int(np.argmin(distance))
+        normal = T_world_pads[skin.pad_of[used][k], :3, 2]
+        axial = T[:3, 0]
+        away = -(T[:3, :3] @ gradient[k])
+        away -= (away @ axial) * axial
+        away /= np.linalg.norm(away) + 1e-12
+        pose = np.array(
+            [np.log(max(distance[k], 0.003)), nearest[k, 0], 1.0 - abs(float(away @ normal)), abs(float(axial @ normal))]
+        )
+        return Relative(pose, np.stack([axial, np.cross(away, axial), away]))
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A Gaussian process for each part of R_c: logs of the variances along, across, away [m^2], and about across and away
+    [rad^2]. points (k, 4): the training's relative poses; lengths (5, 4) and amplitudes (5,) of the kernels; weights (k, 5);
+    means (5,)."""
+
+    points: Array
+    lengths: Array
+    amplitudes: Array
+    weights: Array
+    means: Array
+
+    def variances(self, pose: Array) -> Array:
+        """Variances (5,) at a relative pose (4,)."""
+        apart = (self.points[:, None] - pose) / self.lengths
+        kernels = self.amplitudes * np.exp(-0.5 * np.sum(apart**2, axis=-1))
+        return np.exp(self.means + np.sum(kernels * self.weights, axis=0))
 
 
 @dataclass(frozen=True)
 class PoseNetwork:
-    """Weights and biases of five layers (four hidden), and the prior that it was trained with: home (4, 4), spread
-    (6,) of the pose error about it."""
+    """Weights and biases of five layers (four hidden), the prior that it was trained with: home (4, 4), spread (6,) of the pose
+    error about it; and R_c."""
 
     weights: tuple[NDArray[np.float32], ...]
     biases: tuple[NDArray[np.float32], ...]
     home: Array
     spread: Array
+    regression: Regression
 
-    def gaussian(self, x: NDArray[np.float32]) -> tuple[Array, Array]:
-        """Mean (6,) and precision (6, 6) of the pose error about home, in units of `spread`, for one input (f,)."""
+    def mean(self, x: NDArray[np.float32]) -> Array:
+        """Mean (6,) of the pose error about home, in units of `spread`, for one input (f,)."""
         for W, b in zip(self.weights[:-1], self.biases[:-1], strict=True):
             x = np.maximum(x @ W + b, 0.0)
-        out = np.asarray(x @ self.weights[-1] + self.biases[-1], dtype=np.float64)
-        L = np.zeros((6, 6))
-        L[_ROWS, _COLUMNS] = np.where(_DIAGONAL, np.exp(np.minimum(out[6:], LOG_LIMIT)), out[6:])
-        return out[:6], L @ L.T
+        return np.asarray(x @ self.weights[-1] + self.biases[-1], dtype=np.float64)
 
     def posterior(self, x: NDArray[np.float32]) -> Array:
         """T_world_target that the network thinks most probable, prior included: where a solve may start."""
-        return perturb(self.home, self.spread * self.gaussian(x)[0])
+        return perturb(self.home, self.spread * self.mean(x))
 
-    def likelihood(self, x: NDArray[np.float32]) -> tuple[Array, Array]:
-        """T_world_target where the evidence alone peaks, and its information (6, 6) about `geometry.perturb`: the network's
-        precision less the prior's (which is one in its units), clipped to be positive."""
-        mean, precision = self.gaussian(x)
+    def covariance(self, relative: Relative) -> Array:
+        """R_c (6, 6) of the pose error of that, about `geometry.perturb`: the roll as the prior has it."""
+        frame = np.zeros((6, 6))
+        frame[:3, :3] = frame[3:, 3:] = relative.frame
+        along, across, away, pitch, yaw = self.regression.variances(relative.pose)
+        roll = float(np.mean(self.spread[3:] ** 2))
+        return np.asarray(frame.T @ np.diag([along, across, away, roll, pitch, yaw]) @ frame)
+
+    def likelihood(self, x: NDArray[np.float32], relative: Relative) -> tuple[Array, Array]:
+        """T_world_target where the evidence alone peaks, and its information (6, 6) about `geometry.perturb`: R_c's inverse less
+        the prior's, clipped to be positive."""
+        mean = self.mean(x)
         # d(pose error at the mean) / d(pose error about home): the left Jacobian of the rotation
         A = np.eye(6)
         A[3:, 3:] = _left_jacobian(self.spread[3:] * mean[3:])
         to_units = np.linalg.inv(A) / self.spread[:, None]
-        information = to_units.T @ (precision - np.eye(6)) @ to_units
+        information = np.linalg.inv(self.covariance(relative)) - to_units.T @ to_units
         return peak(perturb(self.home, self.spread * mean), information, to_units.T @ mean)
 
 
@@ -95,13 +142,13 @@ def _left_jacobian(rotation: Array) -> Array:
 
 
 def fingerprint(cell: cells.Cell, target: str) -> str:
-    """What a network was trained for: pads, robots and body. Another cell needs another training."""
+    """What a network was trained for: what the pads respond with, where they are, robots and body. Another cell needs another
+    training; a calibration does not."""
     parts = {
-        "pads": {name: pad.model_dump() for name, pad in cell.pads.items()},
-        "types": {name: kind.model_dump() for name, kind in cell.pad_types.items()},
+        "pads": {
+            name: [response.fingerprint(cell, name, target), pad.link, pad.position, pad.rpy] for name, pad in cell.pads.items()
+        },
         "robots": {name: robot.model_dump() for name, robot in cell.robots.items()},
-        "mesh": cell.targets[target].mesh,
-        "body": cell.body.model_dump(),
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -119,4 +166,6 @@ def load(path: Path, cell: cells.Cell, target: str) -> PoseNetwork:
         count = sum(name.startswith("weight") for name in data.files)
         weights = tuple(data[f"weight{i}"].astype(np.float32) for i in range(count))
         biases = tuple(data[f"bias{i}"].astype(np.float32) for i in range(count))
-        return PoseNetwork(weights, biases, data["home"], data["spread"])
+        names = ("points", "lengths", "amplitudes", "kernel_weights", "means")
+        regression = Regression(*(data[name].astype(np.float64) for name in names))
+        return PoseNetwork(weights, biases, data["home"], data["spread"], regression)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from services.haptics import network
-from services.haptics.estimator import Estimate, Estimator
+from services.haptics.estimator import FOREIGN, Estimate, Estimator
 from services.haptics.kinematics import PadPoses
 from services.haptics.window import Backlog, Collector, Window
 from shared.body import target_mesh
 from shared.geometry import position_orientation
 from shared.messages import HapticPose, Joints, Voltages
+from shared.response import Response
 from shared.robot import robot_models
 from shared.service import Node
 from shared.skin import Skin
@@ -22,6 +24,10 @@ from shared.topics import HAPTIC, JOINTS, VOLTAGES
 
 NAME = "haptics"
 WEIGHTS = Path(__file__).parent / "weights"
+SHARE = 0.01
+"""Of one window in a pad's mean misfit: two seconds are remembered."""
+WORST = 10.0
+"""A larger residual, in standard deviations, counts as this one."""
 LASTING_NS = 1_000_000_000
 """A fault, or its end, is told when it has lasted this long."""
 
@@ -38,9 +44,10 @@ def start(node: Node, options: argparse.Namespace) -> None:
     skin = Skin(cell)
     poses = PadPoses(cell, skin, robot_models(cell))
     collector = Collector(skin, length_ns=int(options.window_ms * 1e6))
-    estimators = {name: _estimator(node, options, skin, name) for name in cell.targets}
+    estimators = {name: estimator(node, options, skin, name) for name in cell.targets}
     backlog = Backlog()
     told = Faults(node)
+    misfits = Misfits(node, skin)
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
         poses.add(names["robot"], message.stamp_ns, message.position)
@@ -55,21 +62,24 @@ def start(node: Node, options: argparse.Namespace) -> None:
         faults = dict(window.faults)
         if found is None:
             faults["joints"] = "no joint angles near the time of the voltages: is the robot's source running?"
-        told.update(faults, window.stamp_ns)
-        for target, estimator in estimators.items():
+        for target, which in estimators.items():
             if not node.owns(f"haptic/{target}"):
                 continue
             if found is None:
-                estimate = estimator.nothing()
+                estimate = which.nothing(faults["joints"])
             else:
-                estimate = estimator.update(window.stamp_ns, window.amplitude, window.samples, window.alive, *found)
+                estimate = which.update(window.stamp_ns, window.amplitude, window.samples, *found)
+            if estimate.why == FOREIGN:
+                faults[target] = FOREIGN
+            misfits.update(estimate, window)
             node.publish(HAPTIC, _message(estimate, window, target, cell.frame), target=target)
+        told.update(faults, window.stamp_ns)
 
     node.subscribe(JOINTS, on_joints)
     node.subscribe(VOLTAGES, on_voltages)
 
 
-def _estimator(node: Node, options: argparse.Namespace, skin: Skin, target: str) -> Estimator:
+def estimator(node: Node, options: argparse.Namespace, skin: Skin, target: str) -> Estimator:
     """Ready to run: weights loaded where they fit the cell, code compiled."""
     cell = node.cell
     path = options.weights / f"{cell.name}-{target}.npz"
@@ -80,16 +90,43 @@ def _estimator(node: Node, options: argparse.Namespace, skin: Skin, target: str)
         node.log.warning("no network: the solve starts from the target's home instead", target=target, why=str(error))
     mesh = target_mesh(cell.targets[target], cell)
     spread = cell.targets[target].home_spread
-    estimator = Estimator(
+    made = Estimator(
         skin,
+        Response(cell, target),
         Surface(mesh.vertices, mesh.faces),
         cell.targets[target].home.transform,
         np.repeat([spread.position, spread.rotation], 3),
         weights,
         options.method,
     )
-    estimator.warm_up(sum(len(robot.joints) for robot in cell.robots.values()))
-    return estimator
+    made.warm_up(sum(len(robot.joints) for robot in cell.robots.values()))
+    return made
+
+
+class Misfits:
+    """Per pad, what the limb leaves unexplained, in the health's report as misfit/PAD: mean squared residual in variances, of
+    windows in which a limb is in range. A pad that is turned, or has another pad's calibration, stands out."""
+
+    def __init__(self, node: Node, skin: Skin):
+        self._node, self._skin = node, skin
+        self._means: dict[str, float] = {}
+
+    def update(self, estimate: Estimate, window: Window) -> None:
+        """Takes the residuals of a window."""
+        if not estimate.in_range:
+            return
+        squares = np.minimum(estimate.residuals**2, WORST**2)
+        for k, pad in enumerate(self._skin.pads):
+            own = self._skin.of(k)
+            used = window.samples[own] > 0
+            if used.any():
+                now = float(squares[own][used].mean())
+                before = self._means.get(pad, now)
+                self._means[pad] = before + SHARE * (now - before)
+                self._node.report[f"misfit/{pad}"] = partial(self._told, pad)
+
+    def _told(self, pad: str) -> float:
+        return round(self._means[pad], 2)
 
 
 class Faults:

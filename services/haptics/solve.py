@@ -1,16 +1,16 @@
-"""Least squares of the pose on the voltages themselves, through the response law and the target's surface.
+"""Least squares of limb pose and size on the voltages of all electrodes, through the field model's derivatives.
 
-Each electrode's gap is its distance to the target's mesh; its derivative by the pose is the unit direction from the nearest
-surface point, so a Gauss-Newton step costs one nearest-point query. Residuals in volts keep the noise white and Gaussian
-also where an electrode feels nothing. Three things keep it honest:
+The unknowns are a pose error (6,) and the limb's size (2,): the logs of its length and girth. Residuals in volts keep the noise
+white and Gaussian also where an electrode feels nothing. What keeps it honest and sure:
 
-- the first steps use the secant of the law between the measured and the predicted gap instead of its tangent: the gap is
-  nearly linear in the pose, the voltage is not;
-- what the model gets wrong counts as noise, a fraction of the signal;
-- an electrode that feels something else (an upper arm, a torso) loses its weight.
+- the first steps compare logs of the signals where these stand out of the noise (an inverse hyperbolic sine does that): the log
+  of a signal is smooth in the pose over centimetres, the signal itself is not;
+- a step that makes the fit worse is halved;
+- what the field model gets wrong counts as noise, a share of the signal;
+- an electrode that feels something else, or is faulty, loses its weight as its residual grows.
 
-What is handed on is the likelihood alone, J^T R^-1 J and the point where it peaks: a prior is inside the solve only to
-hold the directions that the skin does not see.
+A prior is inside the solve only to hold what the skin does not feel. What is handed on is the likelihood: J^T R^-1 J, and where
+it peaks.
 """
 
 from __future__ import annotations
@@ -22,44 +22,234 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from shared.geometry import perturb
+from shared.geometry import perturb, pose_error
+from shared.response import Response
 from shared.skin import Skin
-from shared.surface import Surface, nearest_points
 
 Array = NDArray[np.float64]
 
-MODEL_ERROR = 0.03
-"""Standard deviation of what mesh and law get wrong, as a fraction of the signal."""
+MODEL_ERROR = 0.005
+"""Standard deviation of what the response gets wrong, as a share of the signal …"""
+NEAR_ERROR = 0.06
+"""… more where an electrode is nearly touched: it grows by this share with the signal over NEAR_SIGNAL."""
+NEAR_SIGNAL = 1.0
+"""[V]: a gap of half a centimetre."""
+COARSE_ERROR = 0.3
+"""The same share in the first steps: so long each step moves all electrodes alike, near and far."""
 OUTLIER = 3.0
 """Residual, in standard deviations, from which an electrode loses weight as its square."""
+FARTHEST_STEP = np.array([0.06, 0.5, 0.25])
+"""Longest step: position [m], rotation [rad], log size."""
+CONVERGED = 0.05
+"""A step with a smaller expected gain in the log probability is the last one, and is taken on trust."""
+FELT = 3.0
+"""Standard deviations from which an electrode feels something."""
+KNOWN = 4
+"""Unknowns that the voltages usually decide on."""
 LEVER = 0.1
 """Distance [m] at which a rotation counts like a displacement, where the two are compared."""
 WORTHLESS = 0.15
 """A direction known no better than this [m, or rad times LEVER] is published as unknown: beyond, the linearisation that a
 covariance stands for has no meaning."""
-
 TOO_FAR = 0.1
 """The same for a direction along which the likelihood peaks this far [m, or rad times LEVER] from where it was linearised."""
 
 
 @dataclass(frozen=True)
-class Solution:
-    """T_world_target (4, 4): the most probable pose; information (6, 6) and gradient (6,): the likelihood there, about
-    `geometry.perturb`; cost: the robust negative log posterior, up to a constant;
-    evidence: its part that comes from the voltages; misfit: mean squared residual [variances]; gap [m]: the
-    smallest predicted one."""
+class Prior:
+    """What is believed beforehand: T_world_target (4, 4) with its information (6, 6) about `geometry.perturb`, and the size (2,)
+    with its information (2, 2)."""
 
     T: Array
     information: Array
-    gradient: Array
-    cost: float
-    evidence: float
-    misfit: float
-    gap: float
+    size: Array
+    size_information: Array
 
-    def likelihood(self) -> tuple[Array, Array]:
-        """T_world_target at the peak of the likelihood, and its information (6, 6): zero in worthless directions."""
-        return peak(self.T, self.information, self.gradient)
+
+@dataclass(frozen=True)
+class Window:
+    """What is measured: signal, variance (n,): mean voltage less its rest [V], positive near a person, and its variance, infinite
+    for an electrode to leave out; T_world_pads (p, 4, 4); distrust (n,): a factor of at least one on all variances of an
+    electrode, whose pad has not fitted lately."""
+
+    signal: Array
+    variance: Array
+    T_world_pads: Array
+    distrust: Array
+
+
+@dataclass(frozen=True)
+class Point:
+    """T_world_target (4, 4), size (2,), the log signals (n,) [V] there and their derivatives (n, 8) by pose and size."""
+
+    T: Array
+    size: Array
+    logs: Array
+    rows: Array
+
+    def moved(self, step: Array) -> Point:
+        """The point a small step (8,) away, logs to first order."""
+        return Point(perturb(self.T, step[:6]), self.size + step[6:], self.logs + self.rows @ step, self.rows)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The most probable T_world_target (4, 4) and size (2,). cost: the robust negative log posterior, up to a constant; misfit:
+    mean squared residual of what is felt [variances]; residuals (n,): in standard deviations, zero for electrodes left out;
+    signal (n,) [V]: the predicted one; point: all that again for `Solver.likelihood`."""
+
+    T: Array
+    size: Array
+    cost: float
+    misfit: float
+    residuals: Array
+    signal: Array
+    point: Point
+
+
+class Solver:
+    """The solve for the pads of one cell. skin, response: of the same cell."""
+
+    def __init__(self, skin: Skin, response: Response):
+        self.response = response
+        self._pad_of = skin.pad_of
+        self._scale = np.log(skin.gain * skin.sensitivity)
+
+    def solve(self, window: Window, prior: Prior, T: Array, size: Array, coarse: int = 12, fine: int = 8) -> Solution:
+        """The most probable pose and size near a start T (4, 4), size (2,), by at most so many steps on logs and on volts."""
+        here = self._point(window, T, size)
+        for steps, is_coarse in ((coarse, True), (fine, False)):
+            H, g, cost = self._posterior(window, prior, here, is_coarse)
+            for _ in range(steps):
+                step = np.asarray(np.linalg.solve(H, g), np.float64)
+                lengths = np.array([np.linalg.norm(step[:3]), np.linalg.norm(step[3:6]), np.abs(step[6:]).max()])
+                step *= min(1.0, float(np.min(FARTHEST_STEP / (lengths + 1e-12))))
+                gain = float(step @ g) - 0.5 * float(step @ H @ step)
+                if gain < CONVERGED:
+                    if not is_coarse:
+                        here = here.moved(step)
+                    break
+                for _ in range(4):
+                    there = self._point(window, perturb(here.T, step[:6]), here.size + step[6:])
+                    H_there, g_there, cost_there = self._posterior(window, prior, there, is_coarse)
+                    if cost_there <= cost:
+                        break
+                    step *= 0.4
+                else:
+                    break
+                here, H, g, cost = there, H_there, g_there, cost_there
+        z = np.zeros(len(here.logs))
+        *_, cost = self._posterior(window, prior, here, False, z)
+        predicted = np.exp(here.logs)
+        return Solution(here.T, here.size, cost, _misfit(window, predicted, z), z, predicted, here)
+
+    def likelihood(self, window: Window, solution: Solution, lasting: float = 1.0) -> tuple[Array, Array]:
+        """Information (8, 8) and gradient (8,) of the voltages alone at a solution, by pose and size. lasting: the model's error
+        counts with so many times its variance."""
+        H, g = np.zeros((8, 8)), np.zeros(8)
+        at, z = solution.point, np.zeros(len(self._scale))
+        _normal_equations(window.signal, window.variance, window.distrust, at.logs, at.rows, False, lasting, H, g, z)
+        return H, g
+
+    def _point(self, window: Window, T: Array, size: Array) -> Point:
+        T_world_pads = window.T_world_pads
+        R = T_world_pads[:, :3, :3]
+        T_pads_target = np.zeros((len(R), 4, 4))
+        T_pads_target[:, :3, :3] = R.transpose(0, 2, 1) @ T[:3, :3]
+        T_pads_target[:, :3, 3] = np.einsum("pij,pi->pj", R, T[:3, 3] - T_world_pads[:, :3, 3])
+        T_pads_target[:, 3, 3] = 1.0
+        logs, jacobian = self.response.logs(T_pads_target, size)
+        rows = np.empty_like(jacobian)
+        _to_world(T_world_pads, self._pad_of, jacobian, rows)
+        return Point(T, size, logs + self._scale, rows)
+
+    def _posterior(
+        self, window: Window, prior: Prior, at: Point, coarse: bool, z: Array | None = None
+    ) -> tuple[Array, Array, float]:
+        H, g = np.zeros((8, 8)), np.zeros(8)
+        z = np.zeros(len(at.logs)) if z is None else z
+        cost = _normal_equations(window.signal, window.variance, window.distrust, at.logs, at.rows, coarse, 1.0, H, g, z)
+        toward, toward_size = pose_error(prior.T, at.T), prior.size - at.size
+        pull, pull_size = prior.information @ toward, prior.size_information @ toward_size
+        H[:6, :6] += prior.information
+        H[6:, 6:] += prior.size_information
+        g[:6] += pull
+        g[6:] += pull_size
+        return H, g, cost + 0.5 * float(toward @ pull) + 0.5 * float(toward_size @ pull_size)
+
+
+def _misfit(window: Window, predicted: Array, z: Array) -> float:
+    """Mean squared residual [variances] of the electrodes that feel something, or should; one faulty electrode counts no more
+    than OUTLIER."""
+    used = np.isfinite(window.variance)
+    felt = used & (np.maximum(window.signal, predicted) > FELT * np.sqrt(window.variance))
+    if felt.sum() < 2 * KNOWN:
+        felt = used
+    return float(np.minimum(z[felt] ** 2, OUTLIER**2).sum()) / max(int(felt.sum()) - KNOWN, 1)
+
+
+@njit(cache=True, nogil=True)
+def _to_world(T_world_pads, pad_of, jacobian, rows):  # type: ignore[no-untyped-def]
+    """Derivatives (n, 8) by a pose error along each pad's own axes, along the world's."""
+    for e in range(len(jacobian)):
+        k = pad_of[e]
+        for i in range(3):
+            rows[e, i], rows[e, 3 + i] = 0.0, 0.0
+            for j in range(3):
+                rows[e, i] += T_world_pads[k, i, j] * jacobian[e, j]
+                rows[e, 3 + i] += T_world_pads[k, i, j] * jacobian[e, 3 + j]
+        rows[e, 6], rows[e, 7] = jacobian[e, 6], jacobian[e, 7]
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(signal, variance, distrust, logs, rows, coarse, lasting, H, g, z):  # type: ignore[no-untyped-def]
+    """Adds the information (8, 8) and gradient (8,) about the target's pose error in the world and its size, writes residuals
+    (n,) and returns the robust cost."""
+    cost = 0.0
+    for e in range(len(signal)):
+        if not math.isfinite(variance[e]):
+            z[e] = 0.0
+            continue
+        predicted, measured = math.exp(logs[e]), signal[e]
+        at = max(measured, 0.0)
+        if coarse:
+            # residual and slope of asinh(v / 2 sigma): the log far above the noise, linear below it
+            c = 2.0 * math.sqrt(variance[e])
+            residual = math.asinh(measured / c) - math.asinh(predicted / c)
+            slope = predicted / math.sqrt(predicted * predicted + c * c)
+            total = (variance[e] + (COARSE_ERROR * at) ** 2) / (at * at + c * c)
+        else:
+            residual, slope = measured - predicted, predicted
+            share = MODEL_ERROR + NEAR_ERROR * at / NEAR_SIGNAL
+            total = variance[e] + lasting * (share * at) ** 2
+        z[e] = residual / math.sqrt(total)
+        total *= distrust[e]
+        square = residual * residual / total
+        trust = 1.0
+        if square > OUTLIER * OUTLIER and coarse:  # Huber's, which has no minima of its own
+            cost += OUTLIER * (math.sqrt(square) - 0.5 * OUTLIER)
+            trust = OUTLIER / math.sqrt(square)
+        elif square > OUTLIER * OUTLIER:
+            cost += 0.5 * OUTLIER * OUTLIER * (1.0 + math.log(square / (OUTLIER * OUTLIER)))
+            trust = OUTLIER * OUTLIER / square
+        else:
+            cost += 0.5 * square
+        weight = trust * slope / total
+        for i in range(8):
+            g[i] += weight * residual * rows[e, i]
+            for j in range(8):
+                H[i, j] += weight * slope * rows[e, i] * rows[e, j]
+    return cost
+
+
+def marginal(information: Array, gradient: Array, nuisance: Array) -> tuple[Array, Array]:
+    """Information and gradient of a quadratic likelihood after a parameter's directions (m, k) were marginalised: zero along
+    them. Directions that it says nothing about change nothing."""
+    along = information @ nuisance
+    strength = nuisance.T @ along
+    strength += (1e-9 + 1e-12 * np.trace(strength)) * np.eye(len(strength))
+    share = along @ np.linalg.inv(strength)
+    return information - share @ along.T, gradient - share @ (nuisance.T @ gradient)
 
 
 def peak(T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
@@ -73,114 +263,3 @@ def peak(T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
     step = scale * (directions @ steps[known])
     kept = (directions * eigenvalues[known]) @ directions.T / np.outer(scale, scale)
     return perturb(T, step), kept
-
-
-def solve(
-    skin: Skin,
-    surface: Surface,
-    electrodes: Array,
-    amplitude: Array,
-    variance: Array,
-    T_start: Array,
-    T_prior: Array,
-    prior_information: Array,
-    coarse: int = 4,
-    fine: int = 3,
-) -> Solution:
-    """The most probable T_world_target.
-
-    electrodes (n, 3) [m] in the world; amplitude, variance (n,): mean voltages and their variances, infinite for an
-    electrode to leave out; T_prior with prior_information (6, 6): what is believed beforehand; coarse, fine: steps with
-    the secant and with the tangent of the law.
-    """
-    T = np.ascontiguousarray(T_start, dtype=np.float64).copy()
-    information, gradient, numbers = np.empty((6, 6)), np.empty(6), np.empty(4)
-    _solve(
-        np.ascontiguousarray(electrodes), skin.signal(amplitude), 1.0 / np.asarray(variance), skin.peak, skin.a2,
-        *surface.arrays, T, T_prior, np.ascontiguousarray(prior_information), coarse, fine, information, gradient, numbers,
-    )  # fmt: skip
-    return Solution(T, information, gradient, *map(float, numbers))
-
-
-@njit(cache=True, nogil=True)
-def _rotation(vector):  # type: ignore[no-untyped-def]
-    """The matrix of a rotation vector (Rodrigues)."""
-    angle = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    K = np.array([[0.0, -vector[2], vector[1]], [vector[2], 0.0, -vector[0]], [-vector[1], vector[0], 0.0]])
-    if angle < 1e-8:
-        return np.eye(3) + K
-    return np.eye(3) + (math.sin(angle) / angle) * K + ((1.0 - math.cos(angle)) / angle**2) * (K @ K)
-
-
-@njit(cache=True, nogil=True)
-def _rotation_vector(R):  # type: ignore[no-untyped-def]
-    """The rotation vector of a matrix, for angles well below pi."""
-    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    sine = 0.5 * math.sqrt(x * x + y * y + z * z)
-    angle = math.atan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
-    factor = 0.5 if sine < 1e-8 else 0.5 * angle / sine
-    return factor * np.array([x, y, z])
-
-
-@njit(cache=True, nogil=True)
-def _solve(electrodes, signal, weight, law_peak, a2, corners, centers, radii, normals,
-           T, T_prior, prior, coarse, fine, information, gradient, numbers):  # type: ignore[no-untyped-def]  # fmt: skip
-    n = len(electrodes)
-    distance, nearest, slope_gap = np.empty(n), np.empty((n, 3)), np.empty((n, 3))
-    row, toward = np.empty(6), np.empty(6)
-    for iteration in range(coarse + fine + 1):
-        R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
-        nearest_points((electrodes - t) @ R, corners, centers, radii, normals, distance, nearest, slope_gap)
-        information[:] = 0.0
-        gradient[:] = 0.0
-        cost, misfit, used, gap = 0.0, 0.0, 0.0, np.inf
-        for e in range(n):
-            if weight[e] <= 0.0:
-                continue
-            d = max(distance[e], 0.0)
-            gap = min(gap, d)
-            predicted = law_peak[e] / (1.0 + a2[e] * d * d)
-            slope = -2.0 * a2[e] * d * predicted**2 / law_peak[e]
-            expected = predicted
-            measured = law_peak[e] / signal[e] - 1.0 if signal[e] > 0.0 else np.inf
-            if iteration < coarse and measured < a2[e] * 0.25:  # it feels something within half a metre
-                expected = max(predicted, min(signal[e], law_peak[e]))
-                apart = distance[e] - math.sqrt(max(measured, 0.0) / a2[e])
-                if abs(apart) > 1e-4:
-                    slope = min((predicted - signal[e]) / apart, 0.0)
-            residual = signal[e] - predicted
-            inverse_variance = 1.0 / (1.0 / weight[e] + (MODEL_ERROR * expected) ** 2)
-            square = residual * residual * inverse_variance
-            trust = 1.0
-            if square > OUTLIER**2:
-                cost += 0.5 * OUTLIER**2 * (1.0 + math.log(square / OUTLIER**2))
-                if iteration >= coarse:
-                    trust = OUTLIER**2 / square
-            else:
-                cost += 0.5 * square
-            misfit += trust * square
-            used += trust
-            for i in range(3):
-                row[i] = -(R[i, 0] * slope_gap[e, 0] + R[i, 1] * slope_gap[e, 1] + R[i, 2] * slope_gap[e, 2])
-            ax, ay, az = electrodes[e, 0] - t[0], electrodes[e, 1] - t[1], electrodes[e, 2] - t[2]
-            row[3] = ay * row[2] - az * row[1]
-            row[4] = az * row[0] - ax * row[2]
-            row[5] = ax * row[1] - ay * row[0]
-            factor = trust * inverse_variance * slope
-            for i in range(6):
-                gradient[i] += factor * residual * row[i]
-                for j in range(6):
-                    information[i, j] += factor * slope * row[i] * row[j]
-        toward[:3] = T_prior[:3, 3] - t
-        toward[3:] = _rotation_vector(np.ascontiguousarray(T_prior[:3, :3]) @ np.ascontiguousarray(R.T))
-        pull = prior @ toward
-        numbers[0] = cost + 0.5 * np.dot(toward, pull)
-        numbers[1] = cost
-        numbers[2] = misfit / max(used - 4.0, 1.0)
-        numbers[3] = gap
-        if iteration == coarse + fine:
-            break
-        step = np.linalg.solve(information + prior, gradient + pull)
-        shrink = min(1.0, 0.06 / (math.sqrt(np.sum(step[:3] ** 2)) + 1e-12), 0.5 / (math.sqrt(np.sum(step[3:] ** 2)) + 1e-12))
-        T[:3, 3] += shrink * step[:3]
-        T[:3, :3] = _rotation(shrink * step[3:]) @ R

@@ -1,8 +1,8 @@
 """Makes `weights/CELL-TARGET.npz` again from a seed: `penumbra haptics train --cell table`.
 
 Scenes are drawn from a Gaussian somewhat wider than the region of the cell's motion (which the published estimate subtracts
-again), robots anywhere between the joint limits of the cell's `sim` section, upper arm and torso as in `sim/person.py`;
-voltages come from the response law with noise, a model error and now and then a dead pad.
+again), robots anywhere between the joint limits of the cell's `sim` section, limbs of all sizes; voltages come from the fitted
+field model with noise, a model error and now and then a dead pad. R_c is regressed on scenes that the network was not trained on.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import itertools
 import json
 import math
 import time
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +25,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from scipy.spatial.transform import Rotation
 
 from services.haptics.estimator import Estimator
-from services.haptics.network import LOG_LIMIT, OUTPUTS, PoseNetwork, features, fingerprint
+from services.haptics.network import PoseNetwork, Regression, Relative, features, fingerprint
+from services.haptics.slow import SIZE, SIZE_SPREAD
 from services.haptics.solve import MODEL_ERROR
 from shared import cell as cells
+from shared.body import target_mesh
 from shared.geometry import Array, from_rpy, pose_error
+from shared.response import Response
 from shared.robot import robot_models
 from shared.skin import Skin, link_names
 from shared.surface import Surface, nearest_points
-from sim.person import Person
 
 WEIGHTS = Path(__file__).parent / "weights"
 HIDDEN = (256, 256, 256, 256)
@@ -40,8 +44,14 @@ CLOSEST = 0.005
 """Scenes in which an electrode comes nearer to the skin than this [m] are drawn again: the limb would be inside the pad."""
 ENLARGED = 1.5
 """Spread of the training's poses, in standard deviations of a pose uniform in the region of the cell's motion."""
-PERSONS = 8
-"""Places of the shoulder among which scenes are drawn."""
+OUTPUTS = 6 + 21
+"""The pose, and while it is trained the Cholesky factor of its precision: what cannot be known then does not count."""
+LOG_LIMIT = 8.0
+"""Largest log of a precision factor in units of the prior: 3000 times better than beforehand."""
+REGRESSED, KERNELS = 3000, 500
+"""Scenes for R_c, and means of neighbouring ones among them that the Gaussian processes keep."""
+LOG_CHI2 = -1.2704
+"""Mean of the log of a squared standard normal number: a log squared error is so far below the log variance."""
 DEAD = 0.02
 """Share of pads that are dead in training."""
 BATCH, FRESH, START, POOL = 1024, 128, 2000, 400_000
@@ -66,18 +76,15 @@ class Scenes:
         self.spread = ENLARGED * (high - low) / np.sqrt(12.0)
         spread = cell.targets[target].home_spread
         self.expected = cell.targets[target].home.transform, np.repeat([spread.position, spread.rotation], 3)
-        # A person's shoulder is where the cell says only roughly.
-        shoulders = np.array(cell.sim.shoulder) + 0.08 * np.random.default_rng(0).standard_normal((PERSONS, 3))
-        sims = [cell.sim.model_copy(update={"shoulder": tuple(shoulder)}) for shoulder in shoulders]
-        self._persons = [Person(cell, sim, cell.targets[target]) for sim in sims]
-        self.surface, *self._others = [Surface(mesh.vertices, mesh.faces) for mesh in self._persons[0].meshes]
+        mesh = target_mesh(cell.targets[target], cell)
+        self.surface, self.response = Surface(mesh.vertices, mesh.faces), Response(cell, target)
         self.models = robot_models(cell)
 
     def draw(self, rng: np.random.Generator, count: int, motion: bool = False) -> dict[str, Any]:
         """`count` scenes, from the training's Gaussian, or uniformly from the region of the cell's motion.
 
-        T (count, 4, 4), joints (count, j), pads (count, p, 4, 4), gap (count,) to the target, amplitude (count, n), alive
-        (count, p).
+        T (count, 4, 4), size (count, 2), joints (count, j), pads (count, p, 4, 4), gap (count,) to the target, amplitude
+        (count, n), alive (count, p).
         """
         kept: list[dict[str, Any]] = []
         while sum(len(k["gap"]) for k in kept) < count:
@@ -87,8 +94,10 @@ class Scenes:
     def inputs(self, scene: dict[str, Any]) -> NDArray[np.float32]:
         """The network's input for scenes: as `estimator.py` forms it."""
         skin = self.skin
-        variance = skin.noise / SAMPLES + (MODEL_ERROR * np.maximum(skin.signal(scene["amplitude"]), 0.0)) ** 2
-        return features(skin, self.home, scene["amplitude"], variance, scene["alive"], scene["pads"], scene["joints"])
+        signal = skin.signal(scene["amplitude"])
+        variance = skin.noise / SAMPLES + (MODEL_ERROR * np.maximum(signal, 0.0)) ** 2
+        variance = np.where(scene["alive"][..., skin.pad_of], variance, np.inf)
+        return features(skin, self.home, signal, variance, scene["pads"], scene["joints"])
 
     def labels(self, scene: dict[str, Array]) -> NDArray[np.float32]:
         """What the network answers: the pose error about home in units of the spread (count, 6)."""
@@ -117,30 +126,36 @@ class Scenes:
         pads = np.stack([np.broadcast_to(by_name[link], (count, 4, 4)) for link in skin.links], axis=1) @ skin.T_link_pads
         frames = pads[:, skin.pad_of]
         electrodes = np.einsum("snij,nj->sni", frames[..., :3, :3], skin.centroids) + frames[..., :3, 3]
-        gaps = _gaps(electrodes, T, *self.surface.arrays)
-        nearest = gaps
-        parts = self._persons[rng.integers(PERSONS)].poses(T)[1:]
-        for part, T_world_part in zip(self._others, parts, strict=True):
-            nearest = np.minimum(nearest, _gaps(electrodes, T_world_part, *part.arrays))
-        # What law and mesh get wrong is alike for the electrodes of a scene in part; here it is drawn for each.
-        signal = skin.peak / (1.0 + skin.a2 * nearest**2) * (1.0 + MODEL_ERROR * rng.standard_normal(nearest.shape))
-        amplitude = skin.a3 + skin.polarity * signal + np.sqrt(skin.noise / SAMPLES) * rng.standard_normal(nearest.shape)
+        size = SIZE + SIZE_SPREAD * np.sqrt(3.0) * rng.uniform(-1.0, 1.0, (count, 2))
+        gap, ahead = _gaps(electrodes, frames[..., :3, 2], T, np.exp(size), *self.surface.arrays)
+        T_pads_target = np.linalg.inv(pads) @ T[:, None]
+        change = np.stack([self.response.change(each, own) for each, own in zip(T_pads_target, size, strict=True)])
+        signal = skin.gain * skin.sensitivity * change * (1.0 + MODEL_ERROR * rng.standard_normal(change.shape))
+        amplitude = skin.a3 + skin.polarity * signal + np.sqrt(skin.noise / SAMPLES) * rng.standard_normal(change.shape)
         alive = rng.uniform(size=(count, len(skin.pads))) >= DEAD
-        amplitude = np.where(alive[:, skin.pad_of], amplitude, skin.a3)
-        free = nearest.min(axis=1) > CLOSEST
-        scene = {"T": T, "joints": joints, "pads": pads, "gap": gaps.min(axis=1), "amplitude": amplitude, "alive": alive}
+        free = (gap > CLOSEST) & ahead
+        scene = {"T": T, "size": size, "joints": joints, "pads": pads, "gap": gap, "amplitude": amplitude, "alive": alive}
         return {name: value[free] for name, value in scene.items()}
 
 
 @njit(cache=True, nogil=True)
-def _gaps(electrodes, T, corners, centers, radii, normals):  # type: ignore[no-untyped-def]
-    """Signed gaps (s, n) of electrodes (s, n, 3) to a surface at poses (s, 4, 4)."""
+def _gaps(electrodes, normals_out, T, factors, corners, centers, radii, normals):  # type: ignore[no-untyped-def]
+    """Smallest gaps (s,) of electrodes (s, n, 3) to a surface at poses (s, 4, 4), stretched by factors (s, 2) along x and across
+    (about, where it is stretched), and whether the nearest point lies in front of its electrode, whose pad looks along
+    normals_out (s, n, 3)."""
     n = electrodes.shape[1]
-    out, nearest, gradient = np.empty((len(T), n)), np.empty((n, 3)), np.empty((n, 3))
+    out, ahead, distance = np.empty(len(T)), np.empty(len(T), np.bool_), np.empty(n)
+    nearest, gradient = np.empty((n, 3)), np.empty((n, 3))
     for s in range(len(T)):
         R = np.ascontiguousarray(T[s, :3, :3])
-        nearest_points((electrodes[s] - T[s, :3, 3]) @ R, corners, centers, radii, normals, out[s], nearest, gradient)
-    return out
+        local = (electrodes[s] - T[s, :3, 3]) @ R
+        local[:, 0] /= factors[s, 0]
+        local[:, 1:] /= factors[s, 1]
+        nearest_points(local, corners, centers, radii, normals, distance, nearest, gradient)
+        k = np.argmin(distance)
+        out[s] = distance[k] * factors[s, 1]
+        ahead[s] = np.sum((R @ (nearest[k] - local[k])) * normals_out[s, k]) > 0.0
+    return out, ahead
 
 
 def build(inputs: int) -> torch.nn.Sequential:
@@ -166,35 +181,90 @@ def loss(out: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
     return (0.5 * (whitened**2).sum(1) - log_diagonal.sum(1)).mean()
 
 
-def to_numpy(model: torch.nn.Sequential, mean: Array, scale: Array, home: Array, spread: Array) -> PoseNetwork:
-    """The trained network with the inputs' normalisation folded into its first layer."""
+def to_numpy(model: torch.nn.Sequential, mean: Array, scale: Array, scenes: Scenes, regression: Regression) -> PoseNetwork:
+    """The trained network with the inputs' normalisation folded into its first layer, and its pose alone of what it learnt."""
     linear = [layer for layer in model if isinstance(layer, torch.nn.Linear)]
     W = [layer.weight.detach().numpy().T.astype(np.float64) for layer in linear]
     b = [layer.bias.detach().numpy().astype(np.float64) for layer in linear]
     b[0] = b[0] - (mean / scale) @ W[0]
     W[0] = W[0] / scale[:, None]
-    return PoseNetwork(tuple(w.astype(np.float32) for w in W), tuple(v.astype(np.float32) for v in b), home, spread)
+    W[-1], b[-1] = W[-1][:, :6], b[-1][:6]
+    weights, biases = tuple(w.astype(np.float32) for w in W), tuple(v.astype(np.float32) for v in b)
+    return PoseNetwork(weights, biases, scenes.home, scenes.spread, regression)
+
+
+NOTHING_KNOWN = Regression(np.zeros((1, 4)), np.ones((5, 4)), np.ones(5), np.zeros((1, 5)), np.zeros(5))
+
+
+def regress(scenes: Scenes, network: PoseNetwork, seed: int, count: int = REGRESSED) -> Regression:
+    """R_c over the relative pose, from the network's errors in so many scenes of the cell's motion."""
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+    scene = scenes.draw(np.random.default_rng(seed), count, motion=True)
+    x = scenes.inputs(scene)
+    poses, logs = np.empty((count, 4)), np.empty((count, 5))
+    for i in range(count):
+        T = network.posterior(x[i])
+        relative = Relative.of(scenes.skin, scenes.surface, scene["pads"][i], scene["alive"][i][scenes.skin.pad_of], T)
+        error = pose_error(scene["T"][i], T)
+        parts = np.concatenate([relative.frame @ error[:3], relative.frame[1:] @ error[3:]])
+        poses[i], logs[i] = relative.pose, np.log(parts**2 + 1e-12) - LOG_CHI2
+    # Means over neighbours: single logs of squared errors scatter by two, and a process of thousands of points is slow.
+    order = np.argsort(poses[:, 0])
+    groups = [
+        cell for part in np.array_split(order, KERNELS // 10) for cell in np.array_split(part[np.argsort(poses[part, 1])], 10)
+    ]
+    points = np.array([poses[group].mean(axis=0) for group in groups])
+    values = np.array([logs[group].mean(axis=0) for group in groups])
+    spread = points.std(axis=0) + 1e-3
+    lengths, amplitudes, weights, means = np.empty((5, 4)), np.empty(5), np.empty((len(points), 5)), values.mean(axis=0)
+    for j in range(5):
+        kernel = ConstantKernel(1.0, (1e-2, 1e2)) * RBF(spread, [(0.2 * s, 20.0 * s) for s in spread]) + WhiteKernel(
+            0.5, (1e-3, 10.0)
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a length at its bound: that part of the pose does not matter
+            process = GaussianProcessRegressor(kernel, random_state=0).fit(points, values[:, j] - means[j])
+        lengths[j], amplitudes[j] = process.kernel_.k1.k2.length_scale, process.kernel_.k1.k1.constant_value
+        weights[:, j] = process.alpha_
+    found = Regression(points, lengths, amplitudes, weights, means)
+    # Errors have longer tails than a Gaussian: variances are scaled until the squared errors have them on average.
+    squares = np.exp(logs + LOG_CHI2) / np.array([found.variances(pose) for pose in poses])
+    return Regression(points, lengths, amplitudes, weights, means + np.log(np.mean(np.minimum(squares, 25.0), axis=0)))
 
 
 def evaluate(scenes: Scenes, network: PoseNetwork, seed: int, count: int = 4000) -> dict[str, dict[str, Any]]:
     """Errors of single windows of unseen scenes by gap band: root mean squares across, away and along the limb [mm], of its
-    direction [deg], and the normalised squared error per known direction; network alone, and solve from its start without
-    a past. The scenes are uniform in the region of the cell's motion."""
-    scene = scenes.draw(np.random.default_rng(seed), count, motion=True)
+    direction [deg], and the normalised squared error per direction of the network's pose by R_c, or of the published one per
+    known direction; network alone, and solve from its start without a past. The scenes are uniform in the region of the cell's
+    motion."""
     results: dict[str, dict[str, Any]] = {}
     home, spread = scenes.expected
+    samples = np.full(len(scenes.skin), SAMPLES)
+    scene = scenes.draw(np.random.default_rng(seed), count, motion=True)
     for method in ("paper", "solve"):
-        estimator = Estimator(scenes.skin, scenes.surface, home, spread, network, method)
+        estimator = Estimator(scenes.skin, scenes.response, scenes.surface, home, spread, network, method)
         rows = []
         for i in range(count):
             estimator.reset()
-            samples = np.full(len(scenes.skin), SAMPLES)
+            used = scene["alive"][i][scenes.skin.pad_of]
             estimate = estimator.update(
-                1, scene["amplitude"][i], samples, scene["alive"][i], scene["pads"][i], scene["joints"][i]
+                1, scene["amplitude"][i], np.where(used, samples, 0), scene["pads"][i], scene["joints"][i]
             )
-            # Errors are those of the most probable pose; the published one is far off where it says that it does not know.
-            T = estimator.pose if method == "solve" else network.posterior(scenes.inputs({k: v[i] for k, v in scene.items()}))
-            rows.append(_errors(scenes, scene, i, T, estimate.T, estimate.information))
+            T = scene["T"][i]
+            relative = Relative.of(scenes.skin, scenes.surface, scene["pads"][i], used, estimator.pose)
+            error = pose_error(T, estimator.pose)
+            along, across, away = relative.frame @ error[:3]
+            angle = float(np.arccos(np.clip(T[:3, 0] @ estimator.pose[:3, 0], -1.0, 1.0)))
+            if method == "paper":
+                parts = np.concatenate([relative.frame @ error[:3], relative.frame[1:] @ error[3:]])
+                nees = float(np.mean(parts**2 / network.regression.variances(relative.pose)))
+            else:
+                difference = pose_error(T, estimate.T)
+                rank = int((np.linalg.eigvalsh(estimate.information) > 1e-9).sum())
+                nees = float(difference @ estimate.information @ difference / rank) if rank else np.nan
+            rows.append([across, away, along, angle, nees])
         table = np.array(rows)
         results[method] = {}
         for low, high in itertools.pairwise(BANDS):
@@ -214,27 +284,14 @@ def evaluate(scenes: Scenes, network: PoseNetwork, seed: int, count: int = 4000)
     return results
 
 
-def _errors(scenes: Scenes, scene: dict[str, Array], i: int, T_most_probable: Array, T: Array, information: Array) -> list[float]:
-    truth = scene["T"][i]
-    axial = truth[:3, 0]
-    electrodes = scenes.skin.positions(scene["pads"][i])
-    distance, _, gradient = scenes.surface.nearest((electrodes - truth[:3, 3]) @ truth[:3, :3])
-    away = truth[:3, :3] @ gradient[np.argmin(distance)]
-    away -= (away @ axial) * axial
-    away /= np.linalg.norm(away) + 1e-9
-    error = pose_error(truth, T_most_probable)[:3]
-    angle = np.arccos(np.clip(axial @ T_most_probable[:3, 0], -1.0, 1.0))
-    difference = pose_error(truth, T)
-    rank = int((np.linalg.eigvalsh(information) > 1e-9).sum())
-    nees = difference @ information @ difference / rank if rank else np.nan
-    return [error @ np.cross(axial, away), error @ away, error @ axial, float(angle), nees]
-
-
 def save(network: PoseNetwork, path: Path, key: str) -> None:
     """The weights as half-precision arrays: their rounding changes a pose by less than a tenth of its error."""
     arrays: dict[str, Any] = {"home": network.home, "spread": network.spread, "fingerprint": np.array(key)}
     for i, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         arrays[f"weight{i}"], arrays[f"bias{i}"] = W.astype(np.float16), b.astype(np.float32)
+    own = network.regression
+    parts = {"points": own.points, "lengths": own.lengths, "amplitudes": own.amplitudes, "kernel_weights": own.weights}
+    arrays |= {name: part.astype(np.float32) for name, part in parts.items()} | {"means": own.means}
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(path, **arrays)
 
@@ -257,7 +314,8 @@ def main(argv: list[str] | None = None) -> None:
     out = options.out or WEIGHTS / f"{cell.name}-{target}.npz"
     checkpoint = options.checkpoint or Path("runs") / f"haptics-{cell.name}-{target}.pt"
     model, mean, scale, steps, seconds = _train(scenes, fingerprint(cell, target), options, checkpoint)
-    network = to_numpy(model, mean, scale, scenes.home, scenes.spread)
+    network = to_numpy(model, mean, scale, scenes, NOTHING_KNOWN)
+    network = replace(network, regression=regress(scenes, network, options.seed + 2_000_000))
     save(network, out, fingerprint(cell, target))
     schedule = f"--minutes {options.minutes:g}" if options.minutes else f"--steps {options.steps}"
     card = {

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.skin import Skin
+from shared.skin_health import Watch
 
 Array = NDArray[np.float64]
 
@@ -22,13 +23,12 @@ NEVER = -(1 << 62)
 @dataclass(frozen=True)
 class Window:
     """stamp_ns: the middle of the samples; newest_ns: the last one; amplitude (n,) [V]: means; samples (n,): how many are
-    in each; alive (p,): pads that may be believed; faults: reason by pad for the others."""
+    in each, none for electrodes that are not to be believed; faults: the reasons, by PAD or PAD/ELECTRODE."""
 
     stamp_ns: int
     newest_ns: int
     amplitude: Array
     samples: NDArray[np.int64]
-    alive: NDArray[np.bool_]
     faults: dict[str, str]
 
 
@@ -62,6 +62,7 @@ class Collector:
         self._index = {name: k for k, name in enumerate(skin.pads)}
         self._stamps: list[NDArray[np.int64]] = [np.empty(0, np.int64) for _ in skin.pads]
         self._volts: list[Array] = [np.empty((0, skin.of(k).stop - skin.of(k).start)) for k in range(len(skin.pads))]
+        self._watches = [Watch(skin, k) for k in range(len(skin.pads))]
         self._newest = np.full(len(skin.pads), NEVER, dtype=np.int64)
         self._done_ns = self._born_ns = NEVER
 
@@ -83,6 +84,7 @@ class Collector:
             self._forget()  # time jumped back: the source started again
         if self._born_ns == NEVER:
             self._born_ns = stamp_ns
+        self._watches[k].add(stamp_ns, period_ns, volts)
         stamps = stamp_ns - period_ns * np.arange(len(volts) - 1, -1, -1, dtype=np.int64)
         fresh = stamps > max(self._newest[k], stamp_ns - 4 * self.length_ns)
         self._stamps[k] = np.concatenate([self._stamps[k], stamps[fresh]])
@@ -104,36 +106,27 @@ class Collector:
         begin_ns = max(self._done_ns, end_ns - self.length_ns)
         skin = self.skin
         amplitude, samples = skin.a3.copy(), np.zeros(len(skin), np.int64)
-        alive, faults, middles = np.zeros(len(skin.pads), bool), {}, []
+        faults: dict[str, str] = {}
+        middles = []
         for k, name in enumerate(skin.pads):
             inside = (self._stamps[k] > begin_ns) & (self._stamps[k] <= end_ns)
             rows, stamps = self._volts[k][inside], self._stamps[k][inside]
             keep = self._stamps[k] > end_ns
             self._volts[k], self._stamps[k] = self._volts[k][keep], self._stamps[k][keep]
-            fault = "silent" if not len(rows) else self._fault(k, rows)
-            if fault:
-                faults[name] = fault
+            if not len(rows):
+                faults[name] = "silent"
                 continue
-            alive[k] = True
-            amplitude[skin.of(k)], samples[skin.of(k)] = rows.mean(axis=0), len(rows)
+            own = skin.of(k)
+            ended = (rows >= skin.full_scale[own] - 0.5 * skin.lsb[own]).any(axis=0) | (rows <= 0.5 * skin.lsb[own]).any(axis=0)
+            reasons = dict.fromkeys(np.flatnonzero(ended).tolist(), "saturated: it reads the end of its ADC")
+            reasons |= {self._watches[k].names.index(e): fault.text for e, fault in self._watches[k].faults.items()}
+            faults |= {skin.names[own.start + e]: reason for e, reason in reasons.items()}
+            amplitude[own] = rows.mean(axis=0)
+            samples[own] = np.where(np.isin(np.arange(rows.shape[1]), list(reasons)), 0, len(rows))
             middles.append(float((stamps - begin_ns).mean()))
         self._done_ns = end_ns
         middle = int(np.mean(middles)) if middles else self.length_ns // 2
-        return Window(begin_ns + middle, end_ns, amplitude, samples, alive, faults)
-
-    def _fault(self, k: int, rows: Array) -> str | None:
-        """Why a pad's rows cannot be what its law and its ADC give, or None."""
-        skin, own = self.skin, self.skin.of(k)
-        low, high = rows.min(axis=0), rows.max(axis=0)
-        margin = 6.0 * np.sqrt(skin.noise[own]) + 0.05 * skin.peak[own]  # noise, and what a calibration may be off
-        if (high >= skin.reference[own] - 0.5 * skin.lsb[own]).any() or (low <= 0.5 * skin.lsb[own]).any():
-            return "saturated: an electrode reads the end of its ADC"
-        signal = (rows.mean(axis=0) - skin.a3[own]) * skin.polarity[own]
-        if (signal < -margin).any() or (signal > skin.peak[own] + margin).any():
-            return "out of range: an electrode reads what its response law cannot give"
-        if len(rows) > 1 and (high == low).all() and (skin.noise[own] > 4.0 * skin.lsb[own] ** 2).all():
-            return "stuck: no noise on any electrode"
-        return None
+        return Window(begin_ns + middle, end_ns, amplitude, samples, faults)
 
     def _forget(self) -> None:
         for k in range(len(self.skin.pads)):

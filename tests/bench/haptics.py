@@ -1,0 +1,533 @@
+"""`penumbra bench haptics`: how near the skin's pose comes to what its voltages can tell at all.
+
+Voltages come from the full boundary-element model (`sim.field`), never from the response that the estimator uses: random limb
+poses at a given gap, sizes from the 5th percentile woman to the 95th man that the estimator does not know, ten samples averaged,
+noise and converter as the cell says. Beside every error stands the Cramér-Rao bound with that size unknown, once with the broad
+prior that the first look at a limb has, once with a tracking prior.
+
+Then limbs that rest for ten seconds (what is published, and what the default observer makes of it, against their covariances),
+limbs that move through all gaps, and things that are no limb.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from scipy.interpolate import CubicSpline
+from scipy.stats import chi2
+
+from services.fusion.observer import ErrorStateObserver
+from services.haptics import network
+from services.haptics.estimator import Estimator
+from services.haptics.service import WEIGHTS
+from services.haptics.slow import SIZE_SPREAD
+from services.haptics.window import Collector
+from services.skin.train import mountings
+from shared import cell as cells
+from shared import geometry
+from shared.body import target_mesh
+from shared.geometry import Array
+from shared.response import Response, fingerprint
+from shared.robot import robot_models
+from shared.skin import Skin, link_names
+from shared.surface import Surface
+from sim import field
+
+ARRAYS = {"bare": "table", "hull": "arm"}
+"""Cells: pads in a table top, and pads on a robot's hull."""
+GAPS = (0.01, 0.02, 0.03, 0.05, 0.075, 0.10, 0.125, 0.15, 0.20)
+PADS = (8, 4, 1)
+SPEEDS = (0.0, 0.5)
+SAMPLES, PERIOD_NS = 10, 1_000_000
+WINDOW_NS = SAMPLES * PERIOD_NS
+BROAD = np.array([0.08, 0.04, 0.04, 0.3, np.radians(8.0), np.radians(15.0)])
+"""Standard deviations of a prior that no track gives: axial, lateral, height [m], roll, pitch, yaw [rad]."""
+TRACKING = np.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])
+GIRTH, LENGTH = (-0.27, 0.11), (-0.1, 0.1)
+"""Range of log sizes."""
+NAMES = ("axial", "lateral", "height", "roll", "pitch", "yaw")
+RATIO_GOAL, MS_GOAL = 1.2, 2.0
+REST_S, SETTLED_S = 10.0, 1.0
+SHOWN = ("lateral", "height", "axial")
+RESTING_GAPS = (0.02, 0.03, 0.05, 0.075, 0.10, 0.125, 0.15)
+BANDS = ((0.0, 0.04), (0.04, 0.075), (0.075, 0.125), (0.125, 0.175))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many poses of each row, draws of noise and prior of each pose, resting limbs of each gap, moving ones and their
+    seconds, foreign things of each kind."""
+
+    poses: int
+    draws: int
+    resting: int
+    moving: int
+    moving_s: float
+    foreign: int
+
+
+FULL, QUICK = Plan(30, 4, 4, 3, 8.0, 12), Plan(2, 2, 1, 1, 1.0, 2)
+
+
+class Rig:
+    """The pads of a cell, a robot that carries them in the middle of its joints' ranges, and their true field.
+
+    pads (p, 4, 4): poses in the world; joints (j,); chosen: which pads are used when only so many are.
+    """
+
+    def __init__(self, name: str):
+        self.name, self.cell = name, cells.load(ARRAYS[name])
+        self.target = self.cell.one("targets", None)
+        self.skin = Skin(self.cell)
+        self.response = Response(self.cell, self.target)
+        self.mesh = target_mesh(self.cell.targets[self.target], self.cell)
+        self.surface = Surface(self.mesh.vertices, self.mesh.faces)
+        self.home = self.cell.targets[self.target].home.transform
+        sim = self.cell.sim
+        assert sim is not None, f"cell {self.cell.name}: a `sim` section expected"
+        self.joints = (np.array(sim.joints_low) + np.array(sim.joints_high)) / 2.0
+        links, first = {}, 0
+        for robot, model in robot_models(self.cell).items():
+            links[robot] = model.link_transforms(self.joints[first : first + len(model.joints)])
+            first += len(model.joints)
+        self.pads = self.skin.T_world_pads(link_names(links))
+        fields = {each.fingerprint: field.PadField(each.kind, each.backing) for each in mountings(self.cell, self.target)}
+        self.fields = [fields[fingerprint(self.cell, pad, self.target)] for pad in self.cell.pads]
+        self.weights: network.PoseNetwork | None = None
+        try:
+            self.weights = network.load(WEIGHTS / f"{self.cell.name}-{self.target}.npz", self.cell, self.target)
+        except (FileNotFoundError, ValueError) as error:
+            print(f"{name}: without a network: {error}", file=sys.stderr)
+        away = np.linalg.norm(self.pads[:, :3, 3] - self.pads[:, :3, 3].mean(axis=0), axis=1)
+        order = np.argsort(away.round(6), kind="stable")
+        self.chosen = {count: np.sort(order[:count]) for count in PADS}
+
+    def estimator(self, home: Array, spread: Array, method: str = "solve") -> Estimator:
+        """A fresh one that expects the target at home (4, 4), known to spread (6,) along the world's axes."""
+        return Estimator(self.skin, self.response, self.surface, home, spread, self.weights, method)
+
+    def samples(self, count: int) -> np.ndarray:
+        """Samples (n,) in a window of each electrode when only so many pads are used."""
+        return np.where(np.isin(self.skin.pad_of, self.chosen[count]), SAMPLES, 0)
+
+    def signal(self, body: field.Body, T: Array, count: int) -> Array:
+        """True signals (n,) [V] of a body at T; zero at pads that are not used."""
+        out = np.zeros(len(self.skin))
+        for k in self.chosen[count]:
+            own = self.skin.of(k)
+            out[own] = self.fields[k].change(body, geometry.inverse(self.pads[k]) @ T)
+        return out * self.skin.gain * self.skin.sensitivity
+
+    def voltages(self, signal: Array, rng: np.random.Generator) -> Array:
+        """Samples (s, n) [V] of these signals (s, n): noise, then the converter's steps."""
+        skin = self.skin
+        sigma = np.sqrt(skin.noise - skin.lsb**2 / 12.0)
+        analog = skin.a3 + skin.polarity * signal + sigma * rng.standard_normal(signal.shape)
+        return np.round(np.clip(analog, 0.0, skin.full_scale) / skin.lsb) * skin.lsb
+
+    def gap(self, T: Array, size: Array, count: int) -> float:
+        """Smallest distance [m] from an electrode to the skin."""
+        scale = np.exp(size[[0, 1, 1]])
+        used = np.isin(self.skin.pad_of, self.chosen[count])
+        local = (self.skin.positions(self.pads)[used] - T[:3, 3]) @ T[:3, :3] / scale
+        distance, _, gradient = self.surface.nearest(local)
+        return float((distance / np.linalg.norm(gradient / scale, axis=1)).min())
+
+    def axes(self, T: Array, count: int) -> Array:
+        """Directions (6, 6), one a row, of a pose error by NAMES: along the limb, across it in the pads' plane, along the pads'
+        normal, and the turns about these three."""
+        axial = T[:3, 0]
+        normal = self.pads[self.chosen[count], :3, 2].mean(axis=0)
+        normal = normal - (normal @ axial) * axial
+        normal /= np.linalg.norm(normal)
+        frame = np.stack([axial, np.cross(normal, axial), normal])
+        return np.block([[frame, np.zeros((3, 3))], [np.zeros((3, 3)), frame]])
+
+    def place(self, rng: np.random.Generator, gap: float, count: int) -> tuple[Array, Array]:
+        """A random pose at a gap above the pads in use, and a random size (2,)."""
+        size = np.array([rng.uniform(*LENGTH), rng.uniform(*GIRTH)])
+        T = self.home.copy()
+        axes = self.axes(T, count)[:3, :3]
+        T[:3, 3] = self.pads[self.chosen[count], :3, 3].mean(axis=0)
+        T[:3, 3] += np.array([rng.uniform(-0.05, 0.05), rng.uniform(-0.03, 0.03), 0.25]) @ axes
+        turn = np.array([0.3 * rng.standard_normal(), rng.uniform(-0.12, 0.12), rng.uniform(-0.26, 0.26)]) @ axes
+        T[:3, :3] = geometry.perturb(T, np.concatenate([np.zeros(3), turn]))[:3, :3]
+        for _ in range(12):
+            T[:3, 3] += (gap - self.gap(T, size, count)) * axes[2]
+        return T, size
+
+    def information(self, signal: Array, T: Array, size: Array) -> Array:
+        """Fisher information (8, 8) of a window with these true signals (n,) about pose and size, by the response's
+        derivatives."""
+        R = self.pads[:, :3, :3]
+        _, jacobian = self.response.logs(np.stack([geometry.inverse(pad) @ T for pad in self.pads]), size)
+        turned = jacobian.copy()
+        for part in (slice(0, 3), slice(3, 6)):
+            turned[:, part] = np.einsum("nij,nj->ni", R[self.skin.pad_of], jacobian[:, part])
+        J = signal[:, None] * turned
+        return np.asarray(J.T @ (J / (self.skin.noise / SAMPLES)[:, None]))
+
+
+@dataclass
+class Row:
+    """Errors by NAMES (trials, 6) and variances of the bound (poses, 6)."""
+
+    errors: list[Array]
+    bounds: list[Array]
+
+
+def single_windows(rig: Rig, seed: int, plan: Plan, method: str = "solve") -> Iterator[dict[str, Any]]:
+    """Rows of single windows."""
+    for count in PADS:
+        for gap in GAPS:
+            priors = (False, True) if method == "solve" else (False,)  # the network knows no other prior than its training's
+            table = {(prior, speed): Row([], []) for prior in priors for speed in SPEEDS}
+            for k in range(plan.poses):
+                rng = np.random.default_rng([seed, count, int(1e4 * gap), k])
+                T, size = rig.place(rng, gap, count)
+                body = field.limb(rig.mesh, *np.exp(size))
+                axes = rig.axes(T, count)
+                middle = rig.signal(body, T, count)
+                direction = rng.standard_normal(3)
+                step = 0.5 * (WINDOW_NS - PERIOD_NS) * 1e-9 * direction / np.linalg.norm(direction)
+                signals = {0.0: middle}
+                for speed in SPEEDS[1:]:  # the mean over the window's way, by Simpson's rule
+                    ends = [
+                        rig.signal(body, geometry.perturb(T, np.append(s * speed * step, np.zeros(3))), count) for s in (-1, 1)
+                    ]
+                    signals[speed] = (4.0 * middle + ends[0] + ends[1]) / 6.0
+                information = rig.information(middle, T, size)
+                for (prior, speed), row in table.items():
+                    spread = TRACKING if prior else BROAD
+                    row.bounds.append(_bound(information, axes, spread))
+                    for _ in range(plan.draws):
+                        home = geometry.perturb(T, (spread * rng.standard_normal(6)) @ axes)
+                        estimator = rig.estimator(home, np.sqrt(np.diag(axes.T @ np.diag(spread**2) @ axes)), method)
+                        amplitude = rig.voltages(np.tile(signals[speed], (SAMPLES, 1)), rng).mean(axis=0)
+                        estimator.update(1, amplitude, rig.samples(count), rig.pads, rig.joints)
+                        row.errors.append(axes @ geometry.pose_error(T, estimator.pose))
+            for (prior, speed), row in table.items():
+                yield _row(rig, gap, count, prior, speed, row)
+
+
+def _bound(information: Array, axes: Array, spread: Array) -> Array:
+    """Variances (6,) by NAMES of the bound with a prior on pose and size."""
+    total = information.copy()
+    total[:6, :6] += axes.T @ np.diag(spread**-2) @ axes
+    total[6:, 6:] += np.diag(SIZE_SPREAD**-2)
+    return np.asarray(np.diag(axes @ np.linalg.inv(total)[:6, :6] @ axes.T))
+
+
+def _row(rig: Rig, gap: float, count: int, prior: bool, speed: float, row: Row) -> dict[str, Any]:
+    rmse = dict(zip(NAMES, np.sqrt(np.mean(np.square(row.errors), axis=0)), strict=True))
+    bound = dict(zip(NAMES, np.sqrt(np.mean(row.bounds, axis=0)), strict=True))
+    units = {name: 1e3 if name in SHOWN else np.degrees(1.0) for name in NAMES}
+    out: dict[str, Any] = {"array": rig.name, "gap_m": gap, "pads": count, "prior": prior, "speed": speed}
+    for kind, values in (("rmse", rmse), ("bound", bound)):
+        out[f"{kind}_mm"] = {name: round(float(values[name] * units[name]), 3) for name in SHOWN}
+        out[f"{kind}_deg"] = {name: round(float(values[name] * units[name]), 3) for name in ("pitch", "yaw")}
+    out["ratio"] = {name: round(float(rmse[name] / bound[name]), 2) for name in (*SHOWN, "pitch", "yaw")}
+    return out
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Squared errors over their covariances [per degree of freedom] of one limb: of the published poses (mean over the windows),
+    of the pose that the default observer makes of them, and how long a window took from its last sample to its pose [ms]."""
+
+    published: float
+    fused: float
+    in_range: float
+    ms: list[float]
+
+
+def resting(rig: Rig, seed: int, gap: float, k: int) -> Consistency:
+    """A limb that comes into sight and rests."""
+    rng = np.random.default_rng([seed, 100, int(1e4 * gap), k])
+    T, size = rig.place(rng, gap, 8)
+    signal = rig.signal(field.limb(rig.mesh, *np.exp(size)), T, 8)
+    count = int(REST_S * 1e9 / WINDOW_NS)
+    return _followed(rig, rng, [T] * count, np.tile(signal, (count, 1)))[0]
+
+
+def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: Array) -> tuple[Consistency, list[Array]]:
+    """What estimator and observer make of windows with these true poses and signals (windows, n), and the pose errors (6,) by
+    NAMES of the windows after SETTLED_S."""
+    axes = rig.axes(poses[0], 8)
+    home = geometry.perturb(poses[0], (BROAD * rng.standard_normal(6)) @ axes)
+    estimator = rig.estimator(home, np.sqrt(np.diag(axes.T @ np.diag(BROAD**2) @ axes)))
+    spread = rig.cell.targets[rig.target].home_spread
+    observer = ErrorStateObserver(home, (spread.position, spread.rotation))
+    estimator.warm_up(len(rig.joints))
+    collector = Collector(rig.skin, WINDOW_NS)
+    published, fused, ms, errors, seen = [], [], [], [], 0
+    for i, T in enumerate(poses):
+        stamp_ns = (i + 1) * WINDOW_NS
+        volts = rig.voltages(np.tile(signals[i], (SAMPLES, 1)), rng)
+        for pad, name in enumerate(rig.skin.pads):
+            begin = time.perf_counter()
+            window = collector.add(name, stamp_ns, PERIOD_NS, volts[:, rig.skin.of(pad)])
+        assert window is not None
+        estimate = estimator.update(window.stamp_ns, window.amplitude, window.samples, rig.pads, rig.joints)
+        ms.append(1e3 * (time.perf_counter() - begin))
+        if estimate.in_range:
+            observer.measure("haptic", window.stamp_ns, estimate.T, estimate.information)
+        if stamp_ns < SETTLED_S * 1e9:
+            continue
+        errors.append(rig.axes(T, 8) @ geometry.pose_error(T, estimator.pose))
+        if not estimate.in_range:
+            continue
+        seen += 1
+        values = np.linalg.eigvalsh(estimate.information)
+        rank = int((values > 1e-6 * values[-1]).sum())
+        error = geometry.pose_error(T, estimate.T)
+        published.append(float(error @ estimate.information @ error) / rank)
+        if i % 10 == 0:
+            told = observer.estimate(window.stamp_ns)
+            known = np.delete(rig.axes(told.T, 8), NAMES.index("roll"), axis=0)
+            error = known @ geometry.pose_error(T, told.T)
+            fused.append(float(error @ np.linalg.solve(known @ told.covariance @ known.T, error)) / len(known))
+    means = [float(np.mean(values)) if values else float("nan") for values in (published, fused)]
+    return Consistency(*means, seen / max(len(errors), 1), ms), errors
+
+
+def moving(rig: Rig, seed: int, k: int, seconds: float) -> tuple[list[float], list[Array], Consistency]:
+    """A limb that moves through all gaps at up to the highest speed: gaps [m] and pose errors by NAMES, window by window."""
+    rng = np.random.default_rng([seed, 200, k])
+    T, size = rig.place(rng, 0.02, 8)
+    body, axes = field.limb(rig.mesh, *np.exp(size)), rig.axes(T, 8)
+    stamps = np.arange(1, int(seconds * 1e9 / WINDOW_NS) + 1) * WINDOW_NS * 1e-9
+    # along, across, and up and down between 2 and 16 cm: a sine each, at most SPEEDS[-1] together
+    reach, phase = np.array([0.05, 0.03, 0.07]), rng.uniform(0.0, 2.0 * np.pi, 3)
+    rate = rng.uniform(0.5, 1.0, 3)
+    rate *= SPEEDS[-1] / np.linalg.norm(reach * rate)
+    phase[2] = -0.5 * np.pi
+
+    def at(t: Array) -> list[Array]:
+        way = reach * (np.sin(np.outer(t, rate) + phase) - np.sin(phase)) @ axes[:3, :3]
+        return [geometry.perturb(T, np.append(step, np.zeros(3))) for step in way]
+
+    knots = np.arange(0.0, seconds + 0.03, 0.02)
+    logs = np.log(np.maximum([rig.signal(body, pose, 8) for pose in at(knots)], 1e-9))
+    middles = stamps - 0.5 * (SAMPLES - 1) * PERIOD_NS * 1e-9
+    poses = at(middles)
+    found, errors = _followed(rig, rng, poses, np.exp(CubicSpline(knots, logs)(middles)))
+    gaps = [rig.gap(pose, size, 8) for pose in poses[-len(errors) :]]
+    return gaps, errors, found
+
+
+def things(rig: Rig) -> dict[str, field.Body]:
+    """What is no limb: a grounded and a floating metal bar, a plastic block."""
+    bar = trimesh.creation.cylinder(0.015, 0.4, sections=16)
+    block = trimesh.creation.box((0.12, 0.08, 0.05))
+    for _ in range(3):
+        block = block.subdivide()
+    bar = bar.subdivide_to_size(0.03)
+    bar.apply_transform(geometry.from_rpy((0.0, 0.0, 0.0), (0.0, np.pi / 2.0, 0.0)))
+    bodies = {"metal bar, grounded": (bar, np.inf, None), "metal bar": (bar, 0.0, None), "plastic block": (block, 0.0, 3.0)}
+    return {
+        name: field.Body(field.Panels.of_mesh(mesh.vertices, mesh.faces), ground, permittivity)
+        for name, (mesh, ground, permittivity) in bodies.items()
+    }
+
+
+def foreign(rig: Rig, seed: int, count: int) -> dict[str, float]:
+    """Share of windows in which something else is taken for a limb, at 2 to 8 cm, by what it is."""
+    out = {}
+    for name, body in things(rig).items():
+        taken, windows = 0, 0
+        for k in range(count):
+            rng = np.random.default_rng([seed, 300, k])
+            T, _ = rig.place(rng, rng.uniform(0.03, 0.10), 8)
+            signal = rig.signal(body, T, 8)
+            estimator = rig.estimator(rig.home, np.repeat([0.12, 0.4], 3))
+            for i in range(1, 21):
+                amplitude = rig.voltages(np.tile(signal, (SAMPLES, 1)), rng).mean(axis=0)
+                estimate = estimator.update(i * WINDOW_NS, amplitude, rig.samples(8), rig.pads, rig.joints)
+                if i > 10:
+                    windows, taken = windows + 1, taken + estimate.in_range
+        out[name] = round(taken / windows, 3)
+    return out
+
+
+def sequences(rig: Rig, seed: int, plan: Plan, progress: Progress) -> dict[str, Any]:
+    """Resting and moving limbs, and foreign things."""
+    task = progress.add_task(f"{rig.name}: sequences", total=len(RESTING_GAPS) * plan.resting + plan.moving + 1)
+    by_gap, found = {}, []
+    for gap in RESTING_GAPS:
+        here = []
+        for k in range(plan.resting):
+            here.append(resting(rig, seed, gap, k))
+            progress.advance(task)
+        found += here
+        by_gap[f"{gap:g}"] = {
+            name: round(float(np.nanmean([getattr(each, name) for each in here])), 3)
+            for name in ("published", "fused", "in_range")
+        }
+    gaps: list[float] = []
+    errors: list[Array] = []
+    followed = []
+    for k in range(plan.moving):
+        more_gaps, more_errors, each = moving(rig, seed, k, plan.moving_s)
+        gaps, errors, followed = gaps + more_gaps, errors + more_errors, [*followed, each]
+        progress.advance(task)
+    table = {}
+    for low, high in BANDS:
+        inside = (np.array(gaps) >= low) & (np.array(gaps) < high)
+        if inside.any():
+            rmse = np.sqrt(np.mean(np.square(np.array(errors)[inside]), axis=0))
+            units = [1e3 if name in SHOWN else np.degrees(1.0) for name in NAMES]
+            table[f"{low:g}-{high:g}"] = dict(zip(NAMES, np.round(rmse * units, 2).tolist(), strict=True))
+    others = foreign(rig, seed, plan.foreign)
+    progress.remove_task(task)
+    ms = np.concatenate([each.ms[50:] for each in found + followed])
+    fused = [each.fused for each in found if np.isfinite(each.fused)]
+    return {
+        "nees": {
+            "mean": round(float(np.mean(fused)), 3),
+            "band": [round(float(chi2.ppf(p, 5 * len(fused)) / (5 * len(fused))), 3) for p in (0.025, 0.975)],
+            "published": round(float(np.nanmean([each.published for each in found])), 3),
+            "limbs": len(fused),
+            "by_gap": by_gap,
+            "moving": {
+                name: round(float(np.nanmean([getattr(each, name) for each in followed])), 3) for name in ("published", "fused")
+            },
+        },
+        "moving": table,
+        "foreign": others,
+        "ms": {"median": round(float(np.median(ms)), 3), "p95": round(float(np.percentile(ms, 95)), 3)},
+    }
+
+
+def measure(seed: int, plan: Plan, arrays: tuple[str, ...], paper: bool) -> dict[str, Any]:
+    """The whole benchmark."""
+    result: dict[str, Any] = {"seed": seed, "rows": [], "paper": []}
+    parts = {}
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        for name in arrays:
+            rig = Rig(name)
+            rig.estimator(rig.home, np.ones(6)).warm_up(len(rig.joints))
+            methods = ["solve"] + (["paper"] if paper and rig.weights is not None else [])
+            for method in methods:
+                task = progress.add_task(f"{name}: {method}", total=len(PADS) * len(GAPS))
+                for row in single_windows(rig, seed, plan, method):
+                    result["rows" if method == "solve" else "paper"].append(row)
+                    progress.update(task, advance=1.0 / (len(SPEEDS) * (2 if method == "solve" else 1)))
+                progress.remove_task(task)
+            parts[name] = sequences(rig, seed, plan, progress)
+    first = parts[arrays[0]]
+    return result | {"nees": first["nees"], "ms": first["ms"]["median"], "arrays": parts}
+
+
+def show(result: dict[str, Any], console: Console) -> None:
+    """The tables."""
+    ours = {_key(row): row for row in result["rows"]}
+    theirs = {_key(row): row for row in result["paper"]}
+    title = f"seed {result['seed']}: RMSE (bound), lateral / height / axial mm, pitch / yaw deg"
+    table = Table(
+        "array",
+        "pads",
+        "gap cm",
+        "prior",
+        "m/s",
+        "lateral",
+        "height",
+        "axial",
+        "pitch",
+        "yaw",
+        "worst ratio",
+        "paper",
+        title=title,
+    )
+    for key, row in ours.items():
+        values = [f"{row['rmse_mm'][name]:.2f} ({row['bound_mm'][name]:.2f})" for name in SHOWN]
+        values += [f"{row['rmse_deg'][name]:.2f} ({row['bound_deg'][name]:.2f})" for name in ("pitch", "yaw")]
+        paper = " / ".join(f"{theirs[key]['rmse_mm'][name]:.1f}" for name in SHOWN) if key in theirs else ""
+        table.add_row(
+            row["array"], str(row["pads"]), f"{100 * row['gap_m']:g}", "tracking" if row["prior"] else "broad",
+            f"{row['speed']:g}", *values, f"{max(row['ratio'].values()):.2f}", paper,
+        )  # fmt: skip
+    console.print(table)
+    for name, part in result["arrays"].items():
+        nees, ms = part["nees"], part["ms"]
+        verdict = "inside" if nees["band"][0] <= nees["mean"] <= nees["band"][1] else "outside"
+        console.print(
+            f"{name}: limbs that rest for {REST_S:g} s: NEES of the observer's pose {nees['mean']} ({verdict} {nees['band']}, "
+            f"{nees['limbs']} limbs), of the published ones {nees['published']}; moving: {nees['moving']}"
+        )
+        console.print("  by gap: " + ", ".join(f"{100 * float(gap):g} cm {each}" for gap, each in nees["by_gap"].items()))
+        for band, each in part["moving"].items():
+            console.print(f"  moving, gap {band} m: " + ", ".join(f"{key} {value:g}" for key, value in each.items()))
+        console.print(f"  taken for a limb: {part['foreign']}")
+        console.print(f"  from sample to pose: {ms['median']} ms, 95th percentile {ms['p95']} ms (goal {MS_GOAL:g})")
+        worst = [
+            (max(row["ratio"].values()), 100 * row["gap_m"])
+            for row in result["rows"]
+            if row["array"] == name and row["pads"] == 8 and 0.02 <= row["gap_m"] <= 0.15
+        ]
+        if worst:
+            console.print(
+                f"  worst ratio to the bound, 8 pads, 2 to 15 cm: {max(worst)[0]:.2f} at {max(worst)[1]:g} cm (goal {RATIO_GOAL})"
+            )
+
+
+def picture(result: dict[str, Any], path: Path) -> None:
+    """The paper's curve: errors against the gap with eight pads, beside their bounds."""
+    from matplotlib.figure import Figure
+
+    arrays = list(result["arrays"])
+    figure = Figure(figsize=(10.0, 4.2 * len(arrays)), layout="constrained")
+    axes = figure.subplots(len(arrays), 2, squeeze=False)
+    for line, name in zip(axes, arrays, strict=True):
+        for plot, (kind, unit, names) in zip(line, (("mm", "mm", SHOWN), ("deg", "deg", ("pitch", "yaw"))), strict=True):
+            for prior, style in ((True, "-"), (False, ":")):
+                rows = [r for r in result["rows"] if (r["array"], r["pads"], r["prior"], r["speed"]) == (name, 8, prior, 0.0)]
+                gaps = [100 * row["gap_m"] for row in rows]
+                for k, each in enumerate(names):
+                    label = f"{each}, {'tracking' if prior else 'broad'} prior"
+                    plot.plot(gaps, [row[f"rmse_{kind}"][each] for row in rows], f"C{k}o{style}", ms=4, label=label)
+                    plot.plot(gaps, [row[f"bound_{kind}"][each] for row in rows], f"C{k}{style}", lw=4, alpha=0.25)
+            plot.set(
+                xlabel="gap [cm]", ylabel=f"error [{unit}]", yscale="log", title=f"{name} array, 8 pads; pale: Cramér-Rao bound"
+            )
+            plot.grid(alpha=0.3, which="both")
+            plot.legend(fontsize=7)
+    figure.savefig(path, dpi=120)
+
+
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in ("array", "gap_m", "pads", "prior", "speed"))
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="penumbra bench haptics", description=(__doc__ or "").partition("\n\n")[0])
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", type=Path, help="write the numbers here")
+    parser.add_argument("--picture", type=Path, help="draw error against gap here (PNG, PDF or SVG)")
+    parser.add_argument("--array", choices=tuple(ARRAYS), action="append", help="only this one (default: all)")
+    parser.add_argument("--method", choices=("both", "solve"), default="both", help="the paper's beside ours (default: both)")
+    parser.add_argument("--quick", action="store_true", help="a few of everything: whether it runs, no numbers to believe")
+    options = parser.parse_args(argv)
+    result = measure(options.seed, QUICK if options.quick else FULL, tuple(options.array or ARRAYS), options.method == "both")
+    show(result, Console(width=170))
+    if options.picture:
+        picture(result, options.picture)
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
