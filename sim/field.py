@@ -210,9 +210,9 @@ class PadField:
         return self._lost(at_body, -np.linalg.solve(system, at_body @ self._unit[:, 0]))
 
     def _coupling(self, points: Array, normals: Array, size: Array) -> tuple[Array, Array, Array]:
-        """Between a body's panels (points (n, 9, 3), normals (n, 3) and sizes (n,) in the pad's frame) and the pad's: potential and
-        normal field (n, pad) at the body of unit charges on the pad, and what unit charges on the body add to the pad's equations
-        (pad, n)."""
+        """Between a body's panels (points (n, 9, 3), normals (n, 3) and sizes (n,) in the pad's frame) and the pad's: potential
+        and normal field (n, pad) at the body of unit charges on the pad, and what unit charges on the body add to the pad's
+        equations (pad, n)."""
         n, pad = len(points), len(self.panels)
         at_body, along_body, bare = np.empty((n, pad)), np.empty((n, pad)), np.empty((len(self._bare), n))
         _couple(points, normals, size, self.panels.centroids, self.panels.normals, self._bare, at_body, bare, along_body)

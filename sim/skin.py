@@ -1,7 +1,8 @@
 """What the pads read: how a limb changes the capacitance of their electrodes, and the amplitudes that come of it.
 
 The changes come from the networks that stand for the boundary-element field (`shared.response`): eight pads at 1 kHz take a few
-per cent of a core. The person's upper arm and torso, other pads and other links of the robot are not felt.
+per cent of a core. What the robot's other links change is added, as if the limb did not shade them. The person's upper arm and
+torso and other pads are not felt.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ class SkinModel:
         self.skin = Skin(cell)
         self._response = Response(cell, target)
 
-    def change(self, T_world_pads: Array, T_world_target: Array) -> Array:
-        """Changes of capacitance (n,) [fF] by the target, for pads (p, 4, 4)."""
+    def change(self, T_world_pads: Array, T_world_target: Array, joints: ArrayLike = ()) -> Array:
+        """Changes of capacitance (n,) [fF] by the target and by the robots at all their joint angles (j,), for pads (p, 4, 4)."""
         T_pads_target = np.stack([inverse(T) for T in T_world_pads]) @ T_world_target
-        return self._response.change(T_pads_target)
+        return self._response.change(T_pads_target) + self._response.rest(joints)
 
     def volts(self, change: ArrayLike, rng: np.random.Generator) -> Array:
         """Amplitudes (..., n) [V] of samples of a millisecond, for changes (..., n) [fF]: signal chain, white noise of the

@@ -114,9 +114,10 @@ class World:
         return np.maximum(self._surface.nearest(local)[0], 0.0)
 
     def change(self, state: WorldState) -> Array:
-        """Changes of capacitance (n,) [fF] by the target."""
+        """Changes of capacitance (n,) [fF] by the target and the robots."""
         assert self.skin is not None
-        return self.skin.change(self.skin.skin.T_world_pads(link_names(state.links)), state.T_world_target)
+        joints = np.concatenate([*state.joints.values(), np.zeros(0)])
+        return self.skin.change(self.skin.skin.T_world_pads(link_names(state.links)), state.T_world_target, joints)
 
     def view(self, camera: str, time_s: float) -> View:
         """What a camera sees at a time."""
