@@ -31,7 +31,7 @@ Array = np.ndarray
 
 POSES, POSES_BACKED = 45_000, 3_000
 """Fields solved for a bare pad, and for one more mounting."""
-POSTURES = 160
+POSTURES = 80
 """Of the robot, for what its other links change at a pad …"""
 LINK_PANELS = (8, 8)
 """… each in so many rows and columns of panels …"""
@@ -53,8 +53,8 @@ OVERHANG = 0.05
 """How far [m] beside the limb's ends a pad may be."""
 PIECES = (40, 18)
 """Rows and columns of the limb's pieces."""
-HIDDEN = 96
-STEPS, BATCH = 24_000, 512
+HIDDEN = 128
+STEPS, BATCH = 250_000, 512
 HELD_OUT_SEED = 1_000_003
 BANDS = (0.005, 0.015, 0.03, 0.06, 0.12, 0.17, 0.25, 0.5)
 """Gaps [m] between which errors are reported apart."""
