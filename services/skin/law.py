@@ -119,7 +119,7 @@ def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str
             clipped.append(gap)
             continue
         if len(own) >= 10:
-            variances.append(white_noise(own))
+            variances.append((white_noise(own), len(own)))
         rows.append((gap, *_mean(own, lsb)))
     if clipped:
         where = ", ".join(map(_gap, clipped))
@@ -131,7 +131,7 @@ def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str
             "more, from 1 to 20 cm" + (", and turn the amplifier down" if clipped else "")
         )
     gap_, mean, error = (np.array(column) for column in zip(*rows, strict=True))
-    noise = float(np.median(variances)) if variances else None
+    noise = _pooled(np.array(variances)) if variances else None
     return Readings(gap_, mean, error, noise, tuple(notes))
 
 
@@ -206,6 +206,12 @@ def _mean(volts: Array, lsb: float) -> tuple[float, float]:
         stretches = [stretch.mean() for stretch in np.array_split(kept, 10)]
         error = max(error, float(np.std(stretches, ddof=1)) / np.sqrt(10.0))
     return float(kept.mean()), float(np.hypot(error, 0.05 * lsb))
+
+
+def _pooled(variances: Array) -> float:
+    """One variance from those of k gaps, (k, 2) with their numbers of samples; gaps with twice the usual one are left out."""
+    kept = variances[variances[:, 0] <= 2.0 * np.median(variances[:, 0])]
+    return float(np.average(kept[:, 0], weights=kept[:, 1]))
 
 
 def _polarity(read: Readings, name: str) -> Literal[-1, 1]:
