@@ -116,7 +116,9 @@ class Examination:
         T_world_pads = self.skin.T_world_pads(link_names(links))
         T_pads_target = np.stack([inverse(T) for T in T_world_pads]) @ transform(pose.position, pose.orientation)
         own = self.skin.of(self.skin.pads.index(name))
-        predicted = self.skin.signal(self.skin.amplitude(self._response.change(T_pads_target)))[own]
+        angles = np.concatenate([np.empty(0), *(known.position for known in joints.values() if known)])
+        change = self._response.change(T_pads_target) + self._response.rest(angles)
+        predicted = self.skin.signal(self.skin.amplitude(change))[own]
         measured = self.skin.polarity[own] * (volts.mean(axis=0) - self.skin.a3[own])
         gap = np.sqrt(max(self.skin.peak[own].max() / max(predicted.max(), 1e-6) - 1.0, 1.0) / self.skin.a2[own].max())
         error = SLOPE * np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3]).max()) / gap
