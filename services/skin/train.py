@@ -54,7 +54,7 @@ OVERHANG = 0.05
 PIECES = (40, 18)
 """Rows and columns of the limb's pieces."""
 HIDDEN = 128
-STEPS, BATCH = 250_000, 512
+STEPS, STEPS_BACKED, BATCH = 250_000, 25_000, 512
 HELD_OUT_SEED = 1_000_003
 BANDS = (0.005, 0.015, 0.03, 0.06, 0.12, 0.17, 0.25, 0.5)
 """Gaps [m] between which errors are reported apart."""
@@ -316,7 +316,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         "--poses", type=int, help=f"fields to solve for each mounting (default: {POSES}, with a link {POSES_BACKED})"
     )
-    parser.add_argument("--steps", type=int, default=STEPS, help="of the network's training (default: %(default)s)")
+    parser.add_argument("--steps", type=int, help=f"of the network's training (default: {STEPS}, with a link {STEPS_BACKED})")
     parser.add_argument("--again", action="store_true", help="also fit mountings that have a network already")
     options = parser.parse_args(argv)
     cell = cells.load(options.cell)
@@ -335,8 +335,9 @@ def main(argv: list[str]) -> int:
             began = time.monotonic()
             start = known.get(mounting.bare) if mounting.backing is not None else None
             poses = options.poses or (POSES if start is None else POSES_BACKED)
+            steps = options.steps or (STEPS if start is None else STEPS_BACKED)
             data = solve(mounting, mesh, poses, options.seed, progress)
-            network = fit(points, data, options.seed, options.steps, start, progress)
+            network = fit(points, data, options.seed, steps, start, progress)
             held_out = score(network, solve(mounting, mesh, max(poses // 12, 50), HELD_OUT_SEED, progress))
             rest, rest_error = fit_rest(cell, mounting, options.seed) if mounting.backing is not None else (None, None)
             network = replace(network, rest=rest)
@@ -347,7 +348,7 @@ def main(argv: list[str]) -> int:
                 "date": date.today().isoformat(),
                 "fingerprint": mounting.fingerprint,
                 "poses": poses,
-                "steps": options.steps,
+                "steps": steps,
                 "minutes": round((time.monotonic() - began) / 60.0, 1),
                 "held_out_seed": HELD_OUT_SEED,
                 "held_out": held_out,
