@@ -169,7 +169,10 @@ def networks(cell: cells.Cell) -> dict[str, Network]:
     for folder in (cells.BUILT_IN / FOLDER, cell.folder / FOLDER):
         for path in sorted(folder.glob("*.npz")):
             with np.load(path) as data:
-                out[str(data["fingerprint"])] = Network.of(data)
+                try:
+                    out[str(data["fingerprint"])] = Network.of(data)
+                except (KeyError, ValueError) as error:
+                    raise cells.CellError(f"{path}: a network of penumbra skin model expected ({error}): fit it again") from None
     return out
 
 

@@ -17,6 +17,9 @@ from shared import cell as cells
 
 Array = NDArray[np.float64]
 
+GAIN_GAPS = (0.02, 0.05, 0.10)
+"""Gaps [m] at which a calibrated law is compared with the designed one."""
+
 
 def electrode_positions(pad_type: cells.PadType) -> Array:
     """Centroids (e, 3) [m] of a pad's electrodes in the pad's frame (z out of the pad)."""
@@ -28,8 +31,8 @@ class Skin:
 
     pads: names (p,); first (p + 1,): pad k holds electrodes first[k] to first[k + 1]; names (n,) as PAD/ELECTRODE; centroids
     (n, 3) in the frame of each one's pad; peak (n,) = a1 [V], a2, a3, polarity (n,): the calibrated law, or where there is none
-    the designed one; gain (n,): a1 as a share of the designed one; sensitivity (n,) [V/fF]; noise (n,) [V^2]: variance of one
-    sample of a millisecond; lsb (n,) [V]: a step of the converter; full_scale (n,) [V]: where amplitudes end.
+    the designed one; gain (n,): its signal as a share of the designed one's; sensitivity (n,) [V/fF]; noise (n,) [V^2]: variance
+    of one sample of a millisecond; lsb (n,) [V]: a step of the converter; full_scale (n,) [V]: where amplitudes end.
     Raises ValueError where the cell has no pads.
     """
 
@@ -53,7 +56,10 @@ class Skin:
         self.peak, self.a2, self.a3, self.polarity, self.noise = (
             np.array([float(getattr(law, name)) for law in laws]) for name in ("a1", "a2", "a3", "polarity", "noise")
         )
-        self.gain = self.peak / np.concatenate([[e.law.a1 for e in kind.electrodes.values()] for kind in types])
+        designed = [e.law for kind in types for e in kind.electrodes.values()]
+        a1, a2, gaps = np.array([e.a1 for e in designed]), np.array([e.a2 for e in designed]), np.array(GAIN_GAPS)[:, None]
+        ratio = self.peak / (1.0 + self.a2 * gaps**2) / (a1 / (1.0 + a2 * gaps**2))
+        self.gain = np.exp(np.log(ratio).mean(axis=0))  # a1 alone trades off with a2
         self.sensitivity = np.repeat([kind.chain.sensitivity for kind in types], counts)
         self.full_scale = np.repeat([kind.chain.adc_reference / 2.0 for kind in types], counts)
         self.lsb = np.repeat([kind.chain.adc_reference / (2.0**kind.chain.adc_bits - 1.0) for kind in types], counts)
