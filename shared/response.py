@@ -16,6 +16,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -79,7 +80,7 @@ class Network:
 
     def arrays(self) -> dict[str, Array]:
         """Everything under names, to be stored."""
-        out = {"points": self.points, "mean": self.mean, "scale": self.scale}
+        out: dict[str, Any] = {"points": self.points, "mean": self.mean, "scale": self.scale}
         out |= {f"weight{i}": w for i, w in enumerate(self.weights)} | {f"bias{i}": b for i, b in enumerate(self.biases)}
         if self.rest is not None:
             out |= {"rest": self.rest.coefficients, "rest_middle": self.rest.middle, "rest_half": self.rest.half}

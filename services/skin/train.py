@@ -230,15 +230,17 @@ def fit_rest(cell: cells.Cell, mounting: Mounting, seed: int) -> tuple[Rest, flo
 class _Fit(torch.nn.Module):
     def __init__(self, outputs: int):
         super().__init__()
-        self.layers = torch.nn.ModuleList(
-            [torch.nn.Linear(FEATURES, HIDDEN), torch.nn.Linear(HIDDEN, HIDDEN), torch.nn.Linear(HIDDEN, outputs)]
-        )
-        self.skip = torch.nn.Linear(FEATURES, outputs, bias=False)
+        self.first, self.second = torch.nn.Linear(FEATURES, HIDDEN), torch.nn.Linear(HIDDEN, HIDDEN)
+        self.last, self.skip = torch.nn.Linear(HIDDEN, outputs), torch.nn.Linear(FEATURES, outputs, bias=False)
+
+    @property
+    def layers(self) -> tuple[torch.nn.Linear, ...]:
+        """Those with biases, from input to output."""
+        return self.first, self.second, self.last
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        first, second, last = self.layers
-        y: torch.Tensor = last(torch.tanh(second(torch.tanh(first(x))))) + self.skip(x)
-        return y
+        hidden = torch.tanh(self.second(torch.tanh(self.first(x))))
+        return torch.as_tensor(self.last(hidden) + self.skip(x))
 
 
 def fit(
@@ -255,7 +257,7 @@ def fit(
     model = _Fit(y.shape[1])
     with torch.no_grad():
         if start is None:
-            model.layers[2].bias.copy_(y.mean(dim=0))
+            model.last.bias.copy_(y.mean(dim=0))
         else:
             for layer, weight, bias in zip(model.layers, start.weights, start.biases, strict=True):
                 layer.weight.copy_(torch.from_numpy(weight))
