@@ -53,7 +53,7 @@ CONVINCING = 8.0
 window after window, never below zero (Page's cumulative sum, DOI 10.2307/2333009) …"""
 CLEAR = 4.0
 """… of which one window can give no more than this, lest one burst of noise carries the track away."""
-LASTING = 8.0
+LASTING = 5.0
 """Windows in which the model's error is about the same. Whoever fuses poses takes their errors for independent, so it is
 published with so many times its variance."""
 ROLL_MEMORY_S = 0.1

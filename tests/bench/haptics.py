@@ -245,12 +245,14 @@ def _row(rig: Rig, gap: float, count: int, prior: bool, speed: float, row: Row) 
 @dataclass(frozen=True)
 class Consistency:
     """Squared errors over their covariances [per degree of freedom] of one limb: of the published poses (mean over the windows),
-    of the pose that the default observer makes of them, and how long a window took from its last sample to its pose [ms]."""
+    of the pose that the default observer makes of them; the share of windows in range; how long a window took from its last
+    sample to its pose [ms]; and the pose errors (6,) by NAMES of the windows after SETTLED_S, the size being learnt by then."""
 
     published: float
     fused: float
     in_range: float
     ms: list[float]
+    errors: list[Array]
 
 
 def resting(rig: Rig, seed: int, gap: float, k: int) -> Consistency:
@@ -259,12 +261,11 @@ def resting(rig: Rig, seed: int, gap: float, k: int) -> Consistency:
     T, size = rig.place(rng, gap, 8)
     signal = rig.signal(field.limb(rig.mesh, *np.exp(size)), T, 8)
     count = int(REST_S * 1e9 / WINDOW_NS)
-    return _followed(rig, rng, [T] * count, np.tile(signal, (count, 1)))[0]
+    return _followed(rig, rng, [T] * count, np.tile(signal, (count, 1)))
 
 
-def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: Array) -> tuple[Consistency, list[Array]]:
-    """What estimator and observer make of windows with these true poses and signals (windows, n), and the pose errors (6,) by
-    NAMES of the windows after SETTLED_S."""
+def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: Array) -> Consistency:
+    """What estimator and observer make of windows with these true poses and signals (windows, n)."""
     axes = rig.axes(poses[0], 8)
     home = geometry.perturb(poses[0], (BROAD * rng.standard_normal(6)) @ axes)
     estimator = rig.estimator(home, np.sqrt(np.diag(axes.T @ np.diag(BROAD**2) @ axes)))
@@ -300,11 +301,17 @@ def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: A
             error = known @ geometry.pose_error(T, told.T)
             fused.append(float(error @ np.linalg.solve(known @ told.covariance @ known.T, error)) / len(known))
     means = [float(np.mean(values)) if values else float("nan") for values in (published, fused)]
-    return Consistency(*means, seen / max(len(errors), 1), ms), errors
+    return Consistency(*means, seen / max(len(errors), 1), ms, errors)
 
 
-def moving(rig: Rig, seed: int, k: int, seconds: float) -> tuple[list[float], list[Array], Consistency]:
-    """A limb that moves through all gaps at up to the highest speed: gaps [m] and pose errors by NAMES, window by window."""
+def _rmse(errors: list[Array]) -> dict[str, float]:
+    """Root mean squares of errors (6,) by NAMES, in mm and degrees."""
+    units = [1e3 if name in SHOWN else np.degrees(1.0) for name in NAMES]
+    return dict(zip(NAMES, np.round(np.sqrt(np.mean(np.square(errors), axis=0)) * units, 2).tolist(), strict=True))
+
+
+def moving(rig: Rig, seed: int, k: int, seconds: float) -> tuple[list[float], Consistency]:
+    """A limb that moves through all gaps at up to the highest speed: its gaps [m], and what was made of it."""
     rng = np.random.default_rng([seed, 200, k])
     T, size = rig.place(rng, 0.02, 8)
     body, axes = field.limb(rig.mesh, *np.exp(size)), rig.axes(T, 8)
@@ -323,9 +330,8 @@ def moving(rig: Rig, seed: int, k: int, seconds: float) -> tuple[list[float], li
     logs = np.log(np.maximum([rig.signal(body, pose, 8) for pose in at(knots)], 1e-9))
     middles = stamps - 0.5 * (SAMPLES - 1) * PERIOD_NS * 1e-9
     poses = at(middles)
-    found, errors = _followed(rig, rng, poses, np.exp(CubicSpline(knots, logs)(middles)))
-    gaps = [rig.gap(pose, size, 8) for pose in poses[-len(errors) :]]
-    return gaps, errors, found
+    found = _followed(rig, rng, poses, np.exp(CubicSpline(knots, logs)(middles)))
+    return [rig.gap(pose, size, 8) for pose in poses[-len(found.errors) :]], found
 
 
 def things(rig: Rig) -> dict[str, field.Body]:
@@ -372,24 +378,22 @@ def sequences(rig: Rig, seed: int, plan: Plan, progress: Progress) -> dict[str, 
             here.append(resting(rig, seed, gap, k))
             progress.advance(task)
         found += here
-        by_gap[f"{gap:g}"] = {
-            name: round(float(np.nanmean([getattr(each, name) for each in here])), 3)
-            for name in ("published", "fused", "in_range")
+        shares = {name: float(np.nanmean([getattr(each, name) for each in here])) for name in ("published", "fused", "in_range")}
+        by_gap[f"{gap:g}"] = {name: round(share, 3) for name, share in shares.items()} | {
+            "rmse": _rmse([error for each in here for error in each.errors])
         }
     gaps: list[float] = []
     errors: list[Array] = []
     followed = []
     for k in range(plan.moving):
-        more_gaps, more_errors, each = moving(rig, seed, k, plan.moving_s)
-        gaps, errors, followed = gaps + more_gaps, errors + more_errors, [*followed, each]
+        more, each = moving(rig, seed, k, plan.moving_s)
+        gaps, errors, followed = gaps + more, errors + each.errors, [*followed, each]
         progress.advance(task)
     table = {}
     for low, high in BANDS:
         inside = (np.array(gaps) >= low) & (np.array(gaps) < high)
         if inside.any():
-            rmse = np.sqrt(np.mean(np.square(np.array(errors)[inside]), axis=0))
-            units = [1e3 if name in SHOWN else np.degrees(1.0) for name in NAMES]
-            table[f"{low:g}-{high:g}"] = dict(zip(NAMES, np.round(rmse * units, 2).tolist(), strict=True))
+            table[f"{low:g}-{high:g}"] = _rmse(list(np.array(errors)[inside]))
     others = foreign(rig, seed, plan.foreign)
     progress.remove_task(task)
     ms = np.concatenate([each.ms[50:] for each in found + followed])
@@ -467,7 +471,8 @@ def show(result: dict[str, Any], console: Console) -> None:
             f"{name}: limbs that rest for {REST_S:g} s: NEES of the observer's pose {nees['mean']} ({verdict} {nees['band']}, "
             f"{nees['limbs']} limbs), of the published ones {nees['published']}; moving: {nees['moving']}"
         )
-        console.print("  by gap: " + ", ".join(f"{100 * float(gap):g} cm {each}" for gap, each in nees["by_gap"].items()))
+        for gap, each in nees["by_gap"].items():
+            console.print(f"  resting at {100 * float(gap):g} cm: {each}")
         for band, each in part["moving"].items():
             console.print(f"  moving, gap {band} m: " + ", ".join(f"{key} {value:g}" for key, value in each.items()))
         console.print(f"  taken for a limb: {part['foreign']}")
