@@ -123,8 +123,8 @@ class Response:
         self.index = np.array([different.index(each) for each in prints])
         points, ends = np.stack([each.points for each in own]), np.stack([each.ends for each in own])
         mean, scale = np.stack([each.mean for each in own]), np.stack([each.scale for each in own])
-        first, second, third = (np.stack([each.weights[i] for each in own]) for i in range(3))
-        biases = tuple(np.stack([each.biases[i] for each in own]) for i in range(3))
+        first, second, third = (_stack([each.weights[i] for each in own]) for i in range(3))
+        biases = tuple(_stack([each.biases[i] for each in own]) for i in range(3))
         self.arrays = (self.index, points, ends, mean, scale, first, biases[0], second, biases[1], third,
                        biases[2], np.stack([each.skip for each in own]))  # fmt: skip
 
@@ -191,6 +191,12 @@ def features(points: NDArray[np.float32], T_pad_limb: Array, size: Array) -> Arr
     for k in range(len(out)):
         _features(points, ends, np.ascontiguousarray(T_pad_limb[k, :3, :3]), T_pad_limb[k, :3, 3].copy(), size[k], out[k])
     return out
+
+
+def _stack(arrays: list[Array]) -> Array:
+    """Arrays in one, smaller ones filled up with zeros: a unit without weights changes nothing."""
+    shape = np.max([each.shape for each in arrays], axis=0)
+    return np.stack([np.pad(each, [(0, n - k) for n, k in zip(shape, each.shape, strict=True)]) for each in arrays])
 
 
 def _digest(data: bytes) -> str:

@@ -2,7 +2,8 @@
 
 For every mounting of a cell (a pad type, and for a backed pad its robot link) the field is solved for limbs of random size at
 random poses, from contact to where nothing is felt, and a network learns the logarithms. Mountings that already have a network
-are left alone. The first mounting is learned from nothing, the others start from the one without a link and need fewer poses.
+are left alone. The network of a bare pad is learned from nothing; for a pad before a link only what is missing to the bare one,
+which needs fewer poses.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from datetime import date
 import numpy as np
 import torch
 from rich.progress import Progress
+from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull
 
 from services import arguments
@@ -53,8 +55,10 @@ OVERHANG = 0.05
 """How far [m] beside the limb's ends a pad may be."""
 PIECES = (40, 18)
 """Rows and columns of the limb's pieces."""
-HIDDEN = 128
-STEPS, STEPS_BACKED, BATCH = 250_000, 25_000, 512
+HIDDEN, HIDDEN_BACKED = 128, 32
+STEPS, STEPS_BACKED, BATCH = 250_000, 10_000, 512
+FAINTEST = 1e-5
+"""Changes below this [fF] are numerical errors: a limb behind the link."""
 HELD_OUT_SEED = 1_000_003
 BANDS = (0.005, 0.015, 0.03, 0.06, 0.12, 0.17, 0.25, 0.5)
 """Gaps [m] between which errors are reported apart."""
@@ -228,10 +232,10 @@ def fit_rest(cell: cells.Cell, mounting: Mounting, seed: int) -> tuple[Rest, flo
 
 
 class _Fit(torch.nn.Module):
-    def __init__(self, outputs: int):
+    def __init__(self, outputs: int, hidden: int):
         super().__init__()
-        self.first, self.second = torch.nn.Linear(FEATURES, HIDDEN), torch.nn.Linear(HIDDEN, HIDDEN)
-        self.last, self.skip = torch.nn.Linear(HIDDEN, outputs), torch.nn.Linear(FEATURES, outputs, bias=False)
+        self.first, self.second = torch.nn.Linear(FEATURES, hidden), torch.nn.Linear(hidden, hidden)
+        self.last, self.skip = torch.nn.Linear(hidden, outputs), torch.nn.Linear(FEATURES, outputs, bias=False)
 
     @property
     def layers(self) -> tuple[torch.nn.Linear, ...]:
@@ -246,24 +250,22 @@ class _Fit(torch.nn.Module):
 def fit(
     points: Array, data: Solved, seed: int, steps: int, start: Network | None = None, progress: Progress | None = None
 ) -> Network:
-    """The network that has the logarithms of the changes; robust against the few poses that it cannot follow."""
+    """The network that has the logarithms of the changes, robust against the few poses that it cannot follow. With a start, only
+    what is missing to it is learned, by a small network beside it."""
     torch.manual_seed(seed)
     rng = np.random.default_rng([seed, 43])
-    usable = (data.change > 1e-6).all(axis=1)
-    inputs, wanted = features(points, data.T, data.size)[usable], np.log(data.change[usable])
+    usable = (data.change > FAINTEST).all(axis=1)
+    data = Solved(data.T[usable], data.size[usable], data.gap[usable], data.change[usable])
+    inputs, wanted = features(points, data.T, data.size), np.log(data.change)
+    if start is not None:
+        wanted -= np.log(predict(start, data))
     mean, scale = (start.mean, start.scale) if start else (inputs.mean(axis=0), inputs.std(axis=0) + 1e-9)
     x = torch.from_numpy(((inputs - mean) / scale).astype(np.float32))
     y = torch.from_numpy(wanted.astype(np.float32))
-    model = _Fit(y.shape[1])
+    model = _Fit(y.shape[1], HIDDEN if start is None else HIDDEN_BACKED)
     with torch.no_grad():
-        if start is None:
-            model.last.bias.copy_(y.mean(dim=0))
-        else:
-            for layer, weight, bias in zip(model.layers, start.weights, start.biases, strict=True):
-                layer.weight.copy_(torch.from_numpy(weight))
-                layer.bias.copy_(torch.from_numpy(bias))
-            model.skip.weight.copy_(torch.from_numpy(start.skip))
-    optimizer = torch.optim.Adam(model.parameters(), lr=1e-3)
+        model.last.bias.copy_(y.mean(dim=0))
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3, weight_decay=0.0 if start is None else 0.1)
     task = progress.add_task("network", total=steps) if progress else None
     for step in range(steps):
         for group in optimizer.param_groups:
@@ -281,7 +283,17 @@ def fit(
     with torch.no_grad():
         weights = tuple(layer.weight.numpy().astype(float) for layer in model.layers)
         biases = tuple(layer.bias.numpy().astype(float) for layer in model.layers)
-        return Network(points, mean, scale, weights, biases, model.skip.weight.numpy().astype(float))  # type: ignore[arg-type]
+        network = Network(points, mean, scale, weights, biases, model.skip.weight.numpy().astype(float))  # type: ignore[arg-type]
+    return network if start is None else beside(start, network)
+
+
+def beside(one: Network, other: Network) -> Network:
+    """One network that gives the sum of the outputs of two with the same input."""
+    (a0, a1, a2), (b0, b1, b2) = one.weights, other.weights
+    (a3, a4, a5), (b3, b4, b5) = one.biases, other.biases
+    weights = np.concatenate([a0, b0]), block_diag(a1, b1), np.concatenate([a2, b2], axis=1)
+    biases = np.concatenate([a3, b3]), np.concatenate([a4, b4]), a5 + b5
+    return replace(one, weights=weights, biases=biases, skip=one.skip + other.skip)
 
 
 def predict(network: Network, data: Solved) -> Array:
