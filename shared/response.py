@@ -63,7 +63,7 @@ class Rest:
 class Network:
     """The response of one mounting. points (7, k): the limb's skin in pieces, in its own frame: centre [m], normal, area [m^2];
     mean and scale (FEATURES,) of the input; three weight matrices (rows are outputs) with biases; a linear skip (e, FEATURES);
-    rest: the robot's own share, where the pad sits on one."""
+    rest: the robot's own share, where the pad sits on one; error: standard deviation of the relative error on held-out poses."""
 
     points: NDArray[np.float32]
     mean: Array
@@ -72,6 +72,7 @@ class Network:
     biases: tuple[Array, Array, Array]
     skip: Array
     rest: Rest | None = None
+    error: float = 0.0
 
     @property
     def ends(self) -> Array:
@@ -80,7 +81,7 @@ class Network:
 
     def arrays(self) -> dict[str, Array]:
         """Everything under names, to be stored."""
-        out: dict[str, Any] = {"points": self.points, "mean": self.mean, "scale": self.scale}
+        out: dict[str, Any] = {"points": self.points, "mean": self.mean, "scale": self.scale, "error": self.error}
         out |= {f"weight{i}": w for i, w in enumerate(self.weights)} | {f"bias{i}": b for i, b in enumerate(self.biases)}
         if self.rest is not None:
             out |= {"rest": self.rest.coefficients, "rest_middle": self.rest.middle, "rest_half": self.rest.half}
@@ -95,11 +96,12 @@ class Network:
         )
         mean, scale, skip = (np.ascontiguousarray(data[name], dtype=float) for name in ("mean", "scale", "skip"))
         rest = Rest(*(data[name].astype(float) for name in ("rest", "rest_middle", "rest_half"))) if "rest" in data else None
-        return Network(points, mean, scale, weights, biases, skip, rest)  # type: ignore[arg-type]
+        return Network(points, mean, scale, weights, biases, skip, rest, float(data["error"]))  # type: ignore[arg-type]
 
 
 class Response:
     """The networks of all pads of a cell for one of its targets; every pad has e electrodes, in the order of `shared.skin.Skin`.
+    error (n,): standard deviation of what they get wrong, as a share of the change.
 
     Raises CellError where a pad's mounting has no network, or pads differ in their number of electrodes.
     """
@@ -120,6 +122,7 @@ class Response:
             raise cells.CellError(f"cell {cell.name}: pads with equally many electrodes expected, {sorted(sizes)} came")
         self.electrodes = sizes.pop()
         self._rest = [known[each].rest for each in prints]
+        self.error = np.repeat([known[each].error for each in prints], self.electrodes)
         self.index = np.array([different.index(each) for each in prints])
         points, ends = np.stack([each.points for each in own]), np.stack([each.ends for each in own])
         mean, scale = np.stack([each.mean for each in own]), np.stack([each.scale for each in own])
@@ -180,7 +183,7 @@ def networks(cell: cells.Cell) -> dict[str, Network]:
 def save(path: Path, network: Network, own: str) -> None:
     """Store a network for the mounting with this fingerprint, in half the memory."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {name: a.astype(np.float32) for name, a in network.arrays().items()}
+    arrays = {name: np.asarray(a, np.float32) for name, a in network.arrays().items()}
     np.savez_compressed(path, fingerprint=np.array(own), **arrays)  # type: ignore[arg-type]
 
 

@@ -16,7 +16,7 @@ from services.haptics.estimator import FOREIGN, Estimate, Estimator
 from services.haptics.nearest import nearest_points
 from services.haptics.network import Relative
 from services.haptics.slow import SIZE, SIZE_SPREAD, Size, Tare
-from services.haptics.solve import MODEL_ERROR, NEAR_ERROR, NEAR_SIGNAL, Prior, Solver, Window, marginal, peak
+from services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, Prior, Solver, Window, marginal, peak
 from shared import cell as cells
 from shared import geometry
 from shared.body import target_mesh
@@ -139,14 +139,14 @@ def test_the_information_is_that_of_the_voltages_derivatives(skin: Skin, respons
     T, step = geometry.from_rpy((0.01, -0.02, 0.14), (0.1, -0.1, 0.2)), 1e-5
     solver = Solver(skin, response)
     prior = Prior(T, 1e-9 * np.eye(6), SIZES, 1e-9 * np.eye(2))
-    window = Window(signal(skin, response, T), skin.noise / 10, pads, np.ones(len(skin)))
+    window = Window(signal(skin, response, T), skin.noise / 10, pads, np.ones(len(skin)), np.zeros(len(skin)))
     information, gradient = solver.likelihood(window, solver.solve(window, prior, T, SIZES, 0, 0))
     moved = [
         [signal(skin, response, geometry.perturb(T, s * step * e[:6]), SIZES + s * step * e[6:]) for s in (1, -1)]
         for e in np.eye(8)
     ]
     J = np.stack([(up - down) / (2 * step) for up, down in moved], axis=1)
-    share = MODEL_ERROR + NEAR_ERROR * window.signal / NEAR_SIGNAL
+    share = response.error + NEAR_ERROR * window.signal / NEAR_SIGNAL
     expected = J.T @ (J / (skin.noise / 10 + (share * window.signal) ** 2)[:, None])
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.04)
@@ -161,7 +161,7 @@ def test_the_solve_finds_pose_and_size_from_centimetres_away(
     solver = Solver(skin, response)
     away = geometry.perturb(T, np.array([0.02, -0.02, 0.03, 0.1, 0.1, -0.1]))
     prior = Prior(away, np.diag(np.repeat([0.02, 0.1], 3) ** -2.0), SIZE, np.diag(SIZE_SPREAD**-2))
-    window = Window(signal(skin, response, T), skin.noise / 1000, pads, np.ones(len(skin)))
+    window = Window(signal(skin, response, T), skin.noise / 1000, pads, np.ones(len(skin)), np.zeros(len(skin)))
     found = solver.solve(window, prior, away, SIZE)
     at_truth = solver.solve(window, prior, T, SIZES)
     assert found.cost == pytest.approx(at_truth.cost, abs=0.2)

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from services.haptics.network import PoseNetwork, Relative, features
 from services.haptics.slow import PERSON_S, SIZE_GAP, SIZE_LASTING, Size, Tare
-from services.haptics.solve import LEVER, MODEL_ERROR, Prior, Solution, Solver, Window, marginal, peak
+from services.haptics.solve import LEVER, Prior, Solution, Solver, Window, marginal, peak
 from shared.geometry import Array, perturb, pose_error
 from shared.response import Response
 from shared.skin import Skin
@@ -46,8 +46,10 @@ STRANGE = 3.5
 FOREIGN = "what is felt is no limb: something else is near"
 AGAIN = 3
 """Of so many windows that nothing explains, one is solved from scratch: a search takes some milliseconds."""
+OTHER_EVERY = 2
+"""Of so many windows one also looks elsewhere."""
 GROWN = 8
-"""Windows in which another solution grows beside the track before the two are compared."""
+"""Such windows in which another solution grows beside the track before the two are compared."""
 CONVINCING = 8.0
 """A solve from scratch replaces the track when doubt has summed up to this: the log of how much more probable it is, less one,
 window after window, never below zero (Page's cumulative sum, DOI 10.2307/2333009) …"""
@@ -56,6 +58,8 @@ CLEAR = 4.0
 LASTING = 5.0
 """Windows in which the model's error is about the same. Whoever fuses poses takes their errors for independent, so it is
 published with so many times its variance."""
+LINKS_ERROR = 0.005
+"""Standard deviation of what the robot's other links are predicted to change, as a share."""
 ROLL_MEMORY_S = 0.1
 """MEMORY_S of the roll about the limb's axis. Short: a wrong roll that was once believed must not be kept for seconds."""
 SLIDES = (0.0, -0.08, 0.08, -0.16, 0.16)
@@ -117,7 +121,7 @@ class Estimator:
         self._waited, self._away_s, self._misfit = -1, 0.0, 1.0
         self._pad_misfit = np.ones(len(self.skin.pads))
         self._other: tuple[Array, Array] | None = None
-        self._doubt, self._turn, self._age, self._idle = 0.0, 0, 0, False
+        self._doubt, self._turn, self._age, self._rests = 0.0, 0, 0, 0
         self.size.forget()
         self.tare.forget()
 
@@ -151,7 +155,7 @@ class Estimator:
         signal = np.where(samples > 0, self.skin.signal(amplitude) - own - self.tare.offset, 0.0)
         variance = np.where(samples > 0, self.skin.noise / np.maximum(samples, 1), np.inf)
         distrust = np.maximum(1.0, self._pad_misfit / PAD_MISFIT) ** 2
-        window = Window(signal, variance, T_world_pads, distrust[self.skin.pad_of])
+        window = Window(signal, variance, T_world_pads, distrust[self.skin.pad_of], LINKS_ERROR * own)
         estimate = self._by_network(window, joints) if self.method == "paper" else self._by_solve(window, joints)
         self.tare.update(signal, samples, elapsed_s, estimate.in_range)
         self._away_s = 0.0 if estimate.in_range else self._away_s + elapsed_s
@@ -208,10 +212,10 @@ class Estimator:
         if tracked.misfit > MISFIT:
             self._waited = 0
             return self._from_scratch(window, joints)
-        self._idle = not self._idle
-        if self._idle:
+        self._rests = (self._rests + 1) % OTHER_EVERY
+        if self._rests:
             return tracked, *certain
-        # Beside the track another solution grows from scratch, a step or two in every second window.
+        # Beside the track another solution grows from scratch, a step or two at a time.
         home = self._prior(self.home, self._home_covariance)
         if self._other is None:
             self._turn += 1
@@ -292,7 +296,7 @@ class Estimator:
 
     def _features(self, window: Window, joints: ArrayLike) -> NDArray:
         assert self.network is not None
-        variance = window.variance + (MODEL_ERROR * np.maximum(window.signal, 0.0)) ** 2
+        variance = window.variance + (self._response.error * np.maximum(window.signal, 0.0)) ** 2
         return features(self.skin, self.network.home, window.signal, variance, window.T_world_pads, joints)
 
     def _predict(self, stamp_ns: int) -> float:

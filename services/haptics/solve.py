@@ -28,10 +28,8 @@ from shared.skin import Skin
 
 Array = NDArray[np.float64]
 
-MODEL_ERROR = 0.005
-"""Standard deviation of what the response gets wrong, as a share of the signal …"""
 NEAR_ERROR = 0.06
-"""… more where an electrode is nearly touched: it grows by this share with the signal over NEAR_SIGNAL."""
+"""What the response gets wrong grows, where an electrode is nearly touched, by this share with the signal over NEAR_SIGNAL."""
 NEAR_SIGNAL = 1.0
 """[V]: a gap of half a centimetre."""
 COARSE_ERROR = 0.3
@@ -40,6 +38,8 @@ OUTLIER = 3.0
 """Residual, in standard deviations, from which an electrode loses weight as its square."""
 FARTHEST_STEP = np.array([0.06, 0.5, 0.25])
 """Longest step: position [m], rotation [rad], log size."""
+SAME_SLOPE = 0.3
+"""After a step that changes no signal by a larger share the derivatives of the logs are still good for the next one."""
 CONVERGED = 0.05
 """A step with a smaller expected gain in the log probability is the last one, and is taken on trust."""
 FELT = 3.0
@@ -70,12 +70,13 @@ class Prior:
 class Window:
     """What is measured: signal, variance (n,): mean voltage less its rest [V], positive near a person, and its variance, infinite
     for an electrode to leave out; T_world_pads (p, 4, 4); distrust (n,): a factor of at least one on all variances of an
-    electrode, whose pad has not fitted lately."""
+    electrode, whose pad has not fitted lately; doubt (n,) [V]: standard deviation of a rest that was only predicted."""
 
     signal: Array
     variance: Array
     T_world_pads: Array
     distrust: Array
+    doubt: Array
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,8 @@ class Solver:
                         here = here.moved(step)
                     break
                 for _ in range(4):
-                    there = self._point(window, perturb(here.T, step[:6]), here.size + step[6:])
+                    near = not is_coarse and np.abs(here.rows @ step).max() < SAME_SLOPE
+                    there = self._point(window, perturb(here.T, step[:6]), here.size + step[6:], here.rows if near else None)
                     H_there, g_there, cost_there = self._posterior(window, prior, there, is_coarse)
                     if cost_there <= cost:
                         break
@@ -148,27 +150,33 @@ class Solver:
         counts with so many times its variance."""
         H, g = np.zeros((8, 8)), np.zeros(8)
         at, z = solution.point, np.zeros(len(self._scale))
-        _normal_equations(window.signal, window.variance, window.distrust, at.logs, at.rows, False, lasting, H, g, z)
+        _normal_equations(*self._given(window), at.logs, at.rows, False, lasting, H, g, z)
         return H, g
 
-    def _point(self, window: Window, T: Array, size: Array) -> Point:
+    def _point(self, window: Window, T: Array, size: Array, rows: Array | None = None) -> Point:
+        """What is predicted at a pose and size; derivatives that are not given cost six times as much as all else."""
         T_world_pads = window.T_world_pads
         R = T_world_pads[:, :3, :3]
         T_pads_target = np.zeros((len(R), 4, 4))
         T_pads_target[:, :3, :3] = R.transpose(0, 2, 1) @ T[:3, :3]
         T_pads_target[:, :3, 3] = np.einsum("pij,pi->pj", R, T[:3, 3] - T_world_pads[:, :3, 3])
         T_pads_target[:, 3, 3] = 1.0
+        if rows is not None:
+            return Point(T, size, np.log(self.response.change(T_pads_target, size)) + self._scale, rows)
         logs, jacobian = self.response.logs(T_pads_target, size)
         rows = np.empty_like(jacobian)
         _to_world(T_world_pads, self._pad_of, jacobian, rows)
         return Point(T, size, logs + self._scale, rows)
+
+    def _given(self, window: Window) -> tuple[Array, Array, Array, Array, Array]:
+        return window.signal, window.variance, window.distrust, window.doubt, self.response.error
 
     def _posterior(
         self, window: Window, prior: Prior, at: Point, coarse: bool, z: Array | None = None
     ) -> tuple[Array, Array, float]:
         H, g = np.zeros((8, 8)), np.zeros(8)
         z = np.zeros(len(at.logs)) if z is None else z
-        cost = _normal_equations(window.signal, window.variance, window.distrust, at.logs, at.rows, coarse, 1.0, H, g, z)
+        cost = _normal_equations(*self._given(window), at.logs, at.rows, coarse, 1.0, H, g, z)
         toward, toward_size = pose_error(prior.T, at.T), prior.size - at.size
         pull, pull_size = prior.information @ toward, prior.size_information @ toward_size
         H[:6, :6] += prior.information
@@ -202,7 +210,7 @@ def _to_world(T_world_pads, pad_of, jacobian, rows):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(signal, variance, distrust, logs, rows, coarse, lasting, H, g, z):  # type: ignore[no-untyped-def]
+def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coarse, lasting, H, g, z):  # type: ignore[no-untyped-def]
     """Adds the information (8, 8) and gradient (8,) about the target's pose error in the world and its size, writes residuals
     (n,) and returns the robust cost."""
     cost = 0.0
@@ -220,8 +228,8 @@ def _normal_equations(signal, variance, distrust, logs, rows, coarse, lasting, H
             total = (variance[e] + (COARSE_ERROR * at) ** 2) / (at * at + c * c)
         else:
             residual, slope = measured - predicted, predicted
-            share = MODEL_ERROR + NEAR_ERROR * at / NEAR_SIGNAL
-            total = variance[e] + lasting * (share * at) ** 2
+            share = error[e] + NEAR_ERROR * at / NEAR_SIGNAL
+            total = variance[e] + lasting * ((share * at) ** 2 + doubt[e] ** 2)
         z[e] = residual / math.sqrt(total)
         total *= distrust[e]
         square = residual * residual / total

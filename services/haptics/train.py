@@ -27,7 +27,6 @@ from scipy.spatial.transform import Rotation
 from services.haptics.estimator import Estimator
 from services.haptics.network import PoseNetwork, Regression, Relative, features, fingerprint
 from services.haptics.slow import SIZE, SIZE_SPREAD
-from services.haptics.solve import MODEL_ERROR
 from shared import cell as cells
 from shared.body import target_mesh
 from shared.geometry import Array, from_rpy, pose_error
@@ -95,7 +94,7 @@ class Scenes:
         """The network's input for scenes: as `estimator.py` forms it."""
         skin = self.skin
         signal = skin.signal(scene["amplitude"])
-        variance = skin.noise / SAMPLES + (MODEL_ERROR * np.maximum(signal, 0.0)) ** 2
+        variance = skin.noise / SAMPLES + (self.response.error * np.maximum(signal, 0.0)) ** 2
         variance = np.where(scene["alive"][..., skin.pad_of], variance, np.inf)
         return features(skin, self.home, signal, variance, scene["pads"], scene["joints"])
 
@@ -130,7 +129,7 @@ class Scenes:
         gap, ahead = _gaps(electrodes, frames[..., :3, 2], T, np.exp(size), *self.surface.arrays)
         T_pads_target = np.linalg.inv(pads) @ T[:, None]
         change = np.stack([self.response.change(each, own) for each, own in zip(T_pads_target, size, strict=True)])
-        signal = skin.gain * skin.sensitivity * change * (1.0 + MODEL_ERROR * rng.standard_normal(change.shape))
+        signal = skin.gain * skin.sensitivity * change * (1.0 + self.response.error * rng.standard_normal(change.shape))
         amplitude = skin.a3 + skin.polarity * signal + np.sqrt(skin.noise / SAMPLES) * rng.standard_normal(change.shape)
         alive = rng.uniform(size=(count, len(skin.pads))) >= DEAD
         free = (gap > CLOSEST) & ahead
@@ -324,7 +323,7 @@ def main(argv: list[str] | None = None) -> None:
         "seed": options.seed,
         "settings": {
             "network": {"hidden": HIDDEN, "steps": steps, "batch": BATCH, "minutes": round(seconds / 60, 1)},
-            "data": {"samples_per_window": SAMPLES, "model_error": MODEL_ERROR, "dead_pads": DEAD, "closest_m": CLOSEST},
+            "data": {"samples_per_window": SAMPLES, "model_error": "of the response", "dead_pads": DEAD, "closest_m": CLOSEST},
             "prior": {"home": scenes.home.round(6).tolist(), "spread": scenes.spread.round(6).tolist()},
             "fingerprint": fingerprint(cell, target),
         },

@@ -57,6 +57,8 @@ PIECES = (40, 18)
 """Rows and columns of the limb's pieces."""
 HIDDEN, HIDDEN_BACKED = 128, 32
 STEPS, STEPS_BACKED, BATCH = 250_000, 10_000, 512
+NEAR_GAP = 0.05
+"""Nearer [m] the networks err more."""
 FAINTEST = 1e-5
 """Changes below this [fF] are numerical errors: a limb behind the link."""
 HELD_OUT_SEED = 1_000_003
@@ -185,10 +187,9 @@ def pieces(mesh: Mesh) -> Array:
     return np.ascontiguousarray(np.column_stack([panels.centroids, panels.normals, panels.areas]).T, dtype=np.float32)
 
 
-def links(cell: cells.Cell, mounting: Mounting, count: int, seed: int) -> tuple[Array, Array]:
-    """Joint angles (count, j) of the cell's robots, and what all links but the pad's own change there (count, e) [fF]."""
-    rng, models, own = np.random.default_rng([seed, 44]), robot_models(cell), cell.pads[mounting.pad]
-    low, high = joint_range(cell)
+def links(cell: cells.Cell, mounting: Mounting, joints: Array) -> Array:
+    """What all links but the pad's own change (k, e) [fF] at joint angles (k, j) of the cell's robots."""
+    models, own = robot_models(cell), cell.pads[mounting.pad]
     field = PadField(mounting.kind, mounting.backing)
     robot, _, carrier = own.link.partition("/")
     others = {
@@ -198,7 +199,7 @@ def links(cell: cells.Cell, mounting: Mounting, count: int, seed: int) -> tuple[
         if (name, link) != (robot, carrier)
     }
     behind = ConvexHull(geometry.apply(geometry.inverse(own.T_link_pad), models[robot].meshes[carrier].vertices))
-    joints, change = rng.uniform(low, high, (count, len(low))), np.empty((count, len(mounting.kind.electrodes)))
+    change = np.empty((len(joints), len(mounting.kind.electrodes)))
     for k, q in enumerate(joints):
         poses, first = {}, 0
         for name, model in models.items():
@@ -208,7 +209,7 @@ def links(cell: cells.Cell, mounting: Mounting, count: int, seed: int) -> tuple[
         corners = np.concatenate([geometry.apply(T_pad_world @ poses[name][link], c) for (name, link), c in others.items()])
         away = (corners.mean(axis=1) @ behind.equations[:, :3].T + behind.equations[:, 3]).max(axis=1) > JOINED
         change[k] = field.change_of_links(Panels(corners[away]))
-    return joints, change
+    return change
 
 
 def joint_range(cell: cells.Cell) -> tuple[Array, Array]:
@@ -222,13 +223,12 @@ def joint_range(cell: cells.Cell) -> tuple[Array, Array]:
 def fit_rest(cell: cells.Cell, mounting: Mounting, seed: int) -> tuple[Rest, float]:
     """The polynomial for the other links of a pad's robot, and the 95th percentile of its relative error on others."""
     low, high = joint_range(cell)
-    joints, change = links(cell, mounting, POSTURES, seed)
-    middle, half = 0.5 * (low + high), 0.5 * np.maximum(high - low, 1e-6)
-    empty = Rest(np.zeros((change.shape[1], 1)), middle, half)
-    coefficients = np.linalg.lstsq(empty.terms(joints), np.log(change), rcond=None)[0].T
-    rest = Rest(coefficients, middle, half)
-    joints, change = links(cell, mounting, POSTURES // 5, HELD_OUT_SEED)
-    return rest, float(np.percentile(np.abs(rest.change(joints) / change - 1.0), 95))
+    postures = np.random.default_rng([seed, 44]).uniform(low, high, (POSTURES, len(low)))
+    others = np.random.default_rng([HELD_OUT_SEED, 44]).uniform(low, high, (POSTURES // 5, len(low)))
+    empty = Rest(np.zeros((len(mounting.kind.electrodes), 1)), 0.5 * (low + high), 0.5 * np.maximum(high - low, 1e-6))
+    change, held_out = links(cell, mounting, postures), links(cell, mounting, others)
+    rest = replace(empty, coefficients=np.linalg.lstsq(empty.terms(postures), np.log(change), rcond=None)[0].T)
+    return rest, float(np.percentile(np.abs(rest.change(others) / held_out - 1.0), 95))
 
 
 class _Fit(torch.nn.Module):
@@ -304,6 +304,12 @@ def predict(network: Network, data: Solved) -> Array:
     return np.exp(second @ network.weights[2].T + network.biases[2] + x @ network.skip.T)
 
 
+def error(network: Network, data: Solved) -> float:
+    """Standard deviation of the relative error beyond NEAR_GAP, as the median has it: its tails are the estimator's outliers."""
+    far = data.gap > NEAR_GAP
+    return float(1.4826 * np.median(np.abs(np.log(predict(network, data)[far] / np.maximum(data.change[far], FAINTEST)))))
+
+
 def score(network: Network, data: Solved) -> dict[str, dict[str, float]]:
     """Median and 95th percentile of the relative error of all electrodes [%] per band of the gap [cm]."""
     error = 100.0 * np.abs(predict(network, data) / data.change - 1.0)
@@ -352,9 +358,10 @@ def main(argv: list[str]) -> int:
             steps = options.steps or (STEPS if start is None else STEPS_BACKED)
             data = solve(mounting, mesh, poses, options.seed, progress)
             network = fit(points, data, options.seed, steps, start, progress)
-            held_out = score(network, solve(mounting, mesh, max(poses // 12, 50), HELD_OUT_SEED, progress))
+            unseen = solve(mounting, mesh, max(poses // 12, 50), HELD_OUT_SEED, progress)
+            held_out = score(network, unseen)
             rest, rest_error = fit_rest(cell, mounting, options.seed) if mounting.backing is not None else (None, None)
-            network = replace(network, rest=rest)
+            network = replace(network, rest=rest, error=error(network, unseen))
             path = cell.folder / FOLDER / f"{mounting.name}.npz"
             save(path, network, mounting.fingerprint)
             card = {

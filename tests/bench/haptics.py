@@ -34,7 +34,7 @@ from services.haptics.estimator import Estimator
 from services.haptics.service import WEIGHTS
 from services.haptics.slow import SIZE_SPREAD
 from services.haptics.window import Collector
-from services.skin.train import mountings
+from services.skin.train import links, mountings
 from shared import cell as cells
 from shared import geometry
 from shared.body import target_mesh
@@ -98,13 +98,18 @@ class Rig:
         sim = self.cell.sim
         assert sim is not None, f"cell {self.cell.name}: a `sim` section expected"
         self.joints = (np.array(sim.joints_low) + np.array(sim.joints_high)) / 2.0
-        links, first = {}, 0
+        carriers, first = {}, 0
         for robot, model in robot_models(self.cell).items():
-            links[robot] = model.link_transforms(self.joints[first : first + len(model.joints)])
+            carriers[robot] = model.link_transforms(self.joints[first : first + len(model.joints)])
             first += len(model.joints)
-        self.pads = self.skin.T_world_pads(link_names(links))
-        fields = {each.fingerprint: field.PadField(each.kind, each.backing) for each in mountings(self.cell, self.target)}
-        self.fields = [fields[fingerprint(self.cell, pad, self.target)] for pad in self.cell.pads]
+        self.pads = self.skin.T_world_pads(link_names(carriers))
+        known = {each.fingerprint: each for each in mountings(self.cell, self.target)}
+        fields = {own: field.PadField(each.kind, each.backing) for own, each in known.items()}
+        prints = [fingerprint(self.cell, pad, self.target) for pad in self.cell.pads]
+        self.fields = [fields[own] for own in prints]
+        self._rest = np.zeros(len(self.skin))  # what the robot's other links add
+        if len(self.joints):
+            self._rest = np.concatenate([links(self.cell, known[own], self.joints[None])[0] for own in prints])
         self.weights: network.PoseNetwork | None = None
         try:
             self.weights = network.load(WEIGHTS / f"{self.cell.name}-{self.target}.npz", self.cell, self.target)
@@ -131,11 +136,10 @@ class Rig:
         return out * self.skin.gain * self.skin.sensitivity
 
     def voltages(self, signal: Array, rng: np.random.Generator) -> Array:
-        """Samples (s, n) [V] of these signals (s, n): noise, then the converter's steps."""
+        """Samples (s, n) [V] of these signals (s, n): with what the robot's other links add, and noise."""
         skin = self.skin
-        sigma = np.sqrt(skin.noise - skin.lsb**2 / 12.0)
-        analog = skin.a3 + skin.polarity * signal + sigma * rng.standard_normal(signal.shape)
-        return np.round(np.clip(analog, 0.0, skin.full_scale) / skin.lsb) * skin.lsb
+        clean = skin.amplitude(signal / (skin.gain * skin.sensitivity) + self._rest)
+        return np.clip(clean + np.sqrt(skin.noise) * rng.standard_normal(signal.shape), 0.0, skin.full_scale)
 
     def gap(self, T: Array, size: Array, count: int) -> float:
         """Smallest distance [m] from an electrode to the skin."""
