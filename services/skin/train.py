@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 
@@ -160,25 +161,32 @@ class Solved:
 
 
 def solve(
-    mounting: Mounting, mesh: Mesh, count: int, seed: int, progress: Progress | None = None, gap: float | None = None
+    mounting: Mounting,
+    mesh: Mesh,
+    count: int,
+    seed: int,
+    progress: Progress | None = None,
+    gaps: Sequence[float] = (),
+    limbs: dict[tuple[float, ...], Body] | None = None,
 ) -> Solved:
-    """So many random fields, at one gap [m] or at all."""
+    """So many random fields, at these gaps [m] in turn or at all. limbs: those prepared so far, by size: preparing takes time."""
     field, poses = PadField(mounting.kind, mounting.backing), Poses(mesh, mounting.backing, seed)
-    limbs: dict[int, Body] = {}
-    T, size, gaps = np.empty((count, 4, 4)), np.empty((count, 2)), np.empty(count)
+    limbs = {} if limbs is None else limbs
+    T, size, gap = np.empty((count, 4, 4)), np.empty((count, 2)), np.empty(count)
     change = np.empty((count, len(mounting.kind.electrodes)))
     task = progress.add_task(f"{mounting.name}: fields", total=count) if progress else None
     for k in range(count):
-        T[k], which, gaps[k] = poses.draw(gap)
+        T[k], which, gap[k] = poses.draw(gaps[k % len(gaps)] if gaps else None)
         size[k] = poses.sizes[which]
-        if which not in limbs:
-            limbs[which] = limb(mesh, *np.exp(size[k]))
-        change[k] = field.change(limbs[which], T[k])
+        key = tuple(size[k].tolist())
+        if key not in limbs:
+            limbs[key] = limb(mesh, *np.exp(size[k]))
+        change[k] = field.change(limbs[key], T[k])
         if progress and task is not None and k % 50 == 0:
             progress.update(task, completed=k)
     if progress and task is not None:
         progress.remove_task(task)
-    return Solved(T, size, gaps, change)
+    return Solved(T, size, gap, change)
 
 
 def pieces(mesh: Mesh) -> Array:

@@ -25,7 +25,7 @@ from shared import cell as cells
 from shared import geometry
 from shared.body import Mesh, target_mesh
 from shared.classes import Label
-from shared.response import Network, Response, networks
+from shared.response import Response, networks
 from shared.surface import Surface
 from sim.field import Body, PadField, limb, shell
 
@@ -141,12 +141,13 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
     target, aim = next(iter(cell.targets.items()))
     mesh, known, response = target_mesh(aim, cell), networks(cell), Response(cell, target)
     errors: dict[float, list[Array]] = {gap: [] for gap in GAPS_CM}
-    mountings = train.mountings(cell, target)
-    for number, mounting in enumerate(mountings):
-        network: Network = known[mounting.fingerprint]
-        for gap in GAPS_CM:
-            data = train.solve(mounting, mesh, max(1, poses // len(mountings)), seed * 100 + number, gap=gap / 100)
-            errors[gap].append(np.abs(train.predict(network, data) / data.change - 1.0).ravel())
+    mountings, limbs = train.mountings(cell, target), {}
+    for mounting in mountings:
+        count = len(GAPS_CM) * max(1, poses // len(mountings))
+        data = train.solve(mounting, mesh, count, seed, gaps=[gap / 100 for gap in GAPS_CM], limbs=limbs)
+        relative = np.abs(train.predict(known[mounting.fingerprint], data) / data.change - 1.0)
+        for k, gap in enumerate(GAPS_CM):
+            errors[gap].append(relative[k :: len(GAPS_CM)].ravel())
     pooled = {gap: np.concatenate(parts) for gap, parts in errors.items()}
     T = np.tile(geometry.from_rpy((0.0, 0.0, 0.12), (0.1, 0.2, 0.3)), (len(cell.pads), 1, 1))
     response.change(T)
