@@ -78,7 +78,7 @@ class Plan:
     foreign: int
 
 
-FULL, QUICK = Plan(30, 4, 4, 3, 8.0, 12), Plan(2, 2, 1, 1, 1.0, 2)
+FULL, QUICK = Plan(12, 4, 4, 3, 4.0, 8), Plan(2, 2, 1, 1, 1.0, 2)
 
 
 class Rig:
@@ -192,26 +192,37 @@ class Row:
     bounds: list[Array]
 
 
-def single_windows(rig: Rig, seed: int, plan: Plan, method: str = "solve") -> Iterator[dict[str, Any]]:
-    """Rows of single windows."""
+Scene = tuple[Array, Array, dict[float, Array], np.random.Generator]
+
+
+def _scene(rig: Rig, seed: int, count: int, gap: float, k: int) -> Scene:
+    """A random pose and size, the window's mean signals (n,) by speed, and what draws the rest."""
+    rng = np.random.default_rng([seed, count, int(1e4 * gap), k])
+    T, size = rig.place(rng, gap, count)
+    body = field.limb(rig.mesh, *np.exp(size))
+    direction = rng.standard_normal(3)
+    step = 0.5 * (WINDOW_NS - PERIOD_NS) * 1e-9 * direction / np.linalg.norm(direction)
+    signals = {0.0: rig.signal(body, T, count)}
+    for speed in SPEEDS[1:]:  # the mean over the window's way, by Simpson's rule
+        ends = [rig.signal(body, geometry.perturb(T, np.append(s * speed * step, np.zeros(3))), count) for s in (-1, 1)]
+        signals[speed] = (4.0 * signals[0.0] + ends[0] + ends[1]) / 6.0
+    return T, size, signals, rng
+
+
+def single_windows(
+    rig: Rig, seed: int, plan: Plan, method: str = "solve", scenes: dict[tuple[int, float, int], Scene] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Rows of single windows. scenes: those of another method, whose fields need not be solved again."""
+    scenes = {} if scenes is None else scenes
     for count in PADS:
         for gap in GAPS:
             priors = (False, True) if method == "solve" else (False,)  # the network knows no other prior than its training's
             table = {(prior, speed): Row([], []) for prior in priors for speed in SPEEDS}
             for k in range(plan.poses):
-                rng = np.random.default_rng([seed, count, int(1e4 * gap), k])
-                T, size = rig.place(rng, gap, count)
-                body = field.limb(rig.mesh, *np.exp(size))
-                axes = rig.axes(T, count)
-                middle = rig.signal(body, T, count)
-                direction = rng.standard_normal(3)
-                step = 0.5 * (WINDOW_NS - PERIOD_NS) * 1e-9 * direction / np.linalg.norm(direction)
-                signals = {0.0: middle}
-                for speed in SPEEDS[1:]:  # the mean over the window's way, by Simpson's rule
-                    ends = [
-                        rig.signal(body, geometry.perturb(T, np.append(s * speed * step, np.zeros(3))), count) for s in (-1, 1)
-                    ]
-                    signals[speed] = (4.0 * middle + ends[0] + ends[1]) / 6.0
+                if (count, gap, k) not in scenes:
+                    scenes[count, gap, k] = _scene(rig, seed, count, gap, k)
+                T, size, signals, rng = scenes[count, gap, k]
+                axes, middle = rig.axes(T, count), signals[0.0]
                 information = rig.information(middle, T, size)
                 for (prior, speed), row in table.items():
                     spread = TRACKING if prior else BROAD
@@ -330,7 +341,7 @@ def moving(rig: Rig, seed: int, k: int, seconds: float) -> tuple[list[float], Co
         way = reach * (np.sin(np.outer(t, rate) + phase) - np.sin(phase)) @ axes[:3, :3]
         return [geometry.perturb(T, np.append(step, np.zeros(3))) for step in way]
 
-    knots = np.arange(0.0, seconds + 0.03, 0.02)
+    knots = np.arange(0.0, seconds + 0.05, 0.04)
     logs = np.log(np.maximum([rig.signal(body, pose, 8) for pose in at(knots)], 1e-9))
     middles = stamps - 0.5 * (SAMPLES - 1) * PERIOD_NS * 1e-9
     poses = at(middles)
@@ -427,10 +438,11 @@ def measure(seed: int, plan: Plan, arrays: tuple[str, ...], paper: bool) -> dict
         for name in arrays:
             rig = Rig(name)
             rig.estimator(rig.home, np.ones(6)).warm_up(len(rig.joints))
+            scenes: dict[tuple[int, float, int], Scene] = {}
             methods = ["solve"] + (["paper"] if paper and rig.weights is not None else [])
             for method in methods:
                 task = progress.add_task(f"{name}: {method}", total=len(PADS) * len(GAPS))
-                for row in single_windows(rig, seed, plan, method):
+                for row in single_windows(rig, seed, plan, method, scenes):
                     result["rows" if method == "solve" else "paper"].append(row)
                     progress.update(task, advance=1.0 / (len(SPEEDS) * (2 if method == "solve" else 1)))
                 progress.remove_task(task)

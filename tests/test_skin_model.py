@@ -1,0 +1,68 @@
+"""`penumbra skin model`: networks for pads, limbs and mountings that are new."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.skin import train
+from shared import cell as cells
+from shared import geometry
+from shared.body import forearm_mesh
+from shared.response import FOLDER, Response, Rest, networks
+from sim.field import PadField, limb
+
+
+@pytest.fixture
+def few_limbs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, "LIMBS", 3)
+
+
+def test_a_cell_with_another_limb_is_fitted_once_and_then_usable(tmp_path, few_limbs, capsys) -> None:
+    text = (cells.BUILT_IN / "table.yaml").read_text()
+    path = tmp_path / "mine.yaml"
+    path.write_text(text + "\nbody: {forearm_circumference: 0.24, wrist_circumference: 0.15}\n")
+    with pytest.raises(cells.CellError, match="penumbra skin model"):
+        Response(cells.load(path), "forearm")
+    assert train.main(["--cell", str(path), "--poses", "150", "--steps", "1500"]) == 0
+    cell = cells.load(path)
+    assert sorted(p.name for p in (tmp_path / FOLDER).iterdir()) == ["five-forearm.json", "five-forearm.npz"]
+    response, pad = Response(cell, "forearm"), PadField(cell.pad_types["five"])
+    T = geometry.from_rpy((0.0, 0.0, 0.12), (0.0, 0.0, 0.5))
+    found = response.change(np.tile(T, (8, 1, 1)))
+    np.testing.assert_allclose(found[:5], pad.change(limb(forearm_mesh(cell.body)), T), rtol=0.5)  # from 150 poses
+    assert 0.0 < response.error[0] < 0.5
+    capsys.readouterr()
+    assert train.main(["--cell", str(path)]) == 0  # nothing is left to do
+    assert "kept" in capsys.readouterr().out
+
+
+def test_two_networks_beside_each_other_give_the_sum_of_their_logs() -> None:
+    (one, other) = (replace(n, rest=None) for n in list(networks(cells.load("arm")).values())[:2])
+    data = train.Solved(
+        np.tile(geometry.from_rpy((0.0, 0.02, 0.12), (0.1, 0.2, 0.3)), (2, 1, 1)), np.zeros((2, 2)), *[np.ones(2)] * 2
+    )
+    other = replace(other, mean=one.mean, scale=one.scale)
+    both = train.predict(train.beside(one, other), data)
+    np.testing.assert_allclose(both, train.predict(one, data) * train.predict(other, data), rtol=1e-9)
+
+
+def test_drawn_limbs_keep_clear_of_the_board_and_have_the_wanted_gap(few_limbs) -> None:
+    mesh = forearm_mesh(cells.load("table").body)
+    poses = train.Poses(mesh, None, 5)
+    for _ in range(20):
+        T, which, gap = poses.draw(0.05)
+        assert gap == pytest.approx(0.05, rel=0.03)
+        assert poses._gap(poses.solid, T[:3, :3], T[:3, 3], np.exp(poses.sizes[which][[0, 1, 1]])) > train.CLEAR
+
+
+def test_what_other_links_change_follows_the_joints_within_their_range() -> None:
+    cell = cells.load("arm")
+    mounting = next(m for m in train.mountings(cell, "forearm") if m.pad == "p1")
+    low, high = train.joint_range(cell)
+    joints = np.random.default_rng(8).uniform(low, high, (2, len(low)))
+    rest = networks(cell)[mounting.fingerprint].rest
+    assert rest is not None
+    np.testing.assert_allclose(rest.change(joints), train.links(cell, mounting, joints), rtol=0.02)
+    held = Rest(rest.coefficients, rest.middle, rest.half)
+    np.testing.assert_allclose(held.change(high + 1.0), held.change(high), rtol=1e-6)  # beyond the range as at its end
