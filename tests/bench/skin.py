@@ -108,7 +108,7 @@ def figures(cell: cells.Cell) -> dict[str, Any]:
     return {
         "plate_pF": pad.plate_pF,
         "centre_fF": {gap: centre(gap / 100) for gap in CENTRE_FF},
-        "law": fitted,
+        "law": {**fitted, "a3": kind.rest.a3},
         "snr_1db_cm": float(100.0 * np.interp(-1.0, -decibel, gaps)),
         "lateral_contrast": contrast,
         "link_factor": factor,
@@ -186,8 +186,8 @@ def show(found: dict[str, Any], console: Console) -> None:
     table.add_row("all conductors at 1 V, pF", f"{found['plate_pF']:.3f}", f"{PLATE_PF}")
     for gap, value in found["centre_fF"].items():
         table.add_row(f"change at the centre, {gap} cm, fF", f"{value:.3g}", f"{CENTRE_FF[gap]:.3g}")
-    for name, value in found["law"].items():
-        table.add_row(f"law, {name}", f"{value:.5g}", f"{LAW[name]:.5g}")
+    for name, value in LAW.items():
+        table.add_row(f"law, {name}", f"{found['law'][name]:.5g}", f"{value:.5g}")
     table.add_row("SNR of 1 dB at, cm", f"{found['snr_1db_cm']:.1f}", f"{SNR_1DB_CM:g}")
     for gap, value in found["lateral_contrast"].items():
         table.add_row(f"lateral contrast, {gap} cm", f"{value:.3f}", f"{CONTRAST[gap]}")
