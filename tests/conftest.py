@@ -1,9 +1,12 @@
 """Fixtures that several files share."""
 
+import threading
+from collections.abc import Iterator
+
 import pytest
 
-from shared import messages, topics
-from tests.live import Running, penumbra_up, wait_for
+from shared import bus, messages, topics
+from tests.live import Running, free_port, penumbra_up, wait_for
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -23,6 +26,15 @@ def running() -> Running:
         truths.undeclare()
         wait_for(running.is_tracking, 20, "a tracked pose of the resting arm", 0.2)
         yield running
+
+
+@pytest.fixture
+def router() -> Iterator[str]:
+    """The endpoint of a router of the test's own."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    session = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)
+    yield endpoint
+    session.close()
 
 
 def in_reach(sample) -> bool:

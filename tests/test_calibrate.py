@@ -1,7 +1,6 @@
 """`penumbra skin calibrate`: laws from readings, what it says of bad ones, and what it writes."""
 
 import json
-import threading
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from shared import cell as cells
 from shared.messages import Voltages
 from shared.service import Node
 from shared.skin import Skin
-from tests.live import free_port
 
 CELL = cells.load("table")
 KIND = CELL.pad_types["five"]
@@ -277,14 +275,6 @@ class Held:
     def answer(self):
         self.gap = next(self.answers)
         return ""
-
-
-@pytest.fixture
-def router():
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    session = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)
-    yield endpoint
-    session.close()
 
 
 def test_the_guided_procedure_asks_for_every_gap_and_fits_what_the_bus_brings(router, tmp_path, monkeypatch, capsys):

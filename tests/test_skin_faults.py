@@ -1,7 +1,6 @@
 """Faults of the skin: made by the emulator, found in voltages alone, and by `penumbra doctor --skin` on the bus."""
 
 import json
-import threading
 
 import numpy as np
 import pytest
@@ -262,14 +261,6 @@ def test_likely_wants_signals_that_belong_together():
 
 
 # ---- penumbra doctor --skin
-
-
-@pytest.fixture
-def router():
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    session = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)
-    yield endpoint
-    session.close()
 
 
 def pads_on_the_bus(endpoint, faults, silent=()):
