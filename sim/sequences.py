@@ -46,13 +46,24 @@ class Variety:
 
 
 @dataclass(frozen=True)
+class Poses:
+    """Where the target is. T_camera_target (frames, 4, 4); intrinsics (4,) of the window: fx, fy, cx, cy [px]; vertices (n, 3) [m]
+    of the target's mesh, which is that of the person seen."""
+
+    T_camera_target: Array
+    intrinsics: Array
+    vertices: Array
+
+
+@dataclass(frozen=True)
 class Sequence:
     """images (frames, h, w, 3) uint8 RGB, labels (frames, h, w) uint8, hidden (frames,): share of the target's pixels in the
-    window that something covers."""
+    window that something covers; poses: None where only the labels are known."""
 
     images: NDArray[np.uint8]
     labels: NDArray[np.uint8]
     hidden: NDArray[np.float64]
+    poses: Poses | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +80,8 @@ def render(seed: int, index: int, variety: Variety = Variety()) -> Sequence:
     rng = np.random.default_rng([seed, index])
     camera, things = scene(rng, variety)
     look = appearance.look(rng, tuple(things[0].T[0, :3, 3]))
-    renderer = Renderer(camera, (*_window(camera, things[0], variety, rng), variety.size, variety.size))
+    x0, y0 = _window(camera, things[0], variety, rng)
+    renderer = Renderer(camera, (x0, y0, variety.size, variety.size))
     images, labels, hidden = [], [], []
     for t in range(variety.frames):
         bodies = [Body(thing.shape, thing.T[t], thing.appearance) for thing in things]
@@ -77,7 +89,11 @@ def render(seed: int, index: int, variety: Variety = Variety()) -> Sequence:
         images.append(picture.image)
         labels.append(picture.labels)
         hidden.append(renderer.hidden_fraction(picture, bodies, 0))
-    return Sequence(np.stack(images), np.stack(labels), np.array(hidden))
+    T_camera_target = np.stack([geometry.inverse(camera.T_world_camera) @ T for T in things[0].T])
+    poses = Poses(
+        T_camera_target, np.array([camera.fx, camera.fy, camera.cx - x0, camera.cy - y0]), things[0].shape.mesh.vertices
+    )
+    return Sequence(np.stack(images), np.stack(labels), np.array(hidden), poses)
 
 
 def _window(camera: cells.Camera, target: Thing, variety: Variety, rng: np.random.Generator) -> tuple[int, int]:
