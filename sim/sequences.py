@@ -47,8 +47,8 @@ class Variety:
 
 @dataclass(frozen=True)
 class Poses:
-    """Where the target is. T_camera_target (frames, 4, 4); intrinsics (4,) of the window: fx, fy, cx, cy [px]; vertices (n, 3) [m]
-    of the target's mesh, which is that of the person seen."""
+    """Where the target is. T_camera_target (frames, 4, 4); intrinsics (4,) of the window: fx, fy, cx, cy [px]; vertices (n, 3)
+    [m] of the target's mesh, which is that of the person seen."""
 
     T_camera_target: Array
     intrinsics: Array
