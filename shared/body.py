@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,7 +112,13 @@ def torso_mesh(body: cells.Body) -> Mesh:
 
 
 def target_mesh(target: cells.Target, cell: cells.Cell) -> Mesh:
-    """The mesh of a target: the parametric forearm, or the user's own file (metres, x along the limb). Raises CellError."""
+    """The mesh of a target in its size: of the parametric forearm, or the user's own file (metres, x along the limb). Raises
+    CellError."""
+    mesh, size = _mesh(target, cell), target.size
+    return replace(mesh, vertices=mesh.vertices * (size.length, size.girth, size.girth))
+
+
+def _mesh(target: cells.Target, cell: cells.Cell) -> Mesh:
     if target.mesh == "body:forearm":
         return forearm_mesh(cell.body)
     if target.mesh.startswith("body:"):

@@ -223,12 +223,21 @@ class Spread(_Model):
     rotation: Positive
 
 
+class Size(_Model):
+    """Factors by which a target's mesh is stretched along its x axis and across it."""
+
+    length: Positive = 1.0
+    girth: Positive = 1.0
+
+
 class Target(_Model):
     """What is tracked. `mesh`: `body:forearm` (the parametric forearm with hand) or a mesh file beside the cell file, in
-    metres, its x axis along the limb. `labels`: the mask classes that show it. `home`: where it is expected before anything
-    is known, with its spread."""
+    metres, its x axis along the limb. `size`: how much larger than the mesh the person at hand is; the skin's field model
+    follows without being fitted again. `labels`: the mask classes that show it. `home`: where it is expected before anything is
+    known, with its spread."""
 
     mesh: str
+    size: Size = Size()
     labels: tuple[Literal["robot", "torso", "upper_arm", "forearm", "hand", "occluder"], ...]
     home: Placement
     home_spread: Spread = Spread(position=0.15, rotation=0.4)

@@ -6,7 +6,7 @@ part of the limb that is, and gives the logarithm of the change of capacitance [
 every limb: what is grounded takes field lines away.
 `penumbra skin model` fits the networks; a mounting is known by its fingerprint wherever the files come from.
 
-The limb's size is two logarithms, of the factors by which the target's mesh is stretched along its axis and across it.
+The limb's size is two logarithms, of the factors by which it is longer and thicker than the cell file's target in its size.
 """
 
 from __future__ import annotations
@@ -121,6 +121,8 @@ class Response:
         if len(sizes) > 1:
             raise cells.CellError(f"cell {cell.name}: pads with equally many electrodes expected, {sorted(sizes)} came")
         self.electrodes = sizes.pop()
+        own_size = cell.targets[target].size
+        self._size = np.log([own_size.length, own_size.girth])
         self._rest = [known[each].rest for each in prints]
         self.error = np.repeat([known[each].error for each in prints], self.electrodes)
         self.index = np.array([different.index(each) for each in prints])
@@ -134,7 +136,7 @@ class Response:
     def change(self, T_pads_target: Array, size: ArrayLike = (0.0, 0.0)) -> Array:
         """Changes (n,) [fF] by the limb at T_pads_target (p, 4, 4), with its size (2,): log length, log girth."""
         out = np.empty(len(self.index) * self.electrodes)
-        values(*self.arrays, np.ascontiguousarray(T_pads_target), np.asarray(size, dtype=float), out)
+        values(*self.arrays, np.ascontiguousarray(T_pads_target), self._size + size, out)
         return np.exp(out)
 
     def rest(self, joints: ArrayLike) -> Array:
@@ -147,7 +149,7 @@ class Response:
         of each electrode's own pad, and by the two sizes."""
         out = np.empty(len(self.index) * self.electrodes)
         jacobian = np.empty((len(out), 8))
-        derivatives(*self.arrays, np.ascontiguousarray(T_pads_target), np.asarray(size, dtype=float), out, jacobian)
+        derivatives(*self.arrays, np.ascontiguousarray(T_pads_target), self._size + size, out, jacobian)
         return out, jacobian
 
 

@@ -19,7 +19,8 @@ class Person:
         self.whole = target.mesh == "body:forearm"
         if self.whole:
             self.meshes += [bodies.upper_arm_mesh(cell.body), bodies.torso_mesh(cell.body)]
-        self._body = cell.body
+        self._elbow = target.size.length * cell.body.forearm_length / 2.0
+        self._upper_arm = cell.body.upper_arm_length
         self._shoulder = np.asarray(sim.shoulder)
         self._R_world_torso = geometry.from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, target.home.rpy[2]))[:3, :3]
 
@@ -28,12 +29,12 @@ class Person:
         cell's shoulder and keeps its length, the torso stays upright and follows."""
         if not self.whole:
             return [T_world_target]
-        elbow = T_world_target[..., :3, 3] - T_world_target[..., :3, 0] * self._body.forearm_length / 2.0
+        elbow = T_world_target[..., :3, 3] - T_world_target[..., :3, 0] * self._elbow
         x = elbow - self._shoulder
         x /= np.linalg.norm(x, axis=-1, keepdims=True)
         y = np.cross((0.0, 0.0, 1.0), x)
         y /= np.linalg.norm(y, axis=-1, keepdims=True)
-        shoulder = elbow - self._body.upper_arm_length * x
+        shoulder = elbow - self._upper_arm * x
         upper_arm = frame(np.stack([x, y, np.cross(x, y)], axis=-1), shoulder)
         return [T_world_target, upper_arm, frame(self._R_world_torso, shoulder)]
 

@@ -59,3 +59,10 @@ def test_a_mesh_that_cannot_be_a_limb_is_refused_with_the_reason(tmp_path, write
     target = loaded.targets["forearm"].model_copy(update={"mesh": "limb.stl"})
     with pytest.raises(cell.CellError, match=reason):
         body.target_mesh(target, loaded)
+
+
+def test_a_target_in_its_size_is_the_mesh_stretched():
+    table = cell.load("table")
+    large = table.targets["forearm"].model_copy(update={"size": cell.Size(length=1.1, girth=0.9)})
+    vertices = body.target_mesh(table.targets["forearm"], table).vertices
+    np.testing.assert_allclose(body.target_mesh(large, table).vertices, vertices * (1.1, 0.9, 0.9))

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from services.search.search import Search, VisionEstimate
-from services.segmentation.crop import corners_of, window_around
 from shared import geometry
 from shared.classes import Label
 from shared.messages import Mask
+from shared.window import corners_of, window_around
 from sim import shots
 from sim.shots import Shot
 

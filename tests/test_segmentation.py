@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from services.segmentation import compiled, evaluate, infer, loss, prednet, train
-from services.segmentation.crop import Window, corners_of, extrapolate, shift_state, whole_frame, window_around
+from services.segmentation.crop import shift_state
 from services.segmentation.prednet import PredNet, Settings
-from shared import body, cell, geometry
 from shared.classes import Label
+from shared.window import Window, corners_of, window_around
 from sim import sequences, shots
 
 SMALL = Settings(channels=(4, 4, 8), kernels=(3, 3, 3), decoder_channels=4)
@@ -99,28 +99,6 @@ def test_state_shifted_with_the_window_is_the_state_of_the_shifted_window():
         inner = slice(16 // stride, 24 // stride)  # seen by both windows, away from both borders
         torch.testing.assert_close(got[..., inner, inner], expected[..., inner, inner], rtol=1e-4, atol=1e-5)
         assert not got[..., -8 // stride :].any()  # what the old window did not see is unknown
-
-
-def test_the_window_holds_the_whole_target_and_stays_while_it_does():
-    table = cell.load("table")
-    camera, mesh = table.cameras["front"], body.forearm_mesh(table.body)
-    corners = corners_of(mesh.vertices)
-    T = geometry.from_rpy((0.02, 0.0, 0.2), (0.1, 0.1, 0.2))
-    window = window_around(camera, [(T, corners)])
-    points = geometry.apply(geometry.inverse(camera.T_world_camera) @ T, mesh.vertices)
-    pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    assert (pixels > (window.x0, window.y0)).all() and (pixels < (window.right, window.bottom)).all()
-    assert window.x0 % 8 == window.y0 % 8 == window.width % 8 == window.height % 8 == 0
-    nudged = extrapolate(T, np.array([0.1, 0, 0, 0, 0, 0]), 0.05)
-    assert window_around(camera, [(nudged, corners)], window) == window
-
-
-def test_a_target_out_of_the_picture_has_no_window_and_the_whole_frame_is_coarse():
-    table = cell.load("table")
-    camera = table.cameras["front"]
-    behind = geometry.from_rpy((0.35, -3.0, 0.9), (0, 0, 0))
-    assert window_around(camera, [(behind, corners_of(body.forearm_mesh(table.body).vertices))]) is None
-    assert whole_frame(camera) == Window(0, 0, 320, 240, 2)
 
 
 def test_sequences_are_a_function_of_seed_and_index_and_show_the_target():

@@ -8,7 +8,7 @@ import pytest
 from services.skin import train
 from shared import cell as cells
 from shared import geometry
-from shared.body import forearm_mesh
+from shared.body import forearm_mesh, target_mesh
 from shared.response import FOLDER, Response, Rest, networks
 from sim.field import PadField, limb
 
@@ -66,3 +66,14 @@ def test_what_other_links_change_follows_the_joints_within_their_range() -> None
     np.testing.assert_allclose(rest.change(joints), train.links(cell, mounting, joints), rtol=0.02)
     held = Rest(rest.coefficients, rest.middle, rest.half)
     np.testing.assert_allclose(held.change(high + 1.0), held.change(high), rtol=1e-6)  # beyond the range as at its end
+
+
+def test_a_person_of_another_size_needs_no_new_network() -> None:
+    table = cells.load("table")
+    aim = table.targets["forearm"].model_copy(update={"size": cells.Size(length=1.08, girth=0.9)})
+    cell = table.model_copy(update={"targets": {"forearm": aim}})
+    response, field = Response(cell, "forearm"), PadField(cell.pad_types["five"])
+    T = geometry.from_rpy((0.02, 0.01, 0.08), (0.2, 0.1, 0.3))
+    expected = field.change(limb(target_mesh(aim, cell)), T)
+    assert response.change(np.tile(T, (8, 1, 1)))[:5] == pytest.approx(expected, rel=0.05)
+    assert Response(table, "forearm").change(np.tile(T, (8, 1, 1)))[:5] != pytest.approx(expected, rel=0.05)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from services.segmentation import infer
-from services.segmentation.crop import STEP, Window, whole_frame
 from shared.classes import Label
+from shared.window import STEP, Window, whole_frame
 
 SETTLE = 4
 PERIOD_NS = 50_000_000

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from services.segmentation import prednet
 from services.segmentation.compiled import Compiled
-from services.segmentation.crop import MAX_PIXELS, SIZE_STEP, Window, shift_state
+from services.segmentation.crop import shift_state
 from services.segmentation.prednet import PredNet, State
 from shared.classes import Label
+from shared.window import MAX_PIXELS, SIZE_STEP, Window
 
 log = logging.getLogger("penumbra.segmentation")
 

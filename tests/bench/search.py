@@ -26,12 +26,12 @@ from scipy.stats import chi2, rankdata
 
 from services.search.fit import Noise
 from services.search.search import Search, VisionEstimate
-from services.segmentation.crop import Window, corners_of, whole_frame, window_around
 from services.segmentation.infer import Segmenter, load_segmenter
 from shared import geometry
 from shared.classes import Label
 from shared.geometry import Array
 from shared.messages import Mask
+from shared.window import Window, corners_of, whole_frame, window_around
 from sim import shots
 from sim.shots import Shot
 from tests import bound

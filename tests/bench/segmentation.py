@@ -21,8 +21,8 @@ from rich.progress import track
 from rich.table import Table
 
 from services.segmentation import evaluate, infer
-from services.segmentation.crop import Window, corners_of, whole_frame, window_around
 from services.segmentation.evaluate import WARM_UP, FrameScore
+from shared.window import Window, corners_of, whole_frame, window_around
 from sim import sequences, shots
 
 SEED_BASE = 50_000_000
