@@ -12,6 +12,7 @@ from shared import body, geometry
 from shared.cell import Camera, Cell
 from shared.geometry import Array
 from shared.messages import FusedPose
+from shared.prediction import predict
 
 STEP = 8
 """Windows lie and measure in multiples of this many of their own pixels: the stride of the network's coarsest layer."""
@@ -23,8 +24,6 @@ MAX_PIXELS_WIDE = 320 * 240
 """Of the whole frame, or of all around the targets' homes, when nobody knows where one of them is."""
 HOME_SIGMAS = 2.0
 """A lost target is looked for so many standard deviations around its home: further away it would not be believed to be it."""
-MAX_POSE_AGE_S = 0.5
-"""A fused pose older than the frame by more than this says nothing about it."""
 MARGIN_M = 0.04
 """Room around the target [m]: the prediction's error, and the surroundings that tell the contour."""
 NEAR_M = 0.1
@@ -51,11 +50,6 @@ class Window:
     def bottom(self) -> int:
         """The first image row beyond the window."""
         return self.y0 + self.height * self.scale
-
-
-def extrapolate(T: Array, velocity: Array, dt_s: float) -> Array:
-    """A pose after dt [s] at a constant twist (6,), linear [m/s] and angular [rad/s] along the fixed frame's axes."""
-    return geometry.perturb(T, np.asarray(velocity) * dt_s)
 
 
 def corners_of(vertices: Array) -> Array:
@@ -110,7 +104,7 @@ class Lookout:
 
     def look(self, stamp_ns: int) -> Window:
         """The window for a frame exposed at a stamp: kept where it was while it does (`window_around`)."""
-        known = {name: predicted(self._poses.get(name), stamp_ns) for name in self._boxes}
+        known = {name: predict(self._poses.get(name), stamp_ns)[0] for name in self._boxes}
         sure = [(T, self._boxes[name]) for name, T in known.items() if T is not None]
         found = window_around(self._camera, sure, self._window) if len(sure) == len(known) else None
         self._window = found or self._wide([name for name, T in known.items() if T is None], sure)
@@ -119,16 +113,6 @@ class Lookout:
     def _wide(self, lost: Iterable[str] = (), sure: Iterable[tuple[Array, Array]] = ()) -> Window:
         homes = [self._homes[name] for name in lost or self._homes]
         return window_around(self._camera, [*homes, *sure], None, MAX_PIXELS_WIDE) or whole_frame(self._camera)
-
-
-def predicted(pose: FusedPose | None, stamp_ns: int) -> Array | None:
-    """T_world_target at a stamp; None where the pose is lost or too old to say."""
-    if pose is None or pose.state == "lost":
-        return None
-    dt_s = (stamp_ns - pose.stamp_ns) * 1e-9
-    if abs(dt_s) > MAX_POSE_AGE_S:
-        return None
-    return extrapolate(geometry.transform(pose.position, pose.orientation), pose.velocity, dt_s)
 
 
 def window_around(

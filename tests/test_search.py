@@ -11,12 +11,13 @@ import pytest
 from services.search import detect, evidence, overlap
 from services.search.contour import Model
 from services.search.fit import Noise, fit
-from services.search.prediction import JointHistory, predict
+from services.search.joints import JointHistory
 from services.search.robots import RobotDepth
 from services.search.search import Search, VisionEstimate
 from shared import body, cell, geometry, raster
 from shared.classes import Label
 from shared.messages import FusedPose, Mask
+from shared.prediction import predict
 
 CELL = cell.load("table")
 CAMERA = CELL.cameras["front"]

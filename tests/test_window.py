@@ -5,7 +5,7 @@ import pytest
 
 from shared import body, cell, geometry
 from shared.messages import FusedPose
-from shared.window import MAX_PIXELS_WIDE, Lookout, Window, corners_of, extrapolate, whole_frame, window_around
+from shared.window import MAX_PIXELS_WIDE, Lookout, Window, corners_of, whole_frame, window_around
 
 S = 1_000_000_000
 
@@ -20,7 +20,7 @@ def test_the_window_holds_the_whole_target_and_stays_while_it_does():
     pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     assert (pixels > (window.x0, window.y0)).all() and (pixels < (window.right, window.bottom)).all()
     assert window.x0 % 8 == window.y0 % 8 == window.width % 8 == window.height % 8 == 0
-    nudged = extrapolate(T, np.array([0.1, 0, 0, 0, 0, 0]), 0.05)
+    nudged = geometry.perturb(T, np.array([0.005, 0, 0, 0, 0, 0]))
     assert window_around(camera, [(nudged, corners)], window) == window
 
 

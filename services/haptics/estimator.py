@@ -3,7 +3,8 @@
 Each window is estimated from its own samples; what is handed on is its likelihood. Earlier windows enter as the point and spread
 where the solve looks, and through what changes slowly (`slow.py`):
 
-1. predict: the last pose drifts back to its home as an Ornstein-Uhlenbeck process, so its spread never exceeds home's
+1. predict: from the fused pose where that is known, else the last pose drifts back to its home as an Ornstein-Uhlenbeck process,
+   so its spread never exceeds home's
 2. solve from there (`solve.py`), with the limb's size as it is known by now
 3. if that does not explain the voltages, nothing is tracked, or some time has passed, solve from scratch: from home, from the
    network's pose, turned about the limb; this replaces the track where it explains the voltages clearly better
@@ -30,6 +31,11 @@ from shared.surface import Surface
 
 MEMORY_S = 10.0
 """Time in which a pose is forgotten: with a home known to 12 cm, 5 mm a window, twice what a limb moves."""
+EXPECTED_SIGMA = 0.05
+"""A fused pose is looked at where its position is known so well along its worst direction [m]: what the camera saw a moment ago
+tells apart places that feel alike …"""
+EXPECTED_INFLATION, EXPECTED_FLOOR = 2.0, (0.01, 0.1)
+"""… with its standard deviations doubled, and these [m, rad] added: it says where to look and not what is felt."""
 MISFIT = 2.5
 """Misfit above which the voltages are not explained, and the solve starts afresh."""
 NO_LIMB = 2.2
@@ -143,14 +149,22 @@ class Estimator:
         return self._T
 
     def update(
-        self, stamp_ns: int, amplitude: Array, samples: NDArray[np.integer], T_world_pads: Array, joints: ArrayLike = ()
+        self,
+        stamp_ns: int,
+        amplitude: Array,
+        samples: NDArray[np.integer],
+        T_world_pads: Array,
+        joints: ArrayLike = (),
+        expected: tuple[Array, Array] | None = None,
     ) -> Estimate:
         """The estimate at stamp_ns of mean voltages (n,) over so many samples (n,), none for electrodes to leave out, with the
-        pads at T_world_pads (p, 4, 4)."""
+        pads at T_world_pads (p, 4, 4); expected: T_world_target (4, 4) and covariance (6, 6) by all senses."""
         samples = np.asarray(samples)
         if not (samples > 0).any():
             return self.nothing("no electrode can be believed")
         elapsed_s = self._predict(stamp_ns)
+        if expected is not None:
+            self._expect(*expected)
         own = self.skin.gain * self.skin.sensitivity * self._response.rest(joints)  # what the robot's other links change
         signal = np.where(samples > 0, self.skin.signal(amplitude) - own - self.tare.offset, 0.0)
         variance = np.where(samples > 0, self.skin.noise / np.maximum(samples, 1), np.inf)
@@ -316,6 +330,12 @@ class Estimator:
         spread = float(axis @ self._home_covariance @ axis) - float(axis @ self._covariance @ axis)
         self._covariance += max(0.0, (1.0 - (1.0 - forgotten) ** 2) * spread) * np.outer(axis, axis)
         return elapsed_s
+
+    def _expect(self, T: Array, covariance: Array) -> None:
+        """Looks around a pose (4, 4) with its covariance (6, 6), where it is known well enough."""
+        if float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < EXPECTED_SIGMA**2:
+            self._T = T
+            self._covariance = EXPECTED_INFLATION**2 * covariance + np.diag(np.repeat(np.square(EXPECTED_FLOOR), 3))
 
     def _roll(self, T: Array) -> float:
         """The turn about the limb's axis [rad] from home: the twist of the rotation between them."""

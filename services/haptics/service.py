@@ -1,4 +1,4 @@
-"""Voltages and joint angles in, haptic poses out: one for each window of the skin's own samples, 50 a second."""
+"""Voltages, joint angles and the fused pose in, haptic poses out: one for each window of the skin's own samples, 50 a second."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from services.haptics.kinematics import PadPoses
 from services.haptics.window import Backlog, Collector, Window
 from shared.body import target_mesh
 from shared.geometry import position_orientation
-from shared.messages import HapticPose, Joints, Voltages
+from shared.messages import FusedPose, HapticPose, Joints, Voltages
+from shared.prediction import predict
 from shared.response import Response
 from shared.robot import robot_models
 from shared.service import Node
 from shared.skin import Skin
 from shared.surface import Surface
-from shared.topics import HAPTIC, JOINTS, VOLTAGES
+from shared.topics import FUSED, HAPTIC, JOINTS, VOLTAGES
 
 NAME = "haptics"
 WEIGHTS = Path(__file__).parent / "weights"
@@ -48,6 +49,10 @@ def start(node: Node, options: argparse.Namespace) -> None:
     backlog = Backlog()
     told = Faults(node)
     misfits = Misfits(node, skin)
+    fused: dict[str, FusedPose] = {}
+
+    def on_fused(message: FusedPose, names: dict[str, str]) -> None:
+        fused[names["target"]] = message
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
         poses.add(names["robot"], message.stamp_ns, message.position)
@@ -68,13 +73,16 @@ def start(node: Node, options: argparse.Namespace) -> None:
             if found is None:
                 estimate = which.nothing(faults["joints"])
             else:
-                estimate = which.update(window.stamp_ns, window.amplitude, window.samples, *found)
+                T, covariance = predict(fused.get(target), window.stamp_ns)
+                expected = None if T is None or covariance is None else (T, covariance)
+                estimate = which.update(window.stamp_ns, window.amplitude, window.samples, *found, expected)
             if estimate.why == FOREIGN:
                 faults[target] = FOREIGN
             misfits.update(estimate, window)
             node.publish(HAPTIC, _message(estimate, window, target, cell.frame), target=target)
         told.update(faults, window.stamp_ns)
 
+    node.subscribe(FUSED, on_fused)
     node.subscribe(JOINTS, on_joints)
     node.subscribe(VOLTAGES, on_voltages)
 

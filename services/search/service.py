@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 from collections import deque
 
-from services.search.prediction import JointHistory, predict
+from services.search.joints import JointHistory
 from services.search.search import METHODS, Search
 from shared import geometry
 from shared.messages import Frame, FusedPose, Joints, Mask, VisionPose
+from shared.prediction import predict
 from shared.service import Node
 from shared.topics import FRAME, FUSED, JOINTS, MASK, VISION
 
