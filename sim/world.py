@@ -265,10 +265,16 @@ def record(
 
     frames: without them nothing is rendered (a hundred times faster), and the truth says that nothing is hidden.
     """
-    world = World(cell, seed)
+    return stream(World(cell, seed), seconds, frames, epoch_ns)
+
+
+def stream(
+    world: World, seconds: float, frames: bool = True, epoch_ns: int = 10**18
+) -> Iterator[tuple[Topic, dict[str, str], Message]]:
+    """`record` of a world that has been given commands."""
     sensors = Sensors(world, epoch_ns)
     ends_ns = epoch_ns + round(seconds * 1e9)
-    counts = dict.fromkeys(cell.cameras if frames else (), 0)
+    counts = dict.fromkeys(world.cell.cameras if frames else (), 0)
     for k in range(1, (ends_ns - epoch_ns) // TICK_NS + 1):
         for camera in counts:
             while sensors.frame_stamp_ns(camera, counts[camera]) <= epoch_ns + k * TICK_NS:

@@ -1,0 +1,273 @@
+"""`penumbra bench table1`: the paper's result table, on runs that nothing was fitted to, beside the paper's own numbers.
+
+A cell of the table is what the skin reaches (all of the run, or nothing of it), how far away the camera stands, and the share of
+the limb that is hidden. `sim.trial` draws its runs, `tests.trials` plays them through the services: ProcNet (our vision) and what
+fusion makes of it with the skin, PoseCNN likewise, and the paper's own search, network and observer throughout.
+
+Errors are those of the object's centre, averages over all scored frames as in the paper, with the 95 % confidence interval of a
+bootstrap over the runs. A sense that has no pose in a frame cannot be scored there: the share of such frames stands beside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from sim import trial
+from sim.trial import SETTINGS, Setting
+from tests import campaign, trials
+from tests.trials import CHAINS
+
+REFERENCE = Path(__file__).parents[1] / "references" / "paper_table1.json"
+COLUMNS = {
+    "procnet": ("procnet", "vision"),
+    "multimodal_procnet": ("procnet", "fused"),
+    "posecnn": ("posecnn", "vision"),
+    "multimodal_posecnn": ("posecnn", "fused"),
+    "paper_procnet": ("faithful", "vision"),
+    "paper_multimodal_procnet": ("faithful", "fused"),
+}
+"""By name, the chain and which of its poses. The first four are the paper's; the last two are its method, as we built it."""
+PAPERS = tuple(COLUMNS)[:4]
+REACHES = {"inside": "haptic_range_inside", "outside": "haptic_range_outside"}
+DISTANCES = {"short": "short_0_3m", "medium": "medium_3_6m", "long": "long_6_10m"}
+"""Names of the paper's table."""
+TRIALS, QUICK_TRIALS = 20, 1
+QUICK_S = 2.0
+"""Length of a quick run: half of its scored time."""
+GOAL, HEAVY_GOAL = 1.0 / 2.0, 1.0 / 3.0
+"""Multimodal ProcNet's error over the paper's best column; the second under heavy occlusion in the skin's range."""
+DRAWS = 2000
+CAMERA = (
+    f"one camera: {trial.SENSOR_PX[0]} x {trial.SENSOR_PX[1]} pixels, focal length {trial.FOCAL_PX:g} px, {trial.RATE_HZ:g} Hz; "
+    "read around the limb, its pixels summed "
+    + ", ".join(f"{n} x {n} ({name}: {trial.FOCAL_PX / n:g} px)" for name, n in trial.BINNING.items())
+)
+
+
+@functools.cache
+def reference() -> dict[str, Any]:
+    """The paper's table."""
+    found: dict[str, Any] = json.loads(REFERENCE.read_text())
+    return found
+
+
+def paper_of(setting: Setting) -> list[float]:
+    """The paper's four numbers [cm] of a setting."""
+    numbers: list[float] = reference()[REACHES[setting.reach]][DISTANCES[setting.distance]][setting.occlusion]
+    return numbers
+
+
+def one(setting: dict[str, Any], seed: int, index: int, seconds: float) -> dict[str, Any]:
+    """A trial, drawn and played."""
+    return trials.played(trial.draw(Setting(**setting), seed, index), seconds, trials.available())
+
+
+def jobs(seed: int, count: int, seconds: float) -> list[campaign.Job]:
+    """All trials, those of every setting in turn."""
+    return [
+        campaign.Job(f"{seed}-{setting}-{k}-{seconds:g}", "tests.bench.table1:one", (asdict(setting), seed, k, seconds))
+        for k in range(count)
+        for setting in SETTINGS
+    ]
+
+
+def table(results: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
+    """The whole table in the layout of the paper's, of `trials.played` results."""
+    out: dict[str, Any] = {
+        "source": f"penumbra bench table1 --seed {seed}; average position error in cm; paper: {reference()['source']}",
+        "seed": seed,
+        "columns": list(COLUMNS),
+        "camera": CAMERA,
+        "bands": {
+            "camera_distance_m": trial.DISTANCE_M,
+            "occlusion": trial.HIDDEN,
+            "gap_m": {"inside": list(trial.GAP_M["inside"]), "outside": [trial.GAP_M["outside"][0], None]},
+        },
+    }
+    for setting in SETTINGS:
+        own = [each for each in results if Setting(**each["setting"]) == setting]
+        row = out.setdefault(REACHES[setting.reach], {}).setdefault(DISTANCES[setting.distance], {})
+        row[setting.occlusion] = {**score(own), "paper": paper_of(setting)}
+    out["goals"] = goals(out)
+    return out
+
+
+def score(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The numbers of one cell of the table, lists in the order of COLUMNS; None where no frame has a pose."""
+    scored = [trials.is_scored(each) for each in results]
+    out: dict[str, Any] = {"trials": len(results), "frames": int(sum(each.sum() for each in scored))}
+    out |= {"mean_hidden": _mean([np.array(each["hidden"])[use] for each, use in zip(results, scored, strict=True)])}
+    out |= {"mean_gap_m": _mean([np.array(each["gap_m"])[use] for each, use in zip(results, scored, strict=True)])}
+    names = ("ours", "ours_ci95", "p95_cm", "axis_deg", "roll_deg", "lateral_cm", "depth_cm", "no_pose")
+    out |= {name: [] for name in names}
+    values = {
+        error: {column: [_errors(each, *where, error, use) for each, use in zip(results, scored, strict=True)]
+                for column, where in COLUMNS.items()}
+        for error in trials.ERRORS
+    }  # fmt: skip
+    for column in COLUMNS:
+        cm = values["cm"][column]
+        every = np.concatenate(cm) if cm else np.zeros(0)
+        known = every[np.isfinite(every)]
+        out["ours"].append(_rounded(known.mean()) if len(known) else None)
+        out["ours_ci95"].append(bootstrap([each[np.isfinite(each)] for each in cm]))
+        out["p95_cm"].append(_rounded(np.percentile(known, 95)) if len(known) else None)
+        for error in ("axis_deg", "roll_deg", "lateral_cm", "depth_cm"):
+            out[error].append(_mean([each[np.isfinite(each)] for each in values[error][column]]))
+        out["no_pose"].append(_rounded(1.0 - len(known) / len(every)) if len(every) else None)
+    out["lost"] = {column: out["no_pose"][k] for k, column in enumerate(COLUMNS) if "multimodal" in column}
+    out["fused_against_vision"] = {
+        chain: _both(values["cm"][vision], values["cm"][fused])
+        for chain, vision, fused in zip(CHAINS, tuple(COLUMNS)[::2], tuple(COLUMNS)[1::2], strict=True)
+    }
+    return out
+
+
+def bootstrap(groups: Sequence[np.ndarray]) -> list[float] | None:
+    """The 95 % confidence interval of the mean over all values, drawn anew by groups: values within one hang together. None of
+    fewer than two groups with values."""
+    groups = [each for each in groups if len(each)]
+    if len(groups) < 2:
+        return None
+    sums, counts = np.array([each.sum() for each in groups]), np.array([len(each) for each in groups])
+    drawn = np.random.default_rng(0).integers(0, len(groups), (DRAWS, len(groups)))
+    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    return [_rounded(value) for value in np.percentile(means, [2.5, 97.5])]
+
+
+def goals(found: dict[str, Any]) -> dict[str, Any]:
+    """How many cells meet each goal, and which miss it, with their errors over what it allows."""
+    out: dict[str, Any] = {}
+    wanted = {
+        "multimodal ProcNet at most half of the paper's best (a third: heavy, in range)": _against_best,
+        "ProcNet better than the paper's": lambda setting, cell: _ratio(cell["ours"][0], cell["paper"][0]),
+        "fusion not worse than its own vision": lambda setting, cell: _ratio(
+            *(cell["fused_against_vision"]["procnet"][name] for name in ("fused_cm", "vision_cm"))
+        ),
+    }
+    for goal, value in wanted.items():
+        ratios = {}
+        for setting in SETTINGS:
+            ratios[str(setting)] = value(setting, found[REACHES[setting.reach]][DISTANCES[setting.distance]][setting.occlusion])
+        missed = {name: ratio for name, ratio in ratios.items() if ratio is None or ratio > 1.0}
+        out[goal] = {"met": len(SETTINGS) - len(missed), "of": len(SETTINGS), "missed": missed}
+    return out
+
+
+def _against_best(setting: Setting, cell: dict[str, Any]) -> float | None:
+    hard = (setting.reach, setting.occlusion) == ("inside", "heavy")
+    return _ratio(cell["ours"][1], (HEAVY_GOAL if hard else GOAL) * min(cell["paper"]))
+
+
+def _ratio(value: float | None, allowed: float | None) -> float | None:
+    return None if value is None or allowed is None else _rounded(value / allowed)
+
+
+def _both(vision: list[np.ndarray], fused: list[np.ndarray]) -> dict[str, Any]:
+    """Mean errors where both have a pose, and the confidence interval of what fusion adds."""
+    both = [np.isfinite(v) & np.isfinite(f) for v, f in zip(vision, fused, strict=True)]
+    v = [each[use] for each, use in zip(vision, both, strict=True)]
+    f = [each[use] for each, use in zip(fused, both, strict=True)]
+    return {
+        "frames": int(sum(use.sum() for use in both)),
+        "vision_cm": _mean(v),
+        "fused_cm": _mean(f),
+        "added_cm_ci95": bootstrap([b - a for a, b in zip(v, f, strict=True)]),
+    }
+
+
+def _errors(result: dict[str, Any], chain: str, sense: str, error: str, use: np.ndarray) -> np.ndarray:
+    """One error of the scored frames, NaN where there is no pose."""
+    if chain not in result["chains"]:
+        return np.full(int(use.sum()), np.nan)
+    return np.array(result["chains"][chain][sense][error], dtype=float)[use]
+
+
+def _mean(groups: Sequence[np.ndarray]) -> float | None:
+    every = np.concatenate(groups) if groups else np.zeros(0)
+    return _rounded(every.mean()) if len(every) else None
+
+
+def _rounded(value: float) -> float:
+    return round(float(value), 3)
+
+
+def show(found: dict[str, Any], console: Console) -> None:
+    """The table, ours over the paper's, and the goals."""
+    for reach, key in REACHES.items():
+        view = Table(
+            "camera", "hidden", *(f"{name}\nours / paper" for name in ("ProcNet", "multimodal", "PoseCNN", "multimodal")),
+            "paper's method\nvision / fused", "no pose\nvision / fused", title=f"{reach} of the skin's range: position error, cm",
+        )  # fmt: skip
+        for distance, name in DISTANCES.items():
+            for occlusion, cell in found[key][name].items():
+                cells = [_cell(cell, k) for k in range(len(PAPERS))]
+                faithful = " / ".join(_text(cell["ours"][k]) for k in (4, 5))
+                missing = " / ".join(
+                    f"{100 * cell['no_pose'][k]:.0f}%" if cell["no_pose"][k] is not None else "-" for k in (0, 1)
+                )
+                view.add_row(distance, occlusion, *cells, faithful, missing)
+        console.print(view)
+    console.print(found["camera"])
+    for goal, result in found["goals"].items():
+        missed = "".join(f", {name} {_text(ratio)}" for name, ratio in result["missed"].items())
+        console.print(f"{goal}: {result['met']} of {result['of']}{missed and ' (over the goal:' + missed[1:] + ')'}")
+
+
+def _cell(cell: dict[str, Any], k: int) -> str:
+    value, interval, paper = cell["ours"][k], cell["ours_ci95"][k], cell["paper"][k]
+    spread = f" [{interval[0]:.2f}, {interval[1]:.2f}]" if interval else ""
+    return f"{_text(value)}{spread} / {paper:.2f}"
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def measure(options: argparse.Namespace, folder: Path, progress: Progress) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The table and the trials that it is made of."""
+    count, seconds = (QUICK_TRIALS, QUICK_S) if options.quick else (options.trials, trial.SECONDS)
+    results = campaign.run(jobs(options.seed, count, seconds), folder, options.jobs, progress, "trials")
+    return table(results, options.seed), results
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags that `penumbra bench paper` has too."""
+    parser.add_argument("--seed", type=int, default=1, help="draws persons, motions, looks, occluders and the camera's places")
+    parser.add_argument("--trials", type=int, default=TRIALS, help="runs of each cell of the table (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="one short run a cell: whether it runs, no numbers to believe")
+    parser.add_argument("--jobs", type=int, default=2, help="processes, each on one core (default: %(default)s)")
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="penumbra bench table1", description=(__doc__ or "").partition("\n\n")[0])
+    arguments(parser)
+    parser.add_argument("--resume", type=Path, metavar="FOLDER", help="keep finished runs here, and take those that are there")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file")
+    options = parser.parse_args(argv)
+    started = time.monotonic()
+    with tempfile.TemporaryDirectory() as temporary, campaign.bar(Console(stderr=True)) as progress:
+        folder = options.resume or Path(temporary)
+        found, _ = measure(options, folder, progress)
+    found["wall_s"] = round(time.monotonic() - started, 1)
+    show(found, Console())
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
