@@ -22,6 +22,7 @@ COMMANDS = {
     "emulator": "a simulated cell: frames, joints, skin and truth",
     "segmentation": "frames to masks (`segmentation infer`: of files; `segmentation train`: learn the network again)",
     "search": "masks to the camera's pose (`search refine`, `search track`: of any rigid mesh on mask files)",
+    "posecnn": "frames to the camera's pose, in place of segmentation and search (`posecnn train`: learn the network again)",
     "skin": "sensing boards on serial ports to voltages (`skin decode`, `calibrate`, `characterise`, `model`: see each --help)",
     "haptics": "voltages to the skin's pose (`haptics train`: learn the network again)",
     "fusion": "both poses to the one pose",
@@ -32,12 +33,13 @@ COMMANDS = {
     "bench": "run a benchmark",
     "doctor": "check this machine and say how to mend it",
 }
-SERVICES = ("router", "emulator", "segmentation", "search", "skin", "haptics", "fusion")
+SERVICES = ("router", "emulator", "segmentation", "search", "posecnn", "skin", "haptics", "fusion")
 TOOLS = {
     ("segmentation", "train"): "services.segmentation.train:main",
     ("segmentation", "infer"): "services.segmentation.files:main",
     ("search", "refine"): "services.search.tools:refine",
     ("search", "track"): "services.search.tools:track",
+    ("posecnn", "train"): "services.posecnn.train:main",
     ("skin", "decode"): "services.skin.decode:main",
     ("skin", "calibrate"): "services.skin.calibrate:main",
     ("skin", "characterise"): "services.skin.characterise:main",

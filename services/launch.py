@@ -29,13 +29,15 @@ from shared.service import Node
 @dataclass(frozen=True)
 class Process:
     """One line of the table. `extra`: what `pip install -e '.[extra]'` it needs; `needs`: the part of the cell without which it
-    has nothing to do; `flags`: flags of `penumbra up` that are passed on to it."""
+    has nothing to do; `vision`: the way to see that it belongs to, None where to all; `flags`: flags of `penumbra up` that are
+    passed on to it."""
 
     name: str
     extra: str
     replicas: int = 1
     restart: Literal["always", "never"] = "always"
     needs: Literal["cameras", "pads", "sim"] | None = None
+    vision: str | None = None
     flags: tuple[str, ...] = ()
 
     @property
@@ -49,13 +51,16 @@ class Process:
 PROCESSES = (
     Process("router", "router", replicas=0),  # inside the launcher; a process of its own in containers
     Process("emulator", "emulator", needs="sim", flags=("seed",)),
-    Process("segmentation", "segmentation", needs="cameras"),
-    Process("search", "search", needs="cameras", flags=("method",)),
+    Process("segmentation", "segmentation", needs="cameras", vision="procnet"),
+    Process("search", "search", needs="cameras", vision="procnet", flags=("method",)),
+    Process("posecnn", "posecnn", needs="cameras", vision="posecnn"),
     Process("skin", "skin", replicas=0, needs="pads"),  # belongs to a machine with boards, which name their ports
     Process("haptics", "haptics", needs="pads"),
     Process("fusion", "fusion", flags=("observer",)),
 )
 
+VISION = ("procnet", "posecnn")
+"""Ways to see: segmentation and search of its masks, or the paper's rival in place of both."""
 BACKOFF_S = (0.2, 10.0)
 STABLE_S = 10.0
 """A process that ran this long is healthy again: its back-off starts anew."""
@@ -255,7 +260,11 @@ class Launcher:
 def commands(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> list[Supervised]:
     """The processes that this cell needs, ready to start. Raises CellError for an unknown process name."""
     known = {process.name: process for process in PROCESSES if process.replicas}
-    replicas = {name: process.replicas for name, process in known.items() if process.is_needed(cell)}
+    replicas = {
+        name: process.replicas
+        for name, process in known.items()
+        if process.is_needed(cell) and process.vision in (None, options.vision)
+    }
     for text in options.replicas:
         name, _, number = text.partition("=")
         if name not in known or not number.isdigit():
@@ -288,6 +297,9 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--connect", metavar="ENDPOINT", help="use a router that runs elsewhere, and start none")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after this time (default: at Ctrl-C)")
     parser.add_argument("--seed", type=int, help="of the emulator")
+    parser.add_argument(
+        "--vision", choices=VISION, default=VISION[0], help="segmentation and search, or PoseCNN (default: %(default)s)"
+    )
     parser.add_argument("--observer", help="of the fusion (see penumbra fusion --help)")
     parser.add_argument("--method", help="of the search (see penumbra search --help)")
     parser.add_argument("--replicas", action="append", default=[], metavar="NAME=N", help="run N of a process; 0 leaves it out")

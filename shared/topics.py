@@ -54,7 +54,7 @@ MASK = Topic(
     "segmentation",
     "class indices of a window of a frame",
 )
-VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, "search",
+VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, "search or posecnn",
                "the camera's pose and covariance")  # fmt: skip
 HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 50, 16, 0.1, "haptics",
                "the skin's pose and information")  # fmt: skip

@@ -33,6 +33,7 @@ def test_only_the_emulator_train_py_and_characterise_py_know_the_simulated_world
         ("haptics", {"torch", "cv2"}),
         ("search", {"torch"}),
         ("segmentation", {"numba", "pybullet", "trimesh"}),
+        ("posecnn", {"openvino", "pybullet", "trimesh"}),
         ("emulator", {"torch"}),
     ],
 )

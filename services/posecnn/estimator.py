@@ -1,0 +1,210 @@
+"""The pose of one target in one camera's pictures by PoseCNN: patch, network, votes, rotation, and a judgement of the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from services.posecnn import network, patch, voting
+from services.posecnn.network import REFERENCE_PX, STRIDE, Network
+from services.posecnn.uncertainty import Signs, Uncertainty
+from shared import body, geometry, raster
+from shared.body import Mesh
+from shared.cell import Camera, Cell
+from shared.classes import Label
+from shared.geometry import Array
+from shared.window import Window
+
+State = Literal["tracking", "occluded", "lost"]
+
+WEIGHTS = Path(__file__).parent / "weights" / "posecnn.npz"
+SMALLEST = 24
+"""Pixels of the target, counted at the network's stride, below which there is nothing to vote."""
+AGREEING = 0.6
+"""Share of the pixels that must agree with the vote."""
+FITS = 0.5
+"""Overlap of the target's pixels and the mesh at the pose below which this is not the pose."""
+HIDDEN = 0.92
+"""A larger hidden share leaves too little to measure a pose."""
+COVERED = 0.5
+"""Share of the predicted picture covered by something from which on the target is occluded and not lost."""
+COVERS = (Label.ROBOT, Label.TORSO, Label.UPPER_ARM, Label.OCCLUDER)
+ROOM = 1.3
+"""Side of a patch around a target that was found, in extents of its picture."""
+TOO_SMALL = 0.4
+"""Extent of a target's picture, in sides of the patch, below which it is looked at again from nearer."""
+UNKNOWN = np.diag([1.0**2] * 3 + [1.5**2] * 3)
+"""Covariance of a pose that says nothing, [m^2, rad^2]."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """T_world_target, covariance (6, 6) along the world's axes, overlap and hidden share in [0, 1], state; signs: what the
+    covariance was read from, None where nothing was found."""
+
+    T: Array
+    covariance: Array
+    overlap: float
+    hidden: float
+    state: State
+    signs: Signs | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """What one look shows: T_camera_target, the vote, pixels of the target at the network's stride."""
+
+    T: Array
+    vote: voting.Vote
+    overlap: float
+    hidden: float
+    extent: float
+    middle: Array
+
+
+class PoseCNN:
+    """One target seen by one camera. Raises CellError for a name that the cell does not have."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        camera: str | None = None,
+        target: str | None = None,
+        net: Network | None = None,
+        uncertainty: Uncertainty | None = None,
+    ):
+        self._camera: Camera = cell.cameras[cell.one("cameras", camera)]
+        self._target = cell.targets[cell.one("targets", target)]
+        self._mesh: Mesh = body.target_mesh(self._target, cell)
+        self._length = float(np.ptp(self._mesh.vertices[:, 0]))
+        self._shape = torch.from_numpy(network.proportions(self._mesh.vertices))[None]
+        if net is None or uncertainty is None:
+            net, uncertainty = load()
+        self._net, self._uncertainty = net, uncertainty
+        able = torch.cpu.get_capabilities()
+        self._half = bool(able.get("avx512_bf16") or able.get("amx_bf16"))
+        self._T_camera_world = geometry.inverse(self._camera.T_world_camera)
+        self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])
+
+    def prepare(self) -> None:
+        """Compiles what `update` needs, so that the first frame does not wait for it."""
+        image = np.zeros((self._camera.height, self._camera.width, 3), np.uint8)
+        with torch.inference_mode():
+            self._look(patch.cut(image, self._intrinsics, np.array([patch.SIDE / 2.0] * 2), float(patch.SIDE)))
+        voting.vote(np.array([[4.0, 4.0], [8.0, 4.0]]), np.array([[1.0, 0.0], [-1.0, 0.0]]), patch.SIDE // STRIDE)
+        ahead = geometry.apply(geometry.from_rpy((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)), self._mesh.vertices)
+        raster.silhouette(ahead, self._mesh.faces, (50.0, 50.0, 32.0, 32.0), (0, 0, 64, 64))
+
+    def update(self, image: NDArray[np.uint8], window: Window, T_prior: Array | None = None) -> Estimate:
+        """What an image (h, w, 3) uint8 RGB says about the target's pose, looked for in a window; T_prior (4 x 4): the predicted
+        T_world_target, None where nothing is known: it decides only whether a target that is not seen counts as occluded.
+
+        Raises ValueError for an image that is not of the camera's size.
+        """
+        if image.shape[:2] != (self._camera.height, self._camera.width):
+            expected, came = f"{self._camera.width} x {self._camera.height}", f"{image.shape[1]} x {image.shape[0]}"
+            raise ValueError(f"image: {expected} expected (the cell file), {came} came")
+        middle = np.array([window.x0 + window.right - 1, window.y0 + window.bottom - 1]) / 2.0
+        side = float(max(window.right - window.x0, window.bottom - window.y0))
+        with torch.inference_mode():
+            square = patch.cut(image, self._intrinsics, middle, side)
+            labels, found = self._look(square)
+            if found is not None and found.extent < TOO_SMALL * side:
+                square = patch.cut(image, self._intrinsics, found.middle, ROOM * found.extent)
+                nearer_labels, nearer = self._look(square)
+                labels, found = (nearer_labels, nearer) if nearer is not None else (labels, found)
+        return self._judge(labels, square, found, T_prior)
+
+    @property
+    def _intrinsics(self) -> Array:
+        camera = self._camera
+        return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+
+    def _look(self, square: patch.Patch) -> tuple[NDArray[np.int64], Found | None]:
+        """The class of every position (side / STRIDE, …) of a patch, and the target in it, None where too little of it shows."""
+        picture = torch.from_numpy(square.pixels).movedim(-1, 0)[None].float() / 255.0
+        with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
+            out = self._net(picture, self._shape)
+        labels = out.logits[0].argmax(0).numpy()
+        seen = np.isin(labels, self._target.label_values)
+        rows, columns = np.nonzero(seen)
+        if len(rows) < SMALLEST:
+            return labels, None
+        directions = out.direction[0].numpy()[:, rows, columns].T.astype(np.float64)
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
+        vote = voting.vote(np.column_stack([columns, rows]).astype(np.float64), directions, len(labels))
+        lengths = out.length[0].numpy()[rows, columns][vote.agrees]
+        if not len(lengths):
+            return labels, None
+        length_px = REFERENCE_PX * float(np.exp(lengths.mean()))
+        centre = vote.centre * STRIDE + (STRIDE - 1) / 2.0
+        depth = square.focal * self._length / length_px
+        T = np.eye(4)
+        T[:3, 3] = depth * np.array([*(centre - square.centre) / square.focal, 1.0])
+        pooled = torch.from_numpy(centre[None].astype(np.float32)), torch.tensor([length_px])
+        quaternion = self._net.rotations(out.features, *pooled)[0].numpy()
+        T[:3, :3] = patch.facing(T[:3, 3]) @ Rotation.from_quat(quaternion).as_matrix()
+        return labels, self._found(T, vote, labels, seen, square)
+
+    def _found(
+        self, T: Array, vote: voting.Vote, labels: NDArray[np.int64], seen: NDArray[np.bool_], square: patch.Patch
+    ) -> Found | None:
+        vertices = geometry.apply(T, self._mesh.vertices)
+        if vertices[:, 2].min() < raster.NEAR:
+            return None
+        fx, fy, cx, cy = self._intrinsics
+        shown = vertices[:, :2] / vertices[:, 2:] * [fx, fy] + [cx, cy]
+        low, high = shown.min(axis=0), shown.max(axis=0)
+        whole, inside = self._silhouette(vertices, square, len(labels))
+        both = int((seen & inside).sum())
+        free = int((inside & ~seen & ~np.isin(labels, COVERS)).sum())
+        return Found(
+            T,
+            vote,
+            overlap=both / max(int(seen.sum()) + free, 1),
+            hidden=float(np.clip(1.0 - seen.sum() / max(whole, 1), 0.0, 1.0)),
+            extent=float((high - low).max()),
+            middle=(low + high) / 2.0,
+        )
+
+    def _silhouette(self, vertices: Array, square: patch.Patch, side: int) -> tuple[int, NDArray[np.bool_]]:
+        """Positions that vertices (n, 3) in the camera's frame cover at the network's stride: how many in all, and which of the
+        patch (side, side)."""
+        focal, centre = square.focal / STRIDE, (square.centre - (STRIDE - 1) / 2.0) / STRIDE
+        window = (-side, -side, 3 * side, 3 * side)
+        covered = raster.silhouette(vertices, self._mesh.faces, (focal, focal, *centre), window)
+        return int(covered.sum()), covered[side : 2 * side, side : 2 * side]
+
+    def _judge(self, labels: NDArray[np.int64], square: patch.Patch, found: Found | None, T_prior: Array | None) -> Estimate:
+        T_world_camera = self._camera.T_world_camera
+        if found is not None and found.hidden <= HIDDEN and found.vote.share >= AGREEING and found.overlap >= FITS:
+            own = self._camera.fx * self._length / found.T[2, 3]
+            signs = Signs(
+                found.hidden, min(own, square.focal * self._length / found.T[2, 3]), found.vote.spread, found.vote.share
+            )
+            covariance = self._axes @ self._uncertainty.covariance(found.T, self._length, signs) @ self._axes.T
+            return Estimate(T_world_camera @ found.T, covariance, found.overlap, found.hidden, "tracking", signs)
+        T = self._target.home.transform if T_prior is None else T_prior
+        state: State = "occluded" if T_prior is not None and self._is_covered(labels, square, T_prior) else "lost"
+        overlap, hidden = (found.overlap, found.hidden) if found is not None else (0.0, 1.0)
+        return Estimate(T, UNKNOWN, overlap, hidden, state)
+
+    def _is_covered(self, labels: NDArray[np.int64], square: patch.Patch, T_world_target: Array) -> bool:
+        """Whether most of the target's picture at a pose shows things that can stand before it."""
+        vertices = geometry.apply(self._T_camera_world @ T_world_target, self._mesh.vertices)
+        if vertices[:, 2].min() < raster.NEAR:
+            return False
+        _, inside = self._silhouette(vertices, square, len(labels))
+        return bool(inside.any() and np.isin(labels[inside], COVERS).mean() >= COVERED)
+
+
+def load(path: Path = WEIGHTS) -> tuple[Network, Uncertainty]:
+    """The network of a weights file and the uncertainty in its card. Raises FileNotFoundError that says how to make one."""
+    net, card = network.load(path)
+    return net, Uncertainty({kind: tuple(values) for kind, values in card["calibration"]["coefficients"].items()})

@@ -1,0 +1,71 @@
+"""Wiring: camera frames and fused poses in, the camera's poses out."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from services.posecnn.estimator import WEIGHTS, PoseCNN, load
+from shared import geometry
+from shared.messages import Frame, FusedPose, VisionPose
+from shared.prediction import predict
+from shared.service import Node
+from shared.topics import FRAME, FUSED, VISION
+from shared.window import Lookout
+
+NAME = "posecnn"
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags of this service."""
+    parser.add_argument("--camera", help="the camera whose frames are looked at (default: all of the cell)")
+    parser.add_argument("--target", help="estimate only this target (default: all)")
+    parser.add_argument("--weights", type=Path, default=WEIGHTS, help="the network, made by `penumbra posecnn train`")
+
+
+def start(node: Node, options: argparse.Namespace) -> None:
+    """Subscribes; every frame of the cell's cameras is searched for every target that this replica owns."""
+    torch.set_num_threads(1)
+    cell = node.cell
+    cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
+    targets = [cell.one("targets", options.target)] if options.target else list(cell.targets)
+    net, uncertainty = load(options.weights)
+    estimators = {(c, t): PoseCNN(cell, c, t, net, uncertainty) for c in cameras for t in targets}
+    for estimator in estimators.values():
+        estimator.prepare()
+    lookouts = {camera: Lookout(cell, camera) for camera in cameras}
+    fused: dict[str, FusedPose] = {}
+
+    def on_fused(message: FusedPose, names: dict[str, str]) -> None:
+        fused[names["target"]] = message
+        for lookout in lookouts.values():
+            lookout.hear(message)
+
+    def on_frame(frame: Frame, names: dict[str, str]) -> None:
+        camera = names["camera"]
+        window = lookouts[camera].look(frame.stamp_ns)
+        for target in targets:
+            if not node.owns(f"{camera}/{target}"):
+                continue
+            T_prior, _ = predict(fused.get(target), frame.stamp_ns)
+            estimate = estimators[camera, target].update(frame.image, window, T_prior)
+            position, orientation = geometry.position_orientation(estimate.T)
+            pose = VisionPose(
+                stamp_ns=frame.stamp_ns,
+                target=target,
+                camera=camera,
+                frame=cell.frame,
+                position=position,
+                orientation=orientation,
+                covariance=estimate.covariance,
+                overlap=estimate.overlap,
+                hidden=estimate.hidden,
+                state=estimate.state,
+            )
+            node.publish(VISION, pose, target=target)
+
+    node.subscribe(FUSED, on_fused)
+    for camera in cameras:
+        node.subscribe(FRAME, on_frame, camera=camera)

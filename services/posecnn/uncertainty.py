@@ -1,0 +1,99 @@
+"""How far off a pose may be, learned from held-out pictures: standard deviations as functions of what the network saw.
+
+Errors are split along the directions in which they are about independent: along the ray to the target (relative to its
+distance), across it (relative to the target's length), of the limb's axis and of the roll about it. The logarithm of each
+deviation is linear in features of the estimate; its coefficients are those of the greatest likelihood under normal errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from services.posecnn.patch import facing
+from shared import geometry
+from shared.geometry import Array
+
+KINDS = ("depth", "lateral", "axis", "roll")
+"""Depth by the distance, lateral by the target's length, axis and roll in radians."""
+BOUNDS = {"depth": (0.01, 0.5), "lateral": (0.005, 1.0), "axis": (0.02, 1.0), "roll": (0.05, 1.5)}
+"""Of the standard deviations: a few hundred pictures say nothing about smaller and larger ones."""
+LENGTH_PX = 100.0
+
+
+@dataclass(frozen=True)
+class Signs:
+    """What tells how good an estimate is. hidden: share of the target that is not seen; length_px: its apparent length in the
+    image; spread [rad]: of the votes for its centre; share: of its pixels that agree with the vote."""
+
+    hidden: float
+    length_px: float
+    spread: float
+    share: float
+
+    @property
+    def features(self) -> Array:
+        """(6,)."""
+        hidden = min(max(self.hidden, 0.0), 1.0)
+        size = np.log(max(self.length_px, 1.0) / LENGTH_PX)
+        return np.array([1.0, hidden, hidden**4, min(size, 0.0), np.log(max(self.spread, 0.01) / 0.1), 1.0 - self.share])
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """coefficients: (6,) of the logarithm of each kind's standard deviation."""
+
+    coefficients: dict[str, tuple[float, ...]]
+
+    def deviations(self, signs: Signs) -> dict[str, float]:
+        """The standard deviation of each kind."""
+        features = signs.features
+        return {kind: float(np.clip(np.exp(features @ np.array(self.coefficients[kind])), *BOUNDS[kind])) for kind in KINDS}
+
+    def covariance(self, T: Array, length: float, signs: Signs) -> Array:
+        """(6, 6) in the camera's frame of a pose T_camera_target of a target of this length [m]."""
+        sigma = self.deviations(signs)
+        distance, ray = float(np.linalg.norm(T[:3, 3])), facing(T[:3, 3])
+        across, along = sigma["lateral"] * length, sigma["depth"] * distance
+        position = ray @ np.diag(np.square([across, across, along])) @ ray.T
+        rotation = T[:3, :3] @ np.diag(np.square([sigma["roll"], sigma["axis"], sigma["axis"]])) @ T[:3, :3].T
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3], covariance[3:, 3:] = position, rotation
+        return (covariance + covariance.T) / 2.0
+
+
+def errors(T_true: Array, T: Array, length: float) -> dict[str, Array]:
+    """The errors of a pose T_camera_target by kind, in the kind's unit: one of depth and roll, two of lateral and axis."""
+    error = geometry.pose_error(T_true, T)
+    position = facing(T[:3, 3]).T @ error[:3]
+    rotation = T[:3, :3].T @ error[3:]
+    return {
+        "depth": position[2:] / np.linalg.norm(T[:3, 3]),
+        "lateral": position[:2] / length,
+        "axis": rotation[1:],
+        "roll": rotation[:1],
+    }
+
+
+def fitted(signs: list[Signs], missed: list[dict[str, Array]], clip: float = 4.0) -> Uncertainty:
+    """The uncertainty under which errors (`errors`) are most probable. Those that lie beyond `clip` deviations count as being
+    there: a few arms seen end for end must not widen all others."""
+    features = np.array([one.features for one in signs])
+    coefficients = {}
+    for kind in KINDS:
+        values = np.array([one[kind] for one in missed])
+
+        def cost(a: NDArray[np.float64], values: Array = values) -> float:
+            log_sigma = features @ a
+            z = np.minimum(np.abs(values) * np.exp(-log_sigma)[:, None], clip)
+            return float(np.sum(0.5 * z**2) + values.shape[1] * np.sum(log_sigma) + 0.5 * np.sum(a[1:] ** 2))
+
+        start = np.array([np.log(np.median(np.abs(values)) / 0.67), *np.zeros(features.shape[1] - 1)])
+        found = minimize(
+            cost, start, method="Nelder-Mead", options={"maxiter": 6000, "maxfev": 6000, "fatol": 1e-6, "xatol": 1e-5}
+        )
+        coefficients[kind] = tuple(round(float(a), 4) for a in found.x)
+    return Uncertainty(coefficients)
