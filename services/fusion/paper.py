@@ -1,20 +1,30 @@
-"""The paper's observer ("Modified Luenberger Observer" and "Integration of Perception Methods"), kept as `--observer paper`.
+"""The paper's observer (section "Modified Luenberger-type Observer" and the two after it), kept as `--observer paper`.
+
+Equations are named by their label in the paper, or by their section where they have none: x (6,) position and roll, pitch, yaw;
+y, g, z (12,) and C (12, 6) of both senses, vision first; R (12, 12) = diag(R_v, R_c); G = K (6, 12); P, Q (6, 6).
 
 What the paper leaves open or what cannot be done as printed, and what is done here:
-- x is position and roll, pitch, yaw. They wrap: innovations are taken modulo 2 pi. They are singular at a pitch of 90 degrees.
-- y^ contains the noise n(t): left out. z is called a vector of 6: y has 12 entries, and so has z.
-- f and u are not given: f(x, u) = u, a constant velocity, and so A = 0. Nothing measures u: it is the rate of x^, smoothed.
-- Q is not given. Here Q = lambda^2 W_v: a fully hidden arm, seen by the camera alone, is followed with a rate of lambda. Table I
-  asks for a fast one: out of the skin's range the fused error there equals the camera's.
-- R_v is zero when nothing is hidden, which believes the camera entirely: a floor of 1 cm and 1.4 degrees, what a camera at 1.5 m
-  can resolve. R_v then grows by W_v = 8 m^2 and 16 pi rad^2, so that a hundredth of the arm hidden gives the camera a standard
-  deviation of 28 cm: whenever the skin is in range it decides nearly alone. That is the paper's weighting, and kept.
-- R_c is a function of the pose found by regression: here the information that the haptic estimator publishes. It is zero along
-  directions that the skin does not observe; R^-1 is used throughout, R never.
+- equ:luenberger_pose, y^ = g(x^) + n: nobody knows the noise n(t), left out.
+- equ:luenberger_pose, "z in R^6": y has 12 entries, and so has z.
+- equ:luenberger_pose, x has angles that wrap: z is taken modulo 2 pi. They are singular at a pitch of 90 degrees.
+- equ:luenberger_pose has a gain G and equ:luenberger_estim a gain K, and nothing says that they are one: G = K.
+- f, g and u are "nonlinear" and not given: both senses report poses, g(x) = [x; x] and C = [I; I]; f(x, u) = u, a constant
+  velocity, and so A = 0. Nothing measures u: it is the rate of x^, smoothed.
+- Q is not given: Q = lambda^2 W_v, so that a fully hidden arm seen by the camera alone is followed with a rate of lambda. The
+  table of results asks for a fast one: out of the skin's range the fused error there equals the camera's.
+- f_v sums m^ - m over all pixels, so that a mask too large elsewhere makes up for what is hidden, and divides by zero where the
+  rendered mask is empty: here the share of m^ that is hidden, in [0, 1], as the search publishes it with every pose.
+- R_v = f_v W_v is zero when nothing is hidden, which believes the camera entirely: a floor of 1 cm and 1.4 degrees, what a camera
+  at 1.5 m can resolve. R_v then grows by W_v = 8 m^2 and 16 pi rad^2, so that a hundredth of the arm hidden gives the camera a
+  standard deviation of 28 cm: whenever the skin is in range it decides nearly alone. That is the paper's weighting, and kept.
+- R_c = f_c(x^, theta) by Gaussian-process regression: its inverse is the information of the haptic pose, with `penumbra haptics
+  --method paper` that of the regression (`Regression` of services/haptics/network.py). Along what the skin does not observe it is
+  zero, and R_c infinite; so R^-1 is used throughout, R never, and a sense that has nothing to say has a block of zeros.
 - Continuous time, with measurements that arrive one by one: between two of them y moves on with u, and an old one is dropped.
-  The Riccati equation is integrated by backward Euler in information form, stable for any step; the low-pass exactly.
-- P has no scale of its own, since that of Q and W_v is arbitrary. What is published as covariance is what the senses' own
-  covariances become through the stationary weights of the two, growing with their age.
+  The Riccati equation is integrated by backward Euler in information form, stable for any step and gain; the low-pass exactly.
+- Late measurements: a sense's older pose after a newer one is refused; y is not taken back to its stamp.
+- P_0 is not given: W_v. P has no scale of its own, since that of Q and W_v is arbitrary. What is published as covariance is what
+  the senses' own covariances become through the stationary weights of the two, growing with their age.
 - The paper has no gate: every measurement is used.
 """
 
@@ -30,6 +40,20 @@ from shared import geometry
 from shared.messages import Source
 
 STEP_S = 0.01
+SENSES = {"vision": slice(0, 6), "haptic": slice(6, 12)}
+"""Rows of y, g, z and C, and blocks of R."""
+C = np.vstack([np.eye(6), np.eye(6)])
+"""C = dg/dx (section "Modified Luenberger-type Observer"), (12, 6)."""
+
+
+def f(x: Array, u: Array) -> Array:
+    """f(x, u) (6,) of equ:luenberger_pose: a constant velocity u (6,)."""
+    return u
+
+
+def g(x: Array) -> Array:
+    """g(x) (12,): the pose that vision and the skin would each measure."""
+    return C @ x
 
 
 @dataclass(frozen=True)
@@ -37,7 +61,7 @@ class PaperSettings:
     """Numbers of the paper's observer.
 
     W_v : noise of a fully hidden arm, position [m^2] and rotation [rad^2] (section "Numerical Simulation").
-    omega_n, zeta : low-pass on the pose [rad/s] and its damping (ibid.).
+    omega_n, zeta : low-pass on the pose [rad/s] and its damping (the same section).
     floor : least hidden share: 1.25e-5 of W_v is (1 cm)^2 and (1.4 degrees)^2.
     rate : lambda [1/s] in Q = lambda^2 W_v: one camera period.
     velocity_time : smoothing of u [s].
@@ -145,7 +169,8 @@ class PaperObserver:
         return Estimate(_transform(state.smooth), velocity, covariance, self.settings.limits.state(age_s, covariance), sources)
 
     def R_v(self, hidden: float) -> Array:
-        """R_v (6, 6) of a hidden share in [0, 1]: f_v of the paper, with a floor."""
+        """R_v (6, 6) = f_v W_v of the share f_v in [0, 1] of the arm that is hidden, with a floor (section "Integration of
+        Perception Methods")."""
         return max(hidden, self.settings.floor) * self._W_v
 
     def _newest_ns(self) -> int:
@@ -169,27 +194,35 @@ class PaperObserver:
         decay = float(np.exp(-h / self.settings.velocity_time))
         x = state.x + self.settings.velocity_time * (1.0 - decay) * state.u
         smooth, rate = self._low_pass(state, x, h)
-        return _State(stamp_ns, x, self._riccati(state.P, h, np.zeros((6, 6))), decay * state.u, smooth, rate)
+        return _State(stamp_ns, x, self._riccati(state.P, h, np.zeros((12, 12))), decay * state.u, smooth, rate)
 
-    def _riccati(self, P: Array, h: float, information: Array) -> Array:
-        """P after a step h; `information` (6, 6) is C' R^-1 C. A sense that says next to nothing keeps P bounded."""
-        P = np.linalg.inv(P + h * self._Q)  # eq. (luenberger_estim): dP/dt = Q - P C' R^-1 C P
-        P = np.linalg.inv(P + h * information + h * self._nobody)
+    def _measured(self, state: _State, stamp_ns: int) -> tuple[Array, Array]:
+        """y (12,) and R^-1 (12, 12) at a stamp; zeros for a sense that is not in use."""
+        y, R_inverse = np.zeros(12), np.zeros((12, 12))
+        for name, held in self._in_use(stamp_ns).items():
+            rows = SENSES[name]
+            y[rows] = held.y + (stamp_ns - held.stamp_ns) * 1e-9 * state.u
+            R_inverse[rows, rows] = held.R_inverse  # R = diag(R_v, R_c), equ:luenberger_estim
+        return y, R_inverse
+
+    def _riccati(self, P: Array, h: float, R_inverse: Array) -> Array:
+        """P (6, 6) after a step h [s] of equ:luenberger_estim, dP/dt = A P + P A' + Q - P C' R^-1 C P with A = df/dx = 0.
+
+        A sense that says next to nothing keeps P bounded where no other does.
+        """
+        P = np.linalg.inv(P + h * self._Q)
+        P = np.linalg.inv(P + h * (C.T @ R_inverse @ C) + h * self._nobody)
         return 0.5 * (P + P.T)
 
     def _step(self, state: _State, stamp_ns: int) -> _State:
         settings = self.settings
         h = (stamp_ns - state.stamp_ns) * 1e-9
-        in_use = self._in_use(stamp_ns)
-        x_predicted = state.x + h * state.u  # f(x^, u) = u
-        # C = [I; I], of which the rows of what is not in use are left out
-        information = sum((held.R_inverse for held in in_use.values()), start=np.zeros((6, 6)))
-        P = self._riccati(state.P, h, information)
-        x = x_predicted
-        for held in in_use.values():
-            y = held.y + (stamp_ns - held.stamp_ns) * 1e-9 * state.u
-            z = _wrapped(y - x_predicted)  # eq. (luenberger_pose): z = y - y^
-            x = x + h * (P @ (held.R_inverse @ z))  # G z with G = K = P C' R^-1
+        y, R_inverse = self._measured(state, stamp_ns)
+        P = self._riccati(state.P, h, R_inverse)
+        G = P @ C.T @ R_inverse  # K = P C' R^-1, equ:luenberger_estim
+        x = state.x + h * f(state.x, state.u)
+        z = _wrapped(y - g(x))  # z = y - y^, equ:luenberger_pose
+        x = x + h * (G @ z)  # dx^/dt = f(x^, u) + G z, equ:luenberger_pose
         share = 1.0 - np.exp(-h / settings.velocity_time)
         u = state.u + share * ((x - state.x) / h - state.u)
         smooth, rate = self._low_pass(state, x, h)
@@ -197,7 +230,8 @@ class PaperObserver:
         return _State(stamp_ns, x - turns, P, u, smooth - turns, rate)
 
     def _low_pass(self, state: _State, x: Array, h: float) -> tuple[Array, Array]:
-        """s'' + 2 zeta omega_n s' + omega_n^2 s = omega_n^2 x over a step h with x held: output (6,) and its rate (6,)."""
+        """The canonical second-order low-pass (section "Modified Luenberger-type Observer"): s'' + 2 zeta omega_n s' + omega_n^2 s
+        = omega_n^2 x over a step h with x held. Output (6,) and its rate (6,)."""
         damping = self.settings.zeta * self.settings.omega_n
         omega = self.settings.omega_n * np.sqrt(1.0 - self.settings.zeta**2)
         a = state.smooth - x
@@ -231,8 +265,10 @@ def _transform(x: Array) -> geometry.Array:
 
 
 def _wrapped(x: Array) -> Array:
-    """x (6,) with its angles within (-pi, pi]."""
-    return np.concatenate([x[:3], np.pi - np.mod(np.pi - x[3:], 2.0 * np.pi)])
+    """x (6,), or z (12,), with its angles within (-pi, pi]."""
+    x = x.reshape(-1, 6).copy()
+    x[:, 3:] = np.pi - np.mod(np.pi - x[:, 3:], 2.0 * np.pi)
+    return x.ravel()
 
 
 def _rates(x: Array) -> Array:
