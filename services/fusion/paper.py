@@ -230,8 +230,8 @@ class PaperObserver:
         return _State(stamp_ns, x - turns, P, u, smooth - turns, rate)
 
     def _low_pass(self, state: _State, x: Array, h: float) -> tuple[Array, Array]:
-        """The canonical second-order low-pass (section "Modified Luenberger-type Observer") over a step h with x held: output (6,)
-        and its rate (6,) of s'' + 2 zeta omega_n s' + omega_n^2 s = omega_n^2 x."""
+        """The canonical second-order low-pass (section "Modified Luenberger-type Observer") over a step h with x held: output
+        (6,) and its rate (6,) of s'' + 2 zeta omega_n s' + omega_n^2 s = omega_n^2 x."""
         damping = self.settings.zeta * self.settings.omega_n
         omega = self.settings.omega_n * np.sqrt(1.0 - self.settings.zeta**2)
         a = state.smooth - x
