@@ -25,6 +25,7 @@ from shared.body import Mesh, target_mesh
 from shared.geometry import Array
 from shared.messages import Message
 from shared.topics import Topic
+from sim.occluder import AWAY
 from sim.world import World, stream
 
 Reach = Literal["inside", "outside"]
@@ -62,6 +63,9 @@ SIZE = 0.12
 SPEED_M_S = (0.15, 0.40)
 DIRECTION = np.radians([12.0, 8.0])
 """How far the camera stands, to both sides, from the direction of the built-in one: around the vertical, and up and down."""
+PASSAGE = ((0.0, 0.0), (1.5, 0.2), (3.0, 0.5), (4.5, 0.85), (6.0, 1.0), (7.5, 0.0))
+"""From when [s] which share is hidden in a `passage`."""
+PASSAGE_S, PASSAGE_WITHIN = 9.5, 0.06
 COARSE_PX = 160
 """Width of the pictures in which hidden shares are counted."""
 TRIES = 400
@@ -144,22 +148,36 @@ class Trial:
 
 def draw(setting: Setting, seed: int, index: int) -> Trial:
     """Trial `index` of the endless set of a setting and a seed. Raises RuntimeError where no run keeps to its bands."""
-    name = ("table", "arm")[index % 2]
     for attempt in range(TRIES):
         root = np.random.SeedSequence([seed, SETTINGS.index(setting), index, attempt])
         rng = np.random.default_rng(root)
-        try:
-            cell = _cell(name, setting, rng)
-            trial = Trial(setting, index, cell, int(root.generate_state(1)[0]), ())
-            shown = Coarse(trial.world)
-        except cells.CellError:  # the region holds no pose that keeps clear of the robot
+        trial = _scene(("table", "arm")[index % 2], setting, index, root, rng, SECONDS)
+        if trial is None:
             continue
-        if not _keeps_gap(trial) or not _keeps_picture(trial):
-            continue
-        trial = dataclasses.replace(trial, occlusion=_occlusion(setting, shown, rng))
+        trial = dataclasses.replace(trial, occlusion=_occlusion(setting, Coarse(trial.world), rng))
         if _keeps_hidden(trial):
             return trial
     raise RuntimeError(f"trial {index} of {setting}: in {TRIES} tries none kept to its bands")
+
+
+def passage(seed: int) -> Trial:
+    """A longer run of `arm` in the skin's range, PASSAGE_S long, through all levels of occlusion (PASSAGE). Raises RuntimeError
+    where none keeps to them."""
+    setting = Setting("inside", "short", "heavy")
+    for attempt in range(TRIES):
+        root = np.random.SeedSequence([seed, len(SETTINGS), attempt])
+        trial = _scene("arm", setting, 0, root, np.random.default_rng(root), PASSAGE_S)
+        if trial is None:
+            continue
+        shown = Coarse(trial.world)
+        ends = [begin for begin, _ in PASSAGE[1:]] + [PASSAGE_S]
+        holds = [(begin, (begin + end) / 2.0, share) for (begin, share), end in zip(PASSAGE, ends, strict=True)]
+        levels = [shown.level(middle, share) if share else 0.0 for _, middle, share in holds]
+        reached = [shown.hidden(middle, level or AWAY) for (_, middle, _), level in zip(holds, levels, strict=True)]
+        if np.abs(np.subtract(reached, [share for _, _, share in holds])).max() <= PASSAGE_WITHIN:
+            commands = tuple((begin, level) for (begin, _, _), level in zip(holds, levels, strict=True))
+            return dataclasses.replace(trial, occlusion=commands)
+    raise RuntimeError(f"passage of seed {seed}: in {TRIES} tries none kept to its levels")
 
 
 def frame_times(begin_s: float = 0.0, seconds: float = SECONDS) -> Array:
@@ -219,6 +237,18 @@ class Coarse:
         self._raster.draw(geometry.apply(self._T_camera_world @ T, mesh.vertices), mesh.faces, *self._k, value)
 
 
+def _scene(
+    name: str, setting: Setting, index: int, root: np.random.SeedSequence, rng: np.random.Generator, seconds: float
+) -> Trial | None:
+    """A trial that nothing is commanded in; None where its limb leaves the picture or the bands of its gap."""
+    try:
+        trial = Trial(setting, index, _cell(name, setting, rng), int(root.generate_state(1)[0]), ())
+        kept = _keeps_gap(trial, seconds) and _keeps_picture(trial, seconds)
+    except cells.CellError:  # the region holds no pose that keeps clear of the robot
+        return None
+    return trial if kept else None
+
+
 def _cell(name: str, setting: Setting, rng: np.random.Generator) -> cells.Cell:
     """A built-in cell with a person of another size, another region of motion, and the experiment's camera."""
     cell = cells.load(name)
@@ -275,18 +305,18 @@ def _reached(cell: cells.Cell) -> Array:
     return np.concatenate([geometry.apply(T, vertices) for T in poses])
 
 
-def _keeps_gap(trial: Trial) -> bool:
+def _keeps_gap(trial: Trial, seconds: float) -> bool:
     low, high = GAP_M[trial.setting.reach]
     world = trial.world
-    gaps = [world.gaps(world.state(time_s)).min() for time_s in frame_times(LEAD_S)]
+    gaps = [world.gaps(world.state(time_s)).min() for time_s in frame_times(LEAD_S, seconds)]
     return min(gaps) >= low and max(gaps) <= high
 
 
-def _keeps_picture(trial: Trial) -> bool:
+def _keeps_picture(trial: Trial, seconds: float) -> bool:
     """Whether the limb lies wholly in the picture."""
     camera, world = trial.camera, trial.world
     T_camera_world = geometry.inverse(camera.T_world_camera)
-    for time_s in frame_times():
+    for time_s in frame_times(0.0, seconds):
         points = geometry.apply(T_camera_world @ world.state(time_s).T_world_target, world.person.meshes[0].vertices)
         pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         if pixels.min() < 0.0 or (pixels > (camera.width - 1, camera.height - 1)).any():

@@ -8,9 +8,9 @@ fused is the pose published nearest to the frame's exposure, if it is not lost, 
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,6 +46,8 @@ CHAINS = {
 }
 """procnet: ours. faithful: the paper's search, network and observer."""
 
+Played = dict[str, Any]
+"""What `played` gives: it is stored as JSON."""
 ERRORS = ("cm", "lateral_cm", "depth_cm", "axis_deg", "roll_deg", "attitude_deg")
 """Of a pose: distance of the object's centre [cm], its parts across and along the line of sight, of the limb's axis, of the twist
 about it, of the whole rotation [deg]."""
@@ -53,7 +55,8 @@ about it, of the whole rotation [deg]."""
 
 def available() -> tuple[str, ...]:
     """The chains whose services are there."""
-    return tuple(n for n, c in CHAINS.items() if all(importlib.util.find_spec(f"services.{s}.service") for s in c.services))
+    folder = Path(__file__).parents[1] / "services" / "posecnn" / "weights"
+    return tuple(name for name in CHAINS if name != "posecnn" or (folder / "posecnn.npz").is_file())
 
 
 def centroid(mesh: Mesh) -> Array:
@@ -83,8 +86,9 @@ def errors(T_true: Array, T: Array, centre: Array, eye: ArrayLike) -> dict[str, 
     }
 
 
-def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple(CHAINS)) -> dict[str, Any]:
-    """All frames of a trial: times, hidden shares, gaps, and for each chain lists of ERRORS, None where there is no pose."""
+def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple(CHAINS)) -> Played:
+    """All frames of a trial: times, hidden shares, gaps, and for each chain lists of ERRORS, None where there is no pose, and the
+    fused poses."""
     world, camera = trial.world, trial.camera
     messages = list(trial.record(seconds))
     ends_ns = EPOCH_NS + round(seconds * 1e9)  # nothing says any more what is in a frame exposed at the very end
@@ -109,7 +113,7 @@ def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple
         nearest = [fused[int(np.argmin(np.abs(said - stamp)))] for stamp in stamps]
         found[name] = {
             "vision": _columns([scored(vision.get(stamp)) for stamp in stamps]),
-            "fused": _columns([scored(pose) for pose in nearest]),
+            "fused": _columns([scored(pose) for pose in nearest]) | {"poses": [_pose(pose) for pose in nearest]},
         }
     return {
         "setting": dataclasses.asdict(trial.setting),
@@ -124,7 +128,7 @@ def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple
     }
 
 
-def is_scored(played: Mapping[str, Any]) -> np.ndarray:
+def is_scored(played: Played) -> np.ndarray:
     """Which frames (n,) count: after the lead-in, with the hidden share in the setting's band."""
     low, high = HIDDEN[Setting(**played["setting"]).occlusion]
     hidden = np.array(played["hidden"])
@@ -134,6 +138,11 @@ def is_scored(played: Mapping[str, Any]) -> np.ndarray:
 def _after(truths: list[Truth], stamp_ns: int) -> Truth:
     """The first truth at or after a frame: it knows what that frame shows."""
     return next((truth for truth in truths if truth.stamp_ns >= stamp_ns), truths[-1])
+
+
+def _pose(pose: FusedPose) -> list[float]:
+    """Position [m] and quaternion, stored."""
+    return np.round([*pose.position, *pose.orientation], 6).tolist()
 
 
 def _columns(rows: list[dict[str, float] | None]) -> dict[str, list[float | None]]:

@@ -15,7 +15,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -210,11 +210,16 @@ def _scene(rig: Rig, seed: int, count: int, gap: float, k: int) -> Scene:
 
 
 def single_windows(
-    rig: Rig, seed: int, plan: Plan, method: str = "solve", scenes: dict[tuple[int, float, int], Scene] | None = None
+    rig: Rig,
+    seed: int,
+    plan: Plan,
+    method: str = "solve",
+    scenes: dict[tuple[int, float, int], Scene] | None = None,
+    counts: Sequence[int] = PADS,
 ) -> Iterator[dict[str, Any]]:
-    """Rows of single windows. scenes: those of another method, whose fields need not be solved again."""
+    """Rows of single windows with so many pads. scenes: those of another method, whose fields need not be solved again."""
     scenes = {} if scenes is None else scenes
-    for count in PADS:
+    for count in counts:
         for gap in GAPS:
             priors = (False, True) if method == "solve" else (False,)  # the network knows no other prior than its training's
             table = {(prior, speed): Row([], []) for prior in priors for speed in SPEEDS}

@@ -1,0 +1,78 @@
+"""`penumbra bench paper`: the paper's whole experiment: its table, its curves as pictures with their data, and a page of all.
+
+In FOLDER: index.html, which needs no other file; table1.json; for each picture NAME.png and NAME.json. Finished runs are kept in
+FOLDER/runs: a run that was killed goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from sim import trial
+from tests import campaign, curves, page, pictures, trials
+from tests.bench import table1
+
+
+def passed(seed: int) -> trials.Played:
+    """A run through all levels of occlusion."""
+    return trials.played(trial.passage(seed), trial.PASSAGE_S, trials.available())
+
+
+def jobs(seed: int, quick: bool) -> list[campaign.Job]:
+    """What is measured beside the table's runs."""
+    here = "tests.bench.paper"
+    return [
+        campaign.Job(f"{seed}-passage", f"{here}:passed", (seed,)),
+        campaign.Job(f"{seed}-haptic{'-quick' * quick}", "tests.curves:haptic_by_gap", (seed, quick)),
+        campaign.Job("response", "tests.curves:response_by_gap", ()),
+    ]
+
+
+def draw(found: dict[str, Any], results: Sequence[trials.Played], others: Sequence[Any], seed: int, folder: Path) -> None:
+    """All pictures with their data."""
+    passage, haptic, response = others
+    shown = {
+        "table": found,
+        "vision_by_distance": curves.vision_by_distance(results),
+        "haptic_by_gap": haptic,
+        "through_occlusion": curves.through_occlusion(passage),
+        "response_by_gap": response,
+    }
+    for name, data in shown.items():
+        pictures.DRAWN[name](data, folder / f"{name}.png")
+        (folder / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n")
+    frames = curves.examples(passage)
+    pictures.examples(trial.passage(seed), frames, folder / "examples.png")
+    (folder / "examples.json").write_text(json.dumps(frames, indent=1) + "\n")
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="penumbra bench paper", description=(__doc__ or "").partition("\n\n")[0])
+    table1.arguments(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where pictures, data and index.html go")
+    options = parser.parse_args(argv)
+    started = time.monotonic()
+    folder: Path = options.out
+    folder.mkdir(parents=True, exist_ok=True)
+    with campaign.bar(Console(stderr=True)) as progress:
+        others = campaign.run(jobs(options.seed, options.quick), folder / "runs", options.jobs, progress, "curves")
+        found, results = table1.measure(options, folder / "runs", progress)
+    draw(found, results, others, options.seed, folder)
+    found["wall_s"] = round(time.monotonic() - started, 1)
+    (folder / "table1.json").write_text(json.dumps(found, indent=1) + "\n")
+    page.write(found, folder, folder / "index.html", options.quick)
+    console = Console()
+    table1.show(found, console)
+    console.print(f"{folder / 'index.html'}: the table, the curves and the paper's numbers")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
