@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.fusion.filter import UNITS, Sense
+from services.fusion.filter import Sense
+from services.fusion.kernel import UNITS
 from shared import geometry
 from shared.geometry import Array
 

@@ -29,7 +29,7 @@ def test_only_the_emulator_train_py_and_characterise_py_know_the_simulated_world
 @pytest.mark.parametrize(
     ("service", "heavy"),
     [
-        ("fusion", {"torch", "numba", "cv2", "pybullet", "trimesh"}),
+        ("fusion", {"torch", "cv2", "pybullet", "trimesh"}),
         ("haptics", {"torch", "cv2"}),
         ("search", {"torch"}),
         ("segmentation", {"numba", "pybullet", "trimesh"}),

@@ -1,19 +1,43 @@
-"""What every observer of this service answers, and how it calls its own state."""
+"""What every observer of this service answers, what it refuses, and how it calls its own state."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from services.fusion import so3
 from shared import geometry
 from shared.messages import Source
 
 Array = NDArray[np.floating[Any]]
 
 SOURCES = ("vision", "haptic")
+STATES = ("tracking", "coasting", "lost")
+TRACKING, COASTING, LOST = range(len(STATES))
+FATES = ("accepted", "gated", "late", "duplicate", "nothing", "future", "pose", "information")
+"""What may become of a measurement: taken; too far from the prediction; older than the history; known already; observing nothing.
+The others are faults of its own, for which it is refused."""
+ACCEPTED, GATED, LATE, DUPLICATE, NOTHING, FUTURE, POSE_FAULT, INFORMATION_FAULT = range(len(FATES))
+AHEAD_S = 0.05
+"""How far ahead of the reader's clock a stamp may be: the clocks of one cell differ by less. One measurement from the future
+would make late whatever comes until then."""
+NO_CLOCK = (1 << 63) - 1
+"""The latest stamp where nobody looks at a clock."""
+ROUNDING = 1e-6
+"""What a rotation or a symmetric matrix without negative eigenvalues may be off by, relative to its largest entry."""
+
+
+class Refused(ValueError):
+    """A measurement that was refused for a fault of its own. `kind` groups equal faults, so that they can be counted."""
+
+    def __init__(self, kind: str, text: str):
+        super().__init__(text)
+        self.kind = kind
 
 
 @dataclass(frozen=True)
@@ -45,52 +69,141 @@ class Limits:
 
     def state(self, age_s: float, covariance: Array) -> str:
         """tracking, coasting or lost, from the age of the newest measurement in use and the pose's covariance (6, 6)."""
-        sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-        if sigma > self.lost_sigma or age_s > self.lost_age:
-            return "lost"
-        return "tracking" if age_s <= self.tracking_age and sigma <= self.tracking_sigma else "coasting"
+        return STATES[state_of(age_s, np.ascontiguousarray(covariance), np.array(astuple(self)))]
+
+
+@njit(cache=True)
+def state_of(age_s, covariance, limits):  # type: ignore[no-untyped-def]
+    """Which of STATES, by the Limits (4,) in the order of their fields."""
+    eigenvalues, _ = so3.eigen(covariance[:3, :3].copy())
+    sigma = math.sqrt(eigenvalues[2])
+    if sigma > limits[2] or age_s > limits[3]:
+        return LOST
+    return TRACKING if age_s <= limits[0] and sigma <= limits[1] else COASTING
 
 
 @dataclass
 class Counts:
-    """What became of the measurements of one source."""
+    """What became of the measurements of one source: see FATES; `refused` by kind."""
 
     accepted: int = 0
-    gated: int = 0  # further from the prediction than both uncertainties allow
-    late: int = 0  # older than the history
+    gated: int = 0
+    late: int = 0
     duplicate: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
 
 
-@dataclass
 class Log:
     """Counts per source, and since when each was heard [ns]."""
 
-    counts: dict[str, Counts] = field(default_factory=lambda: {source: Counts() for source in SOURCES})
-    heard_ns: dict[str, int] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self.counts = {source: Counts() for source in SOURCES}
+        self.heard_ns: dict[str, int] = {}
 
-    def heard(self, source: str, stamp_ns: int) -> None:
+    def check(self, source: str) -> None:
+        """Raises ValueError for a source that is not known."""
         if source not in self.counts:
             raise ValueError(f"source: one of {', '.join(self.counts)} expected, {source!r} came")
+
+    def heard(self, source: str, stamp_ns: int) -> None:
+        """Notes that a sense is there."""
+        self.check(source)
         self.heard_ns.setdefault(source, stamp_ns)
 
+    def took(self, source: str, stamp_ns: int, fate: int) -> None:
+        """Counts a measurement by what became of it (which of FATES)."""
+        if fate >= FUTURE:
+            self.refused(source, FATES[fate])
+            return
+        self.heard(source, stamp_ns)
+        if fate != NOTHING:
+            counts, name = self.counts[source], FATES[fate]
+            setattr(counts, name, getattr(counts, name) + 1)
 
-def checked(T: Array, information: Array) -> tuple[Array, Array]:
-    """A measurement's pose (4, 4) and information (6, 6), symmetric. Raises ValueError that says what is wrong with them."""
-    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
-        raise ValueError("pose: a finite rigid transform (4, 4) expected, what came is none")
-    if information.shape != (6, 6) or not np.isfinite(information).all():
-        raise ValueError("information: a finite (6, 6) matrix expected, what came is none")
-    information = 0.5 * (information + information.T)
-    low, high = np.linalg.eigvalsh(information)[[0, -1]]
-    if high < 0.0 or low < -1e-6 * high:
-        raise ValueError(f"information: no negative eigenvalue expected, {low:.3g} beside {high:.3g} came")
-    return T, information
+    def refused(self, source: str, kind: str) -> None:
+        """Counts a measurement with a fault."""
+        refused = self.counts[source].refused
+        refused[kind] = refused.get(kind, 0) + 1
+
+    def admitted(
+        self, source: str, stamp_ns: int, T: Array, information: Array, now_ns: int | None = None
+    ) -> tuple[Array, Array]:
+        """A measurement's pose (4, 4) and information (6, 6), symmetric. Raises Refused, having counted it, where something is
+        wrong with them, and ValueError on an unknown source. now_ns: the reader's clock, where the stamp is to be compared."""
+        self.check(source)
+        T, information = shaped(T, (4, 4)), shaped(information, (6, 6))
+        fate = fault(stamp_ns, T, information, latest(now_ns))
+        if fate:
+            self.refused(source, FATES[fate])
+            raise refusal(fate, stamp_ns, T, information, now_ns)
+        self.heard(source, stamp_ns)
+        return T, 0.5 * (information + information.T)
+
+
+def shaped(values: Array, shape: tuple[int, ...]) -> Array:
+    """Contiguous numbers of this shape; what has another shape becomes none at all (NaN), which is a fault."""
+    values = np.ascontiguousarray(values, np.float64)
+    return values if values.shape == shape else np.full(shape, np.nan)
+
+
+def latest(now_ns: int | None) -> int:
+    """The latest stamp [ns] that is believed at a time, None: without a clock."""
+    return NO_CLOCK if now_ns is None else now_ns + int(AHEAD_S * 1e9)
+
+
+@njit(cache=True)
+def fault(stamp_ns, T, information, latest_ns):  # type: ignore[no-untyped-def]
+    """FUTURE, POSE_FAULT or INFORMATION_FAULT of a measurement, 0 where it has none: what `refusal` puts in words."""
+    if stamp_ns > latest_ns:
+        return FUTURE
+    off = 0.0
+    for i in range(4):
+        for j in range(4):
+            if not math.isfinite(T[i, j]):
+                return POSE_FAULT
+            if i == 3:
+                off = max(off, abs(T[i, j] - (1.0 if j == 3 else 0.0)))
+            elif j < 3:
+                off = max(off, abs(so3.dot(T[i, :3], T[j, :3]) - (1.0 if i == j else 0.0)))
+    if off > ROUNDING or so3.dot(so3.cross(T[0, :3], T[1, :3]), T[2, :3]) < 0.0:
+        return POSE_FAULT
+    largest = off = 0.0
+    for i in range(6):
+        for j in range(6):
+            if not math.isfinite(information[i, j]):
+                return INFORMATION_FAULT
+            largest = max(largest, abs(information[i, j]))
+            off = max(off, abs(information[i, j] - information[j, i]))
+    if off > ROUNDING * largest:
+        return INFORMATION_FAULT
+    eigenvalues, _ = so3.eigen(information)
+    return INFORMATION_FAULT if eigenvalues[5] < 0.0 or eigenvalues[0] < -ROUNDING * eigenvalues[5] else 0
+
+
+def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int | None) -> Refused:
+    """What is wrong with a measurement that has a `fault`, in words."""
+    if fate == FUTURE:
+        ahead = f"{1e-9 * (stamp_ns - (now_ns or 0)):.3f} s came: check the clocks of its publisher and of fusion (chrony, ptp4l)"
+        text = f"stamp: at most {AHEAD_S} s ahead of the clock expected, {ahead}"
+    elif fate == POSE_FAULT:
+        text = (
+            "pose: a finite rigid transform (4, 4) with a rotation expected, what came is none: is its quaternion of length one?"
+        )
+    elif not np.isfinite(information).all():
+        text = "information: a finite (6, 6) matrix expected, what came is none"
+    elif np.abs(information - information.T).max() > ROUNDING * np.abs(information).max():
+        text = "information: a symmetric matrix expected, one with different halves came"
+    else:
+        low, high = np.linalg.eigvalsh(information)[[0, -1]]
+        text = f"information: no negative eigenvalue expected, {low:.3g} beside {high:.3g} came"
+    return Refused(FATES[fate], text)
 
 
 def information(covariance: Array) -> Array:
-    """The inverse (6, 6) of a covariance. Raises ValueError where it is not symmetric and positive definite."""
+    """The inverse (6, 6) of a covariance. Raises Refused where it is not symmetric and positive definite."""
     eigenvalues, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     low, high = eigenvalues[[0, -1]]
-    if np.abs(covariance - covariance.T).max() > 1e-6 * high or low <= 1e-14 * high:
-        raise ValueError(f"covariance: symmetric and positive definite expected, eigenvalues {low:.3g} to {high:.3g} came")
+    if np.abs(covariance - covariance.T).max() > ROUNDING * high or low <= 1e-14 * high:
+        text = f"covariance: symmetric and positive definite expected, eigenvalues {low:.3g} to {high:.3g} came"
+        raise Refused("covariance", text)
     return (vectors / eigenvalues) @ vectors.T

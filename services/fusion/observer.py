@@ -1,76 +1,151 @@
 """The default observer: takes poses of any rank, late and in any order, and answers with the pose at any moment.
 
-The arithmetic of one step is in `filter.py`, the going back and replaying in `history.py`.
+The arithmetic, the going back and the replaying are in `kernel.py`, compiled: a call does it for as many targets as it is given.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
-from services.fusion.estimate import Array, Estimate, Log, checked
-from services.fusion.filter import MOTION, POSE, Filter, Measurement, Settings, State
-from services.fusion.history import History
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fusion import kernel
+from services.fusion.estimate import (
+    ACCEPTED,
+    FUTURE,
+    SOURCES,
+    STATES,
+    Array,
+    Estimate,
+    Log,
+    latest,
+    refusal,
+    shaped,
+)
+from services.fusion.filter import Settings, model
+from services.fusion.kernel import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, STATE
 from shared import geometry
 from shared.messages import Source
 
 
-class ErrorStateObserver:
-    """Fuses the poses of the senses by how much each can be trusted now.
+class Bank:
+    """The observers of n targets, which share nothing but the calls.
 
-    home : expected pose (4, 4) before anything is known, with standard deviations `spread` (position [m], rotation [rad]).
+    homes : expected poses (n, 4, 4) before anything is known, with standard deviations `spreads` (n, 2), of position [m] and
+    rotation [rad].
     """
 
-    def __init__(self, home: geometry.Array, spread: tuple[float, float], settings: Settings | None = None):
+    def __init__(self, homes: Array, spreads: Sequence[tuple[float, float]], settings: Settings | None = None):
         self.settings = settings or Settings()
-        self.log = Log()
-        self._home = home
-        self._home_covariance = np.diag(np.repeat(np.square(spread), 3))
-        self._filter = Filter(self.settings, home, self._home_covariance)
-        self._history: History[State, Measurement] = History(self._filter.step, self.settings.horizon)
+        n = len(homes)
+        self.logs = [Log() for _ in range(n)]
+        self._models = np.array([model(self.settings, *given) for given in zip(homes, spreads, strict=True)], MODEL)
+        self._states = np.zeros((n, self.settings.capacity), STATE)
+        self._measurements = np.zeros((n, self.settings.capacity), MEASUREMENT)
+        self._rings = np.zeros((n, 2), np.int64)
+        kernel.clear_all(self._states, self._measurements, self._rings)
 
-    def measure(self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None) -> bool:
+    def __len__(self) -> int:
+        return len(self.logs)
+
+    def measure(
+        self,
+        targets: NDArray[np.int64],
+        sources: NDArray[np.int64],
+        stamps_ns: NDArray[np.int64],
+        T: Array,
+        information: Array,
+        now_ns: int | None = None,
+    ) -> NDArray[np.int64]:
+        """Takes m poses T (m, 4, 4) with their information (m, 6, 6), one after the other; their fates (m,), of FATES.
+
+        targets, sources (m,) : which target each belongs to, and which of SOURCES it comes from; otherwise as
+        `ErrorStateObserver.measure`. What is refused is counted, and the others are taken.
+        """
+        fates = np.empty(len(targets), np.int64)
+        kernel.measure_all(
+            *(self._models, self._states, self._measurements, self._rings),
+            *(targets, sources, stamps_ns, T, information, latest(now_ns), fates),
+        )
+        columns = (each.tolist() for each in (targets, sources, stamps_ns, fates))
+        for target, source, stamp_ns, fate in zip(*columns, strict=True):
+            self.logs[target].took(SOURCES[source], stamp_ns, fate)
+        return fates
+
+    def estimate(self, stamp_ns: int, targets: slice = slice(None)) -> NDArray[np.void]:
+        """The ESTIMATE of every target (n,) at a stamp, or of some of them; otherwise as `ErrorStateObserver.estimate`."""
+        models = self._models[targets]
+        out = np.empty(len(models), ESTIMATE)
+        kernel.estimate_all(models, self._states[targets], self._rings[targets], stamp_ns, out)
+        return out
+
+    def estimates(self, stamp_ns: int) -> list[Estimate]:
+        """The same, each with its sources, to be told to others."""
+        return [_told(found, log, stamp_ns) for found, log in zip(self.estimate(stamp_ns), self.logs, strict=True)]
+
+
+class ErrorStateObserver:
+    """Fuses the poses of the senses by how much each can be trusted now: one target of a bank.
+
+    home : expected pose (4, 4) before anything is known, with standard deviations `spread` (position [m], rotation [rad]).
+    bank, target : the bank that it is a part of, with these homes, spreads and settings; without one it has a bank of its own.
+    """
+
+    def __init__(
+        self,
+        home: geometry.Array,
+        spread: tuple[float, float],
+        settings: Settings | None = None,
+        bank: Bank | None = None,
+        target: int = 0,
+    ):
+        self._bank = bank or Bank(np.asarray(home)[None], [spread], settings)
+        self._target = target
+        self.settings, self.log = self._bank.settings, self._bank.logs[target]
+
+    def measure(
+        self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None, now_ns: int | None = None
+    ) -> bool:
         """Takes a pose T (4, 4) with its information (6, 6, zero along what is not observed). True if it was accepted.
 
-        `hidden` is not used: the information says how good the measurement is. Raises ValueError on a pose or an information
-        that is none, and on an unknown source.
+        `hidden` is not used: the information says how good the measurement is. `now_ns` is the reader's clock, where the stamp is
+        to be compared with it. Raises Refused, which is counted and leaves the state as it is, for a pose that is no rigid
+        transform, an information that is not symmetric and positive semi-definite, and a stamp from the future; ValueError on an
+        unknown source.
         """
-        self.log.heard(source, stamp_ns)
-        counts = self.log.counts[source]
-        measurement = self._filter.measurement(source, stamp_ns, *checked(T, information))
-        if measurement.rank == 0:
-            return False
-        fate = self._history.insert(measurement)
-        if fate == "applied":
-            passed = self._history.after(measurement.key).passed
-            counts.accepted += passed
-            counts.gated += not passed
-            return passed
-        counts.late += fate == "late"
-        counts.duplicate += fate == "duplicate"
-        return False
+        self.log.check(source)
+        T, information = shaped(T, (4, 4)), shaped(information, (POSE, POSE))
+        target, which, stamp = np.array([[self._target], [SOURCES.index(source)], [stamp_ns]])
+        fate = int(self._bank.measure(target, which, stamp, T[None], information[None], now_ns)[0])
+        if fate >= FUTURE:
+            raise refusal(fate, stamp_ns, T, information, now_ns)
+        return fate == ACCEPTED
 
     def estimate(self, stamp_ns: int) -> Estimate:
         """The pose at a stamp, from the measurements up to it. Disturbs nothing.
 
         A stamp before the history reads its oldest state. A source's weight is its share of the information that the senses
-        brought in the last `weight_time`, fading exponentially; information in nats, as `filter.Record.gain` defines it.
+        brought in the last `weight_time`, fading exponentially; information in nats, as `kernel.STATE` defines its gain.
         """
-        state = self._history.before(stamp_ns)
-        senses = state.senses if state else {}
-        total = sum(record.gain for record in senses.values())
-        sources = {}
-        for name, since_ns in self.log.heard_ns.items():
-            record = senses.get(name)
-            newest_ns = record.accepted_ns if record and record.accepted_ns is not None else since_ns
-            weight = record.gain / total if record and total > 0.0 else 0.0
-            sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), weight)
-        if state is None:
-            return Estimate(self._home, np.zeros(6), self._home_covariance, "lost", sources)
-        dt = max(0.0, (stamp_ns - state.stamp_ns) * 1e-9)
-        p, R, velocity = self._filter.moved(state, dt)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, p
-        F, Q = self._filter.transition(state, dt)
-        covariance = F[:POSE] @ state.P[:MOTION, :MOTION] @ F[:POSE].T + Q[:POSE, :POSE]
-        age_s = (stamp_ns - state.accepted_ns) * 1e-9
-        return Estimate(T, velocity, covariance, self.settings.limits.state(age_s, covariance), sources)
+        return _told(self._bank.estimate(stamp_ns, slice(self._target, self._target + 1))[0], self.log, stamp_ns)
+
+
+def _told(found: np.void, log: Log, stamp_ns: int) -> Estimate:
+    """One ESTIMATE in words."""
+    believed, weights = found["believed_ns"].tolist(), found["weight"].tolist()
+    sources = {}
+    for name, since_ns in log.heard_ns.items():
+        s = SOURCES.index(name)
+        newest_ns = believed[s] if believed[s] != NEVER else since_ns
+        sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), weights[s])
+    return Estimate(found["T"], found["velocity"], found["covariance"], STATES[found["state"]], sources)
+
+
+def warm_up() -> None:
+    """Compiles everything, or loads what an earlier start has compiled, so that the first measurement takes no longer than the
+    others."""
+    bank = Bank(np.eye(4)[None], [(1.0, 1.0)])
+    targets = np.zeros(1, np.int64)
+    bank.measure(targets, targets, np.ones(1, np.int64), np.eye(4)[None], np.eye(POSE)[None])
+    bank.estimate(1)

@@ -35,7 +35,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from services.fusion import so3
-from services.fusion.estimate import Array, Estimate, Limits, Log, checked
+from services.fusion.estimate import Array, Estimate, Limits, Log
 from shared import geometry
 from shared.messages import Source
 
@@ -119,14 +119,16 @@ class PaperObserver:
         self._covariance = self._home_covariance
         self._weights: dict[str, float] = {}
 
-    def measure(self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None) -> bool:
+    def measure(
+        self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None, now_ns: int | None = None
+    ) -> bool:
         """Takes a pose T (4, 4) with its information (6, 6). True if it is newer than the one before of this source.
 
-        source : `vision` (R_v from the share `hidden`) or `haptic` (R_c from the information). Raises ValueError on a pose or an
-        information that is none, and on an unknown source.
+        source : `vision` (R_v from the share `hidden`) or `haptic` (R_c from the information). Raises Refused, which is
+        counted, for a pose that is no rigid transform, an information that is not symmetric and positive semi-definite, and a
+        stamp ahead of the reader's clock `now_ns` (where it is given); ValueError on an unknown source.
         """
-        self.log.heard(source, stamp_ns)
-        T, information = checked(T, information)
+        T, information = self.log.admitted(source, stamp_ns, T, information, now_ns)
         before = self._held.get(source)
         if before is not None and stamp_ns <= before.stamp_ns:
             self.log.counts[source].late += 1

@@ -1,4 +1,4 @@
-"""Rotations for the observer's inner loop: scipy's Rotation costs 5 to 20 us a call, which a replay makes hundreds of times.
+"""Rotations for the observer's inner loop, compiled; each may be called from Python too.
 
 Rotation vectors r (3,) [rad]; `exp(r)` turns about the fixed axes. Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for
 state estimation in robotics" (2018), arXiv:1812.01537, appendix B.
@@ -7,23 +7,82 @@ state estimation in robotics" (2018), arXiv:1812.01537, appendix B.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.floating[Any]]
+from numba import njit
 
 
-def hat(r: Array) -> Array:
+@njit(cache=True)
+def hat(r):  # type: ignore[no-untyped-def]
     """The skew matrix (3, 3) with hat(r) @ s == cross(r, s)."""
-    x, y, z = float(r[0]), float(r[1]), float(r[2])
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
 
 
-def exp(r: Array) -> Array:
+@njit(cache=True)
+def cross(r, s):  # type: ignore[no-untyped-def]
+    """The cross product (3,)."""
+    return np.array([r[1] * s[2] - r[2] * s[1], r[2] * s[0] - r[0] * s[2], r[0] * s[1] - r[1] * s[0]])
+
+
+@njit(cache=True)
+def dot(r, s):  # type: ignore[no-untyped-def]
+    """The scalar product of two vectors (n,)."""
+    out = 0.0
+    for i in range(len(r)):
+        out += r[i] * s[i]
+    return out
+
+
+@njit(cache=True)
+def product(A, B):  # type: ignore[no-untyped-def]
+    """A @ B, for matrices so small that calling a library costs more than the sums."""
+    out = np.zeros((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            for j in range(B.shape[1]):
+                out[i, j] += A[i, k] * B[k, j]
+    return out
+
+
+@njit(cache=True)
+def product_transposed(A, B):  # type: ignore[no-untyped-def]
+    """A @ B.T."""
+    out = np.zeros((A.shape[0], B.shape[0]))
+    for i in range(A.shape[0]):
+        for j in range(B.shape[0]):
+            for k in range(A.shape[1]):
+                out[i, j] += A[i, k] * B[j, k]
+    return out
+
+
+@njit(cache=True)
+def eigen(A):  # type: ignore[no-untyped-def]
+    """Eigenvalues (n,), ascending, and eigenvectors (n, n), as columns, of a symmetric matrix."""
+    return np.linalg.eigh(A)
+
+
+@njit(cache=True)
+def turn(R, A):  # type: ignore[no-untyped-def]
+    """R @ A in place of A (3, n)."""
+    for j in range(A.shape[1]):
+        x, y, z = A[0, j], A[1, j], A[2, j]
+        for i in range(3):
+            A[i, j] = R[i, 0] * x + R[i, 1] * y + R[i, 2] * z
+
+
+@njit(cache=True)
+def turned(R, v):  # type: ignore[no-untyped-def]
+    """R @ v (3,)."""
+    out = np.empty(3)
+    for i in range(3):
+        out[i] = R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2]
+    return out
+
+
+@njit(cache=True)
+def exp(r):  # type: ignore[no-untyped-def]
     """The rotation matrix (3, 3) of a rotation vector (Rodrigues)."""
-    x, y, z = float(r[0]), float(r[1]), float(r[2])
+    x, y, z = r[0], r[1], r[2]
     square = x * x + y * y + z * z
     if square < 1e-8:  # the next terms are below 1e-17
         a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
@@ -39,56 +98,67 @@ def exp(r: Array) -> Array:
     )
 
 
-def log(R: Array) -> Array:
-    """The rotation vector of a rotation matrix, its angle in [0, pi]."""
+@njit(cache=True)
+def log(R):  # type: ignore[no-untyped-def]
+    """The rotation vector (3,) of a rotation matrix, its angle in [0, pi]."""
     x, y, z, w = quaternion(R)
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, w) / sine
     return np.array([scale * x, scale * y, scale * z])
 
 
-def quaternion(R: Array) -> tuple[float, float, float, float]:
+@njit(cache=True)
+def quaternion(R):  # type: ignore[no-untyped-def]
     """(x, y, z, w) with w >= 0 of a rotation matrix.
 
     Computed from the largest of the four (Shepperd 1978): no loss of digits near an angle of pi.
     """
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    a, e, i = R[0, 0], R[1, 1], R[2, 2]
     if a + e + i > 0.0:
-        q = (1.0 + a + e + i, h - f, c - g, d - b)
+        w, x, y, z = 1.0 + a + e + i, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     elif a >= e and a >= i:
-        q = (h - f, 1.0 + a - e - i, b + d, c + g)
+        w, x, y, z = R[2, 1] - R[1, 2], 1.0 + a - e - i, R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]
     elif e >= i:
-        q = (c - g, b + d, 1.0 + e - a - i, f + h)
+        w, x, y, z = R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], 1.0 + e - a - i, R[1, 2] + R[2, 1]
     else:
-        q = (d - b, c + g, f + h, 1.0 + i - a - e)
-    scale = math.copysign(1.0 / math.sqrt(sum(v * v for v in q)), q[0])
-    return q[1] * scale, q[2] * scale, q[3] * scale, q[0] * scale
+        w, x, y, z = R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], 1.0 + i - a - e
+    scale = math.copysign(1.0 / math.sqrt(w * w + x * x + y * y + z * z), w)
+    return x * scale, y * scale, z * scale, w * scale
 
 
-def left_jacobian_inverse(r: Array) -> Array:
+@njit(cache=True)
+def left_jacobian_inverse(r):  # type: ignore[no-untyped-def]
     """J (3, 3) with log(exp(d) @ exp(r)) = r + J @ d for a small d."""
-    square = float(r @ r)
+    square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     if square < 1e-8:
         c = 1.0 / 12.0
     else:
         half = 0.5 * math.sqrt(square)
         c = (1.0 - half / math.tan(half)) / square
     K = hat(r)
-    return np.eye(3) - 0.5 * K + c * (K @ K)
+    J = c * product(K, K) - 0.5 * K
+    for i in range(3):
+        J[i, i] += 1.0
+    return J
 
 
-def swing(a: Array, b: Array) -> Array:
-    """The rotation vector of the shortest turn that takes the unit vector a (3,) to b (3,)."""
-    cross = hat(a) @ b
-    sine, cosine = math.sqrt(float(cross @ cross)), float(a @ b)
-    if sine > 1e-9:
-        return math.atan2(sine, cosine) / sine * cross
-    if cosine > 0.0:
-        return cross
-    across = hat(a) @ np.eye(3)[np.argmin(np.abs(a))]  # opposite: half a turn about any axis across
-    return math.pi / math.sqrt(float(across @ across)) * across
+@njit(cache=True)
+def swing(a, b):  # type: ignore[no-untyped-def]
+    """The rotation vector (3,) of the shortest turn that takes the unit vector a (3,) to b (3,)."""
+    axis = cross(a, b)
+    sine, cosine = math.sqrt(dot(axis, axis)), dot(a, b)
+    if sine < 1e-9 and cosine < 0.0:  # opposite: half a turn about any axis across
+        other = np.zeros(3)
+        other[np.argmin(np.abs(a))] = 1.0
+        axis = cross(a, other)
+        return math.pi / math.sqrt(dot(axis, axis)) * axis
+    return math.atan2(sine, cosine) / sine * axis if sine > 1e-9 else axis
 
 
-def orthonormal(R: Array) -> Array:
-    """R after one Newton step towards the nearest rotation: keeps rounding from piling up over a long run."""
-    return 1.5 * R - 0.5 * (R @ R.T @ R)
+@njit(cache=True)
+def orthonormalise(R):  # type: ignore[no-untyped-def]
+    """One Newton step of R, in place, towards the nearest rotation: keeps rounding from piling up over a long run."""
+    near = product(product_transposed(R, R), R)
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = 1.5 * R[i, j] - 0.5 * near[i, j]
