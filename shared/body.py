@@ -115,7 +115,7 @@ def target_mesh(target: cells.Target, cell: cells.Cell) -> Mesh:
     """The mesh of a target in its size: of the parametric forearm, or the user's own file (metres, x along the limb). Raises
     CellError."""
     mesh, size = _mesh(target, cell), target.size
-    return replace(mesh, vertices=mesh.vertices * (size.length, size.girth, size.girth))
+    return mesh if size is None else replace(mesh, vertices=mesh.vertices * (size.length, size.girth, size.girth))
 
 
 def _mesh(target: cells.Target, cell: cells.Cell) -> Mesh:

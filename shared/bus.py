@@ -308,7 +308,7 @@ class Reader:
             return
         traffic.took(message.stamp_ns, self._now_ns())
         try:
-            self._handler(message, names)
+            self._handler(message, names | {"publisher": _publisher(sample.source_info)})
         except Exception as error:
             self._failed(f"reader of {key}", error)
 
@@ -320,6 +320,10 @@ class Reader:
                 "size", f"{self._kind.__name__}: at most {self._kind.MAX_BYTES} bytes expected, {len(sample.payload)} came"
             )
         return decode(self._kind, sample.payload.to_bytes(), self._now_ns())
+
+
+def _publisher(info: zenoh.SourceInfo | None) -> str:
+    return "" if info is None else f"{info.source_id.zid}/{info.source_id.eid}"
 
 
 def _short(error: Exception) -> str:

@@ -232,12 +232,13 @@ class Size(_Model):
 
 class Target(_Model):
     """What is tracked. `mesh`: `body:forearm` (the parametric forearm with hand) or a mesh file beside the cell file, in
-    metres, its x axis along the limb. `size`: how much larger than the mesh the person at hand is; the skin's field model
-    follows without being fitted again. `labels`: the mask classes that show it. `home`: where it is expected before anything is
+    metres, its x axis along the limb. `size`: how much larger than the mesh the person at hand is, where that was measured; the
+    skin's field model follows without being fitted again. Not given: the camera takes the mesh for the person, the skin knows
+    only how people differ. `labels`: the mask classes that show it. `home`: where it is expected before anything is
     known, with its spread."""
 
     mesh: str
-    size: Size = Size()
+    size: Size | None = None
     labels: tuple[Literal["robot", "torso", "upper_arm", "forearm", "hand", "occluder"], ...]
     home: Placement
     home_spread: Spread = Spread(position=0.15, rotation=0.4)

@@ -121,8 +121,8 @@ class Response:
         if len(sizes) > 1:
             raise cells.CellError(f"cell {cell.name}: pads with equally many electrodes expected, {sorted(sizes)} came")
         self.electrodes = sizes.pop()
-        own_size = cell.targets[target].size
-        self._size = np.log([own_size.length, own_size.girth])
+        size = cell.targets[target].size or cells.Size()
+        self._size = np.log([size.length, size.girth])
         self._rest = [known[each].rest for each in prints]
         self.error = np.repeat([known[each].error for each in prints], self.electrodes)
         self.index = np.array([different.index(each) for each in prints])

@@ -19,7 +19,7 @@ class Person:
         self.whole = target.mesh == "body:forearm"
         if self.whole:
             self.meshes += [bodies.upper_arm_mesh(cell.body), bodies.torso_mesh(cell.body)]
-        self._elbow = target.size.length * cell.body.forearm_length / 2.0
+        self._elbow = (target.size.length if target.size else 1.0) * cell.body.forearm_length / 2.0
         self._upper_arm = cell.body.upper_arm_length
         self._shoulder = np.asarray(sim.shoulder)
         self._R_world_torso = geometry.from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, target.home.rpy[2]))[:3, :3]

@@ -31,9 +31,9 @@ from shared.surface import Surface
 
 MEMORY_S = 10.0
 """Time in which a pose is forgotten: with a home known to 12 cm, 5 mm a window, twice what a limb moves."""
-EXPECTED_SIGMA = 0.05
+EXPECTED_SIGMA = 0.02
 """A fused pose is looked at where its position is known so well along its worst direction [m]: what the camera saw a moment ago
-tells apart places that feel alike …"""
+tells apart places that feel alike. A worse one rests on what was felt, and would feed it back …"""
 EXPECTED_INFLATION, EXPECTED_FLOOR = 2.0, (0.01, 0.1)
 """… with its standard deviations doubled, and these [m, rad] added: it says where to look and not what is felt."""
 MISFIT = 2.5
@@ -64,6 +64,8 @@ CLEAR = 4.0
 LASTING = 5.0
 """Windows in which the model's error is about the same. Whoever fuses poses takes their errors for independent, so it is
 published with so many times its variance."""
+SIZE_LASTS = 100.0
+"""The same of what is not known of the limb's size, which stays for as long as the person does."""
 LINKS_ERROR = 0.005
 """Standard deviation of what the robot's other links are predicted to change, as a share."""
 ROLL_MEMORY_S = 0.1
@@ -98,7 +100,8 @@ class Estimate:
 
 class Estimator:
     """home (4, 4), spread (6,): where the target is expected; network: None where none was trained (the solve then starts
-    from home); method: `solve`, or `paper` for the network alone. Raises ValueError for `paper` without a network."""
+    from home); method: `solve`, or `paper` for the network alone; measured: whether the limb's size is that of the cell file's
+    target, and not any person's. Raises ValueError for `paper` without a network."""
 
     def __init__(
         self,
@@ -109,13 +112,14 @@ class Estimator:
         spread: Array,
         network: PoseNetwork | None = None,
         method: str = "solve",
+        measured: bool = False,
     ):
         if method not in ("solve", "paper"):
             raise ValueError(f"method: solve or paper expected, {method!r} came")
         if method == "paper" and network is None:
             raise ValueError("method paper needs the network's weights: run `penumbra haptics train` for this cell, or use solve")
         self.skin, self.surface, self.home, self.network, self.method = skin, surface, home, network, method
-        self.size, self.tare = Size(), Tare(skin.noise)
+        self.size, self.tare = Size(measured), Tare(skin.noise)
         self._response, self._solver = response, Solver(skin, response)
         self._home_covariance = np.diag(np.asarray(spread, dtype=float) ** 2)
         self._home_information = np.linalg.inv(self._home_covariance)
@@ -201,7 +205,7 @@ class Estimator:
         self._misfit += MISFIT_SHARE * (min(solution.misfit, WORST) - self._misfit)
         if self._misfit > NO_LIMB or self.size.strangeness > STRANGE:
             return self._estimate(T, np.zeros((6, 6)), gap, FOREIGN, solution.residuals)
-        information, gradient = _size_known(*self._solver.likelihood(window, solution, LASTING), size, self.size, LASTING)
+        information, gradient = _size_known(*self._solver.likelihood(window, solution, LASTING), size, self.size, SIZE_LASTS)
         information, gradient = self._without_roll(T, information, gradient)
         if scatter.any():
             keep = np.linalg.inv(np.eye(6) + information @ scatter)

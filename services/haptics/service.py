@@ -106,6 +106,7 @@ def estimator(node: Node, options: argparse.Namespace, skin: Skin, target: str) 
         np.repeat([spread.position, spread.rotation], 3),
         weights,
         options.method,
+        cell.targets[target].size is not None,
     )
     made.warm_up(sum(len(robot.joints) for robot in cell.robots.values()))
     return made

@@ -16,6 +16,8 @@ SIZE = np.array([0.0, -0.08])
 """Log length and log girth of a limb, as shares of the target's mesh, before anything is felt …"""
 SIZE_SPREAD = np.array([0.06, 0.11])
 """… and their standard deviations: the 5th percentile woman to the 95th man (ANSUR II) lie at log girths of -0.27 to 0.11."""
+SIZE_MEASURED = np.array([0.015, 0.03])
+"""The same of a person who was measured, around the target's stated size."""
 SIZE_GAP = 0.06
 """Nearer than this [m] the size is learnt."""
 SIZE_MEMORY_S = 20.0
@@ -35,26 +37,27 @@ FARTHEST_TARE = 0.02
 
 
 class Size:
-    """mean (2,): log length and log girth; information (2, 2)."""
+    """mean (2,): log length and log girth; information (2, 2). measured: whether the cell file states this person's size."""
 
-    def __init__(self) -> None:
-        self._prior = np.diag(1.0 / SIZE_SPREAD**2)
+    def __init__(self, measured: bool = False) -> None:
+        self._usual: Array = np.zeros(2) if measured else SIZE
+        self._spread: Array = SIZE_MEASURED if measured else SIZE_SPREAD
         self.forget()
 
     def forget(self) -> None:
         """Another person may come."""
-        self.mean, self.information = SIZE.copy(), self._prior.copy()
+        self.mean, self.information = self._usual.copy(), np.diag(1.0 / self._spread**2)
 
     @property
     def strangeness(self) -> float:
         """How far the mean is from a usual one, in standard deviations between people."""
-        return float(np.linalg.norm((self.mean - SIZE) / SIZE_SPREAD))
+        return float(np.linalg.norm((self.mean - self._usual) / SIZE_SPREAD))
 
     def predict(self, elapsed_s: float) -> None:
         """What was learnt fades."""
         keep = np.exp(-elapsed_s / SIZE_MEMORY_S)
-        covariance = keep**2 * np.linalg.inv(self.information) + (1.0 - keep**2) * np.diag(SIZE_SPREAD**2)
-        self.mean = SIZE + keep * (self.mean - SIZE)
+        covariance = keep**2 * np.linalg.inv(self.information) + (1.0 - keep**2) * np.diag(self._spread**2)
+        self.mean = self._usual + keep * (self.mean - self._usual)
         self.information = np.linalg.inv(covariance)
 
     def learn(self, size: Array, information: Array, gradient: Array, pose_information: Array) -> None:

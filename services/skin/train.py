@@ -352,7 +352,7 @@ def main(argv: list[str]) -> int:
         raise cells.CellError(f"cell {cell.name} has no pads: nothing to fit")
     torch.set_num_threads(1)
     target = cell.one("targets", options.target)
-    mesh = target_mesh(cell.targets[target].model_copy(update={"size": cells.Size()}), cell)  # the networks know of sizes
+    mesh = target_mesh(cell.targets[target].model_copy(update={"size": None}), cell)  # the networks know of sizes
     points = pieces(mesh)
     with Progress() as progress:
         for mounting in mountings(cell, target):
