@@ -78,7 +78,23 @@ def test_a_message_arrives_with_the_names_in_its_key(node):
     reader.subscribe(topics.VOLTAGES, lambda message, names: got.append((names, message.volts.shape)))
     reader.open(), writer.open()
     until(lambda: got, lambda: writer.publish(topics.VOLTAGES, voltages(), pad="p3"), "a message")
-    assert got[0] == ({"pad": "p3"}, (5, 5))
+    names, shape = got[0]
+    assert (names["pad"], shape) == ("p3", (5, 5))
+
+
+def test_a_reader_is_told_which_of_two_publishers_sent_a_message(node):
+    heard = {}
+    reader, writers = node(), [node(), node()]
+    reader.subscribe(topics.VOLTAGES, lambda message, names: heard.setdefault(names["publisher"], []).append(message.stamp_ns))
+    reader.open(), [writer.open() for writer in writers]
+
+    def publish():
+        for writer in writers:
+            writer.publish(topics.VOLTAGES, voltages(), pad="p3")
+
+    until(lambda: len(heard) > 1, publish, "messages of both")
+    until(lambda: all(len(stamps) > 3 for stamps in heard.values()), publish, "more of both")
+    assert len(heard) == 2 and "" not in heard
 
 
 def test_a_slow_reader_of_one_topic_does_not_hold_up_another(node):
