@@ -84,6 +84,8 @@ STATE = np.dtype(
         ("stamp_ns", "i8"),  # NEVER: nothing is known yet
         ("accepted_ns", "i8"),  # stamp of the last accepted measurement of any sense
         ("passed", "i8"),  # whether the last measurement was accepted
+        ("distance", "f8"),  # its squared Mahalanobis distance, and how many directions that has: 0 where it began the state
+        ("rank", "i8"),
         ("p", "f8", 3),
         ("R", "f8", (3, 3)),
         ("velocity", "f8", POSE),
@@ -122,7 +124,8 @@ ESTIMATE = np.dtype(
 def forget(state):  # type: ignore[no-untyped-def]
     """Makes a state that knows nothing."""
     state.stamp_ns = state.accepted_ns = NEVER
-    state.passed = 0
+    state.passed = state.rank = 0
+    state.distance = 0.0
     state.agility = 1.0
     for i in range(POSE):
         state.velocity[i] = 0.0
@@ -190,6 +193,7 @@ def step(model, state, m):  # type: ignore[no-untyped-def]
         if fresh:
             break
         distance = so3.dot(innovation, innovation)
+        state.distance, state.rank = distance, m.rank
         learn(model, state, m, innovation)
         if distance <= model.threshold[m.rank]:
             break
