@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import threading
 import time
 from collections.abc import Iterator
 
@@ -13,8 +14,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from services.fusion import service, so3
-from services.fusion.estimate import information
-from services.fusion.observer import ErrorStateObserver
+from services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, SOURCES, Refused, information
+from services.fusion.filter import Settings
+from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
 from shared import bus, cell, geometry, messages, topics
 from shared.geometry import Array, perturb, pose_error
@@ -165,22 +167,109 @@ def test_before_the_first_measurement_the_target_is_lost_at_home(make: type) -> 
     assert "haptic" not in estimate.sources
 
 
+FAR = perturb(HOME, [0.03, 0.0, 0.0, 0.0, 0.0, 0.1])
+SKEW = VISION + np.diag([1e3] * 4, k=2)
+
+
 @pytest.mark.parametrize("make", OBSERVERS)
 @pytest.mark.parametrize(
-    ("T", "seen", "text"),
+    ("T", "seen", "ahead", "kind", "text"),
     [
-        (np.full((4, 4), np.nan), VISION, "rigid transform"),
-        (2.0 * np.eye(4), VISION, "rigid transform"),
-        (HOME, np.diag([1.0, 1, 1, 1, 1, -1]), "no negative eigenvalue expected, -1 beside 1 came"),
-        (HOME, np.eye(5), "(6, 6)"),
+        pytest.param(np.full((4, 4), np.nan), VISION, 0.0, "pose", "a finite rigid transform", id="not a number"),
+        pytest.param(
+            np.diag([0.0, 0, 0, 1]), VISION, 0.0, "pose", "is its quaternion of length one?", id="quaternion of length 0"
+        ),
+        pytest.param(np.diag([2.0, 2, 2, 1]), VISION, 0.0, "pose", "a finite rigid transform", id="stretched"),
+        pytest.param(FAR @ np.diag([1.0, 1, -1, 1]), VISION, 0.0, "pose", "a finite rigid transform", id="mirrored"),
+        pytest.param(np.eye(3), VISION, 0.0, "pose", "(4, 4)", id="a rotation only"),
+        pytest.param(FAR, -VISION, 0.0, "information", "no negative eigenvalue expected, -1e+04 beside", id="negative"),
+        pytest.param(
+            FAR,
+            np.diag([1.0, 1, 1, 1, 1, -1]),
+            0.0,
+            "information",
+            "no negative eigenvalue expected, -1 beside 1 came",
+            id="mixed",
+        ),
+        pytest.param(FAR, SKEW, 0.0, "information", "a symmetric matrix expected", id="not symmetric"),
+        pytest.param(FAR, np.full((6, 6), np.inf), 0.0, "information", "a finite (6, 6) matrix expected", id="infinite"),
+        pytest.param(FAR, np.eye(5), 0.0, "information", "a finite (6, 6) matrix expected", id="another shape"),
+        pytest.param(FAR, VISION, 0.06, "future", "at most 0.05 s ahead of the clock expected, 0.060 s came", id="future"),
     ],
 )
-def test_what_is_no_measurement_is_refused_with_the_reason(make: type, T: Array, seen: Array, text: str) -> None:
-    with pytest.raises(ValueError, match="expected") as caught:
-        make(HOME, SPREAD).measure("vision", ns(0), T, seen)
-    assert text in str(caught.value)
+def test_what_is_no_measurement_is_refused_with_the_reason_counted_and_changes_nothing(
+    make: type, T: Array, seen: Array, ahead: float, kind: str, text: str
+) -> None:
+    observer = make(HOME, SPREAD)
+    still(observer, HOME, 0.0, 1.0)
+    before = observer.estimate(ns(1.1))
+    with pytest.raises(Refused) as caught:
+        observer.measure("vision", ns(1.0 + ahead), T, seen, 0.0, now_ns=ns(1.0))
+    assert caught.value.kind == kind and text in str(caught.value)
+    assert observer.log.counts["vision"].refused == {kind: 1}
+    after = observer.estimate(ns(1.1))
+    np.testing.assert_array_equal(after.T, before.T)
+    np.testing.assert_array_equal(after.covariance, before.covariance)
+    assert after.sources == before.sources
+    assert observer.measure("vision", ns(1.04), HOME, VISION, 0.0, now_ns=ns(1.0)), "clocks differ a little"
+
+
+@pytest.mark.parametrize("make", OBSERVERS)
+def test_a_source_that_nobody_knows_is_refused(make: type) -> None:
     with pytest.raises(ValueError, match="source: one of vision, haptic expected, 'sonar' came"):
         make(HOME, SPREAD).measure("sonar", ns(0), HOME, VISION)
+
+
+# ---- many targets, many measurements
+
+
+def test_a_bank_of_targets_does_what_each_of_them_does_alone() -> None:
+    homes = [perturb(HOME, [0.1 * i, 0, 0, 0, 0, 0.3 * i]) for i in range(3)]
+    bank = Bank(np.array(homes), [SPREAD] * 3)
+    alone = [ErrorStateObserver(home, SPREAD) for home in homes]
+    streams = [stream(0.5, seed=i) for i in range(3)]
+    for rows in zip(*streams, strict=True):
+        stamps = np.array([row[1] for row in rows])
+        sources = np.array([SOURCES.index(row[0]) for row in rows])
+        T, seen = (np.array([row[column] for row in rows]) for column in (2, 3))
+        fates = bank.measure(np.arange(3), sources, stamps, T, seen)
+        for observer, row, fate in zip(alone, rows, fates, strict=True):
+            assert observer.measure(*row) == (fate == ACCEPTED)
+    for found, observer in zip(bank.estimates(ns(0.52)), alone, strict=True):
+        expected = observer.estimate(ns(0.52))
+        np.testing.assert_array_equal(found.T, expected.T)
+        np.testing.assert_array_equal(found.covariance, expected.covariance)
+        assert (found.state, found.sources) == (expected.state, expected.sources)
+    assert [log.counts for log in bank.logs] == [observer.log.counts for observer in alone]
+
+
+def test_a_bank_takes_what_is_good_beside_what_is_bad() -> None:
+    bank = Bank(np.array([HOME, HOME]), [SPREAD] * 2)
+    targets, sources, stamps = np.array([0, 1, 1, 1]), np.zeros(4, np.int64), np.full(4, ns(0.0))
+    seen = np.array([-VISION, VISION, VISION, VISION])
+    fates = bank.measure(targets, sources, stamps, np.array([HOME, np.zeros((4, 4)), FAR, FAR]), seen, now_ns=ns(0.0))
+    assert [FATES[fate] for fate in fates] == ["information", "pose", "accepted", "duplicate"]
+    assert [e.state for e in bank.estimates(ns(0.0))] == ["lost", "tracking"]
+    assert fates[3] == DUPLICATE and bank.logs[0].counts["vision"].refused == {"information": 1}
+
+
+def test_a_storm_of_measurements_shortens_the_history_and_nothing_else() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD, Settings(capacity=16))
+    for k in range(100):
+        observer.measure("haptic", ns(0.001 * k), HOME, VISION)
+    assert observer.measure("vision", ns(0.0905), HOME, VISION)
+    assert not observer.measure("vision", ns(0.0505), HOME, VISION)
+    assert observer.log.counts["vision"].late == 1
+    assert observer.estimate(ns(0.1)).state == "tracking"
+    np.testing.assert_allclose(observer.estimate(ns(0.1)).T, HOME, atol=1e-9)
+
+
+def test_no_measurement_is_believed_beyond_the_floor() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    observer.measure("vision", ns(0.0), HOME, 1e18 * np.eye(6))
+    floor = Settings().senses["vision"].floor
+    sigma = np.sqrt(np.diag(observer.estimate(ns(0.0)).covariance))
+    np.testing.assert_allclose(sigma, floor * np.array([0.1, 0.1, 0.1, 1, 1, 1]), rtol=0.02)
 
 
 # ---- directions that are not observed
@@ -309,9 +398,6 @@ def test_the_service_publishes_and_answers_in_both_formats(observer: str, table:
             return answer()["state"] == "tracking"
 
         wait_for(tracking, 5.0, "the state tracking")
-        user.publish(topics.VISION, vision_pose(table, frame="moon", position=np.array([9.0, 9.0, 9.0])), target="forearm")
-        user.publish(topics.VISION, vision_pose(table, covariance=np.zeros((6, 6))), target="forearm")
-        wait_for(lambda: sum(fusion.health()["faults"].values()) == 2, 5.0, "two refused poses")
         user.publish(topics.VISION, vision_pose(table), target="forearm")
         pose = answer()
         np.testing.assert_allclose(pose["position"], [0.01, 0.02, 0.15], atol=1e-3)
@@ -336,6 +422,74 @@ def test_the_service_publishes_and_answers_in_both_formats(observer: str, table:
         wait_for(lambda: len(heard) > 20, 5.0, "fused poses on the bus")
         stamps = np.diff([message.stamp_ns for message in heard])
         assert (stamps > 0).all()
+
+
+@pytest.mark.parametrize("observer", ["default", "paper"])
+def test_what_the_service_refuses_is_counted_in_its_health_by_kind_and_moves_nothing(
+    observer: str, table: cell.Cell, router: str
+) -> None:
+    parser = argparse.ArgumentParser()
+    service.arguments(parser)
+    fusion = Node(service.NAME, table, bus.Connection(connect=(router,)))
+    service.start(fusion, parser.parse_args(["--observer", observer]))
+    user, rival = (Node("user", table, bus.Connection(connect=(router,))) for _ in range(2))
+    key = topics.current_pose("table", "forearm")
+
+    def health() -> dict:
+        (reply,) = user.query(topics.health("table", service.NAME, fusion.instance)) or [b"{}"]
+        return json.loads(reply)
+
+    def refused() -> dict:
+        return health().get("report", {}).get("forearm", {}).get("vision", {}).get("refused", {})
+
+    def by_decoder() -> int:
+        return health()["topics"][topics.VISION.at(cell="table", target="forearm")]["bad"].get("values", 0)
+
+    with fusion, user, rival:
+        good = threading.Event()
+
+        def hold_still() -> None:
+            while not good.wait(0.02):
+                user.publish(topics.VISION, vision_pose(table), target="forearm")
+
+        publisher = threading.Thread(target=hold_still, daemon=True)
+        publisher.start()
+        wait_for(lambda: health().get("report", {}).get("forearm", {}).get("state") == "tracking", 5.0, "the state tracking")
+        away = np.array([0.06, 0.02, 0.15])
+        wrong = [
+            ("frame", user, {"frame": "moon"}),
+            ("frame", user, {"target": "leg"}),
+            ("camera", user, {"camera": "back"}),
+            ("covariance", user, {"covariance": np.zeros((6, 6))}),
+            ("future", user, {"stamp_ns": 300_000_000}),
+            ("publisher", rival, {}),
+        ]
+        counted: dict[str, int] = {}
+        for kind, node, changes in wrong:
+            counted[kind] = counted.get(kind, 0) + 1
+            stamp_ns = time.time_ns() + changes.pop("stamp_ns", 0)
+            node.publish(topics.VISION, vision_pose(table, position=away, stamp_ns=stamp_ns, **changes), target="forearm")
+            wait_for(lambda counted=counted: refused() == counted, 5.0, f"{kind} among {counted}")
+        for k, changes in enumerate(({"orientation": np.zeros(4)}, {"covariance": np.diag([1.0, 1, 1, 1, 1, -1])})):
+            user.publish(topics.VISION, vision_pose(table, position=away, **changes), target="forearm")
+            wait_for(lambda k=k: by_decoder() == k + 1, 5.0, "what is not even decoded")
+        good.set()
+        publisher.join()
+        assert health()["faults"] == {} and health()["report"]["forearm"]["vision"]["accepted"] > 5
+        pose = json.loads(user.query(key, "format=json")[0])
+        np.testing.assert_allclose(pose["position"], [0.01, 0.02, 0.15], atol=2e-3)
+
+
+def test_another_publisher_of_a_stream_is_heard_after_the_silence_of_the_first_and_beside_another_stream() -> None:
+    publishers = service.Publishers()
+    publishers.check("front", "a", ns(0.0), 0.3)
+    publishers.check("side", "b", ns(0.1), 0.3)
+    publishers.check("front", "a", ns(0.2), 0.3)
+    with pytest.raises(Refused, match="front: one publisher expected, b came beside a: two processes publish the same poses"):
+        publishers.check("front", "b", ns(0.4), 0.3)
+    publishers.check("front", "b", ns(0.6), 0.3)
+    with pytest.raises(Refused, match="a came beside b"):
+        publishers.check("front", "a", ns(0.7), 0.3)
 
 
 def test_a_target_that_the_cell_does_not_have_is_told(table: cell.Cell) -> None:

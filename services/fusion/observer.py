@@ -80,29 +80,36 @@ class Bank:
         kernel.estimate_all(models, self._states[targets], self._rings[targets], stamp_ns, out)
         return out
 
+    def innovation(self, target: int) -> tuple[float, int]:
+        """As `ErrorStateObserver.innovation`, of one target."""
+        first, count = self._rings[target]
+        newest = self._states[target, (first + count - 1) % self._states.shape[1]]
+        return float(newest["distance"]), int(newest["rank"])
+
     def estimates(self, stamp_ns: int) -> list[Estimate]:
         """The same, each with its sources, to be told to others."""
         return [_told(found, log, stamp_ns) for found, log in zip(self.estimate(stamp_ns), self.logs, strict=True)]
 
 
 class ErrorStateObserver:
-    """Fuses the poses of the senses by how much each can be trusted now: one target of a bank.
+    """Fuses the poses of the senses by how much each can be trusted now.
 
     home : expected pose (4, 4) before anything is known, with standard deviations `spread` (position [m], rotation [rad]).
-    bank, target : the bank that it is a part of, with these homes, spreads and settings; without one it has a bank of its own.
     """
 
-    def __init__(
-        self,
-        home: geometry.Array,
-        spread: tuple[float, float],
-        settings: Settings | None = None,
-        bank: Bank | None = None,
-        target: int = 0,
-    ):
-        self._bank = bank or Bank(np.asarray(home)[None], [spread], settings)
-        self._target = target
-        self.settings, self.log = self._bank.settings, self._bank.logs[target]
+    def __init__(self, home: geometry.Array, spread: tuple[float, float], settings: Settings | None = None):
+        self._join(Bank(np.asarray(home)[None], [spread], settings), 0)
+
+    @classmethod
+    def of(cls, bank: Bank, target: int) -> ErrorStateObserver:
+        """The observer of one target of a bank."""
+        observer = cls.__new__(cls)
+        observer._join(bank, target)
+        return observer
+
+    def _join(self, bank: Bank, target: int) -> None:
+        self._bank, self._target = bank, target
+        self.settings, self.log = bank.settings, bank.logs[target]
 
     def measure(
         self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None, now_ns: int | None = None
@@ -122,6 +129,11 @@ class ErrorStateObserver:
             raise refusal(fate, stamp_ns, T, information, now_ns)
         return fate == ACCEPTED
 
+    def innovation(self) -> tuple[float, int]:
+        """Squared Mahalanobis distance of the newest measurement's innovation (NIS) and its degrees of freedom: 0 and 0 where it
+        began the state."""
+        return self._bank.innovation(self._target)
+
     def estimate(self, stamp_ns: int) -> Estimate:
         """The pose at a stamp, from the measurements up to it. Disturbs nothing.
 
@@ -140,12 +152,3 @@ def _told(found: np.void, log: Log, stamp_ns: int) -> Estimate:
         newest_ns = believed[s] if believed[s] != NEVER else since_ns
         sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), weights[s])
     return Estimate(found["T"], found["velocity"], found["covariance"], STATES[found["state"]], sources)
-
-
-def warm_up() -> None:
-    """Compiles everything, or loads what an earlier start has compiled, so that the first measurement takes no longer than the
-    others."""
-    bank = Bank(np.eye(4)[None], [(1.0, 1.0)])
-    targets = np.zeros(1, np.int64)
-    bank.measure(targets, targets, np.ones(1, np.int64), np.eye(4)[None], np.eye(POSE)[None])
-    bank.estimate(1)

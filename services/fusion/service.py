@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import threading
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from services.fusion import so3
-from services.fusion.estimate import Estimate, information
-from services.fusion.observer import ErrorStateObserver
+from services.fusion.estimate import Array, Estimate, Refused, information
+from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
 from shared import cell, geometry, messages, topics
 from shared.service import Node
@@ -30,70 +32,164 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: Node, options: argparse.Namespace) -> None:
-    """Wires one observer per target. Raises CellError for a target that the cell does not have."""
+    """Wires one observer per target, and one timer for all. Raises CellError for a target that the cell does not have."""
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
-    for name in names:
-        Fusion(node, name, options.observer)
+    warm_up(OBSERVERS[options.observer])
+    group = Group(options.observer, [node.cell.targets[name] for name in names])
+    fusions = [Fusion(node, name, group, observer) for name, observer in zip(names, group.observers, strict=True)]
+
+    def publish() -> None:
+        if any(node.owns(name) for name in names):
+            stamp_ns, estimates = group.estimates(node.now_ns)
+            for fusion, estimate in zip(fusions, estimates, strict=True):
+                fusion.publish(stamp_ns, estimate)
+
+    node.every(PERIOD_S, publish)
+
+
+def warm_up(kind: type[ErrorStateObserver | PaperObserver]) -> None:
+    """Compiles everything, or loads what an earlier start has compiled, so that the first measurement takes no longer than the
+    others."""
+    observer = kind(np.eye(4), (1.0, 1.0))
+    observer.measure("vision", 1, np.eye(4), np.eye(6))
+    so3.quaternion(observer.estimate(1).T[:3, :3])
+
+
+class Group:
+    """The observers of the cell's targets, of which all can be asked at once."""
+
+    def __init__(self, kind: str, targets: list[cell.Target]):
+        homes = [target.home.transform for target in targets]
+        spreads = [(target.home_spread.position, target.home_spread.rotation) for target in targets]
+        self.lock = threading.Lock()
+        self.observers: Sequence[ErrorStateObserver | PaperObserver]
+        if kind == "paper":
+            self.observers = [PaperObserver(home, spread) for home, spread in zip(homes, spreads, strict=True)]
+            self._bank = None
+        else:
+            self._bank = Bank(np.array(homes), spreads)
+            self.observers = [ErrorStateObserver.of(self._bank, i) for i in range(len(targets))]
+
+    def estimates(self, now_ns: Callable[[], int]) -> tuple[int, list[Estimate]]:
+        """The time [ns] and the estimates of all."""
+        with self.lock:
+            stamp_ns = now_ns()
+            if self._bank is not None:
+                return stamp_ns, self._bank.estimates(stamp_ns)
+            return stamp_ns, [observer.estimate(stamp_ns) for observer in self.observers]
+
+
+class Publishers:
+    """Who may speak for a stream: one process at a time. Two that do not know of each other would count every error twice. A
+    replica that takes over is heard as soon as the one before it has been silent for a while."""
+
+    def __init__(self) -> None:
+        self._speaks: dict[str, tuple[str, int]] = {}
+
+    def check(self, stream: str, publisher: str, now_ns: int, silence_s: float) -> None:
+        """Raises Refused for a publisher while another one of this stream was heard in the last silence_s."""
+        speaker, heard_ns = self._speaks.get(stream, (publisher, now_ns))
+        if speaker != publisher and now_ns - heard_ns < silence_s * 1e9:
+            raise Refused(
+                "publisher",
+                f"{stream}: one publisher expected, {publisher} came beside {speaker}: two processes publish the same poses; "
+                "end one of them",
+            )
+        self._speaks[stream] = publisher, now_ns
 
 
 class Fusion:
     """One target: its observer, what it hears and what it says. Every replica listens, the stream's owner publishes."""
 
-    def __init__(self, node: Node, target: str, observer: str):
-        self.node, self.target = node, target
-        home: cell.Target = node.cell.targets[target]
-        spread = (home.home_spread.position, home.home_spread.rotation)
-        self.observer = OBSERVERS[observer](home.home.transform, spread)
-        self._lock = threading.Lock()
+    def __init__(self, node: Node, target: str, group: Group, observer: ErrorStateObserver | PaperObserver):
+        self.node, self.target, self.group, self.observer = node, target, group, observer
+        self._publishers = Publishers()
+        self._told: set[tuple[str, str]] = set()
         self._state = "lost"
         node.subscribe(topics.VISION, self.on_vision, target=target)
         node.subscribe(topics.HAPTIC, self.on_haptic, target=target)
-        node.every(PERIOD_S, self.publish)
         node.answer(topics.current_pose(node.cell.name, target), self.answer)
+        node.report[target] = self.describe
 
     def on_vision(self, message: messages.VisionPose, names: dict[str, str]) -> None:
-        self._take("vision", message, information(message.covariance) if message.state == "tracking" else None, message.hidden)
+        """A camera's pose; each camera of the cell is a stream of its own."""
+        self._take("vision", message, lambda now_ns: self._seen(message, names["publisher"], now_ns), message.hidden)
 
     def on_haptic(self, message: messages.HapticPose, names: dict[str, str]) -> None:
-        self._take("haptic", message, message.information if message.state == "in_range" else None, None)
+        """The skin's pose."""
+        self._take("haptic", message, lambda now_ns: self._felt(message, names["publisher"], now_ns), None)
 
-    def _take(self, source: str, message: Any, information: Any, hidden: float | None) -> None:
-        """A measurement, or with no information the news that a sense is there but has nothing to say."""
-        expected = (self.target, self.node.cell.frame)
-        if (message.target, message.frame) != expected:
-            raise ValueError(f"{source} pose: target and frame {expected} expected, {(message.target, message.frame)} came")
-        if information is None:
-            with self._lock:
-                self.observer.log.heard(source, message.stamp_ns)
+    def _seen(self, message: messages.VisionPose, publisher: str, now_ns: int) -> Array | None:
+        """The information (6, 6) of a camera's pose, None where it is not to be used. Raises Refused."""
+        if message.camera not in self.node.cell.cameras:
+            known = ", ".join(self.node.cell.cameras)
+            raise Refused("camera", f"vision: a camera of the cell ({known}) expected, {message.camera!r:.60} came")
+        self._publishers.check(f"vision of camera {message.camera}", publisher, now_ns, topics.VISION.stale_s)
+        return information(message.covariance) if message.state == "tracking" else None
+
+    def _felt(self, message: messages.HapticPose, publisher: str, now_ns: int) -> Array | None:
+        """The information (6, 6) of the skin's pose, None where it is not to be used. Raises Refused."""
+        self._publishers.check("haptic", publisher, now_ns, topics.HAPTIC.stale_s)
+        return message.information if message.state == "in_range" else None
+
+    def _take(self, source: str, message: Any, read: Callable[[int], Array | None], hidden: float | None) -> None:
+        """Hands a measurement on to the observer, or the news that a sense is there but has nothing to say; what is refused is
+        counted, and told once of each kind."""
+        now_ns, log = self.node.now_ns(), self.observer.log
+        try:
+            self._check_place(source, message)
+            information = read(now_ns)
+        except Refused as error:
+            log.refused(source, error.kind)
+            self._tell(source, error)
             return
-        T = geometry.transform(message.position, message.orientation)
-        with self._lock:
-            self.observer.measure(source, message.stamp_ns, T, information, hidden)
+        with self.group.lock:
+            if information is None:
+                log.heard(source, message.stamp_ns)
+                return
+            T = geometry.transform(message.position, message.orientation)
+            try:
+                self.observer.measure(source, message.stamp_ns, T, information, hidden, now_ns)
+            except Refused as error:
+                self._tell(source, error)
 
-    def publish(self) -> None:
+    def _check_place(self, source: str, message: Any) -> None:
+        expected, came = (self.target, self.node.cell.frame), (message.target, message.frame)
+        if came != expected:
+            raise Refused("frame", f"{source}: target and frame {expected} expected, {came!r:.120} came")
+
+    def _tell(self, source: str, error: Refused) -> None:
+        if (source, error.kind) not in self._told:
+            self._told.add((source, error.kind))
+            why = "measurement refused; more of this kind are only counted"
+            self.node.log.warning(why, target=self.target, source=source, kind=error.kind, why=str(error))
+
+    def describe(self) -> dict[str, Any]:
+        """For the health report: the state, and what became of the measurements of each source."""
+        return {"state": self._state, **{source: asdict(counts) for source, counts in self.observer.log.counts.items()}}
+
+    def publish(self, stamp_ns: int, estimate: Estimate) -> None:
+        """Publishes an estimate, where this replica owns the target."""
+        changed, self._state = (estimate.state == "lost") != (self._state == "lost"), estimate.state
         if not self.node.owns(self.target):
             return
-        stamp_ns, estimate = self._now()
         self.node.publish(topics.FUSED, self._message(stamp_ns, estimate), target=self.target)
-        if (estimate.state == "lost") != (self._state == "lost"):
+        if changed:
             counts = {f"{source}_{what}": n for source, c in self.observer.log.counts.items() for what, n in vars(c).items() if n}
             self.node.log.info("lost" if estimate.state == "lost" else "found", target=self.target, **counts)
-        self._state = estimate.state
 
     def answer(self, parameters: dict[str, str], payload: bytes) -> tuple[bytes, str]:
         """The current pose: MessagePack of FusedPose, or JSON with `format=json`. Raises ValueError on another format."""
         form = parameters.get("format", "msgpack")
         if form not in ("msgpack", "json"):
             raise ValueError(f"format: msgpack or json expected, {form!r} came")
-        message = self._message(*self._now())
+        with self.group.lock:
+            stamp_ns = self.node.now_ns()
+            estimate = self.observer.estimate(stamp_ns)
+        message = self._message(stamp_ns, estimate)
         if form == "msgpack":
             return messages.encode(message), "application/msgpack"
         return json.dumps(as_json(message)).encode(), "application/json"
-
-    def _now(self) -> tuple[int, Estimate]:
-        with self._lock:
-            stamp_ns = self.node.now_ns()
-            return stamp_ns, self.observer.estimate(stamp_ns)
 
     def _message(self, stamp_ns: int, estimate: Estimate) -> messages.FusedPose:
         return messages.FusedPose(
