@@ -35,10 +35,13 @@ HIDDEN = 0.92
 COVERED = 0.5
 """Share of the predicted picture covered by something from which on the target is occluded and not lost."""
 COVERS = (Label.ROBOT, Label.TORSO, Label.UPPER_ARM, Label.OCCLUDER)
-ROOM = 1.3
-"""Side of a patch around a target that was found, in extents of its picture."""
-TOO_SMALL = 0.4
-"""Extent of a target's picture, in sides of the patch, below which it is looked at again from nearer."""
+TOO_SMALL, ROOM = 0.45, 1.8
+"""When nothing is known of the target and its pixels extend over less than this share of the patch, it is looked at again in a
+square so many times as large as that extent."""
+FEWEST = 8
+"""Pixels, counted at the network's stride, that are looked at again."""
+TILED, TILE = 2.0, 0.6
+"""A window wider than so many patches, when nothing is known of the target, is also looked at in four tiles, of this share."""
 UNKNOWN = np.diag([1.0**2] * 3 + [1.5**2] * 3)
 """Covariance of a pose that says nothing, [m^2, rad^2]."""
 
@@ -58,14 +61,12 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Found:
-    """What one look shows: T_camera_target, the vote, pixels of the target at the network's stride."""
+    """What one look shows: T_camera_target, the vote for its centre, overlap and hidden share in [0, 1]."""
 
     T: Array
     vote: voting.Vote
     overlap: float
     hidden: float
-    extent: float
-    middle: Array
 
 
 class PoseCNN:
@@ -112,14 +113,34 @@ class PoseCNN:
             raise ValueError(f"image: {expected} expected (the cell file), {came} came")
         middle = np.array([window.x0 + window.right - 1, window.y0 + window.bottom - 1]) / 2.0
         side = float(max(window.right - window.x0, window.bottom - window.y0))
+        looks = [(middle, side)]
+        if T_prior is None and side > TILED * patch.SIDE:
+            looks += [(middle + side / 4.0 * np.array([x, y]), TILE * side) for y in (-1, 1) for x in (-1, 1)]
         with torch.inference_mode():
-            square = patch.cut(image, self._intrinsics, middle, side)
-            labels, found = self._look(square)
-            if found is not None and found.extent < TOO_SMALL * side:
-                square = patch.cut(image, self._intrinsics, found.middle, ROOM * found.extent)
-                nearer_labels, nearer = self._look(square)
-                labels, found = (nearer_labels, nearer) if nearer is not None else (labels, found)
-        return self._judge(labels, square, found, T_prior)
+            for at, width in looks:
+                square = patch.cut(image, self._intrinsics, at, width)
+                labels, found = self._look(square)
+                estimate = self._judge(square, labels, found, T_prior)
+                if T_prior is None and (region := self._region(labels, square)) is not None:
+                    nearer = patch.cut(image, self._intrinsics, *region)
+                    estimate = self._judge(nearer, *self._look(nearer), T_prior)
+                if estimate.state == "tracking":
+                    break
+        return estimate
+
+    def _region(self, labels: NDArray[np.int64], square: patch.Patch) -> tuple[Array, float] | None:
+        """Middle (2,) and side [image px] of a square around the pixels of the target, where they take up too little of a patch:
+        the network knows targets that nearly fill it."""
+        columns_rows = np.argwhere(np.isin(labels, self._target.label_values))[:, ::-1] * float(STRIDE)
+        if len(columns_rows) < FEWEST:
+            return None
+        low, high = np.quantile(columns_rows, (0.05, 0.95), axis=0)
+        extent = float((high - low).max()) + STRIDE
+        if extent > TOO_SMALL * patch.SIDE:
+            return None
+        fx, fy, cx, cy = self._intrinsics
+        middle = ((low + high) / 2.0 - square.centre) / square.focal * [fx, fy] + [cx, cy]
+        return middle, ROOM * extent / square.focal * fx
 
     @property
     def _intrinsics(self) -> Array:
@@ -158,9 +179,6 @@ class PoseCNN:
         vertices = geometry.apply(T, self._mesh.vertices)
         if vertices[:, 2].min() < raster.NEAR:
             return None
-        fx, fy, cx, cy = self._intrinsics
-        shown = vertices[:, :2] / vertices[:, 2:] * [fx, fy] + [cx, cy]
-        low, high = shown.min(axis=0), shown.max(axis=0)
         whole, inside = self._silhouette(vertices, square, len(labels))
         both = int((seen & inside).sum())
         free = int((inside & ~seen & ~np.isin(labels, COVERS)).sum())
@@ -169,8 +187,6 @@ class PoseCNN:
             vote,
             overlap=both / max(int(seen.sum()) + free, 1),
             hidden=float(np.clip(1.0 - seen.sum() / max(whole, 1), 0.0, 1.0)),
-            extent=float((high - low).max()),
-            middle=(low + high) / 2.0,
         )
 
     def _silhouette(self, vertices: Array, square: patch.Patch, side: int) -> tuple[int, NDArray[np.bool_]]:
@@ -181,7 +197,7 @@ class PoseCNN:
         covered = raster.silhouette(vertices, self._mesh.faces, (focal, focal, *centre), window)
         return int(covered.sum()), covered[side : 2 * side, side : 2 * side]
 
-    def _judge(self, labels: NDArray[np.int64], square: patch.Patch, found: Found | None, T_prior: Array | None) -> Estimate:
+    def _judge(self, square: patch.Patch, labels: NDArray[np.int64], found: Found | None, T_prior: Array | None) -> Estimate:
         T_world_camera = self._camera.T_world_camera
         if found is not None and found.hidden <= HIDDEN and found.vote.share >= AGREEING and found.overlap >= FITS:
             own = self._camera.fx * self._length / found.T[2, 3]

@@ -23,6 +23,8 @@ START = (0.02, np.radians(4.0))
 """Root mean square length of the predictions' errors: position [m], rotation [rad]."""
 BANDS = ((0.0, 0.33), (0.33, 0.66), (0.66, 1.0))
 """Shares of the target that are hidden: light, medium and heavy occlusion, as in the paper."""
+LEAST = 60
+"""Poses that a calibration needs."""
 UNCALIBRATED = Uncertainty(dict.fromkeys(KINDS, (0.0,) * 6))
 
 
@@ -91,8 +93,10 @@ def results(net: Network, uncertainty: Uncertainty, shown: Iterable[Shown], seed
 
 
 def calibrated(net: Network, shown: Iterable[Shown], seed: int) -> Uncertainty:
-    """The uncertainty that pictures show."""
+    """The uncertainty that pictures show; where too few of them were tracked to say, that of a network that knows nothing."""
     tracked = [one for one in results(net, UNCALIBRATED, shown, seed) if one.estimate.signs is not None]
+    if len(tracked) < LEAST:
+        return UNCALIBRATED
     return fitted([one.estimate.signs for one in tracked if one.estimate.signs is not None], [one.errors for one in tracked])
 
 

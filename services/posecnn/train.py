@@ -120,11 +120,11 @@ class Truth:
 
 
 class Simulated:
-    """Pictures rendered in order by a process of low priority, kept on disk in files of CHUNK."""
+    """Pictures rendered in order by a process of low priority, kept on disk in files of `chunk`."""
 
-    def __init__(self, folder: Path, seed: int, most: int):
+    def __init__(self, folder: Path, seed: int, most: int, chunk: int = CHUNK):
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._seed, self._chunks = folder, seed, -(-most // CHUNK)
+        self._folder, self._seed, self._chunk, self._chunks = folder, seed, chunk, -(-most // chunk)
         self._asked = 0
         self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=os.nice, initargs=(10,))
         self._pending: list[Future[None]] = []
@@ -133,20 +133,22 @@ class Simulated:
 
     def ensure(self, count: int, ahead: int = 4) -> int:
         """Wait until `count` pictures (or all) are there, ask for some more; returns how many may be used."""
-        chunks = min(-(-count // CHUNK), self._chunks)
+        chunks = min(-(-count // self._chunk), self._chunks)
         for chunk in range(self._asked, min(chunks + ahead, self._chunks)):
-            self._pending.append(self._pool.submit(_render_to, self._path(chunk), self._seed, chunk))
+            first = chunk * self._chunk
+            indices = range(first, first + self._chunk)
+            self._pending.append(self._pool.submit(_render_to, self._path(chunk), self._seed, indices))
             self._asked = chunk + 1
         while len(self._pixels) < chunks:
             path = self._path(len(self._pixels))
             self._pending[len(self._pixels)].result()
             self._pixels.append(np.load(path, mmap_mode="r"))
             self._truth.append(np.load(path.with_suffix(".truth.npy")))
-        return chunks * CHUNK
+        return chunks * self._chunk
 
     def __getitem__(self, index: int) -> tuple[NDArray[np.uint8], Truth]:
         """Red, green, blue and class (h, w, 4) of a picture that is there, and what is known of it."""
-        chunk, i = divmod(index, CHUNK)
+        chunk, i = divmod(index, self._chunk)
         return self._pixels[chunk][i], Truth.of(self._truth[chunk][i])
 
     def close(self) -> None:
@@ -157,11 +159,11 @@ class Simulated:
         return self._folder / f"{self._seed}-{chunk:05d}.npy"
 
 
-def _render_to(path: Path, seed: int, chunk: int) -> None:
+def _render_to(path: Path, seed: int, indices: range) -> None:
     if path.is_file():
         return
     pixels, rows = [], []
-    for index in range(chunk * CHUNK, (chunk + 1) * CHUNK):
+    for index in indices:
         sequence = sequences.render(seed, index, VARIETY)
         poses = sequence.poses
         assert poses is not None
