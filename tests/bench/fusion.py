@@ -1,0 +1,461 @@
+"""`penumbra bench fusion`: is the observer as good as it says, is it better than its rivals, and what does it cost.
+
+Monte Carlo runs of simulated limbs and senses (`tests.fusion_runs`: minimum-jerk reaches, errors that last, pictures that are
+late; nothing is drawn from the filter's own model) in six situations, and in a seventh with a hand as fast as hands are.
+
+NEES: the squared error of the pose that is published, in units of its covariance, at the moment of publication; 6 degrees of
+freedom, 5 where the roll about the limb is not observed. NIS: the same of the innovations of accepted measurements. Values of
+one run at different times are correlated, those of different runs are not. So the 95 % band is that of the mean of all runs at
+one instant, a chi-square with as many degrees of freedom as these runs have together (Bar-Shalom, Li, Kirubarajan 2001, section
+5.4, as OpenVINS plots it); the value beside it is the mean over all instants, and `inside` the share of instants whose mean over
+the runs is within the band of its own, 0.95 for a perfect filter.
+
+Late: every measurement is 0, 50 or 200 ms late, or each by 0 to 200 ms at random, so that they come in a random order. What is
+compared is the pose as of the newest stamp that has arrived, read at the same moments: a filter that goes back and replays is
+not worse at it, one that takes late for new is. Beside it stand the error of the pose as of now, which must be guessed further
+ahead the later the measurements are, and the largest distance between the poses as of a stamp once everything up to it has
+arrived and those of the run in which nothing is late: 0 for a filter that does not depend on the order of arrival.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from scipy.stats import chi2
+
+from services.fusion import so3
+from services.fusion.estimate import SOURCES, Estimate
+from services.fusion.observer import Bank, ErrorStateObserver
+from services.fusion.paper import PaperObserver
+from shared import geometry, messages
+from shared.geometry import Array
+from tests import fusion_runs as runs
+from tests.fusion_baselines import FixedLagSmoother, Newest
+
+HOME, SPREAD = geometry.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0]), (0.12, 0.4)
+"""Of the cell `table`."""
+INSTANTS_S = 0.11
+"""Between moments that are scored: it walks through all phases of both senses' periods."""
+LATE_S = {"0": (0.0, 0.0), "50": (0.05, 0.05), "200": (0.2, 0.2), "shuffled": (0.0, 0.2)}
+CONFIDENCE = 0.95
+WRONG_GOAL_CM, LATE_GOAL, STEP_GOAL_MS, CORE_GOAL = 3.0, 1.1, 0.3, 1.0
+PUBLISHED_HZ, TARGETS = 200.0, (1, 10, 100)
+WIDTH = 130
+BASELINES = ("oracle", "average", "gtsam", "paper")
+SLOW, SLOW_EVERY = ("gtsam", "paper"), 4
+"""Baselines that take most of the time, and are played in every fourth run only."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """One run: at scored instants [s] (k,) the errors [m] of the observer and of each baseline that was played, the NEES and its
+    degrees of freedom; of every accepted measurement its stamp [s], NIS and degrees of freedom (n,); and counts."""
+
+    times: Array
+    errors: dict[str, Array]
+    nees: Array
+    nees_dof: Array
+    stamps: Array
+    nis: Array
+    nis_dof: Array
+    gated: int
+    states: dict[str, int]
+
+
+def normalised(truth: Array, T: Array, covariance: Array, rolls: bool) -> float:
+    """The squared pose error of T (4, 4) in units of its covariance (6, 6); without `rolls` along the five directions other than
+    the rotation about the limb."""
+    error = geometry.pose_error(truth, T)
+    if not rolls:
+        axes = np.eye(6)
+        axes[3:, 3:] = T[:3, :3]
+        seen = np.delete(axes, 3, axis=1)
+        error, covariance = seen.T @ error, seen.T @ covariance @ seen
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def band(dof: Sequence[float] | Array) -> tuple[float, float]:
+    """The 95 % band of the mean of independent chi-square values with these degrees of freedom."""
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    low, high = chi2.ppf([tail, 1.0 - tail], np.sum(dof)) / len(dof)
+    return float(low), float(high)
+
+
+def consistency(times: Array, values: Array, dof: Array, count: int) -> dict[str, Any]:
+    """Mean, band and share of instants inside of values (n,) at times (n,), of `count` runs; None where there are none."""
+    if not len(values):
+        return {"mean": None, "band": None, "inside": None}
+    low, high = band(np.full(count, dof.mean()))
+    instants = np.round(1000.0 * times).astype(int)
+    inside = []
+    for instant in np.unique(instants):
+        here = instants == instant
+        bounds = band(dof[here])
+        inside.append(bounds[0] <= values[here].mean() <= bounds[1])
+    return {"mean": float(values.mean()), "band": [low, high], "inside": float(np.mean(inside))}
+
+
+class Player:
+    """Hands the messages of a run to whoever wants them, as they arrive."""
+
+    def __init__(self, run: runs.Run, takers: Iterable[Callable[[runs.Message], object]]):
+        self._messages, self._takers, self._next = run.messages, list(takers), 0
+
+    def until(self, now: float) -> None:
+        while self._next < len(self._messages) and self._messages[self._next].arrival <= now + 1e-6:  # a tie is an arrival
+            for take in self._takers:
+                take(self._messages[self._next])
+            self._next += 1
+
+
+def instants(run: runs.Run) -> list[float]:
+    """The moments [s] of a run that count."""
+    every = np.arange(INSTANTS_S, run.seconds, INSTANTS_S)
+    return [float(t) for t in every if run.situation.scored(t)]
+
+
+def taking(observer: ErrorStateObserver | PaperObserver) -> Callable[[runs.Message], bool]:
+    return lambda m: observer.measure(m.source, runs.ns(m.stamp), m.T, m.information, m.hidden)
+
+
+def scored(name: str, seed: int, index: int, seconds: float) -> Scores:
+    """One run of a situation, played to the observer and to all baselines."""
+    run = runs.drawn(name, seed, index, seconds)
+    if run.situation.wrong:
+        run = runs.wronged(run, seed, index)
+    ours, paper = ErrorStateObserver(HOME, SPREAD), PaperObserver(HOME, SPREAD)
+    newest, smoother = Newest(), FixedLagSmoother(HOME, SPREAD)
+    rivals = [taking(paper), smoother.take] if index % SLOW_EVERY == 0 else []
+    player = Player(run, [taking(ours), newest.take, *rivals])
+    errors: dict[str, list[float]] = {key: [] for key in ("ours", *BASELINES)}
+    times, nees, dof, states = instants(run), [], [], {"tracking": 0, "coasting": 0, "lost": 0}
+    for now in times:
+        player.until(now)
+        truth, estimate = run.at(now), ours.estimate(runs.ns(now))
+        poses = {"ours": estimate.T, "average": newest.average(now)}
+        if rivals:
+            poses |= {"gtsam": smoother.pose(now), "paper": paper.estimate(runs.ns(now)).T}
+        for key, T in poses.items():
+            errors[key].append(float(np.linalg.norm(truth[:3, 3] - T[:3, 3])))
+        errors["oracle"].append(newest.oracle(now, truth))
+        rolls = run.situation.rolls(now)
+        nees.append(normalised(truth, estimate.T, estimate.covariance, rolls))
+        dof.append(6 if rolls else 5)
+        states[estimate.state] += 1
+    stamps, nis, nis_dof = innovations(run)
+    return Scores(
+        np.array(times),
+        {key: np.array(values) for key, values in errors.items()},
+        np.array(nees),
+        np.array(dof),
+        stamps,
+        nis,
+        nis_dof,
+        sum(counts.gated for counts in ours.log.counts.values()),
+        states,
+    )
+
+
+def innovations(run: runs.Run) -> tuple[Array, Array, Array]:
+    """Stamps [s], NIS and degrees of freedom of all accepted measurements of a settled observer, each as its sense said it and in
+    the order of the stamps: what comes late is judged once, with all that was before it."""
+    observer, found = ErrorStateObserver(HOME, SPREAD), []
+    for m in runs.delayed(run, lambda: 0.0).messages:
+        accepted = taking(observer)(m)
+        if accepted and m.stamp >= runs.SETTLED_S:
+            found.append((m.stamp, *observer.innovation()))
+    stamps, nis, dof = np.array(found).reshape(-1, 3).T
+    return stamps, nis, dof
+
+
+def shift(seed: int, index: int, seconds: float) -> float:
+    """How far [m] a wrong sense moves the pose at most, beside the same run without it."""
+    right = runs.drawn("one sense wrong", seed, index, seconds)
+    both = [(run, ErrorStateObserver(HOME, SPREAD)) for run in (right, runs.wronged(right, seed, index))]
+    players = [Player(run, [taking(observer)]) for run, observer in both]
+    most = 0.0
+    for now in np.arange(runs.WRONG_S[0], min(seconds, runs.WRONG_S[1] + 4.0), 0.02):
+        for player in players:
+            player.until(now)
+        a, b = (observer.estimate(runs.ns(now)).T for _, observer in both)
+        most = max(most, float(np.linalg.norm(a[:3, 3] - b[:3, 3])))
+    return most
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """Errors [m] of a run with late measurements: of the pose as of the newest stamp that has arrived, and as of now; and how far
+    [m] the poses as of a stamp, once all up to it has arrived, are at most from those of a run without lateness."""
+
+    newest: Array
+    now: Array
+    difference: float
+
+
+def late(seed: int, index: int, seconds: float) -> dict[str, Lateness]:
+    """One visible run for each lateness."""
+    drawn = runs.drawn("visible", seed, index, seconds)
+    longest = max(bounds[1] for bounds in LATE_S.values())
+    times = [t for t in instants(drawn) if t + longest < seconds]
+    found, exact = {}, []
+    for name, bounds in LATE_S.items():
+        rng = np.random.default_rng([seed, index])
+        run = runs.delayed(drawn, lambda bounds=bounds, rng=rng: float(rng.uniform(*bounds)))
+        observer, stamps = ErrorStateObserver(HOME, SPREAD), [0.0]
+        take = taking(observer)
+        player = Player(run, [take, lambda m, stamps=stamps: stamps.append(max(m.stamp, stamps[-1]))])
+        newest, now, settled = [], [], []
+        for when, asked in sorted([*((t, t) for t in times), *((t + longest, t) for t in times)]):
+            player.until(when)
+            if when > asked:
+                settled.append(observer.estimate(runs.ns(asked)).T)
+                continue
+            newest.append(_distance(run.at(stamps[-1]), observer.estimate(runs.ns(stamps[-1])).T))
+            now.append(_distance(run.at(asked), observer.estimate(runs.ns(asked)).T))
+        exact = exact or settled
+        difference = max(_distance(a, b) for a, b in zip(settled, exact, strict=True))
+        found[name] = Lateness(np.array(newest), np.array(now), difference)
+    return found
+
+
+def _distance(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+
+
+def step_times(seed: int, seconds: float) -> dict[str, float]:
+    """Medians [ms] of one predict, update and publish: of measurements in order, and of pictures that come behind the skin's."""
+    run = runs.drawn("one sense wrong", seed, 0, seconds)
+    found = {}
+    for name, each in (("in order", runs.delayed(run, lambda: 0.0)), ("late pictures", run)):
+        observer, took = ErrorStateObserver(HOME, SPREAD), []
+        take = taking(observer)
+        for m in each.messages:
+            began = time.perf_counter()
+            take(m)
+            encoded(observer.estimate(runs.ns(m.arrival)), runs.ns(m.arrival))
+            if name == "in order" or m.source == "vision":
+                took.append(time.perf_counter() - began)
+        found[name] = float(1000.0 * np.median(took[len(took) // 10 :]))
+    return found
+
+
+def encoded(estimate: Estimate, stamp_ns: int) -> bytes:
+    """The pose at a stamp as it goes over the bus."""
+    message = messages.FusedPose(
+        stamp_ns=stamp_ns,
+        target="forearm",
+        frame="world",
+        position=estimate.T[:3, 3],
+        orientation=np.array(so3.quaternion(estimate.T[:3, :3])),
+        velocity=estimate.velocity,
+        covariance=estimate.covariance,
+        state=estimate.state,
+        sources=estimate.sources,
+    )
+    return messages.encode(message)
+
+
+def core_shares(seed: int, seconds: float) -> list[dict[str, float]]:
+    """What a bank of n observers takes of a core to predict, update and answer at 200 Hz: its measurements, those of four
+    runs for all its targets, in the order of their arrival; and the same with every pose put into its message."""
+    drawn = [runs.drawn("one sense wrong", seed, i, seconds) for i in range(4)]
+    found = []
+    for n in TARGETS:
+        bank = Bank(np.tile(HOME, (n, 1, 1)), [SPREAD] * n)
+        batches = _batches(drawn, n, seconds)
+        took, told = [], []
+        for k, batch in enumerate(batches):
+            now_ns = runs.ns((k + 1) / PUBLISHED_HZ)
+            began = time.perf_counter()
+            if len(batch[0]):
+                bank.measure(*batch)
+            bank.estimate(now_ns)
+            took.append(time.perf_counter() - began)
+            began = time.perf_counter()
+            for estimate in bank.estimates(now_ns):
+                encoded(estimate, now_ns)
+            told.append(time.perf_counter() - began)
+        settled = len(batches) // 4
+        share = PUBLISHED_HZ * float(np.mean(took[settled:]))
+        found.append({"n": n, "core_share": share, "with_messages": share + PUBLISHED_HZ * float(np.mean(told[settled:]))})
+    return found
+
+
+def _batches(drawn: list[runs.Run], n: int, seconds: float) -> list[tuple[Array, ...]]:
+    """What arrives for n targets in each of the steps of a stream at 200 Hz: the arguments of `Bank.measure`."""
+    steps = int(seconds * PUBLISHED_HZ)
+    arrived: list[list[tuple[int, runs.Message]]] = [[] for _ in range(steps)]
+    for target in range(n):
+        for m in drawn[target % len(drawn)].messages:
+            step = int(m.arrival * PUBLISHED_HZ)
+            if step < steps:
+                arrived[step].append((target, m))
+    return [
+        (
+            np.array([target for target, _ in each], np.int64),
+            np.array([SOURCES.index(m.source) for _, m in each], np.int64),
+            np.array([runs.ns(m.stamp) for _, m in each], np.int64),
+            np.array([m.T for _, m in each]),
+            np.array([m.information for _, m in each]),
+        )
+        for each in arrived
+    ]
+
+
+def summary(each: list[Scores]) -> dict[str, Any]:
+    """What is told of the runs of a situation."""
+    times, count = np.concatenate([s.times for s in each]), len(each)
+    nees = consistency(times, np.concatenate([s.nees for s in each]), np.concatenate([s.nees_dof for s in each]), count)
+    stamps, nis = np.concatenate([s.stamps for s in each]), np.concatenate([s.nis for s in each])
+    told = consistency(stamps, nis, np.concatenate([s.nis_dof for s in each]), count)
+    errors = {key: 100.0 * np.concatenate([s.errors[key] for s in each]) for key in ("ours", *BASELINES)}
+    there = 100.0 * np.concatenate([s.errors["ours"] for s in each if len(s.errors["gtsam"])])
+    moments = sum(sum(s.states.values()) for s in each)
+    return {
+        "nees": nees["mean"],
+        "nees_band": nees["band"],
+        "nees_inside": nees["inside"],
+        "nis": told["mean"],
+        "nis_band": told["band"],
+        "nis_inside": told["inside"],
+        "error_cm": float(errors["ours"].mean()),
+        "error_p95_cm": float(np.percentile(errors["ours"], 95)),
+        "error_beside_slow_cm": float(there.mean()),
+        "baselines_cm": {key: float(errors[key].mean()) for key in BASELINES},
+        "refused": sum(s.gated for s in each),
+        "states": {state: sum(s.states[state] for s in each) / moments for state in each[0].states},
+    }
+
+
+def lateness(each: list[dict[str, Lateness]]) -> dict[str, Any]:
+    """Mean errors [cm] by lateness, as of the newest stamp and as of now, and the largest difference [mm] after the fact."""
+    return {
+        "late": {name: float(100.0 * np.concatenate([one[name].newest for one in each]).mean()) for name in LATE_S},
+        "late_now": {name: float(100.0 * np.concatenate([one[name].now for one in each]).mean()) for name in LATE_S},
+        "late_difference_mm": {name: 1000.0 * max(one[name].difference for one in each) for name in LATE_S},
+    }
+
+
+EXTRA: dict[str, Callable[[int, int, float], Any]] = {"shift": shift, "late": late}
+
+
+def part(name: str, seed: int, index: int, seconds: float) -> Any:
+    """What one process does at a time: one run of a situation, or of what else is measured."""
+    return EXTRA[name](seed, index, seconds) if name in EXTRA else scored(name, seed, index, seconds)
+
+
+def measured(seed: int, count: int, seconds: float, jobs: int, console: Console) -> dict[str, Any]:
+    """The whole benchmark."""
+    every: dict[str, list[Any]] = {name: [None] * count for name in (*runs.SITUATIONS, *EXTRA)}
+    with Progress(console=console, transient=True) as bar, _pool(jobs) as pool:
+        task = bar.add_task("runs", total=count * len(every))
+        waiting = {pool.submit(part, name, seed, index, seconds): (name, index) for name in every for index in range(count)}
+        for done in as_completed(waiting):
+            name, index = waiting[done]
+            every[name][index] = done.result()
+            bar.advance(task)
+    steps = step_times(seed, seconds)
+    return {
+        "seed": seed,
+        "runs": count,
+        "seconds": seconds,
+        "situations": {name: summary(every[name]) for name in runs.SITUATIONS},
+        **lateness(every["late"]),
+        "wrong_sense_cm": 100.0 * max(every["shift"]),
+        "wrong_sense_median_cm": 100.0 * float(np.median(every["shift"])),
+        "step_ms": steps["in order"],
+        "step_late_ms": steps["late pictures"],
+        "targets": core_shares(seed, min(seconds, 5.0)),
+    }
+
+
+def _pool(jobs: int) -> ProcessPoolExecutor:
+    """Fresh processes: a fork beside the progress bar's thread may hang."""
+    return ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"))
+
+
+def show(found: dict[str, Any], console: Console) -> None:
+    """The tables, beside their goals."""
+    title = f"seed {found['seed']}: {found['runs']} runs of {found['seconds']:g} s"
+    table = Table("situation", "NEES", "95 % band", "inside", "NIS", "95 % band", "inside", "refused", "tracking", title=title)
+    for name, row in found["situations"].items():
+        table.add_row(
+            name, *_judged(row, "nees"), *_judged(row, "nis"), str(row["refused"]), f"{row['states']['tracking']:.0%}"
+        )  # fmt: skip
+    console.print(table)
+    title = f"position error as of now, mean, cm (goal: ours the least); {' and '.join(SLOW)} of every {SLOW_EVERY}th run"
+    table = Table("situation", "ours", "95 % below", *BASELINES, title=title)
+    for name, row in found["situations"].items():
+        ours = {key: row["error_beside_slow_cm" if key in SLOW else "error_cm"] for key in BASELINES}
+        others = (_marked(f"{value:.2f}", ours[key] <= value) for key, value in row["baselines_cm"].items())
+        table.add_row(name, f"{row['error_cm']:.2f}", f"{row['error_p95_cm']:.2f}", *others)
+    console.print(table)
+    table = Table("ms late", "as of the newest stamp, cm", f"goal <= {LATE_GOAL:g} x", "as of now, cm", "after the fact, mm")
+    for name, value in found["late"].items():
+        ratio = value / found["late"]["0"]
+        table.add_row(
+            name, f"{value:.3f}", _marked(f"{ratio:.3f}", ratio <= LATE_GOAL), f"{found['late_now'][name]:.3f}",
+            f"{found['late_difference_mm'][name]:.2g}",
+        )  # fmt: skip
+    console.print(table)
+    wrong, step = found["wrong_sense_cm"], found["step_ms"]
+    told = _marked(f"{wrong:.2f} cm", wrong <= WRONG_GOAL_CM)
+    console.print(
+        f"a sense that is wrong by 10 cm moves the pose by at most {told} (goal {WRONG_GOAL_CM:g}; median "
+        f"{found['wrong_sense_median_cm']:.2f})"
+    )
+    console.print(
+        f"one predict, update and publish: {_marked(f'{step:.3f} ms', step <= STEP_GOAL_MS)} (goal {STEP_GOAL_MS:g}), "
+        f"of a picture behind the skin's measurements {found['step_late_ms']:.3f} ms"
+    )
+
+    table = Table(
+        "targets", "share of a core at 200 Hz", "with messages", title=f"a bank of observers (goal: 100 within {CORE_GOAL:g})"
+    )
+    for row in found["targets"]:
+        share = _marked(f"{row['core_share']:.1%}", row["core_share"] <= CORE_GOAL)
+        table.add_row(f"{row['n']}", share, f"{row['with_messages']:.1%}")
+    console.print(table)
+
+
+def _judged(row: dict[str, Any], key: str) -> tuple[str, str, str]:
+    if row[key] is None:
+        return "-", "-", "-"
+    low, high = row[f"{key}_band"]
+    return _marked(f"{row[key]:.2f}", low <= row[key] <= high), f"{low:.2f} .. {high:.2f}", f"{row[f'{key}_inside']:.0%}"
+
+
+def _marked(text: str, reached: bool) -> str:
+    return text if reached else f"[red]{text}[/red]"
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="penumbra bench fusion", description=__doc__)
+    parser.add_argument("--seed", type=int, default=1, help="draws limbs, errors and delays")
+    parser.add_argument("--runs", type=int, default=100, help="of each situation (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of a run (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file")
+    options = parser.parse_args(argv)
+    found = measured(options.seed, options.runs, options.seconds, options.jobs, Console(stderr=True))
+    console = Console()
+    show(found, console if console.is_terminal else Console(width=max(console.width, WIDTH)))
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
