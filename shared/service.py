@@ -177,9 +177,9 @@ class Node:
         """Calls `handler(message, names)` for every good message, in a thread of this subscription.
 
         names: fix some of the topic's {names}; the others take every value that the cell has. The handler is told them all, and
-        as `publisher` who sent the message (empty where nobody says), which tells two processes on one key apart. While the handler is busy the
-        newest `topic.depth` messages per key are kept. Bad messages are counted and logged once per kind; so are exceptions of
-        the handler. Raises CellError for a name that the cell does not have.
+        as `publisher` who sent the message (empty where nobody says), which tells two processes on one key apart. While the
+        handler is busy the newest `topic.depth` messages per key are kept. Bad messages are counted and logged once per kind; so
+        are exceptions of the handler. Raises CellError for a name that the cell does not have.
         """
         keys = self.keys(topic, names)
         if not keys:

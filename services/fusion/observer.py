@@ -88,7 +88,7 @@ class Bank:
 
     def estimates(self, stamp_ns: int) -> list[Estimate]:
         """The same, each with its sources, to be told to others."""
-        return [_told(found, log, stamp_ns) for found, log in zip(self.estimate(stamp_ns), self.logs, strict=True)]
+        return _told(self.estimate(stamp_ns), self.logs, stamp_ns)
 
 
 class ErrorStateObserver:
@@ -140,15 +140,20 @@ class ErrorStateObserver:
         A stamp before the history reads its oldest state. A source's weight is its share of the information that the senses
         brought in the last `weight_time`, fading exponentially; information in nats, as `kernel.STATE` defines its gain.
         """
-        return _told(self._bank.estimate(stamp_ns, slice(self._target, self._target + 1))[0], self.log, stamp_ns)
+        found = self._bank.estimate(stamp_ns, slice(self._target, self._target + 1))
+        return _told(found, [self.log], stamp_ns)[0]
 
 
-def _told(found: np.void, log: Log, stamp_ns: int) -> Estimate:
-    """One ESTIMATE in words."""
-    believed, weights = found["believed_ns"].tolist(), found["weight"].tolist()
-    sources = {}
-    for name, since_ns in log.heard_ns.items():
-        s = SOURCES.index(name)
-        newest_ns = believed[s] if believed[s] != NEVER else since_ns
-        sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), weights[s])
-    return Estimate(found["T"], found["velocity"], found["covariance"], STATES[found["state"]], sources)
+def _told(found: NDArray[np.void], logs: Sequence[Log], stamp_ns: int) -> list[Estimate]:
+    """The ESTIMATE of n targets (n,) for others to read."""
+    names = ("state", "believed_ns", "weight")
+    arrays, lists = (found["T"], found["velocity"], found["covariance"]), (found[name].tolist() for name in names)
+    out = []
+    for T, velocity, covariance, state, believed_ns, weight, log in zip(*arrays, *lists, logs, strict=True):
+        sources = {}
+        for name, since_ns in log.heard_ns.items():
+            s = SOURCES.index(name)
+            newest_ns = believed_ns[s] if believed_ns[s] != NEVER else since_ns
+            sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), weight[s])
+        out.append(Estimate(T, velocity, covariance, STATES[state], sources))
+    return out
