@@ -53,8 +53,7 @@ class FixedLagSmoother:
 
     A constant linear velocity with white acceleration and a rotation with white rate between nodes at the senses' stamps, which
     are known before the measurements arrive: a late one is attached to its node. gtsam's priors want a full information: the roll
-    that a sense does not observe is taken from the smoother itself, with next to no weight. Errors are white to it. The three
-    numbers were tuned on the seeds 1 to 50 to the least position error over all situations: as strong a rival as it gets.
+    that a sense does not observe is taken from the smoother itself, with next to no weight. Errors are white to it.
 
     lag : how far back measurements are taken and poses smoothed [s].
     acceleration, turning : densities of the white acceleration [m^2/s^3] and the white angular rate [rad^2/s].
