@@ -12,6 +12,7 @@ What covers the target ends the lines, as it guards the mask's boundary.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -105,11 +106,13 @@ def refine(
     regular = np.zeros((7, 7))
     regular[:6, :6] = prior + limits.information
     regular[6, 6] = settings.dilation**-2
-    picture = _Picture(model, *native(image, evidence), settings, T_prior, regular)
-    best = picture.descend(with_prior(first.T, first.covariance, T_prior, prior), settings.passes)
-    if best.rms >= SHARP and prior.any():  # the mask led astray: from the prediction, with twice the reach at first
-        T = picture.halved().descend(T_prior, settings.passes).T
-        best = min(best, picture.descend(T, settings.passes), key=lambda one: one.rms)
+    pictures = _pyramid(_Picture(model, *native(image, evidence), settings, T_prior, regular), evidence.scale)
+    T = with_prior(first.T, first.covariance, T_prior, prior)
+    best = _through(pictures[-1:], T)
+    for start, way in _further(pictures, T, T_prior if prior.any() else None):
+        if best.rms < SHARP:
+            break
+        best = min(best, _through(way, start), key=lambda one: one.rms)
     trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
     T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits)
     k = evidence.intrinsics
@@ -198,6 +201,36 @@ class _Picture:
             points, r - moved[6], kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False
         )
         return _Pass(T, moved, H, g, length, math.sqrt(square / length) if length > 0 else math.inf, rolls)
+
+
+def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:
+    """The picture at the mask's own resolution, which is `scale` times coarser, at twice that, and so on up to its own: a mask is
+    as wrong in its own pixels, however many of the image's they are."""
+    pictures = [replace(picture, settings=replace(picture.settings, mask=scale * picture.settings.mask))]
+    while scale > 1:
+        scale //= 2
+        smaller = pictures[0].halved()
+        pictures.insert(0, replace(smaller, settings=replace(smaller.settings, mask=scale * picture.settings.mask)))
+    return pictures
+
+
+def _further(pictures: list[_Picture], T: Array, T_prior: Array | None) -> Iterator[tuple[Array, list[_Picture]]]:
+    """Starts and ways where the mask's pose T is out of the lines' reach, in the order in which they are tried: from the
+    prediction, if there is one; from coarse to fine; both, with twice the reach at first."""
+    if T_prior is not None:
+        yield T_prior, pictures[-1:]
+    if len(pictures) > 1:
+        yield T, pictures
+    if T_prior is not None:
+        yield T_prior, [pictures[0].halved(), *pictures]
+
+
+def _through(pictures: list[_Picture], T: Array) -> _Pass:
+    """The pose reached from T in one picture after the other, as the last one sees it."""
+    for picture in pictures:
+        found = picture.descend(T, picture.settings.passes)
+        T = found.T
+    return found
 
 
 TYPICAL = 0.2
