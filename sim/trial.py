@@ -63,9 +63,10 @@ SIZE = 0.12
 SPEED_M_S = (0.15, 0.40)
 DIRECTION = np.radians([12.0, 8.0])
 """How far the camera stands, to both sides, from the direction of the built-in one: around the vertical, and up and down."""
-PASSAGE = ((0.0, 0.0), (1.5, 0.2), (3.0, 0.5), (4.5, 0.85), (6.0, 1.0), (7.5, 0.0))
+PASSAGE = ((0.0, 0.0), (1.3, 0.2), (2.6, 0.5), (3.9, 0.85), (5.2, 1.0), (6.5, 0.0))
 """From when [s] which share is hidden in a `passage`."""
-PASSAGE_S, PASSAGE_WITHIN = 9.5, 0.06
+PASSAGE_S, PASSAGE_WITHIN = 8.0, 0.10
+"""How long it takes, and how far the share hidden may be from that."""
 COARSE_PX = 160
 """Width of the pictures in which hidden shares are counted."""
 TRIES = 400
@@ -108,6 +109,8 @@ VOLUMES: dict[tuple[str, Reach], Volume] = {
     ("arm", "outside"): Volume((-0.06, -0.60, 0.50), (0.14, -0.36, 0.74), (0.0, -0.29, 0.0)),
 }
 """By built-in cell."""
+PASSAGE_VOLUME = Volume((-0.06, -0.20, 0.62), (0.10, -0.10, 0.74))
+"""Above the robot's forearm, as the camera sees it: the robot alone does not hide much there."""
 
 
 @dataclass(frozen=True)
@@ -150,10 +153,11 @@ def draw(setting: Setting, seed: int, index: int) -> Trial:
     """Trial `index` of the endless set of a setting and a seed. Raises RuntimeError where no run keeps to its bands."""
     for attempt in range(TRIES):
         root = np.random.SeedSequence([seed, SETTINGS.index(setting), index, attempt])
-        rng = np.random.default_rng(root)
-        trial = _scene(("table", "arm")[index % 2], setting, index, root, rng, SECONDS)
+        name = ("table", "arm")[index % 2]
+        trial = _scene(name, VOLUMES[name, setting.reach], setting, index, root, SECONDS)
         if trial is None:
             continue
+        rng = np.random.default_rng(root.spawn(1)[0])
         trial = dataclasses.replace(trial, occlusion=_occlusion(setting, Coarse(trial.world), rng))
         if _keeps_hidden(trial):
             return trial
@@ -164,19 +168,24 @@ def passage(seed: int) -> Trial:
     """A longer run of `arm` in the skin's range, PASSAGE_S long, through all levels of occlusion (PASSAGE). Raises RuntimeError
     where none keeps to them."""
     setting = Setting("inside", "short", "heavy")
+    ends = [begin for begin, _ in PASSAGE[1:]] + [PASSAGE_S]
     for attempt in range(TRIES):
         root = np.random.SeedSequence([seed, len(SETTINGS), attempt])
-        trial = _scene("arm", setting, 0, root, np.random.default_rng(root), PASSAGE_S)
+        trial = _scene("arm", PASSAGE_VOLUME, setting, 0, root, PASSAGE_S)
         if trial is None:
             continue
-        shown = Coarse(trial.world)
-        ends = [begin for begin, _ in PASSAGE[1:]] + [PASSAGE_S]
-        holds = [(begin, (begin + end) / 2.0, share) for (begin, share), end in zip(PASSAGE, ends, strict=True)]
-        levels = [shown.level(middle, share) if share else 0.0 for _, middle, share in holds]
-        reached = [shown.hidden(middle, level or AWAY) for (_, middle, _), level in zip(holds, levels, strict=True)]
-        if np.abs(np.subtract(reached, [share for _, _, share in holds])).max() <= PASSAGE_WITHIN:
-            commands = tuple((begin, level) for (begin, _, _), level in zip(holds, levels, strict=True))
-            return dataclasses.replace(trial, occlusion=commands)
+        shown, commands = Coarse(trial.world), []
+        slide = 1.0 / trial.world.occlusion.SLOPE
+        holds = zip(PASSAGE, ends, strict=True)
+        for (begin, share), end in sorted(holds, key=lambda hold: hold[0][1]):  # in sight first: there most fail
+            level = shown.level((begin + end) / 2.0, share) if share else 0.0
+            reached = [shown.hidden(t, level or AWAY) for t in (begin + slide, end)]
+            if np.abs(np.array(reached) - share).max() > PASSAGE_WITHIN:
+                break
+            comes = bool(share) and begin == PASSAGE[1][0]  # from beyond the border of the picture
+            commands.append((begin - slide * comes, level))
+        else:
+            return dataclasses.replace(trial, occlusion=tuple(sorted(commands)))
     raise RuntimeError(f"passage of seed {seed}: in {TRIES} tries none kept to its levels")
 
 
@@ -237,23 +246,22 @@ class Coarse:
         self._raster.draw(geometry.apply(self._T_camera_world @ T, mesh.vertices), mesh.faces, *self._k, value)
 
 
-def _scene(
-    name: str, setting: Setting, index: int, root: np.random.SeedSequence, rng: np.random.Generator, seconds: float
-) -> Trial | None:
+def _scene(name: str, volume: Volume, setting: Setting, index: int, root: np.random.SeedSequence, seconds: float) -> Trial | None:
     """A trial that nothing is commanded in; None where its limb leaves the picture or the bands of its gap."""
     try:
-        trial = Trial(setting, index, _cell(name, setting, rng), int(root.generate_state(1)[0]), ())
+        trial = Trial(
+            setting, index, _cell(name, volume, setting, np.random.default_rng(root)), int(root.generate_state(1)[0]), ()
+        )
         kept = _keeps_gap(trial, seconds) and _keeps_picture(trial, seconds)
     except cells.CellError:  # the region holds no pose that keeps clear of the robot
         return None
     return trial if kept else None
 
 
-def _cell(name: str, setting: Setting, rng: np.random.Generator) -> cells.Cell:
+def _cell(name: str, volume: Volume, setting: Setting, rng: np.random.Generator) -> cells.Cell:
     """A built-in cell with a person of another size, another region of motion, and the experiment's camera."""
     cell = cells.load(name)
     assert cell.sim is not None
-    volume = VOLUMES[name, setting.reach]
     motion = cell.sim.motion.model_copy(update={"low": volume.low, "high": volume.high, "speed": rng.uniform(*SPEED_M_S)})
     sim = cell.sim.model_copy(update={"motion": motion, "shoulder": tuple(np.add(cell.sim.shoulder, volume.shift).tolist())})
     middle = tuple(((np.array(volume.low) + volume.high) / 2.0).tolist())

@@ -21,7 +21,7 @@ CLEAR = 0.10
 """Largest share hidden where errors are told by distance, as in the paper."""
 AXES = ("lateral_cm", "depth_cm", "attitude_deg")
 GAPS_CM = np.arange(1.0, 20.5, 1.0)
-LEVELS = {"no occlusion": 0.75, "light": 2.25, "medium": 3.75, "heavy": 5.25}
+LEVELS = {"no occlusion": 0.9, "light": 2.0, "medium": 3.3, "heavy": 4.6}
 """When [s] each level of a passage is in the middle of its stay."""
 
 

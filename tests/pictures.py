@@ -187,9 +187,9 @@ def through_occlusion(data: dict[str, Any], path: Path) -> None:
     times, error = np.array(data["times_s"]), {name: np.array(v, dtype=float) for name, v in data["error_cm"].items()}
     kinds = (
         ("posecnn_vision", RIVAL, "PoseCNN", 1.5),
-        ("procnet_vision", VISION, "ProcNet, ours", 1.5),
-        ("posecnn_fused", RIVAL_FUSED, "PoseCNN and skin", 2.0),
-        ("procnet_fused", OURS, "ProcNet and skin", 2.6),
+        ("procnet_vision", VISION, "ProcNet", 1.5),
+        ("posecnn_fused", RIVAL_FUSED, "PoseCNN and skin, fused", 2.0),
+        ("procnet_fused", OURS, "ProcNet and skin, fused", 2.6),
     )
     _dress(top, "", "position error [cm]")
     ends = {}
