@@ -29,6 +29,9 @@ SHORTEST_PX = 30.0
 FITS, FITS_WELL = 0.8, 0.9
 """Overlap below which the target is not where the fit says, and from which no other explanation is tried. Network masks reach
 0.93 to 0.97 at the right pose."""
+FITS_EXPECTED = 0.6
+"""The same of a pose that the image confirms where a sure prediction expects it: a mask that takes an occluder for the wall behind
+it is no reason to give up."""
 WRONG = 6.0
 """`Fit.misfit` from which a pose is wrong whatever its overlap."""
 GATE = 27.9
@@ -194,7 +197,9 @@ class Search:
         if image is None or seen.seen_px < detect.SMALLEST_PX:
             return found
         closer = refine(self._model, found, image, seen, T_prior, prior)
-        return closer if closer.sharp and closer.overlap >= FITS else found
+        away = geometry.pose_error(closer.T, T_prior)
+        expected = prior.any() and away @ prior @ away < EXPECTED
+        return closer if closer.sharp and closer.overlap >= (FITS_EXPECTED if expected else FITS) else found
 
     def _gather(self, mask: Mask, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None) -> Evidence:
         """`limb`: T_camera_target of the limb, where it is known; beyond its near end nothing is believed."""
@@ -340,7 +345,7 @@ class Search:
         if hidden > (HIDDEN if expected else RECOGNISED) or best.length < (SHORTEST_PX if expected else RECOGNISED_PX):
             state: State = "occluded" if explained > 0.5 else "lost"
         else:
-            state = "tracking" if best.overlap >= FITS and fits else "lost"
+            state = "tracking" if best.overlap >= (FITS_EXPECTED if expected and best.sharp else FITS) and fits else "lost"
         if state == "tracking":
             return self._estimate(best.T, best.covariance, best.overlap, hidden, state, T_probable)
         return self._estimate(best.T_searched, self._limits.covariance, best.overlap, hidden, state, best.T_searched)
