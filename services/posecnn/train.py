@@ -50,7 +50,7 @@ DIFFERS = (
     "loss of the rotation: SLoss on the forearm and PLoss on the hand, distances not squared",
     "the centre is refined by least squares over the rays that agree",
     "covariance: learned from held-out pictures; the original has none; no refinement by depth images",
-    "data: the first frames of PredNet's simulated sequences, 65 536 of them, in place of YCB-Video and its synthetic images",
+    "data: the first frames of PredNet's simulated sequences, 40 960 of them, in place of YCB-Video and its synthetic images",
 )
 VARIETY = sequences.Variety(frames=1)
 """A network without memory learns most from pictures of many scenes."""
@@ -75,7 +75,7 @@ class Schedule:
     decay: float = 1e-3
     batch: int = 16
     reuse: int = 5
-    most: int = 65_536
+    most: int = 40_960
     weights: tuple[tuple[str, float], ...] = (
         ("labels", 1.0),
         ("target", 1.0),
@@ -374,7 +374,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of data, initial weights and batches")
     parser.add_argument("--checkpoint", type=Path, default=Path("posecnn.checkpoint"), help="written every few minutes")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if there is one")
-    parser.add_argument("--cache", type=Path, default=Path("posecnn-data"), help="folder of rendered pictures (10 GB at most)")
+    parser.add_argument("--cache", type=Path, default=Path("posecnn-data"), help="folder of rendered pictures (6 GB)")
     parser.add_argument(
         "--out", type=Path, default=WEIGHTS, help="the weights, their card beside them (default: the committed ones)"
     )

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from services.posecnn.patch import facing
@@ -78,22 +77,22 @@ def errors(T_true: Array, T: Array, length: float) -> dict[str, Array]:
     }
 
 
-def fitted(signs: list[Signs], missed: list[dict[str, Array]], clip: float = 4.0) -> Uncertainty:
-    """The uncertainty under which errors (`errors`) are most probable. Those that lie beyond `clip` deviations count as being
-    there: a few arms seen end for end must not widen all others."""
+def fitted(signs: list[Signs], missed: list[dict[str, Array]]) -> Uncertainty:
+    """The uncertainty under which errors (`errors`) are most probable, with a weak prior against steep coefficients. Outliers
+    count in full: the observer shall rather believe too little than too much."""
     features = np.array([one.features for one in signs])
     coefficients = {}
     for kind in KINDS:
-        values = np.array([one[kind] for one in missed])
+        squared = np.array([np.square(one[kind]) for one in missed])
 
-        def cost(a: NDArray[np.float64], values: Array = values) -> float:
-            log_sigma = features @ a
-            z = np.minimum(np.abs(values) * np.exp(-log_sigma)[:, None], clip)
-            return float(np.sum(0.5 * z**2) + values.shape[1] * np.sum(log_sigma) + 0.5 * np.sum(a[1:] ** 2))
+        def cost(a: Array, squared: Array = squared) -> tuple[float, Array]:
+            """The negative logarithm of the probability, which is convex, and its gradient (6,)."""
+            z = squared.sum(axis=1) * np.exp(-2.0 * features @ a)
+            n = squared.shape[1]
+            value = np.sum(0.5 * z + n * (features @ a)) + 0.5 * np.sum(a[1:] ** 2)
+            return float(value), features.T @ (n - z) + np.array([0.0, *a[1:]])
 
-        start = np.array([np.log(np.median(np.abs(values)) / 0.67), *np.zeros(features.shape[1] - 1)])
-        found = minimize(
-            cost, start, method="Nelder-Mead", options={"maxiter": 6000, "maxfev": 6000, "fatol": 1e-6, "xatol": 1e-5}
-        )
+        start = np.array([0.5 * np.log(squared.mean()), *np.zeros(features.shape[1] - 1)])
+        found = minimize(cost, start, jac=True, method="BFGS")
         coefficients[kind] = tuple(round(float(a), 4) for a in found.x)
     return Uncertainty(coefficients)
