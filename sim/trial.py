@@ -5,7 +5,7 @@ and of `arm` (pads on a moving robot, which hides the limb together with the occ
 the camera's place are drawn anew for every index. A run that leaves its bands is drawn again, before anything is rendered.
 
 One camera serves all distances. Twelve megapixels twenty times a second are neither needed nor read: a run reads the region of
-the sensor that can show the limb, its pixels summed four by four near the limb and two by two further away.
+the sensor that can show the limb, and near the limb its pixels summed two by two.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ Occlusion = Literal["light", "medium", "heavy"]
 
 GAP_M: dict[Reach, tuple[float, float]] = {"inside": (0.02, 0.15), "outside": (0.25, np.inf)}
 """Distance [m] from the nearest electrode to the limb's skin, in every scored frame."""
-DISTANCE_M: dict[Distance, tuple[float, float]] = {"short": (1.2, 3.0), "medium": (3.0, 6.0), "long": (6.0, 10.0)}
-"""From the camera to the middle of the motion [m]; nearer than 1.2 m the limb does not fit into the picture."""
+DISTANCE_M: dict[Distance, tuple[float, float]] = {"short": (1.5, 3.0), "medium": (3.0, 6.0), "long": (6.0, 10.0)}
+"""From the camera to the middle of the motion [m]; nearer than 1.5 m the limb's motion does not fit into the picture."""
 HIDDEN: dict[Occlusion, tuple[float, float]] = {"light": (0.0, 0.33), "medium": (0.33, 0.66), "heavy": (0.66, 1.0)}
 """Share of the limb's pixels that something covers."""
 
-SENSOR_PX, FOCAL_PX, RATE_HZ = (4096, 3000), 5000.0, 20.0
-"""The camera: width and height, focal length (a horizontal field of view of 44.5 degrees), frames a second."""
-BINNING: dict[Distance, int] = {"short": 4, "medium": 2, "long": 1}
+SENSOR_PX, FOCAL_PX, RATE_HZ = (4096, 3000), 7246.0, 20.0
+"""The camera: width and height, focal length (25 mm before pixels of 3.45 um: 31.5 degrees across), frames a second."""
+BINNING: dict[Distance, int] = {"short": 2, "medium": 1, "long": 1}
 """Pixels of the sensor along a side of one that is read."""
 STEP_PX = 8
 """The region that is read begins and ends at multiples of so many pixels."""
-HOME_SIGMAS = 2.0
+HOME_SIGMAS = 1.0
 """The region shows the limb also so far from home, where a search may look for it."""
 
-LEAD_S, SECONDS = 1.0, 3.0
+LEAD_S, SECONDS = 0.8, 2.6
 """Before the occluder comes, not scored; and in all."""
 HOLD_S = (0.5, 1.0)
 """How long the occluder stays before it slides to another place."""

@@ -15,7 +15,7 @@ from sim.field import PadField, limb
 from tests.bench import haptics, skin, table1
 from tests.trials import ERRORS, Played
 
-EDGES_M = (1.2, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0)
+EDGES_M = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0)
 """Camera distances are pooled between these."""
 CLEAR = 0.10
 """Largest share hidden where errors are told by distance, as in the paper."""
