@@ -224,17 +224,23 @@ def fit(
     return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
 
 
-def marginal(T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float, limits: Limits) -> tuple[Array, Array]:
+def marginal(
+    T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float, limits: Limits, waves: Array | None = None
+) -> tuple[Array, Array]:
     """The pose and covariance (6, 6) that the measurement alone says, from the normal equations of pose error and dilation at T,
     which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out but for KEPT, the dilation marginalised (Schur
     complement).
 
-    `rolls`: share of the information about the roll that is believed, see `normal_equations`.
+    `rolls`: share of the information about the roll that is believed, see `normal_equations`; `waves` (7, k): right sides of
+    errors that all of the contour shares, of one standard deviation each.
     """
     gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
     weak = (1.0 - KEPT) * limits.information + KEPT * regular[:6, :6]
     covariance = np.linalg.inv(H[:6, :6] - np.outer(gain, H[6, :6]) + weak)
     offset = covariance @ (g[:6] - gain * (g[6] - regular[6, 6] * moved[6]) - weak @ moved[:6])
+    if waves is not None:
+        bent = covariance @ (waves[:6] - np.outer(gain, waves[6]))
+        covariance = covariance + bent @ bent.T
     # the roll that a nearly round section shows is doubted, and with it all that leans on it
     c = covariance[:, 3:] @ T[:3, 0]
     roll = float(T[:3, 0] @ c[3:])

@@ -43,7 +43,8 @@ class Settings:
     the pooling along the contour [px]; `floor`: least standard deviation of a colour [of 255]; `clipped`: squared Mahalanobis
     distance that a pixel counts at most; `temperature`: pixels of a line that say the same; `mask`: standard deviation of the
     mask's boundary on a line [px]; `huber` [px]; `edge`: standard deviation that an offset has at least [px]; `correlation`:
-    length of contour over which offsets err together [px]; `dilation`: of the whole contour [px]."""
+    length of contour over which offsets err together [px]; `dilation`: of the whole contour [px]; `wave`: of errors that change
+    slowly along each side of the limb, as its shading does [px]: with one side hidden they look like another distance."""
 
     passes: int = 5
     spacing: float = 3.0
@@ -56,6 +57,7 @@ class Settings:
     edge: float = 0.2
     correlation: float = 9.0
     dilation: float = 0.12
+    wave: float = 0.1
 
 
 def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uint8], Evidence]:
@@ -114,7 +116,7 @@ def refine(
             break
         best = min(best, _through(way, start), key=lambda one: one.rms)
     trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
-    T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits)
+    T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits, trust * best.waves)
     k = evidence.intrinsics
     both, free = compare(evidence.state, model.silhouette(best.T, k, (0, 0, *evidence.state.shape[::-1])))
     return replace(
@@ -134,7 +136,7 @@ def refine(
 @dataclass(frozen=True)
 class _Pass:
     """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
-    square of the offsets left [px] and the share of the roll that is believed."""
+    square of the offsets left [px], the share of the roll that is believed, and the right sides (7, k) of `Settings.wave`."""
 
     T: Array
     moved: Array
@@ -143,6 +145,7 @@ class _Pass:
     length: float
     rms: float
     rolls: float
+    waves: Array
 
 
 @dataclass(frozen=True)
@@ -197,10 +200,11 @@ class _Picture:
         believed = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
         r, sigma, kind = offsets(points, self.image, evidence.guarded, by_mask, mask_kind, *believed)
         weight = points[:, 7] / (settings.correlation * (sigma**2 + settings.edge**2))
-        H, g, length, square, _, _, rolls = normal_equations(
-            points, r - moved[6], kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False
-        )
-        return _Pass(T, moved, H, g, length, math.sqrt(square / length) if length > 0 else math.inf, rolls)
+        fixed = (kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False)
+        H, g, length, square, _, _, rolls = normal_equations(points, r - moved[6], *fixed)
+        waves = [normal_equations(points, settings.wave * wave, *fixed)[1] for wave in _waves(points, T)]
+        rms = math.sqrt(square / length) if length > 0 else math.inf
+        return _Pass(T, moved, H, g, length, rms, rolls, np.stack(waves, axis=1))
 
 
 def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:
@@ -231,6 +235,15 @@ def _through(pictures: list[_Picture], T: Array) -> _Pass:
         found = picture.descend(T, picture.settings.passes)
         T = found.T
     return found
+
+
+def _waves(points: Array, T: Array) -> list[Array]:
+    """Shapes (n,) that an error of the contour may have: on either side of the limb, straight and bent along it."""
+    axis = T[:3, 0]
+    along = (points[:, :3] - T[:3, 3]) @ axis
+    s = 2.0 * (along - along.min(initial=0.0)) / max(float(np.ptp(along)) if len(along) else 0.0, 1e-6) - 1.0
+    across = points[:, 5] * axis[1] - points[:, 6] * axis[0] > 0.0
+    return [np.where(across == side, shape, 0.0) for side in (False, True) for shape in (s, 1.5 * s**2 - 0.5)]
 
 
 TYPICAL = 0.2

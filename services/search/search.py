@@ -30,8 +30,8 @@ FITS, FITS_WELL = 0.8, 0.9
 """Overlap below which the target is not where the fit says, and from which no other explanation is tried. Network masks reach
 0.93 to 0.97 at the right pose."""
 FITS_EXPECTED = 0.6
-"""The same of a pose that the image confirms where a sure prediction expects it: a mask that takes an occluder for the wall behind
-it is no reason to give up."""
+"""The same of a pose that the image confirms where a sure prediction expects it: a mask that takes an occluder for the wall is
+no reason to give up."""
 WRONG = 6.0
 """`Fit.misfit` from which a pose is wrong whatever its overlap."""
 GATE = 27.9
