@@ -26,8 +26,8 @@ CAPTIONS = {
     "table": ("All cells at a glance", "Logarithmic scale; the bar is the 95 % confidence interval over the runs."),
     "vision_by_distance": (
         "Vision against camera distance",
-        "Frames of all runs with less than 10 % hidden; means with 95 % confidence. Dotted lines: where the camera's pixels are "
-        "read finer; the focal length in pixels that were read stands above.",
+        "Frames of all runs with less than 10 % hidden; means with 95 % confidence. Above: the focal length in the "
+        "pixels that were read.",
     ),
     "haptic_by_gap": (
         "The skin against distance",

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sim.trial import BINNING, FOCAL_PX, HIDDEN, PASSAGE, PASSAGE_S, Trial
+from sim.trial import BINNING, DISTANCE_M, FOCAL_PX, HIDDEN, PASSAGE, PASSAGE_S, Trial
 from tests import curves
 from tests.bench import table1
 
@@ -90,21 +90,30 @@ def vision_by_distance(data: dict[str, Any], path: Path) -> None:
         axes.set_xlim(1.0, 10.2)
         axes.set_xticks([2, 4, 6, 8, 10])
         _plain(axes, _ticks(axes.dataLim.intervaly))
-        for distance in (3.0, 6.0):
-            axes.axvline(distance, color=PALE, lw=1, ls=":")
-        for middle, count in zip((2.0, 4.5, 8.0), BINNING.values(), strict=True):
-            axes.annotate(
-                f"{FOCAL_PX / count:g} px",
-                (middle, 1.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(0, -4),
-                textcoords="offset points",
-                ha="center",
-                va="top",
-                fontsize=9,
-                color=PALE,
-            )
+        _focal_lengths(axes)
     _save(figure, path)
+
+
+def _focal_lengths(axes: Axes) -> None:
+    """Writes over each range of distances [m] with how many pixels it is seen."""
+    focal: dict[float, tuple[float, float]] = {}
+    for distance, (near, far) in DISTANCE_M.items():
+        length = FOCAL_PX / BINNING[distance]
+        focal[length] = (min(near, focal.get(length, (near, far))[0]), far)
+    for length, (near, far) in focal.items():
+        axes.annotate(
+            f"f = {length:.0f} px",
+            (0.5 * (near + far), 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, -4),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize=9,
+            color=PALE,
+        )
+        if far < max(end for _, end in DISTANCE_M.values()):
+            axes.axvline(far, color=PALE, lw=1, ls=":")
 
 
 def _ticks(interval: Sequence[float]) -> list[float]:
@@ -240,8 +249,8 @@ def examples(scene: Trial, data: Sequence[dict[str, Any]], path: Path) -> None:
         picture = scene.world.view(camera, frame["time_s"]).image.copy()
         shown = curves.outline(scene, frame["pose"]).astype(np.uint8)
         outline, _ = cv2.findContours(shown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(picture, outline, -1, OUTLINE, 2, cv2.LINE_AA)
-        axes.imshow(picture, interpolation="none")
+        cv2.drawContours(picture, outline, -1, OUTLINE, max(2, picture.shape[1] // 350), cv2.LINE_AA)
+        axes.imshow(picture, interpolation="antialiased")
         axes.set_axis_off()
         error = "lost" if frame["cm"] is None else f"error {frame['cm']:.2f} cm"
         axes.set_title(f"{frame['level']}: {100 * frame['hidden']:.0f} % hidden, {error}", fontsize=13, loc="left", color=INK)

@@ -31,7 +31,7 @@ def result(setting=SETTINGS[0], index=0, errors=(1.0, 2.0, 3.0), fused=(0.5, 1.0
         "index": index,
         "cell": "table",
         "distance_m": 2.0,
-        "times_s": [1.0, 1.05, 1.1],
+        "times_s": [trial.LEAD_S, trial.LEAD_S + 0.05, trial.LEAD_S + 0.1],
         "hidden": [hidden] * 3,
         "gap_m": [0.05] * 3,
         "chains": dict.fromkeys(trials.CHAINS, chain),
@@ -98,7 +98,6 @@ def test_the_pictures_are_a_region_of_one_sensor_that_holds_the_limb(drawn):
         camera, binning = one.camera, trial.BINNING[one.setting.distance]
         assert camera.fx == camera.fy == trial.FOCAL_PX / binning
         assert camera.width <= trial.SENSOR_PX[0] // binning and camera.height <= trial.SENSOR_PX[1] // binning
-        assert camera.width * camera.height < 1024 * 768
         # the principal point stays that of the sensor: its middle, seen from the region's corner
         assert (camera.cx - (trial.SENSOR_PX[0] // binning - 1) / 2.0) % trial.STEP_PX == pytest.approx(0.0, abs=1e-9)
         middle = next(iter(one.cell.targets.values())).home.position
@@ -119,14 +118,15 @@ def test_trials_differ_by_seed_and_index_and_are_the_same_again(drawn):
 
 def test_a_coarse_picture_tells_the_hidden_share_of_the_full_one(drawn):
     one = next(each for each in drawn if each.setting.occlusion == "medium")
-    camera, time_s = next(iter(one.cell.cameras)), 2.0
+    camera, time_s = next(iter(one.cell.cameras)), 1.5
     level = one.world.occlusion.at(one.world.occlusion_clock.at(time_s))
     assert trial.Coarse(one.world).hidden(time_s, level) == pytest.approx(one.world.view(camera, time_s).hidden, abs=0.02)
 
 
 def test_only_frames_after_the_lead_in_and_in_the_band_are_scored():
     played = result(Setting("inside", "short", "medium"))
-    played["times_s"], played["hidden"] = [0.9, 1.0, 1.05], [0.5, 0.5, 0.7]
+    lead = trial.LEAD_S
+    played["times_s"], played["hidden"] = [lead - 0.1, lead, lead + 0.05], [0.5, 0.5, 0.7]
     assert trials.is_scored(played).tolist() == [False, True, False]
 
 
@@ -175,11 +175,11 @@ def test_the_table_has_the_papers_layout_and_tells_which_goals_are_missed():
 
 
 def test_one_run_goes_through_the_services_and_a_page_is_made_of_it(tmp_path):
-    setting, seconds = Setting("inside", "short", "light"), 1.15
+    setting, seconds = Setting("inside", "short", "light"), trial.LEAD_S + 0.15
     job = campaign.Job("one", "tests.bench.table1:one", ({**vars(setting)}, 5, 0, seconds))
     with campaign.bar(Console(quiet=True)) as progress:
         (played,) = campaign.run([job], tmp_path, 1, progress, "trials")
-    assert len(played["times_s"]) == 23 and trials.is_scored(played).sum() == 3
+    assert len(played["times_s"]) == round(seconds * trial.RATE_HZ) and trials.is_scored(played).sum() == 3
     assert set(played["chains"]) == set(trials.available())
     fused = np.array(played["chains"]["procnet"]["fused"]["cm"], dtype=float)
     assert np.nanmedian(fused[10:]) < 3.0  # the skin feels it and the camera sees it
