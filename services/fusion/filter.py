@@ -18,7 +18,8 @@ class Sense:
 
     lasting : share of the variance that is the same from one measurement to the next.
     time_constant : after which such an error is forgotten [s].
-    floor : standard deviation that no measurement is better than, in UNITS: 0.01 is 1 mm and 0.6 degrees.
+    floor : standard deviation, in UNITS, of what its covariance does not tell, its calibration: 0.01 is 1 mm and 0.6 degrees. All
+        of it lasts.
     """
 
     lasting: float = 0.8
@@ -41,6 +42,7 @@ class Settings:
     gate : probability with which a good measurement passes the gate.
     patience : after refusing everything of all senses for so long [s], start again from the newest measurement.
     source_patience : after refusing one sense for so long [s] while another is believed, doubt the state.
+    witness : a refused measurement teaches nothing while another sense has been believed within so long [s].
     refusals : and at least so many measurements refused, so that two outliers after a pause do not count as persistence.
     unobserved : a direction with a standard deviation beyond this, in UNITS, is taken as not observed.
     horizon : length of the history [s]: vision is 30 to 100 ms late, more when the machine is busy.
@@ -50,15 +52,16 @@ class Settings:
     """
 
     senses: dict[str, Sense] = field(default_factory=lambda: {"vision": Sense(), "haptic": Sense(lasting=0.2, time_constant=0.3)})
-    acceleration: tuple[float, float] = (0.15, 1.0)
-    velocity_time: float = 1.0
+    acceleration: tuple[float, float] = (0.1, 1.5)
+    velocity_time: float = 0.3
     velocity_spread: tuple[float, float] = (0.4, 1.0)
-    agility: tuple[float, float] = (0.2, 30.0)
+    agility: tuple[float, float] = (0.1, 30.0)
     doubt: float = 100.0
     learning: tuple[float, float] = (0.1, 5.0)
     gate: float = 0.999
     patience: float = 0.5
     source_patience: float = 1.0
+    witness: float = 0.25
     refusals: int = 5
     unobserved: float = 2.0
     horizon: float = 1.0

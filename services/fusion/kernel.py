@@ -53,6 +53,7 @@ MODEL = np.dtype(
         *((name, "f8", SENSES) for name in ("lasting", "time_constant", "floor")),  # as in Sense
         *((name, "f8", 2) for name in ("acceleration", "velocity_spread", "agility", "learning")),  # as in Settings
         *((name, "f8") for name in ("velocity_time", "doubt", "patience", "source_patience", "refusals", "unobserved")),
+        ("witness", "f8"),
         *((name, "f8") for name in ("horizon", "weight_time", "lost_age")),
         ("limits", "f8", 4),  # as in Limits
         ("threshold", "f8", POSE + 1),  # squared Mahalanobis distance that the gate lets pass, by rank
@@ -156,7 +157,7 @@ def reduce(model, source, stamp_ns, T, information, m):  # type: ignore[no-untyp
             for i in range(POSE):
                 m.directions[k, i] = vectors[i, e]
                 m.basis[k, i] = vectors[i, e] / UNITS[i]
-            m.sigma[k] = math.sqrt(1.0 / eigenvalues[e] + model.floor[source] ** 2)
+            m.sigma[k] = math.sqrt(1.0 / eigenvalues[e])
             k += 1
     m.rank, m.has_axis, m.slides = k, 0, 0
     if 0 < k < POSE:
@@ -194,8 +195,10 @@ def step(model, state, m):  # type: ignore[no-untyped-def]
             break
         distance = so3.dot(innovation, innovation)
         state.distance, state.rank = distance, m.rank
-        learn(model, state, m, innovation)
-        if distance <= model.threshold[m.rank]:
+        passes = distance <= model.threshold[m.rank]
+        if passes or not _is_contradicted(model, state, m):
+            learn(model, state, m, innovation)
+        if passes:
             break
         if state.refused[m.source] == 0:
             state.refused_ns[m.source] = m.stamp_ns
@@ -212,6 +215,16 @@ def step(model, state, m):  # type: ignore[no-untyped-def]
             return
         fresh = True  # as if it were the first
     update(state, m, z, PHt, S_inverse)
+
+
+@njit(cache=True)
+def _is_contradicted(model, state, m):  # type: ignore[no-untyped-def]
+    """Whether another sense, heard lately and believed, says that a refused measurement is wrong and not the state: what it would
+    teach is that the limb is faster, until it passes the gate."""
+    for s in range(SENSES):
+        if s != m.source and state.refused[s] == 0 and m.stamp_ns - state.believed_ns[s] < model.witness * 1e9:
+            return True
+    return False
 
 
 @njit(cache=True)
@@ -355,14 +368,16 @@ def linearised(model, state, m):  # type: ignore[no-untyped-def]
 
     A measurement says: the error e with `perturb(T_measured, e) == T_true` is noise along its directions.
     """
-    lasting, first = math.sqrt(state.doubt[m.source] * model.lasting[m.source]), POSE * m.source
+    s, first = m.source, POSE * m.source
     value, derivative = error(state.p.copy(), state.R.copy(), m)
     z, H = np.empty(m.rank), np.empty((m.rank, 2 * POSE))
     for i in range(m.rank):
+        # what no covariance tells, the floor, is a calibration: all of it lasts
+        lasting = math.sqrt(state.doubt[s] * (model.lasting[s] * m.sigma[i] ** 2 + model.floor[s] ** 2))
         z[i] = -value[i]
         for j in range(POSE):
             H[i, j] = derivative[i, j]
-            H[i, POSE + j] = lasting * m.sigma[i] * m.directions[i, j]
+            H[i, POSE + j] = lasting * m.directions[i, j]
             z[i] -= H[i, POSE + j] * state.bias[first + j]
     return z, H
 
@@ -408,7 +423,7 @@ def learn(model, state, m, innovation):  # type: ignore[no-untyped-def]
         alike = so3.dot(innovation, state.innovation[s]) / m.rank  # 0 expected
         unlike = so3.dot(innovation, innovation) / m.rank - alike  # 1 expected
         state.agility = min(max(state.agility * math.exp(step * alike), model.agility[0]), model.agility[1])
-        state.doubt[s] = min(max(state.doubt[s] * math.exp(step * (unlike - 1.0)), 1.0), model.doubt)
+        state.doubt[s] = min(max(state.doubt[s] * math.exp(0.5 * step * (unlike - 1.25)), 1.0), model.doubt)
     state.heard_ns[s], state.has_innovation[s] = m.stamp_ns, 1
     for i in range(POSE):
         state.innovation[s, i] = innovation[i]
