@@ -208,8 +208,7 @@ def test_the_calibration_finds_the_deviations_that_errors_were_drawn_with():
     rng = np.random.default_rng(0)
     truth = Uncertainty({kind: (np.log(0.1), 1.0, 0.0, 0.0, 0.0, 0.0) for kind in KINDS})
     signs = [Signs(rng.uniform(0, 0.9), 100.0, 0.1, 1.0) for _ in range(800)]
-    counts = {"depth": 1, "lateral": 2, "axis": 2, "roll": 1}
-    missed = [{kind: rng.normal(0, truth.deviations(one)[kind], n) for kind, n in counts.items()} for one in signs]
+    missed = [{kind: rng.normal(0, truth.deviations(one)[kind], 1 + (kind == "lateral")) for kind in KINDS} for one in signs]
     found = fitted(signs, missed)
     for hidden in (0.1, 0.8):
         one = Signs(hidden, 100.0, 0.1, 1.0)
@@ -219,18 +218,23 @@ def test_the_calibration_finds_the_deviations_that_errors_were_drawn_with():
 
 def test_the_covariance_lies_along_the_ray_and_the_limb():
     uncertainty = Uncertainty(
-        {kind: (np.log(value), *[0.0] * 5) for kind, value in zip(KINDS, (0.1, 0.02, 0.05, 0.4), strict=True)}
+        {kind: (np.log(value), *[0.0] * 5) for kind, value in zip(KINDS, (0.1, 0.02, 0.05, 0.2, 0.4), strict=True)}
     )
     T = geometry.from_rpy((0.3, -0.2, 1.5), (0.4, 0.2, 1.0))
     covariance = uncertainty.covariance(T, 0.5, Signs(0.0, 100.0, 0.1, 1.0))
     ray, axis = T[:3, 3] / np.linalg.norm(T[:3, 3]), T[:3, 0]
     assert np.sqrt(ray @ covariance[:3, :3] @ ray) == pytest.approx(0.1 * np.linalg.norm(T[:3, 3]))
+    tilt = np.cross(axis, ray) / np.linalg.norm(np.cross(axis, ray))
+    turn = np.cross(tilt, axis)
     assert np.sqrt(axis @ covariance[3:, 3:] @ axis) == pytest.approx(0.4)
+    assert np.sqrt(tilt @ covariance[3:, 3:] @ tilt) == pytest.approx(0.2)
+    assert np.sqrt(turn @ covariance[3:, 3:] @ turn) == pytest.approx(0.05)
     rng = np.random.default_rng(1)
     drawn = rng.multivariate_normal(np.zeros(6), covariance, 4000)
     found = [errors(geometry.perturb(T, error), T, 0.5) for error in drawn[:1000]]
     assert np.std([one["depth"] for one in found]) == pytest.approx(0.1, rel=0.1)
     assert np.std([one["roll"] for one in found]) == pytest.approx(0.4, rel=0.1)
+    assert np.std([one["turn"] for one in found]) == pytest.approx(0.05, rel=0.1)
     assert np.std([one["lateral"] for one in found]) == pytest.approx(0.02, rel=0.1)
 
 

@@ -1,8 +1,9 @@
 """How far off a pose may be, learned from held-out pictures: standard deviations as functions of what the network saw.
 
 Errors are split along the directions in which they are about independent: along the ray to the target (relative to its
-distance), across it (relative to the target's length), of the limb's axis and of the roll about it. The logarithm of each
-deviation is linear in features of the estimate; its coefficients are those of the greatest likelihood under normal errors.
+distance), across it (relative to the target's length), and the rotation about three axes: the turn of the limb as it is seen, its
+tilt towards the camera, which changes little of what is seen, and its roll. The logarithm of each deviation is linear in features
+of the estimate; its coefficients are those of the greatest likelihood under normal errors.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from services.posecnn.patch import facing
 from shared import geometry
 from shared.geometry import Array
 
-KINDS = ("depth", "lateral", "axis", "roll")
-"""Depth by the distance, lateral by the target's length, axis and roll in radians."""
-BOUNDS = {"depth": (0.01, 0.5), "lateral": (0.005, 1.0), "axis": (0.02, 1.0), "roll": (0.05, 1.5)}
+KINDS = ("depth", "lateral", "turn", "tilt", "roll")
+"""Depth by the distance, lateral by the target's length, the others in radians."""
+BOUNDS = {"depth": (0.01, 0.5), "lateral": (0.005, 1.0), "turn": (0.01, 1.0), "tilt": (0.02, 1.0), "roll": (0.05, 1.5)}
 """Of the standard deviations: a few hundred pictures say nothing about smaller and larger ones."""
 LENGTH_PX = 100.0
 
@@ -58,22 +59,34 @@ class Uncertainty:
         distance, ray = float(np.linalg.norm(T[:3, 3])), facing(T[:3, 3])
         across, along = sigma["lateral"] * length, sigma["depth"] * distance
         position = ray @ np.diag(np.square([across, across, along])) @ ray.T
-        rotation = T[:3, :3] @ np.diag(np.square([sigma["roll"], sigma["axis"], sigma["axis"]])) @ T[:3, :3].T
+        axes = rotation_axes(T)
+        rotation = axes @ np.diag(np.square([sigma["roll"], sigma["tilt"], sigma["turn"]])) @ axes.T
         covariance = np.zeros((6, 6))
         covariance[:3, :3], covariance[3:, 3:] = position, rotation
         return (covariance + covariance.T) / 2.0
 
 
+def rotation_axes(T: Array) -> Array:
+    """The axes (3, 3), as columns in the camera's frame, of the roll, tilt and turn of a limb along x at T_camera_target."""
+    limb, ray = T[:3, 0], T[:3, 3] / np.linalg.norm(T[:3, 3])
+    tilt = np.cross(limb, ray)
+    if np.linalg.norm(tilt) < 1e-3:  # it points at the camera: turn and tilt are alike
+        tilt = T[:3, 1]
+    tilt = tilt / np.linalg.norm(tilt)
+    return np.column_stack([limb, tilt, np.cross(tilt, limb)])
+
+
 def errors(T_true: Array, T: Array, length: float) -> dict[str, Array]:
-    """The errors of a pose T_camera_target by kind, in the kind's unit: one of depth and roll, two of lateral and axis."""
+    """The errors of a pose T_camera_target by kind, in the kind's unit: two of lateral, one of every other."""
     error = geometry.pose_error(T_true, T)
     position = facing(T[:3, 3]).T @ error[:3]
-    rotation = T[:3, :3].T @ error[3:]
+    roll, tilt, turn = rotation_axes(T).T @ error[3:]
     return {
         "depth": position[2:] / np.linalg.norm(T[:3, 3]),
         "lateral": position[:2] / length,
-        "axis": rotation[1:],
-        "roll": rotation[:1],
+        "turn": np.array([turn]),
+        "tilt": np.array([tilt]),
+        "roll": np.array([roll]),
     }
 
 
