@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,12 +50,6 @@ Played = dict[str, Any]
 ERRORS = ("cm", "lateral_cm", "depth_cm", "axis_deg", "roll_deg", "attitude_deg")
 """Of a pose: distance of the object's centre [cm], its parts across and along the line of sight, of the limb's axis, of the twist
 about it, of the whole rotation [deg]."""
-
-
-def available() -> tuple[str, ...]:
-    """The chains whose services are there."""
-    folder = Path(__file__).parents[1] / "services" / "posecnn" / "weights"
-    return tuple(name for name in CHAINS if name != "posecnn" or (folder / "posecnn.npz").is_file())
 
 
 def centroid(mesh: Mesh) -> Array:

@@ -22,7 +22,7 @@ from tests.bench import table1
 
 def passed(seed: int) -> trials.Played:
     """A run through all levels of occlusion."""
-    return trials.played(trial.passage(seed), trial.PASSAGE_S, trials.available())
+    return trials.played(trial.passage(seed), trial.PASSAGE_S)
 
 
 def jobs(seed: int, quick: bool) -> list[campaign.Job]:

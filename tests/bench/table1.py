@@ -77,7 +77,7 @@ def paper_of(setting: Setting) -> list[float]:
 
 def one(setting: dict[str, Any], seed: int, index: int, seconds: float) -> trials.Played:
     """A trial, drawn and played."""
-    return trials.played(trial.draw(Setting(**setting), seed, index), seconds, trials.available())
+    return trials.played(trial.draw(Setting(**setting), seed, index), seconds)
 
 
 def jobs(seed: int, count: int, seconds: float) -> list[campaign.Job]:
