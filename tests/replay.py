@@ -45,6 +45,7 @@ class Replay:
         self.heard: list[Heard] = []
         self._listeners: list[tuple[Topic, dict[str, str], Callable[[Any, dict[str, str]], None]]] = []
         self._timers: list[tuple[int, Callable[[], None]]] = []
+        self._answers: dict[str, Callable[[dict[str, str], bytes], Any]] = {}
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._count = itertools.count()
         for name in services:
@@ -71,6 +72,13 @@ class Replay:
 
     def listen(self, topic: Topic, names: dict[str, str], handler: Callable[[Any, dict[str, str]], None]) -> None:
         self._listeners.append((topic, names, handler))
+
+    def ask(self, key: str, **parameters: str) -> Any:
+        """What a service answers to a query of this key."""
+        return self._answers[key](parameters, b"")
+
+    def answer(self, key: str, function: Callable[[dict[str, str], bytes], Any]) -> None:
+        self._answers[key] = function
 
     def every(self, period_ns: int, function: Callable[[], None]) -> None:
         self._timers.append((period_ns, function))
@@ -118,7 +126,7 @@ class ReplayNode:
         self._replay.every(round(period_s * 1e9), function)
 
     def answer(self, key: str, function: Callable[[dict[str, str], bytes], Any]) -> None:
-        """Nobody asks in a replay."""
+        self._replay.answer(key, function)
 
     def owns(self, stream: str) -> bool:
         return True

@@ -25,7 +25,7 @@ def result(setting=SETTINGS[0], index=0, errors=(1.0, 2.0, 3.0), fused=(0.5, 1.0
     def columns(values):
         return {name: list(values) for name in trials.ERRORS}
 
-    chain = {"vision": columns(errors), "fused": {**columns(fused), "poses": [[0.0] * 6 + [1.0]] * 3}}
+    chain = {"vision": columns(errors), "fused": {**columns(fused), "poses": [[0.0] * 6 + [1.0]] * 3}, "live": columns(fused)}
     return {
         "setting": {"reach": setting.reach, "distance": setting.distance, "occlusion": setting.occlusion},
         "index": index,

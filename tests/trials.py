@@ -1,8 +1,9 @@
 """Trials of the paper's experiment played through the services in one process, and the errors of every frame.
 
 A trial (`sim.trial`) is rendered once and then replayed (`tests.replay`) through three chains: ours, PoseCNN in place of our
-vision, and the paper's own method throughout. A frame's vision is the pose of that frame, if its state is tracking; what was
-fused is the pose published nearest to the frame's exposure, if it is not lost, against the truth at its own stamp.
+vision, and the paper's own method throughout. A frame's vision is the pose of that frame, if its state is tracking. What was
+fused is the pose at the frame's exposure, asked for as soon as the frame's vision has been taken in: the paper knows no delays.
+`live` is what was published nearest to the exposure, before anything was known of the frame. Poses that are lost do not count.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from shared import geometry, topics
 from shared.body import Mesh
 from shared.geometry import Array
-from shared.messages import FusedPose, Truth, VisionPose
+from shared.messages import FusedPose, Truth, VisionPose, decode
 from sim.trial import HIDDEN, LEAD_S, SECONDS, Setting, Trial
 from tests.replay import Replay
 
@@ -99,14 +101,19 @@ def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple
     for name in chains:
         chain = CHAINS[name]
         arguments = {service: list(flags) for service, flags in chain.arguments.items()}
-        heard = Replay(trial.cell, chain.services, arguments).run(messages)
+        replay, asked = Replay(trial.cell, chain.services, arguments), dict[int, FusedPose]()
+        if "fusion" not in chain.arguments:  # the paper's observer has no past
+            replay.listen(topics.VISION, {}, partial(_ask, replay, asked))
+        heard = replay.run(messages)
         vision = {item.message.stamp_ns: item.message for item in heard if item.topic is topics.VISION}
         fused = [item.message for item in heard if item.topic is topics.FUSED]
         said = np.array([message.stamp_ns for message in fused])
         nearest = [fused[int(np.argmin(np.abs(said - stamp)))] for stamp in stamps]
         found[name] = {
             "vision": _columns([scored(vision.get(stamp)) for stamp in stamps]),
-            "fused": _columns([scored(pose) for pose in nearest]) | {"poses": [_pose(pose) for pose in nearest]},
+            "fused": _columns([scored(asked.get(stamp, pose)) for stamp, pose in zip(stamps, nearest, strict=True)])
+            | {"poses": [_pose(pose) for pose in nearest]},
+            "live": _columns([scored(pose) for pose in nearest]),
         }
     return {
         "setting": dataclasses.asdict(trial.setting),
@@ -119,6 +126,12 @@ def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple
         "gap_m": [round(_after(truths, stamp).gap, 4) for stamp in stamps],
         "chains": found,
     }
+
+
+def _ask(replay: Replay, asked: dict[int, FusedPose], pose: VisionPose, names: dict[str, str]) -> None:
+    """Asks for the fused pose at a frame's exposure, now that its vision is known."""
+    answer, _ = replay.ask(topics.current_pose(replay.cell.name, pose.target), stamp_ns=str(pose.stamp_ns))
+    asked[pose.stamp_ns] = decode(FusedPose, answer)
 
 
 def is_scored(played: Played) -> np.ndarray:

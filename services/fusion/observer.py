@@ -80,6 +80,11 @@ class Bank:
         kernel.estimate_all(models, self._states[targets], self._rings[targets], stamp_ns, out)
         return out
 
+    def earliest_ns(self, target: int) -> int:
+        """As `ErrorStateObserver.earliest_ns`, of one target."""
+        first, count = self._rings[target]
+        return int(self._states[target, first]["stamp_ns"]) if count else 0
+
     def innovation(self, target: int) -> tuple[float, int]:
         """As `ErrorStateObserver.innovation`, of one target."""
         first, count = self._rings[target]
@@ -133,6 +138,11 @@ class ErrorStateObserver:
         """Squared Mahalanobis distance of the newest measurement's innovation (NIS) and its degrees of freedom: 0 and 0 where it
         began the state."""
         return self._bank.innovation(self._target)
+
+    @property
+    def earliest_ns(self) -> int:
+        """The first stamp at which the pose can be told: that of the oldest measurement kept."""
+        return self._bank.earliest_ns(self._target)
 
     def estimate(self, stamp_ns: int) -> Estimate:
         """The pose at a stamp, from the measurements up to it. Disturbs nothing.

@@ -170,6 +170,11 @@ class PaperObserver:
         velocity = np.concatenate([state.u[:3], B[3:, 3:] @ state.u[3:]])
         return Estimate(_transform(state.smooth), velocity, covariance, self.settings.limits.state(age_s, covariance), sources)
 
+    @property
+    def earliest_ns(self) -> int:
+        """The first stamp at which the pose can be told: that of the newest measurement."""
+        return self._newest_ns() if self._held else 0
+
     def R_v(self, hidden: float) -> Array:
         """R_v (6, 6) = f_v W_v of the share f_v in [0, 1] of the arm that is hidden, with a floor (section "Integration of
         Perception Methods")."""

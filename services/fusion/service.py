@@ -179,12 +179,15 @@ class Fusion:
             self.node.log.info("lost" if estimate.state == "lost" else "found", target=self.target, **counts)
 
     def answer(self, parameters: dict[str, str], payload: bytes) -> tuple[bytes, str]:
-        """The current pose: MessagePack of FusedPose, or JSON with `format=json`. Raises ValueError on another format."""
+        """The current pose, or with `stamp_ns=` that at the stamp of a picture, say, by all that is known by now: MessagePack of
+        FusedPose, or JSON with `format=json`. Raises ValueError on another format, and a stamp that is none or out of reach."""
         form = parameters.get("format", "msgpack")
         if form not in ("msgpack", "json"):
             raise ValueError(f"format: msgpack or json expected, {form!r} came")
         with self.group.lock:
             stamp_ns = self.node.now_ns()
+            if "stamp_ns" in parameters:
+                stamp_ns = _within(parameters["stamp_ns"], self.observer.earliest_ns, stamp_ns)
             estimate = self.observer.estimate(stamp_ns)
         message = self._message(stamp_ns, estimate)
         if form == "msgpack":
@@ -203,6 +206,13 @@ class Fusion:
             state=estimate.state,
             sources=estimate.sources,
         )
+
+
+def _within(text: str, earliest_ns: int, now_ns: int) -> int:
+    """The stamp [ns] that is asked for. Raises ValueError where none is known there."""
+    if not text.isdecimal() or not earliest_ns <= int(text) <= now_ns:
+        raise ValueError(f"stamp_ns: nanoseconds from {earliest_ns} to {now_ns} expected, {text!r} came: ask within the history")
+    return int(text)
 
 
 def as_json(message: messages.FusedPose) -> dict[str, Any]:

@@ -38,8 +38,10 @@ COLUMNS = {
     "multimodal_posecnn": ("posecnn", "fused"),
     "paper_procnet": ("faithful", "vision"),
     "paper_multimodal_procnet": ("faithful", "fused"),
+    "live_multimodal_procnet": ("procnet", "live"),
 }
-"""By name, the chain and which of its poses. The first four are the paper's; the last two are its method, as we built it."""
+"""By name, the chain and which of its poses. The first four are the paper's, two more its method, as we built it; the last is the
+fused pose as it is published, some 40 ms before the camera's pose of the same moment is known."""
 PAPERS = tuple(COLUMNS)[:4]
 REACHES = {"inside": "haptic_range_inside", "outside": "haptic_range_outside"}
 DISTANCES = {"short": "short_0_3m", "medium": "medium_3_6m", "long": "long_6_10m"}
@@ -136,7 +138,7 @@ def score(results: Sequence[trials.Played]) -> dict[str, Any]:
     out["lost"] = {column: out["no_pose"][k] for k, column in enumerate(COLUMNS) if "multimodal" in column}
     out["fused_against_vision"] = {
         chain: _both(values["cm"][vision], values["cm"][fused])
-        for chain, vision, fused in zip(CHAINS, tuple(COLUMNS)[::2], tuple(COLUMNS)[1::2], strict=True)
+        for chain, vision, fused in zip(CHAINS, tuple(COLUMNS)[0:6:2], tuple(COLUMNS)[1:6:2], strict=True)
     }
     return out
 
@@ -215,7 +217,8 @@ def show(found: dict[str, Any], console: Console) -> None:
     for reach, key in REACHES.items():
         view = Table(
             "camera", "hidden", *(f"{name}\nours / paper" for name in ("ProcNet", "multimodal", "PoseCNN", "multimodal")),
-            "paper's method\nvision / fused", "no pose\nvision / fused", title=f"{reach} of the skin's range: position error, cm",
+            "paper's method\nvision / fused", "multimodal\npublished", "no pose\nvision / fused",
+            title=f"{reach} of the skin's range: position error, cm",
         )  # fmt: skip
         for distance, name in DISTANCES.items():
             for occlusion, cell in found[key][name].items():
@@ -224,7 +227,7 @@ def show(found: dict[str, Any], console: Console) -> None:
                 missing = " / ".join(
                     f"{100 * cell['no_pose'][k]:.0f}%" if cell["no_pose"][k] is not None else "-" for k in (0, 1)
                 )
-                view.add_row(distance, occlusion, *cells, faithful, missing)
+                view.add_row(distance, occlusion, *cells, faithful, _text(cell["ours"][6]), missing)
         console.print(view)
     console.print(found["camera"])
     for result in found["goals"].values():
