@@ -74,7 +74,7 @@ def write(found: dict[str, Any], folder: Path, path: Path, quick: bool) -> None:
         data = base64.b64encode((folder / f"{name}.png").read_bytes()).decode()
         parts.append(
             f"<h2>{escape(title)}</h2><figure><img alt='{escape(title)}' src='data:image/png;base64,{data}'>"
-            f"<figcaption>{escape(text)} Data: {name}.json</figcaption></figure>"
+            f"<figcaption>{escape(text)} Data: {'table1' if name == 'table' else name}.json</figcaption></figure>"
         )
     path.write_text("\n".join(parts) + "</html>\n")
 

@@ -207,9 +207,12 @@ def through_occlusion(data: dict[str, Any], path: Path) -> None:
             top.plot(times, error[name], color=colour, lw=width)
             known = np.flatnonzero(np.isfinite(error[name]))
             ends[text] = (float(np.median(error[name][known[-10:]])), colour)
-    known = np.concatenate([v[np.isfinite(v)] for v in error.values()])
-    _plain(top, _ticks((max(float(np.percentile(known, 2)), 0.02), float(known.max()))))
-    for (text, (_, colour)), y in zip(ends.items(), _apart([v for v, _ in ends.values()], 1.45), strict=True):
+    drawn = np.concatenate([error[name][np.isfinite(error[name])] for name, *_ in kinds if name in error])
+    ticks = _ticks((max(float(np.percentile(drawn, 2)), 0.02), float(drawn.max())))
+    _plain(top, ticks)
+    top.set_ylim(ticks[0], ticks[-1])
+    places = _apart([value for value, _ in ends.values()], (ticks[-1] / ticks[0]) ** (1.0 / 15.0))
+    for (text, (_, colour)), y in zip(ends.items(), places, strict=True):
         _name(top, PASSAGE_S, y, text, colour)
     _dress(bottom, "time [s]", "hidden [%]")
     bottom.fill_between(times, 100 * np.array(data["hidden"]), color=INK, alpha=0.25, lw=0)

@@ -1,6 +1,6 @@
 """`penumbra bench paper`: the paper's whole experiment: its table, its curves as pictures with their data, and a page of all.
 
-In FOLDER: index.html, which needs no other file; table1.json; for each picture NAME.png and NAME.json. Finished runs are kept in
+In FOLDER: index.html, which needs no other file; for each picture NAME.png and NAME.json, for the table table1.json. Finished runs are kept in
 FOLDER/runs: a run that was killed goes on where it was.
 """
 
@@ -47,7 +47,8 @@ def draw(found: dict[str, Any], results: Sequence[trials.Played], others: Sequen
     }
     for name, data in shown.items():
         pictures.DRAWN[name](data, folder / f"{name}.png")
-        (folder / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n")
+        if data is not found:
+            (folder / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n")
     frames = curves.examples(passage)
     pictures.examples(trial.passage(seed), frames, folder / "examples.png")
     (folder / "examples.json").write_text(json.dumps(frames, indent=1) + "\n")
@@ -68,7 +69,7 @@ def main(argv: list[str] | None = None) -> int:
     found["wall_s"] = round(time.monotonic() - started, 1)
     (folder / "table1.json").write_text(json.dumps(found, indent=1) + "\n")
     page.write(found, folder, folder / "index.html", options.quick)
-    console = Console()
+    console = Console(width=170)
     table1.show(found, console)
     console.print(f"{folder / 'index.html'}: the table, the curves and the paper's numbers")
     return 0

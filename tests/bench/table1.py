@@ -272,7 +272,7 @@ def main(argv: list[str] | None = None) -> int:
         folder = options.resume or Path(temporary)
         found, _ = measure(options, folder, progress)
     found["wall_s"] = round(time.monotonic() - started, 1)
-    show(found, Console())
+    show(found, Console(width=170))
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n")
     return 0
