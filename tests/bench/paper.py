@@ -1,7 +1,7 @@
 """`penumbra bench paper`: the paper's whole experiment: its table, its curves as pictures with their data, and a page of all.
 
-In FOLDER: index.html, which needs no other file; for each picture NAME.png and NAME.json, for the table table1.json. Finished runs are kept in
-FOLDER/runs: a run that was killed goes on where it was.
+In FOLDER: index.html, which needs no other file; for each picture NAME.png and NAME.json, for the table table1.json. Finished
+runs are kept in FOLDER/runs: a run that was killed goes on where it was.
 """
 
 from __future__ import annotations
