@@ -109,10 +109,10 @@ def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple
         fused = [item.message for item in heard if item.topic is topics.FUSED]
         said = np.array([message.stamp_ns for message in fused])
         nearest = [fused[int(np.argmin(np.abs(said - stamp)))] for stamp in stamps]
+        known = [asked.get(stamp, pose) for stamp, pose in zip(stamps, nearest, strict=True)]
         found[name] = {
             "vision": _columns([scored(vision.get(stamp)) for stamp in stamps]),
-            "fused": _columns([scored(asked.get(stamp, pose)) for stamp, pose in zip(stamps, nearest, strict=True)])
-            | {"poses": [_pose(pose) for pose in nearest]},
+            "fused": _columns([scored(pose) for pose in known]) | {"poses": [_pose(pose) for pose in known]},
             "live": _columns([scored(pose) for pose in nearest]),
         }
     return {
