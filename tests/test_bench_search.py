@@ -9,7 +9,7 @@ import pytest
 
 from services.search import contour
 from services.search.evidence import Intrinsics
-from services.search.search import VisionEstimate
+from services.search.search import Searched
 from shared import geometry
 from shared.messages import FusedPose, VisionPose
 from sim import shots
@@ -75,7 +75,7 @@ def drawn() -> list[search.Result]:
         error = root @ rng.normal(size=6)
         error[3:] += rng.normal() * shot.T_world_target[:3, 0]  # a roll that no covariance tells
         T = geometry.perturb(shot.T_world_target, -error)
-        results.append(search.Result(VisionEstimate(T, root @ root.T, 0.95, 0.0, "tracking", T), shot, 1.0))
+        results.append(search.Result(Searched(T, root @ root.T, 0.95, 0.0, "tracking", T), shot, 1.0))
     return results
 
 
@@ -94,7 +94,7 @@ def test_errors_are_told_apart_along_and_across_the_line_of_sight_and_about_the_
     sight /= np.linalg.norm(sight)
     roll = 0.3 * shot.T_world_target[:3, 0]
     T = geometry.perturb(shot.T_world_target, [*(0.02 * sight), *roll])
-    result = search.Result(VisionEstimate(T, np.eye(6), 1.0, 0.0, "tracking", T), shot, 1.0)
+    result = search.Result(Searched(T, np.eye(6), 1.0, 0.0, "tracking", T), shot, 1.0)
     assert (result.depth, result.lateral) == pytest.approx((0.02, 0.0), abs=1e-9)
     assert (result.roll, result.axis) == pytest.approx((0.3, 0.0), abs=1e-6)
     assert not result.is_wrong

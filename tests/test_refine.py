@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from services.search.search import Search, VisionEstimate
+from services.search.search import Search, Searched
 from shared import geometry
 from shared.classes import Label
 from shared.messages import Mask
@@ -54,7 +54,7 @@ def mask(shot: Shot, T: np.ndarray, spoiled: float = 0.0, seed: int = 0) -> Mask
     return Mask(stamp_ns=shot.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=1)
 
 
-def error_cm(shot: Shot, estimate: VisionEstimate) -> float:
+def error_cm(shot: Shot, estimate: Searched) -> float:
     return 100.0 * float(np.linalg.norm(shot.T_world_target[:3, 3] - estimate.T[:3, 3]))
 
 

@@ -13,7 +13,7 @@ from services.search.contour import Model
 from services.search.fit import Noise, fit
 from services.search.joints import JointHistory
 from services.search.robots import RobotDepth
-from services.search.search import Search, VisionEstimate
+from services.search.search import Search, Searched
 from shared import body, cell, geometry, raster
 from shared.classes import Label
 from shared.messages import FusedPose, Mask
@@ -81,7 +81,7 @@ def search() -> Search:
     return Search(CELL)
 
 
-def position_cm(s: Scene, estimate: VisionEstimate) -> float:
+def position_cm(s: Scene, estimate: Searched) -> float:
     return 100.0 * float(np.linalg.norm(s.T[:3, 3] - estimate.T[:3, 3]))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -19,9 +18,8 @@ from shared.body import Mesh
 from shared.cell import Camera, Cell
 from shared.classes import Label
 from shared.geometry import Array
+from shared.vision import State, VisionEstimate
 from shared.window import Window
-
-State = Literal["tracking", "occluded", "lost"]
 
 WEIGHTS = Path(__file__).parent / "weights" / "posecnn.npz"
 SMALLEST = 24
@@ -47,15 +45,9 @@ UNKNOWN = np.diag([1.0**2] * 3 + [1.5**2] * 3)
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """T_world_target, covariance (6, 6) along the world's axes, overlap and hidden share in [0, 1], state; signs: what the
-    covariance was read from, None where nothing was found."""
+class Estimate(VisionEstimate):
+    """signs: what the covariance was read from, None where nothing was found."""
 
-    T: Array
-    covariance: Array
-    overlap: float
-    hidden: float
-    state: State
     signs: Signs | None = None
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import torch
 
 from services.posecnn.estimator import WEIGHTS, PoseCNN, load
-from shared import geometry
-from shared.messages import Frame, FusedPose, VisionPose
+from shared.messages import Frame, FusedPose
 from shared.prediction import predict
 from shared.service import Node
 from shared.topics import FRAME, FUSED, VISION
@@ -51,20 +50,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
                 continue
             T_prior, _ = predict(fused.get(target), frame.stamp_ns)
             estimate = estimators[camera, target].update(frame.image, window, T_prior)
-            position, orientation = geometry.position_orientation(estimate.T)
-            pose = VisionPose(
-                stamp_ns=frame.stamp_ns,
-                target=target,
-                camera=camera,
-                frame=cell.frame,
-                position=position,
-                orientation=orientation,
-                covariance=estimate.covariance,
-                overlap=estimate.overlap,
-                hidden=estimate.hidden,
-                state=estimate.state,
-            )
-            node.publish(VISION, pose, target=target)
+            node.publish(VISION, estimate.message(frame.stamp_ns, target, camera, cell.frame), target=target)
 
     node.subscribe(FUSED, on_fused)
     for camera in cameras:

@@ -14,7 +14,6 @@ import datetime
 import multiprocessing
 import os
 import signal
-import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass
@@ -25,7 +24,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor
 
 from services.posecnn import evaluate, loss, network, patch
@@ -35,6 +33,7 @@ from shared import body, geometry
 from shared import cell as cells
 from shared.classes import Label
 from shared.geometry import Array
+from shared.training import run
 from sim import sequences, shots
 
 VALIDATION_SEED = 2_000_000
@@ -308,31 +307,6 @@ class Trainer:
         trainer.optimizer.load_state_dict(content["optimizer"])
         trainer.step, trainer.minutes = content["step"], content["minutes"]
         return trainer
-
-
-def run(
-    trainer: Trainer, data: Simulated, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0
-) -> dict[str, float]:
-    """Train up to so many steps, or minutes (over all runs); shows a progress bar. Returns the loss's parts, smoothed."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    total = steps if steps is not None else int(minutes * 60)
-    saved = last = time.monotonic()
-    smooth: dict[str, float] = {}
-    with Progress(*columns) as bar:
-        task = bar.add_task("steps" if steps is not None else "seconds", total=total)
-        while (progress := trainer.step / steps if steps is not None else trainer.minutes / minutes if minutes else 1.0) < 1.0:
-            for name, value in trainer.train_step(data, progress).items():
-                smooth[name] = value if name not in smooth else smooth[name] + 0.02 * (value - smooth[name])
-            now = time.monotonic()
-            trainer.minutes += (now - last) / 60.0
-            last = now
-            text = "  ".join(f"{name} {value:.3f}" for name, value in smooth.items())
-            bar.update(task, completed=int(progress * total), description=f"step {trainer.step}  {text}")
-            if now - saved > save_every_s:
-                trainer.save(checkpoint)
-                saved = now
-    trainer.save(checkpoint)
-    return smooth
 
 
 def held_out_shots(seed: int, count: int) -> Iterator[shots.Shot]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,9 @@ from services.search.robots import RobotDepth
 from shared import body, geometry
 from shared.cell import Cell
 from shared.messages import Mask
+from shared.vision import State, VisionEstimate
 
 Array = NDArray[np.float64]
-State = Literal["tracking", "occluded", "lost"]
 
 METHODS = ("default", "paper")
 HIDDEN = 0.95
@@ -69,15 +68,9 @@ PAPER_SIGMA = (0.02, 0.09)
 
 
 @dataclass(frozen=True)
-class VisionEstimate:
-    """T_world_target, covariance (6, 6) along the world's axes, overlap and hidden share in [0, 1], state. The pose is the
-    measurement's alone; `T_searched` is the most probable one together with the prediction."""
+class Searched(VisionEstimate):
+    """`T_searched`: the most probable pose together with the prediction."""
 
-    T: Array
-    covariance: Array
-    overlap: float
-    hidden: float
-    state: State
     T_searched: Array
 
 
@@ -123,7 +116,7 @@ class Search:
         prior_covariance: Array | None = None,
         joints: Mapping[str, Array] | None = None,
         image: NDArray[np.uint8] | None = None,
-    ) -> VisionEstimate:
+    ) -> Searched:
         """What a mask, and the image it is of, say about the target's pose.
 
         T_prior (4 x 4): the predicted T_world_target, None where nothing is known; `prior_covariance` (6, 6) along the world's
@@ -329,7 +322,7 @@ class Search:
 
     def _judge(
         self, seen: Evidence, best: Fit, with_image: bool, T_prior: Array | None, prior_covariance: Array | None
-    ) -> VisionEstimate:
+    ) -> Searched:
         """The estimate of a fit; `with_image`: an image was there to confirm it; T_prior: T_camera_target as predicted, None
         where nothing is known."""
         fits = best.sharp if with_image else best.misfit < WRONG
@@ -360,20 +353,16 @@ class Search:
         window = (x0, y0, min(int(np.ceil(u.max())) - x0 + 1, 4096), min(int(np.ceil(v.max())) - y0 + 1, 4096))
         return int(np.count_nonzero(self._model.silhouette(T, k, window)))
 
-    def _paper(self, seen: Evidence, T_start: Array) -> VisionEstimate:
+    def _paper(self, seen: Evidence, T_start: Array) -> Searched:
         T, value = overlap.ascend(self._model, T_start, seen.state == TARGET, seen.intrinsics)
         hidden = float(np.clip(1.0 - seen.seen_px / max(self._amodal_px(T, seen.intrinsics), 1), 0.0, 1.0))
         covariance = np.diag(np.repeat(np.square(PAPER_SIGMA), 3))
         return self._estimate(T, covariance, (value + 1.0) / 2.0, hidden, "occluded" if hidden > HIDDEN else "tracking", T)
 
-    def _lost(self, T: Array) -> VisionEstimate:
+    def _lost(self, T: Array) -> Searched:
         return self._estimate(T, self._limits.covariance, 0.0, 1.0, "lost", T)
 
-    def _estimate(
-        self, T: Array, covariance: Array, share: float, hidden: float, state: State, T_searched: Array
-    ) -> VisionEstimate:
+    def _estimate(self, T: Array, covariance: Array, share: float, hidden: float, state: State, T_searched: Array) -> Searched:
         T_world_camera = self._camera.T_world_camera
         covariance = self._axes @ covariance @ self._axes.T
-        return VisionEstimate(
-            T_world_camera @ T, (covariance + covariance.T) / 2.0, share, hidden, state, T_world_camera @ T_searched
-        )
+        return Searched(T_world_camera @ T, (covariance + covariance.T) / 2.0, share, hidden, state, T_world_camera @ T_searched)

@@ -7,8 +7,7 @@ from collections import deque
 
 from services.search.joints import JointHistory
 from services.search.search import METHODS, Search
-from shared import geometry
-from shared.messages import Frame, FusedPose, Joints, Mask, VisionPose
+from shared.messages import Frame, FusedPose, Joints, Mask
 from shared.prediction import predict
 from shared.service import Node
 from shared.topics import FRAME, FUSED, JOINTS, MASK, VISION
@@ -59,19 +58,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
                 continue
             T_prior, covariance = predict(fused.get(target), message.stamp_ns)
             estimate = search.update(message, T_prior, covariance, joints, image)
-            position, orientation = geometry.position_orientation(estimate.T)
-            pose = VisionPose(
-                stamp_ns=message.stamp_ns,
-                target=target,
-                camera=camera,
-                frame=cell.frame,
-                position=position,
-                orientation=orientation,
-                covariance=estimate.covariance,
-                overlap=estimate.overlap,
-                hidden=estimate.hidden,
-                state=estimate.state,
-            )
+            pose = estimate.message(message.stamp_ns, target, camera, cell.frame)
             node.publish(VISION, pose, target=target)
 
     for robot in cell.robots:

@@ -14,7 +14,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -24,11 +23,11 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from services.segmentation import infer, loss, prednet, recordings
 from services.segmentation.evaluate import Labelled, calibrate, held_out
 from services.segmentation.prednet import PredNet, Settings
+from shared.training import run
 from sim import sequences
 
 VALIDATION_SEED = 1_000_000
@@ -395,28 +394,3 @@ def main(argv: list[str] | None = None) -> int:
     card = export(trainer, out, data)
     print(f"{out}: {card['held_out']}")
     return 0
-
-
-def run(
-    trainer: Trainer, data: Data, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0
-) -> dict[str, float]:
-    """Train up to so many steps, or minutes (over all runs); shows a progress bar. Returns the loss's parts, smoothed."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    total = steps if steps is not None else int(minutes * 60)
-    saved = last = time.monotonic()
-    smooth: dict[str, float] = {}
-    with Progress(*columns) as bar:
-        task = bar.add_task("steps" if steps is not None else "seconds", total=total)
-        while (progress := trainer.step / steps if steps is not None else trainer.minutes / minutes if minutes else 1.0) < 1.0:
-            for name, value in trainer.train_step(data, progress).items():
-                smooth[name] = value if name not in smooth else smooth[name] + 0.02 * (value - smooth[name])
-            now = time.monotonic()
-            trainer.minutes += (now - last) / 60.0
-            last = now
-            text = "  ".join(f"{name} {value:.3f}" for name, value in smooth.items())
-            bar.update(task, completed=int(progress * total), description=f"step {trainer.step}  {text}")
-            if now - saved > save_every_s:
-                trainer.save(checkpoint)
-                saved = now
-    trainer.save(checkpoint)
-    return smooth

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, rankdata
 
 from services.search.fit import Noise
-from services.search.search import Search, VisionEstimate
+from services.search.search import Search, Searched
 from services.segmentation.infer import Segmenter, load_segmenter
 from shared import geometry
 from shared.classes import Label
@@ -77,7 +77,7 @@ class Result:
     """One search of one frame, its time [ms], and its errors: position, depth (along the line of sight) and lateral [m], axis and
     roll [rad]."""
 
-    estimate: VisionEstimate
+    estimate: Searched
     shot: Shot
     ms: float
 
@@ -284,7 +284,7 @@ def nees(results: list[Result]) -> dict[str, Any]:
     }
 
 
-def doubt(estimate: VisionEstimate) -> float:
+def doubt(estimate: Searched) -> float:
     """How much an estimate doubts itself, as a score for ranking: infinite where it is not tracking."""
     if estimate.state != "tracking":
         return np.inf
