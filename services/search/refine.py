@@ -111,10 +111,9 @@ def refine(
     pictures = _pyramid(_Picture(model, *native(image, evidence), settings, T_prior, regular), evidence.scale)
     T = with_prior(first.T, first.covariance, T_prior, prior)
     best = _through(pictures[-1:], T)
-    for start, way in _further(pictures, T, T_prior if prior.any() else None):
-        if best.rms < SHARP:
-            break
-        best = min(best, _through(way, start), key=lambda one: one.rms)
+    for enough, start, way in _further(pictures, T, T_prior if prior.any() else None):
+        if best.rms >= enough:
+            best = min(best, _through(way, start), key=lambda one: one.rms)
     trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
     T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits, trust * best.waves)
     k = evidence.intrinsics
@@ -218,15 +217,16 @@ def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:
     return pictures
 
 
-def _further(pictures: list[_Picture], T: Array, T_prior: Array | None) -> Iterator[tuple[Array, list[_Picture]]]:
-    """Starts and ways where the mask's pose T is out of the lines' reach, in the order in which they are tried: from the
-    prediction, if there is one; from coarse to fine; both, with twice the reach at first."""
+def _further(pictures: list[_Picture], T: Array, T_prior: Array | None) -> Iterator[tuple[float, Array, list[_Picture]]]:
+    """Starts and ways where the mask's pose T may have led astray, in the order in which they are tried, each unless the offsets
+    left are small enough already: from the prediction, if there is one; where the right pose was out of the lines' reach, from
+    coarse to fine; both, with twice the reach at first."""
     if T_prior is not None:
-        yield T_prior, pictures[-1:]
+        yield TYPICAL, T_prior, pictures[-1:]
     if len(pictures) > 1:
-        yield T, pictures
+        yield SHARP, T, pictures
     if T_prior is not None:
-        yield T_prior, [pictures[0].halved(), *pictures]
+        yield SHARP, T_prior, [pictures[0].halved(), *pictures]
 
 
 def _through(pictures: list[_Picture], T: Array) -> _Pass:
