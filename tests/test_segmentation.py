@@ -238,6 +238,17 @@ def test_masks_of_the_compiled_network_are_torch_s_but_for_rounding(monkeypatch)
     assert len(np.unique(a)) > 1
 
 
+def test_two_cameras_share_what_is_compiled_and_not_what_they_remember():
+    first, second, window = scene(3), scene(3)[:, ::-1].copy(), Window(0, 0, 96, 96)
+    stamps = [(t + 1) * 50_000_000 for t in range(3)]
+    alone = infer.load_segmenter()
+    wanted = [alone(image, window, stamp) for image, stamp in zip(first, stamps, strict=True)]
+    one, other = infer.load_segmenter(), infer.load_segmenter()
+    for mask, a, b, stamp in zip(wanted, first, second, stamps, strict=True):
+        other(b, window, stamp)
+        np.testing.assert_array_equal(one(a, window, stamp), mask)
+
+
 def test_sizes_made_ready_in_the_background_or_thrown_out_give_the_same_masks(monkeypatch):
     images, windows = scene(4), (Window(0, 0, 96, 96), Window(0, 0, 96, 64))
     plain, prepared = infer.load_segmenter(), infer.load_segmenter()

@@ -26,7 +26,7 @@ MOST = 16
 class Compiled:
     """One time step of a network for pictures of any size. `dtype`, bfloat16 or float32: of the state and the computation.
 
-    Raises ImportError where OpenVINO is not installed.
+    Not for two threads at once: see `twin`. Raises ImportError where OpenVINO is not installed.
     """
 
     def __init__(self, net: PredNet, dtype: torch.dtype):
@@ -37,9 +37,16 @@ class Compiled:
         self._core = openvino.Core()
         self._type = openvino.Type.bf16 if dtype is torch.bfloat16 else openvino.Type.f32
         self._model = self._convert(copy.deepcopy(net).float().eval())
+        self._compiled: dict[tuple[int, int], Any] = {}
         self._requests: dict[tuple[int, int], Any] = {}
         self._asked: set[tuple[int, int]] = set()
         self._lock = threading.Lock()
+
+    def twin(self) -> Compiled:
+        """Another one of the same network, for another stream of pictures: what one compiles the other has."""
+        twin = copy.copy(self)
+        twin._requests = {}
+        return twin
 
     def __call__(self, image: Tensor, state: State) -> tuple[Tensor, State]:
         """(class logits (1, classes, h, w) float32, new state) of an image (1, 3, h, w) in [0, 1] and the old state."""
@@ -64,18 +71,27 @@ class Compiled:
         with contextlib.suppress(OSError, AttributeError):  # not everywhere has a thread a priority
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
         for size in sizes:
-            self._request(*size)
+            self._model_of(size)
 
     def _request(self, height: int, width: int) -> Any:
         size = height, width
         request = self._requests.pop(size, None)
         if request is None:
-            with self._lock:
-                request = self._requests.pop(size, None) or self._compile(height, width)
-                while len(self._requests) >= MOST:
-                    self._requests.pop(next(iter(self._requests)), None)
+            request = self._model_of(size).create_infer_request()
+            while len(self._requests) >= MOST:
+                self._requests.pop(next(iter(self._requests)), None)
         self._requests[size] = request  # the last one used is the last to go
         return request
+
+    def _model_of(self, size: tuple[int, int]) -> Any:
+        with self._lock:
+            model = self._compiled.pop(size, None)
+            if model is None:
+                model = self._compile(*size)
+                while len(self._compiled) >= MOST:
+                    self._compiled.pop(next(iter(self._compiled)))
+            self._compiled[size] = model
+            return model
 
     def _compile(self, height: int, width: int) -> Any:
         shapes = [s.shape for s in (torch.empty(1, 3, height, width), *self._net.initial_state(1, height, width))]
@@ -87,7 +103,7 @@ class Compiled:
             "ENABLE_CPU_PINNING": False,  # two processes would be tied to the same core
             "INFERENCE_PRECISION_HINT": self._type.get_type_name(),
         }
-        return self._core.compile_model(model, "CPU", settings).create_infer_request()
+        return self._core.compile_model(model, "CPU", settings)
 
     def _convert(self, net: PredNet) -> Any:
         """The network as OpenVINO's model; not by `openvino.convert_model`, which reports its use over the internet."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import logging
 import time
 from pathlib import Path
@@ -56,6 +58,13 @@ class Segmenter:
             self._window, self._stamp_ns = window, stamp_ns
             return classes((logits.float() + self._offset)[0])
 
+    def twin(self) -> Segmenter:
+        """Another one of the same network, for another camera: what one has compiled the other need not."""
+        twin = copy.copy(self)
+        twin._state, twin._window, twin._stamp_ns = None, None, 0
+        twin._compiled = self._compiled.twin() if self._compiled else None
+        return twin
+
     def prepare(self, window: Window) -> None:
         """Make ready, in the background, for windows of this size and, one after another, of the sizes that may follow."""
         if self._compiled:
@@ -104,6 +113,11 @@ def load_segmenter(path: Path = WEIGHTS, dtype: torch.dtype | None = None) -> Se
     """A segmenter of a weights file with its card. Raises FileNotFoundError that says how to make one."""
     if not path.is_file():
         raise FileNotFoundError(f"no weights {path}: make them with `penumbra segmentation train --out {path}`")
+    return _loaded(path, path.stat().st_mtime_ns, dtype).twin()
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(path: Path, changed_ns: int, dtype: torch.dtype | None) -> Segmenter:
     net, card = prednet.load(path)
     return Segmenter(net, float(card["calibration"]["target_logit_offset"]), dtype)
 
