@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -136,10 +137,13 @@ def emulator(ports):
     command += ["--serial", "p7", "--serial-folder", str(ports)]
     process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"})
     node, heard = Node("listener", cells.load("arm"), bus.Connection("client", (endpoint,))), {}
+
+    def hear(topic, message, names):
+        stream = (topic.name, *(value for name, value in names.items() if name != "publisher"))
+        heard.setdefault(stream, []).append((node.now_ns(), message))
+
     for topic in (topics.FRAME, topics.JOINTS, topics.VOLTAGES, topics.TRUTH):
-        node.subscribe(
-            topic, lambda m, names, t=topic: heard.setdefault((t.name, *names.values()), []).append((node.now_ns(), m))
-        )
+        node.subscribe(topic, partial(hear, topic))
     try:
         with node:
             yield node, heard

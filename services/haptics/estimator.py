@@ -64,7 +64,7 @@ CLEAR = 4.0
 LASTING = 5.0
 """Windows in which the model's error is about the same. Whoever fuses poses takes their errors for independent, so it is
 published with so many times its variance."""
-SIZE_LASTS = 100.0
+SIZE_LASTS = 25.0
 """The same of what is not known of the limb's size, which stays for as long as the person does."""
 LINKS_ERROR = 0.005
 """Standard deviation of what the robot's other links are predicted to change, as a share."""

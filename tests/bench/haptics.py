@@ -215,11 +215,11 @@ def single_windows(
     plan: Plan,
     method: str = "solve",
     scenes: dict[tuple[int, float, int], Scene] | None = None,
-    counts: Sequence[int] = PADS,
+    counts: Sequence[int] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Rows of single windows with so many pads. scenes: those of another method, whose fields need not be solved again."""
+    """Rows of single windows with so many pads (default: PADS). scenes: those of another method, whose fields need not be solved again."""
     scenes = {} if scenes is None else scenes
-    for count in counts:
+    for count in counts or PADS:
         for gap in GAPS:
             priors = (False, True) if method == "solve" else (False,)  # the network knows no other prior than its training's
             table = {(prior, speed): Row([], []) for prior in priors for speed in SPEEDS}
