@@ -217,7 +217,8 @@ def single_windows(
     scenes: dict[tuple[int, float, int], Scene] | None = None,
     counts: Sequence[int] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Rows of single windows with so many pads (default: PADS). scenes: those of another method, whose fields need not be solved again."""
+    """Rows of single windows with so many pads (default: PADS). scenes: those of another method, whose fields need not be solved
+    again."""
     scenes = {} if scenes is None else scenes
     for count in counts or PADS:
         for gap in GAPS:
