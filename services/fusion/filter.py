@@ -42,7 +42,7 @@ class Settings:
     gate : probability with which a good measurement passes the gate.
     patience : after refusing everything of all senses for so long [s], start again from the newest measurement.
     source_patience : after refusing one sense for so long [s] while another is believed, doubt the state.
-    witness : a refused measurement teaches nothing while another sense has been believed within so long [s].
+    witness : a refused measurement teaches nothing while another sense, heard within so long [s], is less surprising.
     refusals : and at least so many measurements refused, so that two outliers after a pause do not count as persistence.
     unobserved : a direction with a standard deviation beyond this, in UNITS, is taken as not observed.
     horizon : length of the history [s]: vision is 30 to 100 ms late, more when the machine is busy.
@@ -53,7 +53,7 @@ class Settings:
 
     senses: dict[str, Sense] = field(default_factory=lambda: {"vision": Sense(), "haptic": Sense(lasting=0.2, time_constant=0.3)})
     acceleration: tuple[float, float] = (0.1, 1.5)
-    velocity_time: float = 0.3
+    velocity_time: float = 0.35
     velocity_spread: tuple[float, float] = (0.4, 1.0)
     agility: tuple[float, float] = (0.1, 30.0)
     doubt: float = 100.0

@@ -45,6 +45,8 @@ UNITS = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
 """Units [m, rad] in which translations and rotations compare: a turn by 1 rad moves the ends of a forearm by about 10 cm."""
 SENSES = len(SOURCES)
 SIZE = MOTION + POSE * SENSES
+HASTE = 4.0
+"""So many times as fast a measurement that is refused teaches that the limb is faster: while it is, all are refused."""
 NEVER = -(1 << 62)
 """The stamp of what has not happened."""
 
@@ -94,7 +96,9 @@ STATE = np.dtype(
         ("P", "f8", (SIZE, SIZE)),  # covariance of the errors of position, rotation, velocities, and the bias of each sense
         ("agility", "f8"),  # learned factor on the process noise
         # by sense
-        ("heard_ns", "i8", SENSES),  # stamp of the last measurement
+        ("came_ns", "i8", SENSES),  # stamp of the last measurement
+        ("surprise", "f8", SENSES),  # its squared Mahalanobis distance a direction
+        ("heard_ns", "i8", SENSES),  # stamp of the last measurement that taught something
         ("believed_ns", "i8", SENSES),  # and of the last accepted one
         ("refused", "i8", SENSES),  # how many were refused since
         ("refused_ns", "i8", SENSES),  # stamp of the first of them
@@ -133,7 +137,7 @@ def forget(state):  # type: ignore[no-untyped-def]
     for i in range(POSE * SENSES):
         state.bias[i] = 0.0
     for s in range(SENSES):
-        state.heard_ns[s] = state.believed_ns[s] = state.refused_ns[s] = NEVER
+        state.came_ns[s] = state.heard_ns[s] = state.believed_ns[s] = state.refused_ns[s] = NEVER
         state.refused[s] = state.has_innovation[s] = 0
         state.gain[s], state.doubt[s] = 0.0, 1.0
 
@@ -195,16 +199,17 @@ def step(model, state, m):  # type: ignore[no-untyped-def]
             break
         distance = so3.dot(innovation, innovation)
         state.distance, state.rank = distance, m.rank
+        state.surprise[m.source], state.came_ns[m.source] = distance / m.rank, m.stamp_ns
         passes = distance <= model.threshold[m.rank]
         if passes or not _is_contradicted(model, state, m):
-            learn(model, state, m, innovation)
+            learn(model, state, m, innovation, 1.0 if passes else HASTE)
         if passes:
             break
         if state.refused[m.source] == 0:
             state.refused_ns[m.source] = m.stamp_ns
         state.refused[m.source] += 1
         state.passed = 0
-        if _is_blind(model, state):
+        if _is_blind(model, state) and not _is_contradicted(model, state, m):
             start(model, state, m, state.p.copy(), state.R.copy(), state.P[:POSE, :POSE] + model.home_covariance)
         elif _is_persistent(model, state, m):
             # So long a disagreement is no outlier: one of the senses is biased beyond its covariance, nobody knows which.
@@ -219,10 +224,10 @@ def step(model, state, m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _is_contradicted(model, state, m):  # type: ignore[no-untyped-def]
-    """Whether another sense, heard lately and believed, says that a refused measurement is wrong and not the state: what it would
-    teach is that the limb is faster, until it passes the gate."""
+    """Whether another sense, heard lately, is less surprising, believed or not: then a refused measurement is wrong rather than the
+    state. What it would teach is that the limb is faster, until it passes the gate."""
     for s in range(SENSES):
-        if s != m.source and state.refused[s] == 0 and m.stamp_ns - state.believed_ns[s] < model.witness * 1e9:
+        if m.stamp_ns - state.came_ns[s] < model.witness * 1e9 and state.surprise[s] < state.surprise[m.source]:
             return True
     return False
 
@@ -413,7 +418,7 @@ def innovated(model, state, m, z, H):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def learn(model, state, m, innovation):  # type: ignore[no-untyped-def]
+def learn(model, state, m, innovation, haste):  # type: ignore[no-untyped-def]
     """Adapts agility and doubt to an innovation (6,)."""
     s = m.source
     length = math.sqrt(so3.dot(innovation, innovation) / m.rank)
@@ -422,7 +427,7 @@ def learn(model, state, m, innovation):  # type: ignore[no-untyped-def]
         step = min(model.learning[0], model.learning[1] * (m.stamp_ns - state.heard_ns[s]) * 1e-9)
         alike = so3.dot(innovation, state.innovation[s]) / m.rank  # 0 expected
         unlike = so3.dot(innovation, innovation) / m.rank - alike  # 1 expected
-        state.agility = min(max(state.agility * math.exp(step * alike), model.agility[0]), model.agility[1])
+        state.agility = min(max(state.agility * math.exp(haste * step * alike), model.agility[0]), model.agility[1])
         state.doubt[s] = min(max(state.doubt[s] * math.exp(0.5 * step * (unlike - 1.25)), 1.0), model.doubt)
     state.heard_ns[s], state.has_innovation[s] = m.stamp_ns, 1
     for i in range(POSE):
