@@ -224,8 +224,8 @@ def step(model, state, m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _is_contradicted(model, state, m):  # type: ignore[no-untyped-def]
-    """Whether another sense, heard lately, is less surprising, believed or not: then a refused measurement is wrong rather than the
-    state. What it would teach is that the limb is faster, until it passes the gate."""
+    """Whether another sense, heard lately, is less surprising, believed or not: then a refused measurement is wrong rather than
+    the state. What it would teach is that the limb is faster, until it passes the gate."""
     for s in range(SENSES):
         if m.stamp_ns - state.came_ns[s] < model.witness * 1e9 and state.surprise[s] < state.surprise[m.source]:
             return True
