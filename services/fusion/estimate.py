@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from services.fusion import so3
 from shared import geometry
-from shared.messages import Source
+from shared.messages import FusedPose, Source
 
 Array = NDArray[np.floating[Any]]
 
@@ -50,6 +50,20 @@ class Estimate:
     covariance: Array
     state: str
     sources: dict[str, Source]
+
+    def message(self, stamp_ns: int, target: str, frame: str) -> FusedPose:
+        """The estimate at a stamp, as it is published."""
+        return FusedPose(
+            stamp_ns=stamp_ns,
+            target=target,
+            frame=frame,
+            position=self.T[:3, 3],
+            orientation=np.array(so3.quaternion(self.T[:3, :3])),
+            velocity=self.velocity,
+            covariance=self.covariance,
+            state=self.state,
+            sources=self.sources,
+        )
 
 
 @dataclass(frozen=True)

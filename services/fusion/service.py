@@ -173,7 +173,7 @@ class Fusion:
         changed, self._state = (estimate.state == "lost") != (self._state == "lost"), estimate.state
         if not self.node.owns(self.target):
             return
-        self.node.publish(topics.FUSED, self._message(stamp_ns, estimate), target=self.target)
+        self.node.publish(topics.FUSED, estimate.message(stamp_ns, self.target, self.node.cell.frame), target=self.target)
         if changed:
             counts = {f"{source}_{what}": n for source, c in self.observer.log.counts.items() for what, n in vars(c).items() if n}
             self.node.log.info("lost" if estimate.state == "lost" else "found", target=self.target, **counts)
@@ -189,23 +189,10 @@ class Fusion:
             if "stamp_ns" in parameters:
                 stamp_ns = _within(parameters["stamp_ns"], self.observer.earliest_ns, stamp_ns)
             estimate = self.observer.estimate(stamp_ns)
-        message = self._message(stamp_ns, estimate)
+        message = estimate.message(stamp_ns, self.target, self.node.cell.frame)
         if form == "msgpack":
             return messages.encode(message), "application/msgpack"
         return json.dumps(as_json(message)).encode(), "application/json"
-
-    def _message(self, stamp_ns: int, estimate: Estimate) -> messages.FusedPose:
-        return messages.FusedPose(
-            stamp_ns=stamp_ns,
-            target=self.target,
-            frame=self.node.cell.frame,
-            position=estimate.T[:3, 3],
-            orientation=np.array(so3.quaternion(estimate.T[:3, :3])),
-            velocity=estimate.velocity,
-            covariance=estimate.covariance,
-            state=estimate.state,
-            sources=estimate.sources,
-        )
 
 
 def _within(text: str, earliest_ns: int, now_ns: int) -> int:

@@ -38,7 +38,6 @@ from rich.progress import Progress
 from rich.table import Table
 from scipy.stats import chi2
 
-from services.fusion import so3
 from services.fusion.estimate import SOURCES, Estimate
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
@@ -257,18 +256,7 @@ def step_times(seed: int, seconds: float) -> dict[str, float]:
 
 def encoded(estimate: Estimate, stamp_ns: int) -> bytes:
     """The pose at a stamp as it goes over the bus."""
-    message = messages.FusedPose(
-        stamp_ns=stamp_ns,
-        target="forearm",
-        frame="world",
-        position=estimate.T[:3, 3],
-        orientation=np.array(so3.quaternion(estimate.T[:3, :3])),
-        velocity=estimate.velocity,
-        covariance=estimate.covariance,
-        state=estimate.state,
-        sources=estimate.sources,
-    )
-    return messages.encode(message)
+    return messages.encode(estimate.message(stamp_ns, "forearm", "world"))
 
 
 def core_shares(seed: int, seconds: float) -> list[dict[str, float]]:
