@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from services.fusion.filter import Sense
-from services.fusion.kernel import UNITS
+from services.fusion.records import UNITS
 from shared import geometry
 from shared.geometry import Array
 

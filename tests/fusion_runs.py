@@ -2,7 +2,7 @@
 
 Nothing is drawn from the filter's own model. A limb makes minimum-jerk reaches with rests (`sim.motion`). A sense's errors lie
 along its own axes, the camera's ray or the limb, and their share that lasts and the time it lasts are drawn anew for every run,
-around what the filter assumes: vision a share of 0.6 to 0.9 and 0.5 to 2 s (0.8 and 1 s assumed), the skin 0.1 to 0.4 and 0.15
+around what the filter assumes: vision a share of 0.6 to 0.9 and 0.5 to 2 s (0.75 and 1 s assumed), the skin 0.1 to 0.4 and 0.15
 to 0.6 s (0.2 and 0.3 s). On top comes what no covariance tells, the calibration: constant over a run, in every direction of a
 standard deviation of 0.5 mm and 0.3 degrees.
 """

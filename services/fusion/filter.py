@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from services.fusion.estimate import SOURCES, Array, Limits
-from services.fusion.kernel import MODEL, POSE
+from services.fusion.records import MODEL, POSE
 
 
 @dataclass(frozen=True)
@@ -18,13 +18,13 @@ class Sense:
 
     lasting : share of the variance that is the same from one measurement to the next.
     time_constant : after which such an error is forgotten [s].
-    floor : standard deviation, in UNITS, of what its covariance does not tell, its calibration: 0.01 is 1 mm and 0.6 degrees. All
-        of it lasts.
+    floor : standard deviation, in UNITS, of what its covariance does not tell, its calibration: 0.006 is 0.6 mm and 0.34 degrees.
+        All of it lasts.
     """
 
-    lasting: float = 0.8
+    lasting: float = 0.75
     time_constant: float = 1.0
-    floor: float = 0.01
+    floor: float = 0.006
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Settings:
     acceleration : density of the white acceleration, linear [m^2/s^3] and angular [rad^2/s^3]: an arm that reaches 0.25 m/s.
     velocity_time : after which a velocity is forgotten [s]: limbs reach to places and stop there.
     velocity_spread : standard deviation of an unknown velocity, linear [m/s] and angular [rad/s].
-    agility : bounds of the factor on `acceleration` that is learned: from a resting arm to a hand at 2 m/s.
+    agility : bounds of the factors on `acceleration` that are learned: from a resting arm to a hand at 2 m/s.
     doubt : largest factor on the covariance of a sense that is learned.
-    learning : step of both per measurement, at most, and per second.
-    gate : probability with which a good measurement passes the gate.
+    learning : step of all of them per measurement, at most, and per second.
+    gate : probability with which a good measurement passes the gate; the second, while another sense is less surprising.
     patience : after refusing everything of all senses for so long [s], start again from the newest measurement.
     source_patience : after refusing one sense for so long [s] while another is believed, doubt the state.
     witness : a refused measurement teaches nothing while another sense, heard within so long [s], is less surprising.
@@ -55,10 +55,10 @@ class Settings:
     acceleration: tuple[float, float] = (0.1, 1.5)
     velocity_time: float = 0.35
     velocity_spread: tuple[float, float] = (0.4, 1.0)
-    agility: tuple[float, float] = (0.1, 30.0)
+    agility: tuple[float, float] = (0.08, 30.0)
     doubt: float = 100.0
     learning: tuple[float, float] = (0.1, 5.0)
-    gate: float = 0.999
+    gate: tuple[float, float] = (0.9999, 0.999)
     patience: float = 0.5
     source_patience: float = 1.0
     witness: float = 0.25
@@ -79,6 +79,7 @@ def model(settings: Settings, home: Array, spread: tuple[float, float]) -> NDArr
             out[name] = values[name]
     for name in ("lasting", "time_constant", "floor"):
         out[name] = [getattr(settings.senses[source], name) for source in SOURCES]
-    out["threshold"] = [2.0 * gammaincinv(0.5 * max(k, 1), settings.gate) for k in range(POSE + 1)]  # chi-square quantiles
+    ranks = np.maximum(np.arange(POSE + 1), 1)
+    out["threshold"] = 2.0 * gammaincinv(0.5 * ranks, np.array(settings.gate)[:, None])  # chi-square quantiles
     out["home_covariance"] = np.diag(np.repeat(np.square(spread), 3))
     return out

@@ -10,8 +10,9 @@ its variance belongs to the sense's bias, a first-order Gauss-Markov process tha
 bias is kept in units of the measurement's own standard deviation, which changes with distance and occlusion: a measurement of
 covariance L L' reads pose + sqrt(lasting) L bias + white noise.
 
-Two numbers are learned from the innovations on the way, both from whether each resembles the one before of the same sense.
-Innovations that resemble each other mean that the filter lags behind the limb: more process noise. Innovations that are too large
+Numbers are learned from the innovations on the way, all from whether each resembles the one before of the same sense.
+Innovations that resemble each other mean that the filter lags behind the limb: more process noise, linear and angular each on its
+own, or a limb that turns would make way for a sense that is wrong about where it is. Innovations that are too large
 and do not resemble each other mean that the sense is noisier than it says: less belief in it, never more than it asks for.
 
 Measurements come late and out of order: the filter goes back to the stamp, applies, and replays what came after. The result
@@ -20,7 +21,7 @@ filter, what it refused included, is a function of the state before and the meas
 the order of stamp and source, each with the state after it. Its first entry is the newest one that is older than the horizon:
 nothing is inserted before it. `ring` (2,) holds the slot of the first entry and the number of entries.
 
-Everything works in place on records (`MODEL`, `MEASUREMENT`, `STATE`); `measure_all` and `estimate_all` are called from outside,
+Everything works in place on the records of `records.py`; `measure_all` and `estimate_all` are called from outside,
 for as many targets as there are. It is one file because numba keeps what it compiled until the file of the function called from
 outside changes: after a change of `so3.py`, or of what is compiled in `estimate.py`, delete services/fusion/__pycache__.
 
@@ -38,91 +39,14 @@ import numpy as np
 from numba import njit
 
 from services.fusion import so3
-from services.fusion.estimate import ACCEPTED, DUPLICATE, GATED, LATE, LOST, NOTHING, SOURCES, fault, state_of
+from services.fusion.estimate import ACCEPTED, DUPLICATE, GATED, LATE, LOST, NOTHING, fault, state_of
+from services.fusion.records import MEASUREMENT, MOTION, NEVER, POSE, SENSES, SIZE, UNITS
 
-POSE, MOTION = 6, 12  # sizes of the pose, and of the pose with its velocities, within the state
-UNITS = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
-"""Units [m, rad] in which translations and rotations compare: a turn by 1 rad moves the ends of a forearm by about 10 cm."""
-SENSES = len(SOURCES)
-SIZE = MOTION + POSE * SENSES
 HASTE = 4.0
 """So many times as fast a measurement that is refused teaches that the limb is faster: while it is, all are refused."""
-NEVER = -(1 << 62)
-"""The stamp of what has not happened."""
-
-MODEL = np.dtype(
-    [
-        *((name, "f8", SENSES) for name in ("lasting", "time_constant", "floor")),  # as in Sense
-        *((name, "f8", 2) for name in ("acceleration", "velocity_spread", "agility", "learning")),  # as in Settings
-        *((name, "f8") for name in ("velocity_time", "doubt", "patience", "source_patience", "refusals", "unobserved")),
-        ("witness", "f8"),
-        *((name, "f8") for name in ("horizon", "weight_time", "lost_age")),
-        ("limits", "f8", 4),  # as in Limits
-        ("threshold", "f8", POSE + 1),  # squared Mahalanobis distance that the gate lets pass, by rank
-        ("home", "f8", (4, 4)),
-        ("home_covariance", "f8", (POSE, POSE)),
-    ]
-)
-"""The settings, with the home of one target, as compiled code reads them."""
-
-MEASUREMENT = np.dtype(
-    [
-        ("stamp_ns", "i8"),
-        ("source", "i8"),  # which of SOURCES
-        ("rank", "i8"),  # k, how many directions it observes; what follows has k rows in use
-        ("p", "f8", 3),
-        ("R", "f8", (3, 3)),
-        ("directions", "f8", (POSE, POSE)),  # unit vectors (k, 6), in UNITS
-        ("basis", "f8", (POSE, POSE)),  # (k, 6): `basis @ error` has independent entries ...
-        ("sigma", "f8", POSE),  # ... with these standard deviations (k,)
-        ("has_axis", "i8"),  # whether the rotation about `axis` is not observed (a limb's, where its roll is not seen)
-        ("axis", "f8", 3),
-        ("slides", "i8"),  # whether a translation is not observed (along a limb, where neither of its ends is seen)
-    ]
-)
-"""One pose of one sense, reduced to the directions that it observes."""
-
-STATE = np.dtype(
-    [
-        ("stamp_ns", "i8"),  # NEVER: nothing is known yet
-        ("accepted_ns", "i8"),  # stamp of the last accepted measurement of any sense
-        ("passed", "i8"),  # whether the last measurement was accepted
-        ("distance", "f8"),  # its squared Mahalanobis distance, and how many directions that has: 0 where it began the state
-        ("rank", "i8"),
-        ("p", "f8", 3),
-        ("R", "f8", (3, 3)),
-        ("velocity", "f8", POSE),
-        ("bias", "f8", SIZE - MOTION),
-        ("P", "f8", (SIZE, SIZE)),  # covariance of the errors of position, rotation, velocities, and the bias of each sense
-        ("agility", "f8"),  # learned factor on the process noise
-        # by sense
-        ("came_ns", "i8", SENSES),  # stamp of the last measurement
-        ("surprise", "f8", SENSES),  # its squared Mahalanobis distance a direction
-        ("heard_ns", "i8", SENSES),  # stamp of the last measurement that taught something
-        ("believed_ns", "i8", SENSES),  # and of the last accepted one
-        ("refused", "i8", SENSES),  # how many were refused since
-        ("refused_ns", "i8", SENSES),  # stamp of the first of them
-        # information that it brought [nats], fading: by how much it made the logarithm of the volume of the pose's uncertainty
-        # smaller. It counts what was new: the hundredth measurement with the same error brings next to nothing
-        ("gain", "f8", SENSES),
-        ("doubt", "f8", SENSES),  # learned factor on its covariance
-        ("has_innovation", "i8", SENSES),
-        ("innovation", "f8", (SENSES, POSE)),  # the last one, in units of its standard deviation
-    ]
-)
-"""The filter after one measurement."""
-
-ESTIMATE = np.dtype(
-    [
-        ("T", "f8", (4, 4)),
-        ("velocity", "f8", POSE),
-        ("covariance", "f8", (POSE, POSE)),
-        ("state", "i8"),  # which of STATES
-        ("believed_ns", "i8", SENSES),  # stamp of the last accepted measurement of each sense, NEVER where there is none
-        ("weight", "f8", SENSES),
-    ]
-)
-"""What is answered for one target: `estimate.Estimate` in arrays."""
+ODD = 2.0
+"""From so large a squared Mahalanobis distance a direction, 1 expected, a measurement is not heard on how fast the limb is while
+another sense is less surprising: a sense that is wrong by little drags the state along."""
 
 
 @njit(cache=True)
@@ -131,7 +55,7 @@ def forget(state):  # type: ignore[no-untyped-def]
     state.stamp_ns = state.accepted_ns = NEVER
     state.passed = state.rank = 0
     state.distance = 0.0
-    state.agility = 1.0
+    state.agility[0] = state.agility[1] = 1.0
     for i in range(POSE):
         state.velocity[i] = 0.0
     for i in range(POSE * SENSES):
@@ -200,16 +124,19 @@ def step(model, state, m):  # type: ignore[no-untyped-def]
         distance = so3.dot(innovation, innovation)
         state.distance, state.rank = distance, m.rank
         state.surprise[m.source], state.came_ns[m.source] = distance / m.rank, m.stamp_ns
-        passes = distance <= model.threshold[m.rank]
-        if passes or not _is_contradicted(model, state, m):
-            learn(model, state, m, innovation, 1.0 if passes else HASTE)
+        contradicted = _is_contradicted(model, state, m)
+        passes = distance <= model.threshold[1 if contradicted else 0, m.rank]
+        if not passes and not contradicted:
+            learn(model, state, m, innovation, HASTE)
+        elif passes:
+            learn(model, state, m, innovation, 0.0 if contradicted and distance > ODD * m.rank else 1.0)
         if passes:
             break
         if state.refused[m.source] == 0:
             state.refused_ns[m.source] = m.stamp_ns
         state.refused[m.source] += 1
         state.passed = 0
-        if _is_blind(model, state) and not _is_contradicted(model, state, m):
+        if _is_blind(model, state) and not contradicted:
             start(model, state, m, state.p.copy(), state.R.copy(), state.P[:POSE, :POSE] + model.home_covariance)
         elif _is_persistent(model, state, m):
             # So long a disagreement is no outlier: one of the senses is biased beyond its covariance, nobody knows which.
@@ -224,8 +151,8 @@ def step(model, state, m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _is_contradicted(model, state, m):  # type: ignore[no-untyped-def]
-    """Whether another sense, heard lately, is less surprising, believed or not: then a refused measurement is wrong rather than
-    the state. What it would teach is that the limb is faster, until it passes the gate."""
+    """Whether another sense, heard lately, is less surprising, believed or not: then a surprising measurement is wrong rather
+    than the state. What it would teach is that the limb is faster, until it passes the gate."""
     for s in range(SENSES):
         if m.stamp_ns - state.came_ns[s] < model.witness * 1e9 and state.surprise[s] < state.surprise[m.source]:
             return True
@@ -285,7 +212,7 @@ def start(model, state, m, p, R, covariance):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def move(model, dt, p, R, velocity, P, agility):  # type: ignore[no-untyped-def]
     """Takes a pose, its velocity (6,) and the covariance P (n, n), n >= 12, on by dt [s]: an integrated Ornstein-Uhlenbeck
-    velocity. F and Q are its transition and process noise, P = F P F' + Q; entries beyond the 12th stay."""
+    velocity; agility (2,). F and Q are its transition and process noise, P = F P F' + Q; entries beyond the 12th stay."""
     tau = model.velocity_time
     decay, reach, twice = math.exp(-dt / tau), -tau * math.expm1(-dt / tau), -0.5 * tau * math.expm1(-2.0 * dt / tau)
     rotation = reach * velocity[3:]
@@ -298,7 +225,7 @@ def move(model, dt, p, R, velocity, P, agility):  # type: ignore[no-untyped-def]
             for j in range(i):
                 P[i, j], P[j, i] = P[j, i], P[i, j]
     for i in range(POSE):
-        density = agility * model.acceleration[i // 3]
+        density = agility[i // 3] * model.acceleration[i // 3]
         P[i, i] += density * max(0.0, tau**2 * (dt - 2.0 * reach + twice))
         P[i, i + 6] += density * 0.5 * reach**2
         P[i + 6, i] += density * 0.5 * reach**2
@@ -419,7 +346,7 @@ def innovated(model, state, m, z, H):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def learn(model, state, m, innovation, haste):  # type: ignore[no-untyped-def]
-    """Adapts agility and doubt to an innovation (6,)."""
+    """Adapts the agilities, `haste` times as fast as usual, and the doubt to an innovation (6,)."""
     s = m.source
     length = math.sqrt(so3.dot(innovation, innovation) / m.rank)
     innovation = min(1.0, 2.0 / max(length, 1e-9)) * innovation  # an outlier teaches no more than two sigma do
@@ -427,7 +354,15 @@ def learn(model, state, m, innovation, haste):  # type: ignore[no-untyped-def]
         step = min(model.learning[0], model.learning[1] * (m.stamp_ns - state.heard_ns[s]) * 1e-9)
         alike = so3.dot(innovation, state.innovation[s]) / m.rank  # 0 expected
         unlike = so3.dot(innovation, innovation) / m.rank - alike  # 1 expected
-        state.agility = min(max(state.agility * math.exp(haste * step * alike), model.agility[0]), model.agility[1])
+        for half in range(2):
+            share, along = 0.0, 0.0
+            for i in range(3 * half, 3 * half + 3):
+                along += innovation[i] * state.innovation[s, i]
+                for k in range(m.rank):
+                    share += m.directions[k, i] ** 2
+            if share > 1e-3:
+                faster = state.agility[half] * math.exp(haste * step * along / share)
+                state.agility[half] = min(max(faster, model.agility[0]), model.agility[1])
         state.doubt[s] = min(max(state.doubt[s] * math.exp(0.5 * step * (unlike - 1.25)), 1.0), model.doubt)
     state.heard_ns[s], state.has_innovation[s] = m.stamp_ns, 1
     for i in range(POSE):

@@ -24,7 +24,7 @@ from services.fusion.estimate import (
     shaped,
 )
 from services.fusion.filter import Settings, model
-from services.fusion.kernel import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, STATE
+from services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, STATE
 from shared import geometry
 from shared.messages import Source
 
@@ -148,7 +148,7 @@ class ErrorStateObserver:
         """The pose at a stamp, from the measurements up to it. Disturbs nothing.
 
         A stamp before the history reads its oldest state. A source's weight is its share of the information that the senses
-        brought in the last `weight_time`, fading exponentially; information in nats, as `kernel.STATE` defines its gain.
+        brought in the last `weight_time`, fading exponentially; information in nats, as `records.STATE` defines its gain.
         """
         found = self._bank.estimate(stamp_ns, slice(self._target, self._target + 1))
         return _told(found, [self.log], stamp_ns)[0]
