@@ -1,33 +1,131 @@
-"""The loop that every network's training runs: so many steps, or minutes over all runs, with checkpoints and a progress bar."""
+"""How networks are trained: a trainer with checkpoints, the loop of so many steps, or minutes over all runs, and its flags."""
 
 from __future__ import annotations
 
+import argparse
+import copy
+import math
+import signal
 import time
+from abc import ABC, abstractmethod
+from dataclasses import asdict
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
+import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-D = TypeVar("D", contravariant=True)
+
+class Data(Protocol):
+    """What is learned from; something may be making more of it."""
+
+    def close(self) -> None:
+        """Make no more."""
 
 
-class Trainer(Protocol[D]):
-    """A network that learns from data. step, minutes: so many so far, over all runs."""
+D = TypeVar("D", bound=Data)
+N = TypeVar("N", bound=torch.nn.Module)
 
-    step: int
-    minutes: float
 
+class Trainer(ABC, Generic[N, D]):
+    """A network `net` that learns from data, its optimiser, and the running average of its weights, which is exported.
+
+    SETTINGS: the dataclass of the network's settings. step, minutes: so many so far, over all runs. started_from: what the card
+    of the weights told that it began with, None where it began with nothing.
+    """
+
+    SETTINGS: ClassVar[type]
+
+    def __init__(self, settings: Any, schedule: Any, seed: int, net: N, optimizer: torch.optim.Optimizer):
+        self.settings, self.schedule, self.seed = settings, schedule, seed
+        self.net, self.average, self.optimizer = net, copy.deepcopy(net), optimizer
+        self.step, self.minutes = 0, 0.0
+        self.started_from: dict[str, Any] | None = None
+
+    @abstractmethod
     def train_step(self, data: D, progress: float) -> dict[str, float]:
         """A step at a share of the whole training in [0, 1]; returns the parts of its loss."""
-        ...
+
+    def descend(self, total: torch.Tensor, rate: float, clip: float, averaging: float) -> None:
+        """A step down the gradient of a loss, its norm clipped; the average keeps a share `averaging`, less in the beginning."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.optimizer.zero_grad()
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), clip)
+        self.optimizer.step()
+        self.step += 1
+        keep = min(averaging, self.step / (self.step + 10.0))
+        with torch.no_grad():
+            for mean, value in zip(self.average.state_dict().values(), self.net.state_dict().values(), strict=True):
+                if mean.is_floating_point():
+                    mean.lerp_(value, 1.0 - keep)
 
     def save(self, path: Path) -> None:
-        """Writes a checkpoint."""
-        ...
+        """Writes a checkpoint from which `restore` goes on."""
+        content = {
+            "net": self.net.state_dict(),
+            "average": self.average.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "step": self.step,
+            "minutes": self.minutes,
+            "settings": asdict(self.settings),
+            "seed": self.seed,
+            "started_from": self.started_from,
+        }
+        part = path.with_suffix(".part")
+        torch.save(content, part)
+        part.replace(path)
+
+    @classmethod
+    def restore(cls, path: Path, schedule: Any) -> Self:
+        """The trainer of a checkpoint; network and seed are the checkpoint's."""
+        content = torch.load(path, weights_only=True)
+        trainer = cls(cls.SETTINGS(**content["settings"]), schedule, content["seed"])  # type: ignore[call-arg]
+        trainer.net.load_state_dict(content["net"])
+        trainer.average.load_state_dict(content["average"])
+        trainer.optimizer.load_state_dict(content["optimizer"])
+        trainer.step, trainer.minutes, trainer.started_from = content["step"], content["minutes"], content["started_from"]
+        return trainer
+
+
+def one_cycle(progress: float, rise: float) -> float:
+    """The learning rate of the one-cycle policy (Smith 2018, arXiv:1708.07120) as a share of its peak, at a progress in [0, 1];
+    it rises until the progress `rise`."""
+    if progress < rise:
+        return 0.05 + 0.95 * progress / rise
+    fall = min((progress - rise) / (1.0 - rise), 1.0)
+    return 0.005 + 0.995 * 0.5 * (1.0 + math.cos(math.pi * fall))
+
+
+def add_arguments(parser: argparse.ArgumentParser, name: str, minutes: float) -> None:
+    """The flags of every training; minutes: how long it takes where nothing else is asked for."""
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--minutes", type=float, default=minutes, help="train for so long (default: %(default)g)")
+    length.add_argument("--steps", type=int, help="train for so many steps instead: the same result on every run of one machine")
+    parser.add_argument("--seed", type=int, default=0, help="of data, initial weights and batches")
+    parser.add_argument("--checkpoint", type=Path, default=Path(f"{name}.checkpoint"), help="written every few minutes")
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if there is one")
+
+
+def complete(trainer: Trainer[Any, D], data: D, options: argparse.Namespace) -> bool:
+    """Trains as the flags of `add_arguments` ask, on one thread, and closes the data. False where Ctrl-C or SIGTERM ended it: the
+    checkpoint is written then, and the user told how to go on."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    torch.set_num_threads(1)
+    try:
+        run(trainer, data, options.steps, options.minutes, options.checkpoint)
+    except KeyboardInterrupt:
+        trainer.save(options.checkpoint)
+        print(f"stopped at step {trainer.step}: go on with --resume --checkpoint {options.checkpoint}")
+        return False
+    finally:
+        data.close()
+    return True
 
 
 def run(
-    trainer: Trainer[D], data: D, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0
+    trainer: Trainer[Any, D], data: D, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0
 ) -> dict[str, float]:
     """Train up to so many steps, or minutes (over all runs); shows a progress bar. Returns the loss's parts, smoothed."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())

@@ -14,7 +14,7 @@ from services import cli, launch
 from services.posecnn import estimator, evaluate, loss, network, patch, train, voting
 from services.posecnn.estimator import PoseCNN
 from services.posecnn.uncertainty import KINDS, Signs, Uncertainty, errors, fitted
-from shared import body, geometry, raster, topics
+from shared import body, geometry, raster, topics, training
 from shared import cell as cells
 from shared.classes import Label
 from shared.messages import Frame
@@ -171,7 +171,7 @@ def trained(data, steps, checkpoint, resume_at=None):
             trainer.train_step(data, trainer.step / steps)
         trainer.save(checkpoint)
         trainer = train.Trainer.restore(checkpoint, schedule)
-    return trainer, train.run(trainer, data, steps, 0.0, checkpoint)
+    return trainer, training.run(trainer, data, steps, 0.0, checkpoint)
 
 
 def test_training_that_was_interrupted_ends_with_the_same_weights(data, tmp_path):

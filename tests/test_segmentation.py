@@ -10,6 +10,7 @@ import torch
 from services.segmentation import compiled, evaluate, infer, loss, prednet, train
 from services.segmentation.crop import shift_state
 from services.segmentation.prednet import PredNet, Settings
+from shared import training
 from shared.classes import Label
 from shared.window import Window, corners_of, window_around
 from sim import sequences, shots
@@ -127,7 +128,7 @@ def trained(data, steps: int, checkpoint, resume_at: int | None = None) -> train
             trainer.train_step(data, trainer.step / steps)
         trainer.save(checkpoint)
         trainer = train.Trainer.restore(checkpoint, schedule)
-    train.run(trainer, data, steps, 0.0, checkpoint)
+    training.run(trainer, data, steps, 0.0, checkpoint)
     return trainer
 
 

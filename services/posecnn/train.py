@@ -9,11 +9,9 @@ that was not.
 from __future__ import annotations
 
 import argparse
-import copy
 import datetime
 import multiprocessing
 import os
-import signal
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass
@@ -29,11 +27,10 @@ from torch import Tensor
 from services.posecnn import evaluate, loss, network, patch
 from services.posecnn.estimator import WEIGHTS
 from services.posecnn.network import REFERENCE_PX, STRIDE, Network, Settings, proportions
-from shared import body, geometry
+from shared import body, geometry, training
 from shared import cell as cells
 from shared.classes import Label
 from shared.geometry import Array
-from shared.training import run
 from sim import sequences, shots
 
 VALIDATION_SEED = 2_000_000
@@ -94,12 +91,8 @@ class Schedule:
     region: tuple[float, float] = (0.05, 0.08)
 
     def rate(self, progress: float) -> float:
-        """The learning rate of the one-cycle policy (Smith 2018, arXiv:1708.07120) at a progress in [0, 1]."""
-        rise = 0.08
-        if progress < rise:
-            return self.peak_rate * (0.05 + 0.95 * progress / rise)
-        fall = min((progress - rise) / (1.0 - rise), 1.0)
-        return self.peak_rate * (0.005 + 0.995 * 0.5 * (1.0 + float(np.cos(np.pi * fall))))
+        """The learning rate at a progress in [0, 1]."""
+        return self.peak_rate * training.one_cycle(progress, 0.08)
 
 
 @dataclass(frozen=True)
@@ -231,16 +224,17 @@ def colour(pixels: NDArray[np.uint8], rng: np.random.Generator, amount: float) -
     return np.clip((mean + np.float32(contrast) * (picture - mean)) * gain, 0.0, 1.0)
 
 
-class Trainer:
-    """A network being trained, its optimiser and how far it has come."""
+class Trainer(training.Trainer[Network, Simulated]):
+    """PoseCNN being trained."""
+
+    SETTINGS = Settings
+    schedule: Schedule
 
     def __init__(self, settings: Settings, schedule: Schedule, seed: int):
         torch.manual_seed(seed)
-        self.settings, self.schedule, self.seed = settings, schedule, seed
-        self.net = Network(settings)
-        self.average = copy.deepcopy(self.net).eval()
-        self.optimizer = torch.optim.AdamW(self.net.parameters(), weight_decay=schedule.decay)
-        self.step, self.minutes = 0, 0.0
+        net = Network(settings)
+        super().__init__(settings, schedule, seed, net, torch.optim.AdamW(net.parameters(), weight_decay=schedule.decay))
+        self.average.eval()
         mesh = body.forearm_mesh(cells.Body())
         hand = np.unique(mesh.faces[mesh.labels == Label.HAND])
         self._hand = torch.from_numpy(hand)
@@ -254,21 +248,10 @@ class Trainer:
         rng = np.random.default_rng([self.seed, 1, self.step])
         count = data.ensure(8 * CHUNK + self.step * schedule.batch // schedule.reuse)
         batch = draw_batch([data[i] for i in rng.integers(count, size=schedule.batch)], schedule, rng)
-        for group in self.optimizer.param_groups:
-            group["lr"] = schedule.rate(progress)
         parts = self._losses(batch, rng)
         total = sum(weight * parts[name] for name, weight in schedule.weights)
         assert isinstance(total, Tensor)
-        self.optimizer.zero_grad()
-        total.backward()
-        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
-        self.optimizer.step()
-        self.step += 1
-        keep = min(schedule.averaging, self.step / (self.step + 10.0))
-        with torch.no_grad():
-            for mean, value in zip(self.average.state_dict().values(), self.net.state_dict().values(), strict=True):
-                if mean.is_floating_point():
-                    mean.lerp_(value, 1.0 - keep)
+        self.descend(total, schedule.rate(progress), 5.0, schedule.averaging)
         return {name: float(value.detach()) for name, value in parts.items()} | {"total": float(total.detach())}
 
     def _losses(self, batch: Batch, rng: np.random.Generator) -> dict[str, Tensor]:
@@ -287,26 +270,6 @@ class Trainer:
         )
         seen = torch.isin(batch.labels, torch.tensor(loss.TARGET_LABELS)).sum((1, 2)) >= 8
         return parts | {"rotation": (missed * seen).sum() / seen.sum().clamp_min(1)}
-
-    def save(self, path: Path) -> None:
-        """Write a checkpoint from which `restore` goes on."""
-        part = path.with_suffix(".part")
-        content = {"net": self.net.state_dict(), "average": self.average.state_dict(), "optimizer": self.optimizer.state_dict()}
-        torch.save(
-            {**content, "step": self.step, "minutes": self.minutes, "settings": asdict(self.settings), "seed": self.seed}, part
-        )
-        part.replace(path)
-
-    @classmethod
-    def restore(cls, path: Path, schedule: Schedule) -> Trainer:
-        """The trainer of a checkpoint; network and seed are the checkpoint's."""
-        content = torch.load(path, weights_only=True)
-        trainer = cls(Settings(**content["settings"]), schedule, content["seed"])
-        trainer.net.load_state_dict(content["net"])
-        trainer.average.load_state_dict(content["average"])
-        trainer.optimizer.load_state_dict(content["optimizer"])
-        trainer.step, trainer.minutes = content["step"], content["minutes"]
-        return trainer
 
 
 def held_out_shots(seed: int, count: int) -> Iterator[shots.Shot]:
@@ -342,12 +305,7 @@ def export(trainer: Trainer, out: Path, each: int) -> dict[str, Any]:
 def arguments() -> argparse.ArgumentParser:
     """The flags of `penumbra posecnn train`."""
     parser = argparse.ArgumentParser(prog="penumbra posecnn train", description="Train PoseCNN on simulated pictures.")
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--minutes", type=float, default=75.0, help="train for so long (default: %(default)g)")
-    length.add_argument("--steps", type=int, help="train for so many steps instead: the same result on every run of one machine")
-    parser.add_argument("--seed", type=int, default=0, help="of data, initial weights and batches")
-    parser.add_argument("--checkpoint", type=Path, default=Path("posecnn.checkpoint"), help="written every few minutes")
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if there is one")
+    training.add_arguments(parser, "posecnn", 75.0)
     parser.add_argument("--cache", type=Path, default=Path("posecnn-data"), help="folder of rendered pictures (6 GB)")
     parser.add_argument(
         "--out", type=Path, default=WEIGHTS, help="the weights, their card beside them (default: the committed ones)"
@@ -359,22 +317,14 @@ def arguments() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Train, then write weights and card."""
     options = arguments().parse_args(argv)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C: checkpoint written, renderer stopped
-    torch.set_num_threads(1)
     schedule = Schedule()
     if options.resume and options.checkpoint.is_file():
         trainer = Trainer.restore(options.checkpoint, schedule)
     else:
         trainer = Trainer(Settings(), schedule, options.seed)
     data = Simulated(options.cache, trainer.seed, schedule.most)
-    try:
-        run(trainer, data, options.steps, options.minutes, options.checkpoint)
-    except KeyboardInterrupt:
-        trainer.save(options.checkpoint)
-        print(f"stopped at step {trainer.step}: go on with --resume --checkpoint {options.checkpoint}")
+    if not training.complete(trainer, data, options):
         return 130
-    finally:
-        data.close()
     card = export(trainer, options.out, options.held_out)
     print(f"{options.out}: {card['held_out']}")
     return 0

@@ -8,11 +8,9 @@ progress, so that a run of --steps interrupted and resumed ends with the same we
 from __future__ import annotations
 
 import argparse
-import copy
 import datetime
 import multiprocessing
 import os
-import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -27,7 +25,7 @@ from numpy.typing import NDArray
 from services.segmentation import infer, loss, prednet, recordings
 from services.segmentation.evaluate import Labelled, calibrate, held_out
 from services.segmentation.prednet import PredNet, Settings
-from shared.training import run
+from shared import training
 from sim import sequences
 
 VALIDATION_SEED = 1_000_000
@@ -54,12 +52,8 @@ class Schedule:
     seen: tuple[tuple[int, float], ...] = ((0, 0.4), (4, 0.3), (12, 0.2), (36, 0.1))
 
     def rate(self, progress: float) -> float:
-        """The learning rate of the one-cycle policy (Smith 2018, arXiv:1708.07120) at a progress in [0, 1]."""
-        rise = 0.15
-        if progress < rise:
-            return self.peak_rate * (0.05 + 0.95 * progress / rise)
-        fall = min((progress - rise) / (1.0 - rise), 1.0)
-        return self.peak_rate * (0.005 + 0.995 * 0.5 * (1.0 + float(np.cos(np.pi * fall))))
+        """The learning rate at a progress in [0, 1]."""
+        return self.peak_rate * training.one_cycle(progress, 0.15)
 
     def before(self, rng: np.random.Generator) -> int:
         """Frames that the state shall have seen, drawn from `seen`."""
@@ -159,17 +153,16 @@ def _render_to(path: Path, render: Render, seed: int, index: int) -> None:
     part.replace(path)  # a file is there wholly or not at all
 
 
-class Trainer:
-    """A network being trained, its optimiser and how far it has come."""
+class Trainer(training.Trainer[PredNet, Data]):
+    """PredNet being trained."""
+
+    SETTINGS = Settings
+    schedule: Schedule
 
     def __init__(self, settings: Settings, schedule: Schedule, seed: int):
         torch.manual_seed(seed)
-        self.settings, self.schedule, self.seed = settings, schedule, seed
-        self.net = PredNet(settings)
-        self.started_from: dict[str, Any] | None = None
-        self.average = copy.deepcopy(self.net)
-        self.optimizer = torch.optim.Adam(self.net.parameters(), betas=(0.9, 0.98))
-        self.step, self.minutes = 0, 0.0
+        net = PredNet(settings)
+        super().__init__(settings, schedule, seed, net, torch.optim.Adam(net.parameters(), betas=(0.9, 0.98)))
         self._half = infer.fastest_dtype() is torch.bfloat16
 
     def train_step(self, data: Data, progress: float) -> dict[str, float]:
@@ -181,22 +174,12 @@ class Trainer:
         images, labels = draw_batch(
             [data[i] for i in rng.integers(count, size=batch)], self.schedule.frames, size, rng, data.jitter
         )
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.schedule.rate(progress)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
             parts = self._losses(images, labels, self.schedule.before(rng))
         schedule = self.schedule
         weights = {"focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
         total = parts["dice"] + sum(weight * parts[name] for name, weight in weights.items())
-        self.optimizer.zero_grad()
-        total.backward()
-        torch.nn.utils.clip_grad_norm_(self.net.parameters(), self.schedule.clip)
-        self.optimizer.step()
-        self.step += 1
-        keep = min(self.schedule.averaging, self.step / (self.step + 10.0))
-        with torch.no_grad():
-            for mean, value in zip(self.average.parameters(), self.net.parameters(), strict=True):
-                mean.lerp_(value, 1.0 - keep)
+        self.descend(total, schedule.rate(progress), schedule.clip, schedule.averaging)
         return {name: float(value.detach()) for name, value in parts.items()} | {"total": float(total.detach())}
 
     def _losses(self, images: torch.Tensor, labels: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
@@ -222,34 +205,6 @@ class Trainer:
             "target": loss.target_dice(all_logits, all_labels),
             "error": torch.stack(errors).mean(),
         }
-
-    def save(self, path: Path) -> None:
-        """Write a checkpoint from which `restore` goes on."""
-        part = path.with_suffix(".part")
-        content = {"net": self.net.state_dict(), "average": self.average.state_dict(), "optimizer": self.optimizer.state_dict()}
-        torch.save(
-            {
-                **content,
-                "step": self.step,
-                "minutes": self.minutes,
-                "settings": asdict(self.settings),
-                "seed": self.seed,
-                "started_from": self.started_from,
-            },
-            part,
-        )
-        part.replace(path)
-
-    @classmethod
-    def restore(cls, path: Path, schedule: Schedule) -> Trainer:
-        """The trainer of a checkpoint; network, delay and seed are the checkpoint's."""
-        content = torch.load(path, weights_only=True)
-        trainer = cls(Settings(**content["settings"]), schedule, content["seed"])
-        trainer.net.load_state_dict(content["net"])
-        trainer.average.load_state_dict(content["average"])
-        trainer.optimizer.load_state_dict(content["optimizer"])
-        trainer.step, trainer.minutes, trainer.started_from = content["step"], content["minutes"], content["started_from"]
-        return trainer
 
     @classmethod
     def begin(cls, path: Path, schedule: Schedule, seed: int) -> Trainer:
@@ -331,10 +286,7 @@ def arguments() -> argparse.ArgumentParser:
         epilog=recordings.__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--minutes", type=float, default=60.0, help="train for so long (default: 60)")
-    length.add_argument("--steps", type=int, help="train for so many steps instead: the same result on every run of one machine")
-    parser.add_argument("--seed", type=int, default=0, help="of data, initial weights and batches")
+    training.add_arguments(parser, "segmentation", 60.0)
     parser.add_argument("--size", type=int, nargs="+", help="channels of each layer (default: 16 16 32 64)")
     parser.add_argument("--delay", action=argparse.BooleanOptionalAction, default=False, help="axonal delays between the layers")
     parser.add_argument("--cell", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations")
@@ -347,8 +299,6 @@ def arguments() -> argparse.ArgumentParser:
         help="start from these weights (without a value: the committed ones), of their size, instead of random ones",
     )
     parser.add_argument("--data", type=Path, help="your own frames and masks, in the forms below, instead of simulated sequences")
-    parser.add_argument("--checkpoint", type=Path, default=Path("segmentation.checkpoint"), help="written every few minutes")
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if there is one")
     parser.add_argument("--cache", type=Path, default=Path("segmentation-data"), help="folder of rendered sequences (some GB)")
     parser.add_argument(
         "--out", type=Path, help="the weights, their card beside them (default: the committed ones; with --data segmentation.npz)"
@@ -360,8 +310,6 @@ def arguments() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Train, then write weights and card."""
     options = arguments().parse_args(argv)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C: checkpoint written, renderer stopped
-    torch.set_num_threads(1)
     schedule = Schedule()
     if options.error_weight is not None:
         schedule = replace(schedule, error_weight=options.error_weight)
@@ -383,14 +331,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"penumbra segmentation train: {error}", file=sys.stderr)
         return 2
     out = options.out or (Path("segmentation.npz") if options.data else infer.WEIGHTS)
-    try:
-        run(trainer, data, options.steps, options.minutes, options.checkpoint)
-    except KeyboardInterrupt:
-        trainer.save(options.checkpoint)
-        print(f"stopped at step {trainer.step}: go on with --resume --checkpoint {options.checkpoint}")
+    if not training.complete(trainer, data, options):
         return 130
-    finally:
-        data.close()
     card = export(trainer, out, data)
     print(f"{out}: {card['held_out']}")
     return 0
