@@ -74,6 +74,7 @@ def vision_by_distance(data: dict[str, Any], path: Path) -> None:
     )
     for axes, (error, title, unit) in zip(panels, shown, strict=True):
         _dress(axes, "camera distance [m]", unit, title)
+        ends: dict[str, tuple[float, float]] = {}
         for chain, rows in data["chains"].items():
             rows = [row for row in rows if row[error] is not None]
             if not rows:
@@ -85,12 +86,15 @@ def vision_by_distance(data: dict[str, Any], path: Path) -> None:
                     axes.plot(
                         [middle, middle], row[f"{error}_ci95"], color=COLOURS[chain], lw=5, alpha=0.3, solid_capstyle="butt"
                     )
-            if axes is panels[-1]:
-                _name(axes, x[-1], y[-1], NAMES[chain], COLOURS[chain])
+            ends[chain] = x[-1], y[-1]
         axes.set_xlim(1.0, 10.2)
         axes.set_xticks([2, 4, 6, 8, 10])
-        _plain(axes, _ticks(axes.dataLim.intervaly))
+        ticks = _ticks(axes.dataLim.intervaly)
+        _plain(axes, ticks)
         _focal_lengths(axes)
+    places = _apart([y for _, y in ends.values()], (ticks[-1] / ticks[0]) ** (1.0 / 15.0))
+    for (chain, (x_end, _)), y_end in zip(ends.items(), places, strict=True):
+        _name(axes, x_end, y_end, NAMES[chain], COLOURS[chain])
     _save(figure, path)
 
 
