@@ -22,6 +22,7 @@ from rich.table import Table
 
 from services.segmentation import evaluate, infer, train
 from services.segmentation.prednet import Settings
+from shared import training
 from sim import sequences, shots
 from tests.bench import segmentation
 
@@ -56,7 +57,7 @@ def learn(name: str, data: train.Data, seed: int, minutes: float, steps: int | N
     """A variant trained for so many steps, or minutes, and the parts of the loss at the end."""
     settings, error_weight = VARIANTS[name]
     trainer = train.Trainer(settings, replace(SCHEDULE, error_weight=error_weight), seed)
-    last = train.run(trainer, data, steps, minutes, folder / "checkpoint")
+    last = training.run(trainer, data, steps, minutes, folder / "checkpoint")
     return trainer, {part: round(value, 4) for part, value in last.items()}
 
 
