@@ -19,10 +19,13 @@ from typing import Any
 
 import zenoh
 
+from shared import access
 from shared.messages import BadMessage, Message, decode
 from shared.topics import TOPICS, Topic
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+SECURE_ENDPOINT = "tls/127.0.0.1:7447"
+SECURE_PROTOCOLS = ("tls", "quic")
 PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 RATE_WINDOW_S = 3.0
 ATTEMPT_MS = 500
@@ -40,17 +43,31 @@ class Refused(ValueError):
 @dataclass(frozen=True)
 class Connection:
     """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
-    tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise."""
+    tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise; `secure`: a
+    folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part; `service`: who
+    this is, and so whose certificate it shows."""
 
     mode: str | None = None
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     config: Path | None = None
+    secure: Path | None = None
+    service: str = access.VIEWER
+
+    @property
+    def default(self) -> str:
+        """The endpoint where none is given."""
+        return SECURE_ENDPOINT if self.secure else DEFAULT_ENDPOINT
 
     @property
     def where(self) -> str:
         """The endpoints in words."""
-        return ", ".join(self.connect) or (f"the endpoints of {self.config}" if self.config else DEFAULT_ENDPOINT)
+        return ", ".join(self.connect) or (f"the endpoints of {self.config}" if self.config else self.default)
+
+    @property
+    def whereabouts(self) -> str:
+        """Where a router is looked for, and what it must have."""
+        return f"at {self.where}" + (f" with a certificate of the same CA as in {self.secure}" if self.secure else "")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,9 +75,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("bus")
     group.add_argument("-m", "--mode", choices=("client", "peer", "router"), help="Zenoh mode (default: client; router: router)")
     group.add_argument("-e", "--connect", action="append", default=[], metavar="ENDPOINT",
-                       help=f"router to reach; may be repeated (default: $PENUMBRA_CONNECT or {DEFAULT_ENDPOINT})")  # fmt: skip
+                       help=f"router to reach; may be repeated (default: $PENUMBRA_CONNECT or {DEFAULT_ENDPOINT}, "
+                       f"with --secure {SECURE_ENDPOINT})")  # fmt: skip
     group.add_argument("-l", "--listen", action="append", default=[], metavar="ENDPOINT", help="endpoint to listen on")
     group.add_argument("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5)")
+    add_secure(group)
+
+
+def add_secure(group: argparse._ActionsContainer) -> None:
+    """The one switch between a bus for this machine and one for a network."""
+    default = os.environ.get("PENUMBRA_SECURE")
+    group.add_argument(
+        "--secure", type=Path, default=Path(default) if default else None, metavar="FOLDER",
+        help="certificates of `penumbra certs`: TLS, and each may say only what is its own (default: $PENUMBRA_SECURE or off)",
+    )  # fmt: skip
 
 
 def connection(options: argparse.Namespace) -> Connection:
@@ -68,7 +96,7 @@ def connection(options: argparse.Namespace) -> Connection:
     connect = tuple(options.connect)
     if not connect and options.config is None and options.mode in (None, "client"):
         connect = tuple(os.environ.get("PENUMBRA_CONNECT", "").split())
-    return Connection(options.mode, connect, tuple(options.listen), options.config)
+    return Connection(options.mode, connect, tuple(options.listen), options.config, options.secure)
 
 
 def mode(connection: Connection) -> str:
@@ -91,11 +119,11 @@ def configuration(connection: Connection) -> zenoh.Config:
     if connection.connect:
         settings["connect/endpoints"] = connection.connect
     elif mode == "client" and not is_set("connect/endpoints"):
-        settings["connect/endpoints"] = [DEFAULT_ENDPOINT]
+        settings["connect/endpoints"] = [connection.default]
     if connection.listen:
         settings["listen/endpoints"] = connection.listen
     elif mode == "router" and connection.config is None:
-        settings["listen/endpoints"] = [DEFAULT_ENDPOINT]
+        settings["listen/endpoints"] = [connection.default]
     defaults = {
         # one attempt is short, because Ctrl-C is not heard inside it; `open_session` repeats it, and later Zenoh itself does
         "connect/timeout_ms": ATTEMPT_MS,
@@ -110,16 +138,48 @@ def configuration(connection: Connection) -> zenoh.Config:
     if connection.config is None:
         settings["transport/link/tx/lease"] = 1000  # ms after which a frozen process is no longer alive
     for endpoint in (*connection.connect, *connection.listen):
-        if endpoint.partition("/")[0] not in PROTOCOLS:  # Zenoh would try it for ever
+        protocols = SECURE_PROTOCOLS if connection.secure else PROTOCOLS
+        if endpoint.partition("/")[0] not in protocols:  # Zenoh would try it for ever
             raise BusError(
-                f"endpoint {endpoint!r}: PROTOCOL/ADDRESS expected, as in {DEFAULT_ENDPOINT}; protocols: {', '.join(PROTOCOLS)}"
+                f"endpoint {endpoint!r}: PROTOCOL/ADDRESS expected, as in {connection.default}; "
+                f"protocols{' with --secure' if connection.secure else ''}: {', '.join(protocols)}"
             )
+    if connection.secure is not None:
+        settings |= _secure(connection.secure, access.holder(connection.service, mode == "router"), mode)
     for key, value in settings.items():
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
             raise BusError(f"{key}: {json.dumps(value)} is nothing that Zenoh takes: {_short(error)}") from None
     return config
+
+
+def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
+    """Zenoh's settings for mutual TLS, and in a router for who may say what."""
+    if mode == "peer":
+        raise BusError("--secure with --mode peer: client or router expected: only a router looks at who says what")
+    files = {name: folder / f"{name}.pem" for name in ("ca", holder, f"{holder}-key")}
+    for path in files.values():
+        try:
+            path.read_bytes()
+        except OSError as error:
+            names = ", ".join(file.name for file in files.values())
+            raise BusError(
+                f"--secure {folder}: {names} expected, {path.name} cannot be read ({error.strerror}): make them with "
+                f"`penumbra certs --out {folder}`, or copy them from where they were made"
+            ) from None
+    tls = {
+        "root_ca_certificate": str(files["ca"]),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    for side in ("listen", "connect"):
+        tls |= {f"{side}_certificate": str(files[holder]), f"{side}_private_key": str(files[f"{holder}-key"])}
+    settings: dict[str, Any] = {"transport/link/tls": tls, "transport/link/protocols": SECURE_PROTOCOLS}
+    if mode == "router":
+        settings |= {"access_control": access.control(), "low_pass_filter": access.limits()}
+    return settings
 
 
 def open_session(
@@ -140,13 +200,13 @@ def open_session(
         except zenoh.ZError as error:
             if "Address already in use" in str(error):
                 raise BusError(
-                    f"the port of {', '.join(connection.listen) or DEFAULT_ENDPOINT} is taken: another router runs there; "
+                    f"the port of {', '.join(connection.listen) or connection.default} is taken: another router runs there; "
                     "stop it, or give another port (penumbra up --port 7448; penumbra router --listen tcp/127.0.0.1:7448)"
                 ) from None
             if "Unable to connect" not in str(error):
                 raise BusError(f"the Zenoh session does not open: {_short(error)}") from None
         if stopping.is_set() or time.monotonic() > deadline:
-            raise BusError(f"no router at {connection.where}: start `penumbra router` or `penumbra up`, or give --connect")
+            raise BusError(f"no router {connection.whereabouts}: start `penumbra router` or `penumbra up`, or give --connect")
         if not told:
             waiting()
             told = True

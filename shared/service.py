@@ -22,6 +22,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from types import TracebackType
@@ -51,8 +52,8 @@ class Node:
     """
 
     def __init__(self, service: str, cell: cell.Cell, connection: bus.Connection = bus.Connection()):  # noqa: B008 (frozen)
-        self.service, self.cell, self.connection = service, cell, connection
-        self._needs_router = bus.mode(connection) == "client"  # refuses a bad configuration before anything else is done
+        self.service, self.cell, self.connection = service, cell, replace(connection, service=service)
+        self._needs_router = bus.mode(self.connection) == "client"  # refuses a bad configuration before anything else is done
         self.instance = f"{_safe(socket.gethostname())}-{os.getpid()}-{secrets.token_hex(2)}"
         self.log = logs.get(service, instance=self.instance)
         self.stopping = threading.Event()
@@ -345,7 +346,7 @@ class Node:
         self.log.warning("message refused; more of this kind are only counted", key=key, kind=error.kind, why=str(error))
 
     def _tell_waiting(self) -> None:
-        self.log.warning(f"waiting for the router at {self.connection.where}: start `penumbra router` or `penumbra up`")
+        self.log.warning(f"waiting for the router {self.connection.whereabouts}: start `penumbra router` or `penumbra up`")
 
     def _keep_house(self) -> None:
         """Once a second: CPU, the state of the link, and the heartbeat file that a container's health check reads."""

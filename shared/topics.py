@@ -31,6 +31,11 @@ class Topic:
     about: str
     qos: QoS = QoS.LATEST_WINS
 
+    @property
+    def publishers(self) -> tuple[str, ...]:
+        """The services that may publish it."""
+        return tuple(self.publisher.split(" or "))
+
     def at(self, **names: str) -> str:
         """The key expression; a name that is not given becomes the wildcard `*`."""
         wanted = {"cell", "camera", "robot", "pad", "target"}
