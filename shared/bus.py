@@ -20,6 +20,7 @@ from typing import Any
 import zenoh
 
 from shared import access
+from shared.guard import Guard
 from shared.messages import BadMessage, Message, decode
 from shared.topics import TOPICS, Topic
 
@@ -275,8 +276,6 @@ class Traffic:
     stamp_ns: int | None = None
     delay_s: float = math.nan
     rate: Rate = field(default_factory=Rate)
-    _source: Any = None
-    _number: int = 0
 
     def took(self, stamp_ns: int, now_ns: int) -> None:
         """Counts a good message."""
@@ -285,16 +284,10 @@ class Traffic:
         self.delay_s = (now_ns - stamp_ns) * 1e-9
         self.rate.add(time.monotonic())
 
-    def follow(self, info: zenoh.SourceInfo | None) -> None:
-        """Counts what is missing since the last message of the same publisher."""
-        if info is None:
-            return
-        source, number = (info.source_id.zid, info.source_id.eid), info.source_sn
-        if source == self._source and number > self._number:
-            self.dropped = (self.dropped or 0) + number - self._number - 1
-        elif self.dropped is None:
-            self.dropped = 0
-        self._source, self._number = source, number
+    def missed(self, count: int | None) -> None:
+        """Counts messages that did not come; None where the publisher does not number them."""
+        if count is not None:
+            self.dropped = (self.dropped or 0) + count
 
     def age_s(self, now_ns: int) -> float | None:
         """Seconds since the newest measurement; None where none ever came."""
@@ -321,9 +314,9 @@ class Traffic:
 class Reader:
     """One subscription: a ring of `depth` samples and a thread that decodes them and hands them on.
 
-    keys: every concrete key that the cell knows, with its names and counters; a sample on any other key is refused, so that
-    nobody can grow the table. `refused` is told of the first bad message of each kind on a key, `failed` of every exception of
-    the handler.
+    keys: every concrete key that the cell knows, with its names, counters and guard; a sample on any other key is refused, so
+    that nobody can grow the table. `refused` is told of the first bad message of each kind on a key, `failed` of every exception
+    of the handler.
     """
 
     def __init__(
@@ -331,15 +324,15 @@ class Reader:
         session: zenoh.Session,
         expression: str,
         depth: int,
-        kind: type[Message],
-        keys: dict[str, tuple[dict[str, str], Traffic]],
+        topic: Topic,
+        keys: dict[str, tuple[dict[str, str], Traffic, Guard]],
         strangers: Traffic,
         handler: Callable[[Any, dict[str, str]], None],
         now_ns: Callable[[], int],
         refused: Callable[[str, BadMessage], None],
         failed: Callable[[str, Exception], None],
     ):
-        self._kind, self._keys, self._strangers = kind, keys, strangers
+        self._topic, self._keys, self._strangers = topic, keys, strangers
         self._handler, self._now_ns, self._refused, self._failed = handler, now_ns, refused, failed
         self._subscriber = session.declare_subscriber(expression, zenoh.handlers.RingChannel(depth))
         self.thread = threading.Thread(target=self._run, name=f"read {expression}", daemon=True)
@@ -355,12 +348,14 @@ class Reader:
 
     def _take(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
-        names, traffic = self._keys.get(key, (None, self._strangers))
+        names, traffic, guard = self._keys.get(key, ({}, self._strangers, None))
+        publisher, number = _publisher(sample.source_info)
         try:
-            if names is None:
+            if guard is None:
                 raise BadMessage("key", f"one of the cell's {len(self._keys)} keys expected, {key!r:.120} came")
-            traffic.follow(sample.source_info)
+            traffic.missed(guard.admit(publisher, number, time.monotonic()))  # before anything that takes long
             message = self._decode(sample)
+            guard.believe(publisher, message.stamp_ns, time.monotonic())
         except BadMessage as error:
             traffic.bad[error.kind] = traffic.bad.get(error.kind, 0) + 1
             if traffic.bad[error.kind] == 1:
@@ -368,22 +363,22 @@ class Reader:
             return
         traffic.took(message.stamp_ns, self._now_ns())
         try:
-            self._handler(message, names | {"publisher": _publisher(sample.source_info)})
+            self._handler(message, names | {"publisher": publisher})
         except Exception as error:
             self._failed(f"reader of {key}", error)
 
     def _decode(self, sample: zenoh.Sample) -> Message:
+        kind = self._topic.message
         if sample.kind == zenoh.SampleKind.DELETE:
-            raise BadMessage("delete", f"a {self._kind.__name__} expected, a deletion came")
-        if len(sample.payload) > self._kind.MAX_BYTES:  # before it is copied
-            raise BadMessage(
-                "size", f"{self._kind.__name__}: at most {self._kind.MAX_BYTES} bytes expected, {len(sample.payload)} came"
-            )
-        return decode(self._kind, sample.payload.to_bytes(), self._now_ns())
+            raise BadMessage("delete", f"a {kind.__name__} expected, a deletion came")
+        if len(sample.payload) > kind.MAX_BYTES:  # before it is copied
+            raise BadMessage("size", f"{kind.__name__}: at most {kind.MAX_BYTES} bytes expected, {len(sample.payload)} came")
+        return decode(kind, sample.payload.to_bytes(), self._now_ns(), self._topic.oldest_s)
 
 
-def _publisher(info: zenoh.SourceInfo | None) -> str:
-    return "" if info is None else f"{info.source_id.zid}/{info.source_id.eid}"
+def _publisher(info: zenoh.SourceInfo | None) -> tuple[str, int | None]:
+    """Who sent a message, and its number; nobody and None where it does not say."""
+    return ("", None) if info is None else (f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn)
 
 
 def _short(error: Exception) -> str:
