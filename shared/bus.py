@@ -26,7 +26,7 @@ from shared.topics import TOPICS, Topic
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 SECURE_ENDPOINT = "tls/127.0.0.1:7447"
-SECURE_PROTOCOLS = ("tls", "quic")
+SECURE_PROTOCOLS = ("tls",)
 PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 RATE_WINDOW_S = 3.0
 ATTEMPT_MS = 500

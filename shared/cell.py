@@ -380,6 +380,9 @@ def _read(path: Path) -> tuple[Any, yaml.Node | None]:
     try:
         with path.open("rb") as file:
             text = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise CellError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
         if len(text) > MAX_BYTES:
             raise ValueError(f"at most {MAX_BYTES} bytes expected, more came")
         loader = yaml.SafeLoader(text.decode())

@@ -33,8 +33,8 @@ MOST_S = 5.0
 """Processor time for one input; the slowest takes some tens of milliseconds."""
 MOST_MB = 300.0
 """By which memory may grow over all inputs, hypothesis' own included."""
-SHARE = {"messages": 0.7, "board": 0.29, "cell": 0.01}
-"""Of the inputs; a cell file takes a hundred times as long as a message."""
+SHARE = {"messages": 0.6, "board": 0.3, "cell": 0.1}
+"""Of the inputs."""
 
 SMALL_CELL = b"""name: small
 cameras: {front: {width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5, position: [0, -1, 1], look_at: [0, 0, 0]}}
