@@ -31,6 +31,7 @@ COMMANDS = {
     "sim": "steer the emulator: occlude, motion, pause, resume, speed, skin, state",
     "snapshot": "write a picture of the cell and its pose",
     "bench": "run a benchmark",
+    "certs": "make certificates for a cell on a network",
     "doctor": "check this machine and say how to mend it",
 }
 SERVICES = ("router", "emulator", "segmentation", "search", "posecnn", "skin", "haptics", "fusion")
@@ -55,6 +56,7 @@ FUNCTIONS = {
     "topics": "services.client:list_topics",
     "sim": "services.client:sim",
     "snapshot": "services.snapshot:main",
+    "certs": "services.certs:main",
     "doctor": "services.doctor:main",
 }
 
@@ -157,7 +159,7 @@ def _explain_import(command: str, error: ImportError) -> int:
     if error.name == f"services.{command}":
         print(f"penumbra {command}: not part of this installation", file=sys.stderr)
         return 2
-    extra = command if command in SERVICES else ("test" if command == "bench" else "all")
+    extra = command if command in (*SERVICES, "certs") else ("test" if command == "bench" else "all")
     print(f"penumbra {command}: {name} is not installed: pip install -e '.[{extra}]'", file=sys.stderr)
     return 2
 

@@ -8,12 +8,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import zenoh
 
 from services import arguments
-from shared import bus, topics
+from shared import access, bus, topics
 from shared import cell as cells
 
 PATIENCE_S = 1.0
@@ -138,7 +139,7 @@ def sim(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     cell = cells.load(options.cell)
     request = {"command": options.command} | ({"value": " ".join(options.value)} if options.value else {})
-    with open_session(bus.connection(options)) as session:
+    with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:
         answers = bus.ask(session, topics.control(cell.name), payload=json.dumps(request).encode())
     if not answers:
         raise bus.BusError(f"no emulator in cell {cell.name}: start `penumbra emulator` or `penumbra up`")

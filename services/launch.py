@@ -277,6 +277,7 @@ def commands(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> li
     for name, count in replicas.items():
         process = known[name]
         command = [sys.executable, "-m", "services.cli", name, "--cell", str(options.cell), "--connect", endpoint]
+        command += ["--secure", str(options.secure)] if options.secure else []
         command += ["--log-level", options.log_level, *(["--log-json"] if options.log_json else [])]
         for flag in process.flags:
             if (value := getattr(options, flag)) is not None:
@@ -287,13 +288,23 @@ def commands(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> li
     return out
 
 
+def meeting_point(options: argparse.Namespace) -> tuple[bus.Connection, str]:
+    """The launcher's connection, and the endpoint of its processes. Its own router is on loopback, or, secured, on every network
+    of this machine."""
+    if options.connect:
+        return bus.Connection(connect=(options.connect,), secure=options.secure), options.connect
+    protocol, everywhere = ("tls", "0.0.0.0") if options.secure else ("tcp", "127.0.0.1")
+    listen = f"{protocol}/{everywhere}:{options.port}"
+    return bus.Connection("router", listen=(listen,), secure=options.secure), f"{protocol}/127.0.0.1:{options.port}"
+
+
 def main(argv: list[str]) -> int:
     """`penumbra up`"""
     parser = arguments.Parser(
         prog="penumbra up", description="Starts every process of a cell around a router, and shows what they do."
     )
     arguments.add_cell(parser)
-    parser.add_argument("--port", type=int, default=7447, help="TCP port of the router on loopback (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=7447, help="TCP port of the router (default: %(default)s)")
     parser.add_argument("--connect", metavar="ENDPOINT", help="use a router that runs elsewhere, and start none")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after this time (default: at Ctrl-C)")
     parser.add_argument("--seed", type=int, help="of the emulator")
@@ -303,12 +314,12 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--observer", help="of the fusion (see penumbra fusion --help)")
     parser.add_argument("--method", help="of the search (see penumbra search --help)")
     parser.add_argument("--replicas", action="append", default=[], metavar="NAME=N", help="run N of a process; 0 leaves it out")
+    bus.add_secure(parser)
     arguments.add_log(parser)
     options = parser.parse_args(argv)
     logs.configure(options.log_level, options.log_json)
     cell = cells.load(options.cell)
-    endpoint = options.connect or f"tcp/127.0.0.1:{options.port}"
-    connection = bus.Connection(connect=(endpoint,)) if options.connect else bus.Connection("router", listen=(endpoint,))
+    connection, endpoint = meeting_point(options)
     processes = commands(cell, options, endpoint)
     node = Node("launcher", cell, connection)
     with node.until_signal():

@@ -19,10 +19,14 @@ from typing import Any
 
 import zenoh
 
+from shared import access
+from shared.guard import Guard
 from shared.messages import BadMessage, Message, decode
 from shared.topics import TOPICS, Topic
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+SECURE_ENDPOINT = "tls/127.0.0.1:7447"
+SECURE_PROTOCOLS = ("tls",)
 PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 RATE_WINDOW_S = 3.0
 ATTEMPT_MS = 500
@@ -40,17 +44,31 @@ class Refused(ValueError):
 @dataclass(frozen=True)
 class Connection:
     """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
-    tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise."""
+    tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise; `secure`: a
+    folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part; `service`: who
+    this is, and so whose certificate it shows."""
 
     mode: str | None = None
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     config: Path | None = None
+    secure: Path | None = None
+    service: str = access.VIEWER
+
+    @property
+    def default(self) -> str:
+        """The endpoint where none is given."""
+        return SECURE_ENDPOINT if self.secure else DEFAULT_ENDPOINT
 
     @property
     def where(self) -> str:
         """The endpoints in words."""
-        return ", ".join(self.connect) or (f"the endpoints of {self.config}" if self.config else DEFAULT_ENDPOINT)
+        return ", ".join(self.connect) or (f"the endpoints of {self.config}" if self.config else self.default)
+
+    @property
+    def whereabouts(self) -> str:
+        """Where a router is looked for, and what it must have."""
+        return f"at {self.where}" + (f" with a certificate of the same CA as in {self.secure}" if self.secure else "")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,9 +76,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("bus")
     group.add_argument("-m", "--mode", choices=("client", "peer", "router"), help="Zenoh mode (default: client; router: router)")
     group.add_argument("-e", "--connect", action="append", default=[], metavar="ENDPOINT",
-                       help=f"router to reach; may be repeated (default: $PENUMBRA_CONNECT or {DEFAULT_ENDPOINT})")  # fmt: skip
+                       help=f"router to reach; may be repeated (default: $PENUMBRA_CONNECT or {DEFAULT_ENDPOINT}, "
+                       f"with --secure {SECURE_ENDPOINT})")  # fmt: skip
     group.add_argument("-l", "--listen", action="append", default=[], metavar="ENDPOINT", help="endpoint to listen on")
     group.add_argument("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5)")
+    add_secure(group)
+
+
+def add_secure(group: argparse._ActionsContainer) -> None:
+    """The one switch between a bus for this machine and one for a network."""
+    default = os.environ.get("PENUMBRA_SECURE")
+    group.add_argument(
+        "--secure", type=Path, default=Path(default) if default else None, metavar="FOLDER",
+        help="certificates of `penumbra certs`: TLS, and each may say only what is its own (default: $PENUMBRA_SECURE or off)",
+    )  # fmt: skip
 
 
 def connection(options: argparse.Namespace) -> Connection:
@@ -68,7 +97,7 @@ def connection(options: argparse.Namespace) -> Connection:
     connect = tuple(options.connect)
     if not connect and options.config is None and options.mode in (None, "client"):
         connect = tuple(os.environ.get("PENUMBRA_CONNECT", "").split())
-    return Connection(options.mode, connect, tuple(options.listen), options.config)
+    return Connection(options.mode, connect, tuple(options.listen), options.config, options.secure)
 
 
 def mode(connection: Connection) -> str:
@@ -91,11 +120,11 @@ def configuration(connection: Connection) -> zenoh.Config:
     if connection.connect:
         settings["connect/endpoints"] = connection.connect
     elif mode == "client" and not is_set("connect/endpoints"):
-        settings["connect/endpoints"] = [DEFAULT_ENDPOINT]
+        settings["connect/endpoints"] = [connection.default]
     if connection.listen:
         settings["listen/endpoints"] = connection.listen
     elif mode == "router" and connection.config is None:
-        settings["listen/endpoints"] = [DEFAULT_ENDPOINT]
+        settings["listen/endpoints"] = [connection.default]
     defaults = {
         # one attempt is short, because Ctrl-C is not heard inside it; `open_session` repeats it, and later Zenoh itself does
         "connect/timeout_ms": ATTEMPT_MS,
@@ -110,16 +139,48 @@ def configuration(connection: Connection) -> zenoh.Config:
     if connection.config is None:
         settings["transport/link/tx/lease"] = 1000  # ms after which a frozen process is no longer alive
     for endpoint in (*connection.connect, *connection.listen):
-        if endpoint.partition("/")[0] not in PROTOCOLS:  # Zenoh would try it for ever
+        protocols = SECURE_PROTOCOLS if connection.secure else PROTOCOLS
+        if endpoint.partition("/")[0] not in protocols:  # Zenoh would try it for ever
             raise BusError(
-                f"endpoint {endpoint!r}: PROTOCOL/ADDRESS expected, as in {DEFAULT_ENDPOINT}; protocols: {', '.join(PROTOCOLS)}"
+                f"endpoint {endpoint!r}: PROTOCOL/ADDRESS expected, as in {connection.default}; "
+                f"protocols{' with --secure' if connection.secure else ''}: {', '.join(protocols)}"
             )
+    if connection.secure is not None:
+        settings |= _secure(connection.secure, access.holder(connection.service, mode == "router"), mode)
     for key, value in settings.items():
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
             raise BusError(f"{key}: {json.dumps(value)} is nothing that Zenoh takes: {_short(error)}") from None
     return config
+
+
+def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
+    """Zenoh's settings for mutual TLS, and in a router for who may say what."""
+    if mode == "peer":
+        raise BusError("--secure with --mode peer: client or router expected: only a router looks at who says what")
+    files = {name: folder / f"{name}.pem" for name in ("ca", holder, f"{holder}-key")}
+    for path in files.values():
+        try:
+            path.read_bytes()
+        except OSError as error:
+            names = ", ".join(file.name for file in files.values())
+            raise BusError(
+                f"--secure {folder}: {names} expected, {path.name} cannot be read ({error.strerror}): make them with "
+                f"`penumbra certs --out {folder}`, or copy them from where they were made"
+            ) from None
+    tls = {
+        "root_ca_certificate": str(files["ca"]),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    for side in ("listen", "connect"):
+        tls |= {f"{side}_certificate": str(files[holder]), f"{side}_private_key": str(files[f"{holder}-key"])}
+    settings: dict[str, Any] = {"transport/link/tls": tls, "transport/link/protocols": SECURE_PROTOCOLS}
+    if mode == "router":
+        settings |= {"access_control": access.control(), "low_pass_filter": access.limits()}
+    return settings
 
 
 def open_session(
@@ -140,13 +201,13 @@ def open_session(
         except zenoh.ZError as error:
             if "Address already in use" in str(error):
                 raise BusError(
-                    f"the port of {', '.join(connection.listen) or DEFAULT_ENDPOINT} is taken: another router runs there; "
+                    f"the port of {', '.join(connection.listen) or connection.default} is taken: another router runs there; "
                     "stop it, or give another port (penumbra up --port 7448; penumbra router --listen tcp/127.0.0.1:7448)"
                 ) from None
             if "Unable to connect" not in str(error):
                 raise BusError(f"the Zenoh session does not open: {_short(error)}") from None
         if stopping.is_set() or time.monotonic() > deadline:
-            raise BusError(f"no router at {connection.where}: start `penumbra router` or `penumbra up`, or give --connect")
+            raise BusError(f"no router {connection.whereabouts}: start `penumbra router` or `penumbra up`, or give --connect")
         if not told:
             waiting()
             told = True
@@ -215,8 +276,6 @@ class Traffic:
     stamp_ns: int | None = None
     delay_s: float = math.nan
     rate: Rate = field(default_factory=Rate)
-    _source: Any = None
-    _number: int = 0
 
     def took(self, stamp_ns: int, now_ns: int) -> None:
         """Counts a good message."""
@@ -225,16 +284,10 @@ class Traffic:
         self.delay_s = (now_ns - stamp_ns) * 1e-9
         self.rate.add(time.monotonic())
 
-    def follow(self, info: zenoh.SourceInfo | None) -> None:
-        """Counts what is missing since the last message of the same publisher."""
-        if info is None:
-            return
-        source, number = (info.source_id.zid, info.source_id.eid), info.source_sn
-        if source == self._source and number > self._number:
-            self.dropped = (self.dropped or 0) + number - self._number - 1
-        elif self.dropped is None:
-            self.dropped = 0
-        self._source, self._number = source, number
+    def missed(self, count: int | None) -> None:
+        """Counts messages that did not come; None where the publisher does not number them."""
+        if count is not None:
+            self.dropped = (self.dropped or 0) + count
 
     def age_s(self, now_ns: int) -> float | None:
         """Seconds since the newest measurement; None where none ever came."""
@@ -261,9 +314,9 @@ class Traffic:
 class Reader:
     """One subscription: a ring of `depth` samples and a thread that decodes them and hands them on.
 
-    keys: every concrete key that the cell knows, with its names and counters; a sample on any other key is refused, so that
-    nobody can grow the table. `refused` is told of the first bad message of each kind on a key, `failed` of every exception of
-    the handler.
+    keys: every concrete key that the cell knows, with its names, counters and guard; a sample on any other key is refused, so
+    that nobody can grow the table. `refused` is told of the first bad message of each kind on a key, `failed` of every exception
+    of the handler.
     """
 
     def __init__(
@@ -271,15 +324,15 @@ class Reader:
         session: zenoh.Session,
         expression: str,
         depth: int,
-        kind: type[Message],
-        keys: dict[str, tuple[dict[str, str], Traffic]],
+        topic: Topic,
+        keys: dict[str, tuple[dict[str, str], Traffic, Guard]],
         strangers: Traffic,
         handler: Callable[[Any, dict[str, str]], None],
         now_ns: Callable[[], int],
         refused: Callable[[str, BadMessage], None],
         failed: Callable[[str, Exception], None],
     ):
-        self._kind, self._keys, self._strangers = kind, keys, strangers
+        self._topic, self._keys, self._strangers = topic, keys, strangers
         self._handler, self._now_ns, self._refused, self._failed = handler, now_ns, refused, failed
         self._subscriber = session.declare_subscriber(expression, zenoh.handlers.RingChannel(depth))
         self.thread = threading.Thread(target=self._run, name=f"read {expression}", daemon=True)
@@ -295,12 +348,14 @@ class Reader:
 
     def _take(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
-        names, traffic = self._keys.get(key, (None, self._strangers))
+        names, traffic, guard = self._keys.get(key, ({}, self._strangers, None))
+        publisher, number = _publisher(sample.source_info)
         try:
-            if names is None:
+            if guard is None:
                 raise BadMessage("key", f"one of the cell's {len(self._keys)} keys expected, {key!r:.120} came")
-            traffic.follow(sample.source_info)
+            traffic.missed(guard.admit(publisher, number, time.monotonic()))  # before anything that takes long
             message = self._decode(sample)
+            guard.believe(publisher, message.stamp_ns, time.monotonic())
         except BadMessage as error:
             traffic.bad[error.kind] = traffic.bad.get(error.kind, 0) + 1
             if traffic.bad[error.kind] == 1:
@@ -308,22 +363,22 @@ class Reader:
             return
         traffic.took(message.stamp_ns, self._now_ns())
         try:
-            self._handler(message, names | {"publisher": _publisher(sample.source_info)})
+            self._handler(message, names | {"publisher": publisher})
         except Exception as error:
             self._failed(f"reader of {key}", error)
 
     def _decode(self, sample: zenoh.Sample) -> Message:
+        kind = self._topic.message
         if sample.kind == zenoh.SampleKind.DELETE:
-            raise BadMessage("delete", f"a {self._kind.__name__} expected, a deletion came")
-        if len(sample.payload) > self._kind.MAX_BYTES:  # before it is copied
-            raise BadMessage(
-                "size", f"{self._kind.__name__}: at most {self._kind.MAX_BYTES} bytes expected, {len(sample.payload)} came"
-            )
-        return decode(self._kind, sample.payload.to_bytes(), self._now_ns())
+            raise BadMessage("delete", f"a {kind.__name__} expected, a deletion came")
+        if len(sample.payload) > kind.MAX_BYTES:  # before it is copied
+            raise BadMessage("size", f"{kind.__name__}: at most {kind.MAX_BYTES} bytes expected, {len(sample.payload)} came")
+        return decode(kind, sample.payload.to_bytes(), self._now_ns(), self._topic.oldest_s)
 
 
-def _publisher(info: zenoh.SourceInfo | None) -> str:
-    return "" if info is None else f"{info.source_id.zid}/{info.source_id.eid}"
+def _publisher(info: zenoh.SourceInfo | None) -> tuple[str, int | None]:
+    """Who sent a message, and its number; nobody and None where it does not say."""
+    return ("", None) if info is None else (f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn)
 
 
 def _short(error: Exception) -> str:

@@ -17,6 +17,11 @@ from shared import geometry
 from shared.classes import Label
 
 BUILT_IN = Path(__file__).parent / "cells"
+MAX_BYTES = 1_000_000
+MAX_NODES = 200_000
+"""A file has at most so many bytes and values: a thousand calibrated pads."""
+FAULTS = 20
+"""Faults of a file that are told at once."""
 
 Vector3 = Annotated[tuple[float, float, float], Field(description="metres or radians")]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -323,12 +328,12 @@ class Cell(_Model):
                     f"pads.{name}.link: world or ROBOT/LINK with ROBOT one of {sorted(self.robots)} expected, got {pad.link!r}"
                 )
         for name, target in self.targets.items():
-            if not target.mesh.startswith("body:") and not (self.folder / target.mesh).is_file():
+            if not target.mesh.startswith("body:") and not is_file(self.folder / target.mesh):
                 raise ValueError(
                     f"targets.{name}.mesh: no file {self.folder / target.mesh}: give body:forearm or a mesh beside the cell file"
                 )
         for name, robot_model in self.robots.items():
-            if not robot_model.urdf.startswith("pybullet:") and not (self.folder / robot_model.urdf).is_file():
+            if not robot_model.urdf.startswith("pybullet:") and not is_file(self.folder / robot_model.urdf):
                 raise ValueError(
                     f"robots.{name}.urdf: no file {self.folder / robot_model.urdf}: give pybullet:PATH or a file beside this one"
                 )
@@ -347,9 +352,9 @@ class Cell(_Model):
 def source(cell: str | Path) -> Path:
     """The YAML file of a built-in name (`table`, `arm`) or path. Raises CellError where there is none."""
     path = BUILT_IN / f"{cell}.yaml"
-    if not path.is_file():
+    if not is_file(path):
         path = Path(cell)
-    if not path.is_file():
+    if not is_file(path):
         built_in = ", ".join(sorted(p.stem for p in BUILT_IN.glob("*.yaml")))
         raise CellError(f"no cell {str(cell)!r}: give one of {built_in}, or the path of a YAML file")
     return path
@@ -358,18 +363,52 @@ def source(cell: str | Path) -> Path:
 def load(cell: str | Path) -> Cell:
     """The cell of a built-in name (`table`, `arm`) or of a YAML file. Raises CellError with file, line and reason."""
     path = source(cell)
-    text = path.read_text()
-    try:
-        data = yaml.safe_load(text)
-        tree = yaml.compose(text, yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        raise CellError(f"{path}: not YAML: {error}") from None
+    data, tree = _read(path)
     if not isinstance(data, dict):
         raise CellError(f"{path}:1: a map with name, cameras, pads and targets expected, a {type(data).__name__} came")
     try:
         return Cell.model_validate({**data, "folder": path.parent})
     except ValidationError as error:
-        raise CellError("\n".join(_explain(path, tree, e) for e in error.errors())) from None
+        faults = error.errors()
+        more = [f"{path}: and {len(faults) - FAULTS} faults more"] if len(faults) > FAULTS else []
+        raise CellError("\n".join([*(_explain(path, tree, e) for e in faults[:FAULTS]), *more])) from None
+
+
+def _read(path: Path) -> tuple[Any, yaml.Node | None]:
+    """What a YAML file holds, and the nodes that it comes from. Raises CellError where it is none, or more than a cell needs: a
+    short file may name lists of lists of lists that fill any memory."""
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise CellError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        if len(text) > MAX_BYTES:
+            raise ValueError(f"at most {MAX_BYTES} bytes expected, more came")
+        loader = yaml.SafeLoader(text.decode())
+        tree = loader.get_single_node()
+        _count_nodes(tree, {})
+        return None if tree is None else loader.construct_document(tree), tree
+    except Exception as error:  # PyYAML has no end of kinds for what a scalar is not
+        raise CellError(f"{path}: not YAML: {error!s:.500}") from None
+
+
+def _count_nodes(node: yaml.Node | None, known: dict[int, int | None]) -> int:
+    """Nodes in a tree, those that are referred to counted each time. Raises ValueError for more than MAX_NODES, and where one
+    contains itself."""
+    if not isinstance(node, yaml.CollectionNode):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = None
+        pairs = isinstance(node, yaml.MappingNode)
+        inner = [part for pair in node.value for part in pair] if pairs else node.value
+        known[id(node)] = 1 + sum(_count_nodes(part, known) for part in inner)
+    count = known[id(node)]
+    if count is None:
+        raise ValueError("a value that contains itself")
+    if count > MAX_NODES:
+        raise ValueError(f"at most {MAX_NODES} values expected, more came")
+    return count
 
 
 def _explain(path: Path, tree: yaml.Node | None, error: Any) -> str:
@@ -380,8 +419,23 @@ def _explain(path: Path, tree: yaml.Node | None, error: Any) -> str:
         reason = reason.partition(": ")[2]
     got = error.get("input")
     if isinstance(got, str | int | float | bool) and "got" not in reason:
-        reason += f", got {got!r}"
-    return f"{path}:{_line(tree, location)}: {'.'.join(location)}: {reason}"
+        reason += f", got {_short(got)}"
+    return f"{path}:{_line(tree, location)}: {'.'.join(location):.200}: {reason:.500}"
+
+
+def _short(value: str | int | float) -> str:
+    """A value in an error; Python does not print very long integers at all."""
+    if isinstance(value, int) and value.bit_length() > 64:
+        return f"an integer of {value.bit_length()} bits"
+    return f"{value!r:.100}"
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is there; none is where the name cannot be one."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def _line(node: yaml.Node | None, location: list[str]) -> int:

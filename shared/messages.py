@@ -21,7 +21,8 @@ import numpy as np
 MAX_FUTURE_S = 0.5
 """A stamp further ahead of the reader's clock than this is refused: clocks of one cell are kept closer than that."""
 MAX_PAST_S = 5.0
-"""A stamp older than this is refused: after a network cut the backlog arrives late and says nothing about now."""
+"""A stamp older than this is refused, where a topic says nothing else: after a network cut the backlog arrives late and says
+nothing about now."""
 
 
 class BadMessage(ValueError):
@@ -237,8 +238,8 @@ def encode(message: Message) -> bytes:
     return msgpack.packb(out)
 
 
-def decode(kind: type[M], payload: bytes, now_ns: int | None = None) -> M:
-    """The message of this kind in `payload`. With `now_ns`, its stamp must lie within MAX_PAST_S and MAX_FUTURE_S of it.
+def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: float = MAX_PAST_S) -> M:
+    """The message of this kind in `payload`. With `now_ns`, its stamp must not be older than oldest_s, nor MAX_FUTURE_S ahead.
 
     Raises BadMessage that says what was expected and what came.
     """
@@ -257,7 +258,7 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None) -> M:
         )
     message = kind(**{name: _field(kind.__name__, name, hint, metadata, raw[name]) for name, hint, metadata in specs})
     if now_ns is not None:
-        check_stamp(message, now_ns)
+        check_stamp(message, now_ns, oldest_s)
     return message
 
 
@@ -275,11 +276,11 @@ def _unpack(payload: bytes) -> Any:
     return msgpack.unpackb(payload, list_hook=limited, object_hook=limited, **_STRUCTURE)
 
 
-def check_stamp(message: Message, now_ns: int) -> None:
+def check_stamp(message: Message, now_ns: int, oldest_s: float) -> None:
     """Raises BadMessage where the stamp is too far from the reader's clock."""
     age_s = (now_ns - message.stamp_ns) * 1e-9
-    if age_s > MAX_PAST_S:
-        raise BadMessage("past", f"{type(message).__name__}: stamp at most {MAX_PAST_S} s old expected, {age_s:.3f} s came")
+    if age_s > oldest_s:
+        raise BadMessage("past", f"{type(message).__name__}: stamp at most {oldest_s:g} s old expected, {age_s:.3f} s came")
     if age_s < -MAX_FUTURE_S:
         raise BadMessage(
             "future",

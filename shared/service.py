@@ -22,6 +22,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from types import TracebackType
@@ -31,6 +32,7 @@ import psutil
 import zenoh
 
 from shared import bus, cell, logs, topics
+from shared.guard import Guard
 from shared.messages import BadMessage, Message, encode
 from shared.topics import QoS, Topic
 
@@ -51,8 +53,8 @@ class Node:
     """
 
     def __init__(self, service: str, cell: cell.Cell, connection: bus.Connection = bus.Connection()):  # noqa: B008 (frozen)
-        self.service, self.cell, self.connection = service, cell, connection
-        self._needs_router = bus.mode(connection) == "client"  # refuses a bad configuration before anything else is done
+        self.service, self.cell, self.connection = service, cell, replace(connection, service=service)
+        self._needs_router = bus.mode(self.connection) == "client"  # refuses a bad configuration before anything else is done
         self.instance = f"{_safe(socket.gethostname())}-{os.getpid()}-{secrets.token_hex(2)}"
         self.log = logs.get(service, instance=self.instance)
         self.stopping = threading.Event()
@@ -186,8 +188,7 @@ class Node:
             self.log.info("nothing to read: the cell has no such part", topic=topic.name)
             return
         expression = next(iter(keys)) if len(keys) == 1 else topic.at(cell=self.cell.name, **names)
-        traffic = {key: self._received.setdefault(key, bus.Traffic(topic.stale_s)) for key in keys}
-        table = {key: (found, traffic[key]) for key, found in keys.items()}
+        table = {key: (found, self._count(key, topic.stale_s), Guard(self._rate_hz(topic, found))) for key, found in keys.items()}
         strangers = (
             bus.Traffic(float("inf")) if len(keys) == 1 else self._received.setdefault(expression, bus.Traffic(float("inf")))
         )
@@ -197,7 +198,7 @@ class Node:
                 cast(zenoh.Session, self.session),
                 expression,
                 topic.depth * len(keys),
-                topic.message,
+                topic,
                 table,
                 strangers,
                 handler,
@@ -208,6 +209,13 @@ class Node:
             self._threads.append(reader.thread)
 
         self._declare(declare)
+
+    def _rate_hz(self, topic: Topic, names: dict[str, str]) -> float:
+        """How often a key's publisher sends: as the table says, but for what follows the cameras' own rates."""
+        rates = {name: camera.rate_hz for name, camera in self.cell.cameras.items()}
+        if topic is topics.VISION:
+            return max(topic.rate_hz, sum(rates.values()))
+        return max(topic.rate_hz, rates.get(names.get("camera", ""), 0.0))
 
     def _count(self, key: str, stale_s: float) -> bus.Traffic:
         """Counters for one more reader of a key."""
@@ -345,7 +353,7 @@ class Node:
         self.log.warning("message refused; more of this kind are only counted", key=key, kind=error.kind, why=str(error))
 
     def _tell_waiting(self) -> None:
-        self.log.warning(f"waiting for the router at {self.connection.where}: start `penumbra router` or `penumbra up`")
+        self.log.warning(f"waiting for the router {self.connection.whereabouts}: start `penumbra router` or `penumbra up`")
 
     def _keep_house(self) -> None:
         """Once a second: CPU, the state of the link, and the heartbeat file that a container's health check reads."""

@@ -31,6 +31,16 @@ class Topic:
     about: str
     qos: QoS = QoS.LATEST_WINS
 
+    @property
+    def publishers(self) -> tuple[str, ...]:
+        """The services that may publish it."""
+        return tuple(self.publisher.split(" or "))
+
+    @property
+    def oldest_s(self) -> float:
+        """The age after which a message is refused: it is of a backlog, or replayed. Clocks may differ by MAX_FUTURE_S."""
+        return 5.0 * self.stale_s + messages.MAX_FUTURE_S
+
     def at(self, **names: str) -> str:
         """The key expression; a name that is not given becomes the wildcard `*`."""
         wanted = {"cell", "camera", "robot", "pad", "target"}

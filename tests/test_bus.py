@@ -15,6 +15,7 @@ import zenoh
 
 from shared import bus, messages, topics
 from shared import cell as cells
+from shared.guard import RATE_TIMES
 from shared.service import Node
 from tests.live import free_port, wait_for
 from tests.nodes import pose
@@ -182,6 +183,90 @@ def test_what_a_reader_missed_is_counted_from_the_publishers_numbers(node):
     row = reader.health()["topics"][key]
     published = writer.health()["published"][key]["count"]
     assert row["dropped"] <= published - row["count"], "a message before the subscription was not missed"
+
+
+def test_a_message_that_is_sent_again_is_refused_and_the_next_one_taken(node):
+    got = []
+    reader, writer, replayer = node(), node(), node().open()
+    key = topics.FUSED.at(cell="table", target="forearm")
+    tape = replayer.session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+    reader.subscribe(topics.FUSED, lambda message, names: got.append(message.stamp_ns))
+    reader.open(), writer.open()
+    bad = lambda: reader.health()["topics"][key]["bad"]  # noqa: E731
+    until(lambda: got, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "a pose")
+    sample = wait_for(tape.try_recv, 5, "the recorded pose")
+
+    def replay():
+        replayer.session.put(key, sample.payload, source_info=sample.source_info)
+
+    until(lambda: bad().get("replayed", 0) >= 3, replay, "three refusals")
+    before = len(got)
+    until(lambda: len(got) > before, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "the next pose")
+    assert len(set(got)) == len(got)
+
+
+def vision(age_s):
+    now = pose()
+    return messages.VisionPose(
+        stamp_ns=now.stamp_ns - int(1e9 * age_s),
+        target=now.target,
+        frame=now.frame,
+        camera="front",
+        position=now.position,
+        orientation=now.orientation,
+        covariance=now.covariance,
+        overlap=0.9,
+        hidden=0.0,
+        state="tracking",
+    )
+
+
+def test_late_vision_is_taken_and_what_is_of_a_backlog_is_refused(node):
+    ages = []
+    reader, writer = node(), node()
+    reader.subscribe(topics.VISION, lambda message, names: ages.append((time.time_ns() - message.stamp_ns) * 1e-9))
+    reader.open(), writer.open()
+    bad = lambda: reader.health()["topics"][topics.VISION.at(cell="table", target="forearm")]["bad"]  # noqa: E731
+    publish = lambda age_s: lambda: writer.publish(topics.VISION, vision(age_s), target="forearm")  # noqa: E731
+    until(lambda: bad().get("past"), publish(topics.VISION.oldest_s + 0.01), "a refusal")
+    assert not ages
+    until(lambda: ages, publish(1.0), "a pose that is a second old")
+
+
+@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
+def test_no_topic_calls_a_message_a_replay_before_it_calls_itself_stale(topic):
+    assert topic.stale_s + messages.MAX_FUTURE_S < topic.oldest_s <= messages.MAX_PAST_S
+
+
+def test_a_flood_of_one_publisher_is_cut_and_does_not_stop_the_others(node):
+    got = {"p0": 0, "p1": 0}
+    reader, flooding, steady = node(), node(), node()
+
+    def count(message, names):
+        got[names["pad"]] += 1
+
+    reader.subscribe(topics.VOLTAGES, count)
+    reader.open(), flooding.open(), steady.open()
+    started = time.monotonic()
+
+    def publish():
+        for _ in range(100):
+            flooding.publish(topics.VOLTAGES, voltages(), pad="p0")
+        steady.publish(topics.VOLTAGES, voltages(), pad="p1")
+
+    bad = lambda pad: reader.health()["topics"][topics.VOLTAGES.at(cell="table", pad=pad)]["bad"]  # noqa: E731
+    until(lambda: bad("p0").get("rate", 0) > 100 and got["p1"] >= 20, publish, "a cut flood, and the other publisher", 20.0)
+    assert got["p0"] <= RATE_TIMES * topics.VOLTAGES.rate_hz * (time.monotonic() - started + 1.0)
+    assert not bad("p1")
+
+
+def test_a_camera_may_send_at_the_rate_that_the_cell_gives_it(tmp_path):
+    path = tmp_path / "cell.yaml"
+    path.write_text((cells.BUILT_IN / "table.yaml").read_text().replace("rate_hz: 20", "rate_hz: 300", 1))
+    node = Node("test", cells.load(path))
+    rates = [node._rate_hz(topic, {"camera": "front"}) for topic in (topics.FRAME, topics.MASK)]
+    rates += [node._rate_hz(topic, {"target": "forearm"}) for topic in (topics.VISION, topics.FUSED)]
+    assert rates == [300, 300, 300, 200]
 
 
 def test_the_rate_of_a_steady_stream_is_its_rate_and_falls_when_it_ends():

@@ -69,6 +69,18 @@ def test_no_container_can_write_its_image_or_runs_as_root(running):
             assert container["Config"]["User"].startswith("10001"), service
 
 
+def test_no_service_reaches_beyond_the_cell(running):
+    code = """
+import socket
+try:
+    socket.create_connection(("1.1.1.1", 53), 3)
+except OSError:
+    print("isolated")
+"""
+    for service in SERVICES - {"router"}:
+        assert compose("exec", "-T", service, "python", "-c", code).strip() == "isolated", service
+
+
 @pytest.mark.parametrize("service", ["fusion", "segmentation"])
 def test_a_service_that_is_killed_comes_back(session, service):
     wait_for(lambda: is_tracking_now(session), 60, "a tracked pose before the kill")

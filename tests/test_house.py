@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 
@@ -47,6 +48,16 @@ def test_every_package_says_in_its_init_what_it_is_for():
     for folder in ("shared", "sim", "services", *(p.parent.relative_to(ROOT) for p in (ROOT / "services").glob("*/__init__.py"))):
         text = (ROOT / folder / "__init__.py").read_text()
         assert text.startswith('"""'), f"{folder}/__init__.py has no docstring"
+
+
+def test_a_container_has_no_rights_and_only_one_with_a_published_port_has_a_way_out():
+    compose = yaml.safe_load((ROOT / "compose.yaml").read_text())
+    isolated = {name for name, network in compose["networks"].items() if network and network.get("internal")}
+    for name, service in compose["services"].items():
+        assert service["read_only"] and service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert set(service["networks"]) <= isolated or "ports" in service, name
+        assert all(port.startswith("127.0.0.1:") for port in service.get("ports", [])), name
 
 
 def test_every_weight_file_has_a_card_with_its_seed_and_held_out_score():
