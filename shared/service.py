@@ -31,7 +31,7 @@ import psutil
 import zenoh
 
 from shared import bus, cell, logs, topics
-from shared.messages import BadMessage, Message, encode
+from shared.messages import VERSION, BadMessage, Message, encode
 from shared.topics import QoS, Topic
 
 CLOSE_S = 0.8
@@ -70,6 +70,7 @@ class Node:
         self._cpu = 0.0
         self._started = time.monotonic()
         self._reachable = False
+        self._told_version = False
 
     # ---- life
 
@@ -321,6 +322,7 @@ class Node:
             "instance": self.instance,
             "pid": os.getpid(),
             "cell": self.cell.name,
+            "wire_version": VERSION,
             "uptime_s": round(time.monotonic() - self._started, 1),
             "cpu": round(self._cpu, 3),
             "memory_mb": round(self._process.memory_info().rss / 1e6, 1),
@@ -342,6 +344,11 @@ class Node:
             self.log.error(f"{type(error).__name__}: {error}", where=where, at=place, exc_info=error)
 
     def _refused(self, key: str, error: BadMessage) -> None:
+        """Told of the first bad message of each kind on a key. Another release speaks on many keys at once: it is told once."""
+        if error.kind == "version":
+            if self._told_version:
+                return
+            self._told_version = True
         self.log.warning("message refused; more of this kind are only counted", key=key, kind=error.kind, why=str(error))
 
     def _tell_waiting(self) -> None:
