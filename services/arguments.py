@@ -35,4 +35,16 @@ def add_cell(out: argparse.ArgumentParser) -> None:
 def add_log(out: argparse.ArgumentParser) -> None:
     group = out.add_argument_group("log")
     group.add_argument("--log-level", choices=logs.LEVELS, default="info")
-    group.add_argument("--log-json", action="store_true", help="one JSON object a line")
+    group.add_argument(
+        "--log-format",
+        type=_log_format,
+        default=os.environ.get("PENUMBRA_LOG_FORMAT") or "text",
+        metavar="{text,json}",
+        help="json: one object a line (default: $PENUMBRA_LOG_FORMAT or text)",
+    )
+
+
+def _log_format(text: str) -> str:
+    if text not in logs.FORMATS:
+        raise argparse.ArgumentTypeError(f"{' or '.join(logs.FORMATS)} expected, {text!r} came; $PENUMBRA_LOG_FORMAT too")
+    return text

@@ -82,7 +82,7 @@ def main(argv: list[str] | None = None) -> int:
         if not _is_ours(error):
             raise
         for line in str(error).splitlines():
-            print(f"penumbra {command}: {line}", file=sys.stderr)
+            _complain(command, line)
         return 2
 
 
@@ -110,7 +110,7 @@ def serve(name: str, argv: list[str]) -> int:
     module.arguments(parser)
     options = parser.parse_args(argv)
     options.mode = options.mode or getattr(module, "MODE", None)
-    logs.configure(options.log_level, options.log_json)
+    logs.configure(options.log_level, options.log_format, name)
     node = Node(module.NAME, cell.load(options.cell), bus.connection(options))
     module.start(node, options)
     return run(node)
@@ -139,6 +139,15 @@ def _usage() -> str:
     width = max(map(len, COMMANDS))
     rows = "\n".join(f"  {name:{width}}  {about}" for name, about in COMMANDS.items())
     return f"usage: penumbra COMMAND [--help] ...\n\nTracks a forearm beside a robot, also while something hides it.\n\n{rows}"
+
+
+def _complain(command: str, line: str) -> None:
+    from shared import logs
+
+    if logs.is_json():
+        logs.get(command).error(line)
+    else:
+        print(f"penumbra {command}: {line}", file=sys.stderr)
 
 
 def _is_ours(error: Exception) -> bool:

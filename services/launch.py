@@ -159,7 +159,7 @@ class Supervised:
             self._listener.join(0.2)
         self.popen = None
         self.cpu = self.memory_mb = 0.0
-        words = next((line.strip() for line in reversed(self._last_words) if line.strip()), "")
+        words = next((logs.sentence(line.strip()) for line in reversed(self._last_words) if line.strip()), "")
         why = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         self.note = f"{self._hung}{why}: {words}".removesuffix(": ")
         if code == ASKED_FOR_NOTHING or self.restart == "never":
@@ -277,7 +277,7 @@ def commands(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> li
     for name, count in replicas.items():
         process = known[name]
         command = [sys.executable, "-m", "services.cli", name, "--cell", str(options.cell), "--connect", endpoint]
-        command += ["--log-level", options.log_level, *(["--log-json"] if options.log_json else [])]
+        command += ["--log-level", options.log_level, "--log-format", options.log_format]
         for flag in process.flags:
             if (value := getattr(options, flag)) is not None:
                 command += [f"--{flag}", str(value)]
@@ -305,7 +305,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--replicas", action="append", default=[], metavar="NAME=N", help="run N of a process; 0 leaves it out")
     arguments.add_log(parser)
     options = parser.parse_args(argv)
-    logs.configure(options.log_level, options.log_json)
+    logs.configure(options.log_level, options.log_format, "launcher")
     cell = cells.load(options.cell)
     endpoint = options.connect or f"tcp/127.0.0.1:{options.port}"
     connection = bus.Connection(connect=(endpoint,)) if options.connect else bus.Connection("router", listen=(endpoint,))

@@ -70,7 +70,7 @@ class Node:
         self._cpu = 0.0
         self._started = time.monotonic()
         self._reachable = False
-        self._told_version = False
+        self._other_versions = itertools.count()
 
     # ---- life
 
@@ -345,10 +345,8 @@ class Node:
 
     def _refused(self, key: str, error: BadMessage) -> None:
         """Told of the first bad message of each kind on a key. Another release speaks on many keys at once: it is told once."""
-        if error.kind == "version":
-            if self._told_version:
-                return
-            self._told_version = True
+        if error.kind == "version" and next(self._other_versions):
+            return
         self.log.warning("message refused; more of this kind are only counted", key=key, kind=error.kind, why=str(error))
 
     def _tell_waiting(self) -> None:

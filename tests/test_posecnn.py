@@ -334,7 +334,7 @@ def test_the_service_refuses_a_frame_of_another_size():
 @pytest.mark.parametrize(("vision", "there"), [("procnet", {"segmentation", "search"}), ("posecnn", {"posecnn"})])
 def test_up_starts_one_way_to_see(vision, there):
     options = argparse.Namespace(
-        replicas=[], vision=vision, cell="table", log_level="info", log_json=False, seed=None, observer=None, method=None
+        replicas=[], vision=vision, cell="table", log_level="info", log_format="text", seed=None, observer=None, method=None
     )
     started = {process.name for process in launch.commands(TABLE, options, "tcp/127.0.0.1:1")}
     assert started == there | {"emulator", "haptics", "fusion"}
