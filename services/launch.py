@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import psutil
 from rich.console import Console
@@ -190,8 +190,12 @@ class Supervised:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.popen.pid, number)
 
-    def row(self) -> live.ProcessRow:
-        return live.ProcessRow(self.name, self.state, self.pid, self.cpu, self.memory_mb, self.restarts, self.note)
+    def row(self, health: dict[str, Any] | None = None) -> live.ProcessRow:
+        """For the table; health: its own report, where it gave one."""
+        state, note = self.state, self.note
+        if state == "running" and health is not None and health["status"] != "ok":
+            state, note = health["status"], "; ".join([*([note] if note else []), *health["reasons"]])
+        return live.ProcessRow(self.name, state, self.pid, self.cpu, self.memory_mb, self.restarts, note)
 
 
 def stop(processes: list[Supervised]) -> None:
@@ -246,15 +250,17 @@ class Launcher:
 
     def _refresh(self) -> None:
         self.watch.refresh()
+        local = self.watch.local()
         for process in self.processes:
             process.measure()
-            if process.pid in self.watch.health:
+            if process.pid in local:
                 process.heard()
 
     def _rows(self) -> list[live.ProcessRow]:
-        own = self.watch.health.get(os.getpid(), {})
+        local = self.watch.local()
+        own = local.get(os.getpid(), {})
         launcher = live.ProcessRow("launcher", "running", os.getpid(), own.get("cpu", 0.0), own.get("memory_mb", 0.0), 0)
-        return [launcher, *(process.row() for process in self.processes)]
+        return [launcher, *(process.row(local.get(process.pid or 0)) for process in self.processes)]
 
 
 def commands(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> list[Supervised]:

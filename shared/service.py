@@ -20,6 +20,7 @@ import string
 import threading
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import blake2b
@@ -30,7 +31,7 @@ from typing import Any, Literal, cast
 import psutil
 import zenoh
 
-from shared import bus, cell, logs, topics
+from shared import bus, cell, health, logs, topics
 from shared.messages import VERSION, BadMessage, Message, encode
 from shared.topics import QoS, Topic
 
@@ -63,6 +64,7 @@ class Node:
         self._published: dict[str, bus.Traffic] = {}
         self._publishers: dict[tuple[str, ...], tuple[zenoh.Publisher, bus.Traffic, zenoh.EntityGlobalId, itertools.count]] = {}
         self._faults: dict[str, int] = {}
+        self._lately = health.Lately()
         self.report: dict[str, Callable[[], Any]] = {}
         self._replicas = frozenset({self.instance})
         self._owned: dict[str, bool] = {}
@@ -314,12 +316,17 @@ class Node:
         self._spawn(watch, "replicas")
 
     def health(self) -> dict[str, Any]:
-        """What this instance is and how it fares, as JSON: CPU in cores, memory in MB, counters of every topic, and what the
-        service tells of itself in `report`: JSON by name, from a function each."""
+        """What this instance is and how it fares, as JSON: its status and the reasons for it (`shared.health`), CPU in cores,
+        memory in MB, counters of every topic, and what the service tells of itself in `report`: JSON by name, from a function
+        each."""
         now = self.now_ns()
+        status, reasons = health.judge(self._away(), self._received, self._look(), now)
         return {
             "service": self.service,
             "instance": self.instance,
+            "status": status,
+            "reasons": reasons,
+            "host": socket.gethostname(),
             "pid": os.getpid(),
             "cell": self.cell.name,
             "wire_version": VERSION,
@@ -333,6 +340,15 @@ class Node:
             "faults": dict(self._faults),
             **({"report": {name: tell() for name, tell in self.report.items()}} if self.report else {}),
         }
+
+    def _look(self) -> Counter[tuple[str, str]]:
+        return self._lately.look(health.counts(self._received, self._faults), time.monotonic())
+
+    def _away(self) -> str:
+        """Why the others cannot be reached; empty where they can."""
+        if self.session is None:
+            return "not on the bus"
+        return "" if self._reachable else f"no router at {self.connection.where}"
 
     def fault(self, where: str, error: Exception) -> None:
         """Counts an exception; the first of its kind and place is logged with its trace."""
@@ -353,8 +369,10 @@ class Node:
         self.log.warning(f"waiting for the router at {self.connection.where}: start `penumbra router` or `penumbra up`")
 
     def _keep_house(self) -> None:
-        """Once a second: CPU, the state of the link, and the heartbeat file that a container's health check reads."""
+        """Once a second: CPU, what should not happen, the state of the link, and the heartbeat file that a container's health
+        check reads: the status and its reasons, in words."""
         self._cpu = self._process.cpu_percent() / 100
+        grown = self._look()
         session = self.session
         if session is None:
             return
@@ -366,8 +384,11 @@ class Node:
             else:
                 self._tell_waiting()
         heartbeat = os.environ.get("PENUMBRA_HEARTBEAT")
-        if heartbeat and reachable:
-            Path(heartbeat).touch()
+        if heartbeat:
+            status, reasons = health.judge(self._away(), self._received, grown, self.now_ns())
+            fresh = Path(f"{heartbeat}.new")
+            fresh.write_text(": ".join([status, "; ".join(reasons)]).removesuffix(": ") + "\n")
+            fresh.replace(heartbeat)  # nobody reads half of it
 
     def _declare(self, declare: Callable[[], None]) -> None:
         if self.session is None:

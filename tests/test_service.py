@@ -184,16 +184,6 @@ def test_a_handler_that_hangs_does_not_keep_the_node_from_closing(router):
     assert time.monotonic() - started < CLOSE_S + 0.5
 
 
-def test_a_heartbeat_file_is_written_while_the_router_can_be_reached(router, process, tmp_path):
-    path = tmp_path / "heartbeat"
-    process(PENUMBRA_HEARTBEAT=str(path))
-    wait_for(path.exists, 10, "the heartbeat")
-    written = path.stat().st_mtime_ns
-    wait_for(lambda: path.stat().st_mtime_ns > written, 3, "the next heartbeat")
-    router.close()
-    wait_for(lambda: time.time() - path.stat().st_mtime > 2.5, 6, "no heartbeat without a router")
-
-
 def test_a_timer_keeps_its_rhythm_and_goes_on_after_an_exception(replica):
     calls = []
 
