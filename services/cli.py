@@ -11,10 +11,6 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from shared.service import Node
 
 COMMANDS = {
     "up": "start every process of a cell with a router, and show what they do",
@@ -107,18 +103,20 @@ def serve(name: str, argv: list[str]) -> int:
 
     module = importlib.import_module(f"services.{name}.service")
     parser = arguments.parser(name, module.__doc__ or COMMANDS[name])
+    arguments.add_metrics(parser)
     module.arguments(parser)
     options = parser.parse_args(argv)
     options.mode = options.mode or getattr(module, "MODE", None)
     logs.configure(options.log_level, options.log_format, name)
     node = Node(module.NAME, cell.load(options.cell), bus.connection(options))
-    module.start(node, options)
-    return run(node)
+    with arguments.metrics(parser, options.metrics_port, lambda: [node.health()]):
+        module.start(node, options)
+        node.run()
+    return leave()
 
 
-def run(node: Node) -> int:
-    """Serves until SIGINT or SIGTERM, and lets the process end."""
-    node.run()
+def leave() -> int:
+    """Lets a process end whose node has run."""
     if threading.active_count() > 1:  # something hangs: it must not keep the process, even if Zenoh cannot clean /dev/shm then
         logging.shutdown()
         sys.stdout.flush()

@@ -24,7 +24,7 @@ from shared import cell as cells
 ROOT = Path(__file__).parents[1]
 SHM_BYTES = 128 << 20
 """Frames cross between processes in shared memory; Docker's default of 64 MB is too little for two cameras."""
-CORE = ("eclipse-zenoh", "msgpack", "numpy", "scipy", "pydantic", "pyyaml", "psutil", "rich")
+CORE = ("eclipse-zenoh", "msgpack", "numpy", "scipy", "pydantic", "pyyaml", "prometheus_client", "psutil", "rich")
 EXTRAS = {
     "torch": "segmentation",
     "openvino": "segmentation",

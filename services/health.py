@@ -27,11 +27,12 @@ class Instance:
 
 def ask(session: zenoh.Session, cell: str) -> list[Instance]:
     """Every instance of a cell, by service; one that is on the bus but does not answer within ANSWER_S is down."""
-    replies = session.liveliness().get(topics.alive(cell), timeout=ANSWER_S)
-    tokens = {tuple(str(reply.ok.key_expr).split("/")[-2:]) for reply in replies if reply.ok is not None}
     found = {}
+    for reply in session.liveliness().get(topics.alive(cell), timeout=ANSWER_S):
+        if reply.ok is not None:
+            service, instance = str(reply.ok.key_expr).split("/")[-2:]
+            found[instance] = Instance(service, instance, "down", (f"it hangs: no answer within {ANSWER_S:g} s",))
     for report in map(json.loads, bus.ask(session, topics.health(cell), timeout_s=ANSWER_S)):
-        name = report["service"], report["instance"]
-        found[name] = Instance(*name, report["status"], tuple(report["reasons"]))
-    silent = {name: Instance(*name, "down", (f"it hangs: no answer within {ANSWER_S:g} s",)) for name in tokens - found.keys()}
-    return [instance for _, instance in sorted({**found, **silent}.items())]
+        instance = report["instance"]
+        found[instance] = Instance(report["service"], instance, report["status"], tuple(report["reasons"]))
+    return sorted(found.values(), key=lambda each: (each.service, each.instance))

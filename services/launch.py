@@ -218,6 +218,10 @@ class Launcher:
     def __init__(self, node: Node, processes: list[Supervised], console: Console):
         self.node, self.processes, self.console = node, processes, console
         self.watch = live.Watch(node)
+        node.report["processes"] = lambda: {
+            process.name: {"state": process.state, "restarts": process.restarts, "note": process.note}
+            for process in self.processes
+        }
 
     def run(self, seconds: float) -> None:
         """Starts everything, and returns after `seconds` or when the node is stopping; then nothing is left."""
@@ -277,7 +281,8 @@ def commands(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> li
             raise cells.CellError(f"--replicas {text}: NAME=NUMBER with NAME one of {', '.join(known)} expected")
         replicas[name] = int(number)
     environment = {
-        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+        "PENUMBRA_METRICS_PORT": "",  # the launcher's port covers all
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
     }
     out = []
     for name, count in replicas.items():
@@ -310,6 +315,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--method", help="of the search (see penumbra search --help)")
     parser.add_argument("--replicas", action="append", default=[], metavar="NAME=N", help="run N of a process; 0 leaves it out")
     arguments.add_log(parser)
+    arguments.add_metrics(parser)
     options = parser.parse_args(argv)
     logs.configure(options.log_level, options.log_format, "launcher")
     cell = cells.load(options.cell)
@@ -319,5 +325,6 @@ def main(argv: list[str]) -> int:
     node = Node("launcher", cell, connection)
     with node.until_signal():
         launcher = Launcher(node.open(), processes, Console(width=None if sys.stdout.isatty() else 400))
-        launcher.run(options.seconds)
+        with arguments.metrics(parser, options.metrics_port, lambda: launcher.watch.health.values()):
+            launcher.run(options.seconds)
     return 0

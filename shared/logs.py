@@ -48,7 +48,9 @@ def configure(level: str = "info", form: str = "text", service: str = "penumbra"
         logging.captureWarnings(True)
         log = get(service)
         sys.excepthook = lambda kind, error, trace: log.error(f"{kind.__name__}: {error}", exc_info=(kind, error, trace))
-        threading.excepthook = lambda ended: sys.excepthook(ended.exc_type, ended.exc_value, ended.exc_traceback)
+        threading.excepthook = lambda ended: log.error(
+            f"{ended.exc_type.__name__}: {ended.exc_value}", exc_info=(ended.exc_type, ended.exc_value, ended.exc_traceback)
+        )
 
 
 def is_json() -> bool:

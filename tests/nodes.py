@@ -70,7 +70,8 @@ def main() -> None:
     logs.configure(options.log_level, options.log_format, sys.argv[1])
     node = Node(sys.argv[1], cells.load(options.cell), bus.connection(options))
     start(node)
-    sys.exit(cli.run(node))
+    node.run()
+    sys.exit(cli.leave())
 
 
 if __name__ == "__main__":
