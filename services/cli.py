@@ -14,6 +14,8 @@ from pathlib import Path
 
 COMMANDS = {
     "up": "start every process of a cell with a router, and show what they do",
+    "restart": "restart services of the running `penumbra up`, one after another, without losing the pose",
+    "scale": "change the number of replicas of a service of the running `penumbra up`",
     "router": "the meeting point of all processes",
     "emulator": "a simulated cell: frames, joints, skin and truth",
     "segmentation": "frames to masks (`segmentation infer`: of files; `segmentation train`: learn the network again)",
@@ -47,6 +49,8 @@ SWITCH_S = 0.0005
 """A reader thread waits at most this long for a computing one; Python's 5 ms would be half of the skin's period."""
 FUNCTIONS = {
     "up": "services.launch:main",
+    "restart": "services.steer:restart",
+    "scale": "services.steer:scale",
     "pose": "services.client:pose",
     "topics": "services.client:list_topics",
     "sim": "services.client:sim",

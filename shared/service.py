@@ -38,6 +38,8 @@ from shared.topics import QoS, Topic
 CLOSE_S = 0.8
 """Closing a session on a bad network may take much longer; a process that ends does not wait for that."""
 QUERY_DEPTH = 32
+WARM_UP_S = 2.0
+"""How long a replica that joins others may listen before it takes its share."""
 
 Answer = Callable[[dict[str, str], bytes], "bytes | tuple[bytes, str]"]
 
@@ -66,6 +68,10 @@ class Node:
         self._faults: dict[str, int] = {}
         self._lately = health.Lately()
         self.report: dict[str, Callable[[], Any]] = {}
+        self._counting = threading.Lock()
+        self._token: zenoh.LivelinessToken | None = None
+        self.is_warm: Callable[[], bool] = lambda: True
+        self._others: frozenset[str] = frozenset()
         self._replicas = frozenset({self.instance})
         self._owned: dict[str, bool] = {}
         self._process = psutil.Process()
@@ -85,12 +91,36 @@ class Node:
         for declare in self._pending:
             declare()
         self._pending.clear()
-        # the last step: who is alive can be asked and is listening
-        self._token = self.session.liveliness().declare_token(topics.alive(self.cell.name, self.service, self.instance))
+        self._come_alive()
         self._process.cpu_percent()
         self.every(1.0, self._keep_house)
         self.log.info("on the bus", at=", ".join(self.connection.listen) or self.connection.where)
         return self
+
+    def _come_alive(self) -> None:
+        """The last step: who is alive can be asked, is listening, and owns streams. A service that needs to warm up beside living
+        replicas does so first, for at most WARM_UP_S; alone, a cold one is better than none."""
+        session = cast(zenoh.Session, self.session)
+
+        def declare() -> None:
+            self._token = session.liveliness().declare_token(topics.alive(self.cell.name, self.service, self.instance))
+            self._count_replicas()
+
+        def warm_up() -> None:
+            deadline = time.monotonic() + WARM_UP_S
+            while not self.is_warm() and time.monotonic() < deadline and not self.stopping.wait(0.02):
+                pass
+            if not self.stopping.is_set():
+                declare()
+
+        def has_others() -> bool:
+            tokens = session.liveliness().get(topics.alive(self.cell.name, self.service), timeout=1.0)
+            return any(reply.ok is not None for reply in tokens)
+
+        if not self.is_warm() and has_others():
+            self._spawn(warm_up, "warm up")
+        else:
+            declare()
 
     def run(self) -> None:
         """Opens, and serves until SIGINT or SIGTERM; a second signal ends the process at once. Raises bus.BusError."""
@@ -310,10 +340,17 @@ class Node:
                     return
                 instance = str(sample.key_expr).rpartition("/")[2]
                 (living.discard if sample.kind == zenoh.SampleKind.DELETE else living.add)(instance)
-                self._replicas = frozenset(living | {self.instance})
-                self._owned = {}
+                self._others = frozenset(living - {self.instance})
+                self._count_replicas()
 
         self._spawn(watch, "replicas")
+
+    def _count_replicas(self) -> None:
+        """This one counts as soon as the others know of it, or where there are none."""
+        with self._counting:
+            is_guest = self._token is None and self._others
+            self._replicas = self._others if is_guest else self._others | {self.instance}
+            self._owned = {}
 
     def health(self) -> dict[str, Any]:
         """What this instance is and how it fares, as JSON: its status and the reasons for it (`shared.health`), CPU in cores,
@@ -330,6 +367,7 @@ class Node:
             "pid": os.getpid(),
             "cell": self.cell.name,
             "wire_version": VERSION,
+            "ready": self._token is not None,
             "uptime_s": round(time.monotonic() - self._started, 1),
             "cpu": round(self._cpu, 3),
             "memory_mb": round(self._process.memory_info().rss / 1e6, 1),

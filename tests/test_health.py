@@ -12,7 +12,7 @@ from rich.console import Console
 
 from services import cli, doctor, live
 from services import health as cell_health
-from services.launch import Supervised
+from services.supervised import Supervised
 from shared import bus, health, topics
 from shared import cell as cells
 from shared.service import Node

@@ -336,7 +336,7 @@ def test_up_starts_one_way_to_see(vision, there):
     options = argparse.Namespace(
         replicas=[], vision=vision, cell="table", log_level="info", log_format="text", seed=None, observer=None, method=None
     )
-    started = {process.name for process in launch.commands(TABLE, options, "tcp/127.0.0.1:1")}
+    started = {process.name for process in launch.fleet(TABLE, options, "tcp/127.0.0.1:1").processes}
     assert started == there | {"emulator", "haptics", "fusion"}
 
 
