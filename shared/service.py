@@ -38,6 +38,8 @@ from shared.topics import QoS, Topic
 CLOSE_S = 0.8
 """Closing a session on a bad network may take much longer; a process that ends does not wait for that."""
 QUERY_DEPTH = 32
+NEWS_S = 0.2
+"""Within this a session has heard which replicas there are."""
 WARM_UP_S = 2.0
 """How long a replica that joins others may listen before it takes its share."""
 
@@ -70,7 +72,7 @@ class Node:
         self.report: dict[str, Callable[[], Any]] = {}
         self._counting = threading.Lock()
         self._token: zenoh.LivelinessToken | None = None
-        self.is_warm: Callable[[], bool] = lambda: True
+        self.is_warm: Callable[[], bool] = lambda: True  # whether it could go on with what another replica does
         self._others: frozenset[str] = frozenset()
         self._replicas = frozenset({self.instance})
         self._owned: dict[str, bool] = {}
@@ -86,6 +88,8 @@ class Node:
         """Opens the session, waiting for the router, and declares what was asked for. Raises bus.BusError."""
         self.session = bus.open_session(self.connection, self.stopping, self._tell_waiting, patience_s)
         self._reachable = True
+        if not self.is_warm():
+            self._replicas, self._owned = frozenset(), {}  # it owns nothing before it knows whether others do
         self._watch_replicas()
         self.answer(topics.health(self.cell.name, self.service, self.instance), lambda _, __: json.dumps(self.health()).encode())
         for declare in self._pending:
@@ -98,8 +102,8 @@ class Node:
         return self
 
     def _come_alive(self) -> None:
-        """The last step: who is alive can be asked, is listening, and owns streams. A service that needs to warm up beside living
-        replicas does so first, for at most WARM_UP_S; alone, a cold one is better than none."""
+        """The last step: who is alive can be asked, is listening, and owns streams. Beside living replicas a service warms up
+        first, for at most WARM_UP_S; alone, a cold one is better than none."""
         session = cast(zenoh.Session, self.session)
 
         def declare() -> None:
@@ -107,17 +111,13 @@ class Node:
             self._count_replicas()
 
         def warm_up() -> None:
-            deadline = time.monotonic() + WARM_UP_S
-            while not self.is_warm() and time.monotonic() < deadline and not self.stopping.wait(0.02):
-                pass
-            if not self.stopping.is_set():
-                declare()
+            began = time.monotonic()
+            while not self.is_warm() and time.monotonic() - began < (WARM_UP_S if self._others else NEWS_S):
+                if self.stopping.wait(0.02):
+                    return
+            declare()
 
-        def has_others() -> bool:
-            tokens = session.liveliness().get(topics.alive(self.cell.name, self.service), timeout=1.0)
-            return any(reply.ok is not None for reply in tokens)
-
-        if not self.is_warm() and has_others():
+        if not self.is_warm():
             self._spawn(warm_up, "warm up")
         else:
             declare()
@@ -322,7 +322,8 @@ class Node:
         news of a replica's coming or going is under way two may own a stream, or none."""
         owned = self._owned.get(stream)
         if owned is None:
-            owned = self.instance == max(self._replicas, key=lambda replica: blake2b(f"{replica} {stream}".encode()).digest())
+            weight = lambda replica: blake2b(f"{replica} {stream}".encode()).digest()  # noqa: E731
+            owned = self.instance == max(self._replicas, key=weight, default=None)
             self._owned[stream] = owned
         return owned
 
@@ -348,8 +349,7 @@ class Node:
     def _count_replicas(self) -> None:
         """This one counts as soon as the others know of it, or where there are none."""
         with self._counting:
-            is_guest = self._token is None and self._others
-            self._replicas = self._others if is_guest else self._others | {self.instance}
+            self._replicas = self._others if self._token is None and self._others else self._others | {self.instance}
             self._owned = {}
 
     def health(self) -> dict[str, Any]:
