@@ -49,7 +49,7 @@ def configure(level: str = "info", form: str = "text", service: str = "penumbra"
         log = get(service)
         sys.excepthook = lambda kind, error, trace: log.error(f"{kind.__name__}: {error}", exc_info=(kind, error, trace))
         threading.excepthook = lambda ended: log.error(
-            f"{ended.exc_type.__name__}: {ended.exc_value}", exc_info=(ended.exc_type, ended.exc_value, ended.exc_traceback)
+            f"{ended.exc_type.__name__}: {ended.exc_value}", exc_info=ended.exc_value or True
         )
 
 

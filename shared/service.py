@@ -91,7 +91,7 @@ class Node:
         if not self.is_warm():
             self._replicas, self._owned = frozenset(), {}  # it owns nothing before it knows whether others do
         self._watch_replicas()
-        self.answer(topics.health(self.cell.name, self.service, self.instance), lambda _, __: json.dumps(self.health()).encode())
+        self.answer(topics.health(self.cell.name, self.service, self.instance), self._answer_health)
         for declare in self._pending:
             declare()
         self._pending.clear()
@@ -266,7 +266,7 @@ class Node:
 
     def answer(self, key: str, function: Answer) -> None:
         """Answers queries on `key` with `function(parameters, payload)`: bytes, or bytes and their encoding. A ValueError becomes
-        an error reply with its text."""
+        an error reply with its text. While it warms up beside others, it leaves the answers to them."""
 
         def serve(queryable: Any) -> None:
             while True:
@@ -286,6 +286,8 @@ class Node:
     def _reply(self, key: str, query: zenoh.Query, function: Answer) -> None:
         parameters = dict(cast(Any, query.parameters))
         try:
+            if self._token is None and self._others and not self.is_warm() and function != self._answer_health:
+                raise ValueError(f"{self.service} {self.instance} warms up: ask the others")
             result = function(parameters, query.payload.to_bytes() if query.payload is not None else b"")
         except ValueError as error:
             query.reply_err(str(error).encode())
@@ -378,6 +380,9 @@ class Node:
             "faults": dict(self._faults),
             **({"report": {name: tell() for name, tell in self.report.items()}} if self.report else {}),
         }
+
+    def _answer_health(self, parameters: dict[str, str], payload: bytes) -> bytes:
+        return json.dumps(self.health()).encode()
 
     def _look(self) -> Counter[tuple[str, str]]:
         return self._lately.look(health.counts(self._received, self._faults), time.monotonic())

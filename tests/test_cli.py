@@ -38,7 +38,7 @@ def endpoint():
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["fly"], "penumbra: no command 'fly': one of up, router, "),
+        (["fly"], "penumbra: no command 'fly': one of up, restart, scale, router, "),
         (
             ["fusion", "--cell", "nowhere"],
             "penumbra fusion: no cell 'nowhere': give one of arm, table, or the path of a YAML file",

@@ -450,6 +450,9 @@ def test_a_replica_that_takes_over_goes_on_with_the_pose(
             del heard[:]
             wait_for(lambda: len(heard) > 5, 5.0, "poses while the new one has heard nothing")
             assert not new.health()["ready"] and not new.owns("forearm")
+            (answer,) = user.query(topics.current_pose("table", "forearm"), "format=json")
+            assert json.loads(answer)["state"] != "lost", "the old one's"
+            assert len(user.query(topics.health("table", service.NAME))) == 2
             wait_for(lambda: see() or new.health()["ready"], 5.0, "the new one to be ready")
             speaker = heard[0][1]
             old.close()
