@@ -72,7 +72,9 @@ class Launcher:
             process.name: {"state": process.state, "restarts": process.restarts, "note": process.note}
             for process in fleet.processes
         }
+        node.worries = self._worries
         node.answer(topics.launcher(node.cell.name), fleet.answer)
+        self._looping: set[str] = set()
 
     def run(self, seconds: float) -> None:
         """Starts everything, and returns after `seconds` or when the node is stopping; then nothing is left."""
@@ -108,6 +110,17 @@ class Launcher:
             process.measure()
             if (report := local.get(process.pid or 0)) is not None:
                 process.heard(report["ready"])
+
+        self._tell_of_loops()
+
+    def _tell_of_loops(self) -> None:
+        looping = {process.name: process.note for process in self.fleet.processes if process.is_looping}
+        for name in looping.keys() - self._looping:
+            self.node.log.error("a process dies again and again; the others go on", process=name, why=looping[name])
+        self._looping = set(looping)
+
+    def _worries(self) -> list[str]:
+        return [f"{each.name} {each.state}: {each.note}" for each in self.fleet.processes if each.state in ("waiting", "failed")]
 
     def _rows(self) -> list[live.ProcessRow]:
         local = self.watch.local()

@@ -63,6 +63,11 @@ class Supervised:
     def pid(self) -> int | None:
         return self.popen.pid if self.popen else None
 
+    @property
+    def is_looping(self) -> bool:
+        """Whether it died again and again, and has not run for STABLE_S since."""
+        return self._crashes >= CRASH_LOOP
+
     def start(self) -> None:
         """Starts it, from the launcher's main thread: the kernel ends it when that thread ends."""
         self._last_words.clear()
@@ -120,7 +125,7 @@ class Supervised:
             self.state = "failed"
             return
         self._crashes += 1
-        if self._crashes >= CRASH_LOOP:
+        if self.is_looping:
             self.note = f"crash loop: {self.note}"
         self.state, self._due = "waiting", now + self._delay_s
         self._delay_s = min(2 * self._delay_s, BACKOFF_S[1])

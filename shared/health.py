@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from shared.bus import Traffic
 
@@ -42,9 +42,11 @@ def counts(received: Mapping[str, Traffic], faults: Mapping[str, int]) -> dict[t
     return refused | {("", kind): n for kind, n in list(faults.items())}
 
 
-def judge(away: str, received: Mapping[str, Traffic], grown: Mapping[tuple[str, str], int], now_ns: int) -> tuple[str, list[str]]:
+def judge(
+    away: str, received: Mapping[str, Traffic], grown: Mapping[tuple[str, str], int], own: Sequence[str], now_ns: int
+) -> tuple[str, list[str]]:
     """Status and reasons. away: why the others cannot be reached, empty where they can; received: what is read, by key; grown:
-    which of `counts` grew lately."""
+    which of `counts` grew lately; own: what the service itself suffers from."""
     reasons = [away] if away else []
     for key, traffic in sorted(received.items()):
         if traffic.is_stale(now_ns):
@@ -55,6 +57,7 @@ def judge(away: str, received: Mapping[str, Traffic], grown: Mapping[tuple[str, 
         reasons.append(f"refused on {_short(key)} in the last {LATELY_S:.0f} s: {kinds}")
     if faults := ", ".join(f"{n} {kind}" for (where, kind), n in sorted(grown.items()) if not where):
         reasons.append(f"faults in the last {LATELY_S:.0f} s: {faults}")
+    reasons += own
     return "down" if away else "degraded" if reasons else "ok", reasons
 
 

@@ -70,6 +70,7 @@ class Node:
         self._faults: dict[str, int] = {}
         self._lately = health.Lately()
         self.report: dict[str, Callable[[], Any]] = {}
+        self.worries: Callable[[], Sequence[str]] = list  # what the service itself suffers from, in words
         self._counting = threading.Lock()
         self._token: zenoh.LivelinessToken | None = None
         self.is_warm: Callable[[], bool] = lambda: True  # whether it could go on with what another replica does
@@ -359,7 +360,7 @@ class Node:
         memory in MB, counters of every topic, and what the service tells of itself in `report`: JSON by name, from a function
         each."""
         now = self.now_ns()
-        status, reasons = health.judge(self._away(), self._received, self._look(), now)
+        status, reasons = health.judge(self._away(), self._received, self._look(), self.worries(), now)
         return {
             "service": self.service,
             "instance": self.instance,
@@ -428,7 +429,7 @@ class Node:
                 self._tell_waiting()
         heartbeat = os.environ.get("PENUMBRA_HEARTBEAT")
         if heartbeat:
-            status, reasons = health.judge(self._away(), self._received, grown, self.now_ns())
+            status, reasons = health.judge(self._away(), self._received, grown, self.worries(), self.now_ns())
             fresh = Path(f"{heartbeat}.new")
             fresh.write_text(": ".join([status, "; ".join(reasons)]).removesuffix(": ") + "\n")
             fresh.replace(heartbeat)  # nobody reads half of it

@@ -1,6 +1,7 @@
 """Restarts and numbers of replicas while a launcher runs, with real processes asked for by the real commands."""
 
 import json
+import logging
 import os
 import signal
 import sys
@@ -121,11 +122,16 @@ def test_a_successor_that_does_not_start_is_told_and_the_old_one_goes_on(launche
     assert {name: up.pids(name) for name in ("worker", "helper")} == before
 
 
-def test_a_crash_loop_beside_does_not_hold_up_what_is_restarted(launched):
+def test_a_crash_loop_is_told_and_does_not_hold_up_what_is_restarted(launched, caplog, monkeypatch):
+    monkeypatch.setattr(logging.getLogger("penumbra"), "propagate", True)
     crashing = lambda endpoint: Kind(ALWAYS_CRASHES)  # noqa: E731
     up = launched({"crashing": crashing, "worker": small("worker")}, {"crashing": 1, "worker": 1}, {"worker": 1})
     before = up.pids("worker")
-    wait_for(lambda: up.fleet.processes[0].note.startswith("crash loop"), 20, "the report of a crash loop")
+    told = "crashing waiting: crash loop: exit code 1: out of luck"
+    wait_for(lambda: told in up.node.health()["reasons"], 20, "the report of a crash loop")
+    assert up.node.health()["status"] == "degraded"
+    line = "a process dies again and again; the others go on"
+    wait_for(lambda: [record for record in caplog.records if record.message == line], 5, "the line in the log")
     assert up.command("restart", "worker") == 0
     assert len(up.pids("worker")) == 1 and up.pids("worker") != before
 

@@ -71,8 +71,8 @@ def test_counters_that_grew_lately_are_told_and_forgotten_after_a_while():
 
 
 def test_a_process_with_nothing_to_say_is_ok_and_one_off_the_bus_is_down():
-    assert health.judge("", {}, {}, 0) == ("ok", [])
-    assert health.judge("no router at here", {}, {}, 0) == ("down", ["no router at here"])
+    assert health.judge("", {}, {}, [], 0) == ("ok", [])
+    assert health.judge("no router at here", {}, {}, [], 0) == ("down", ["no router at here"])
     report = Node("worker", CELL).health()
     assert (report["status"], report["reasons"]) == ("down", ["not on the bus"])
 
@@ -84,13 +84,14 @@ def test_every_reason_names_what_is_missing_and_since_when():
     fresh.took(now_ns, now_ns)
     received = {f"penumbra/table/skin/{pad}/voltages": traffic for pad, traffic in zip("abc", (never, old, fresh), strict=True)}
     grown = {("penumbra/table/skin/c/voltages", "past"): 2, ("", "ValueError at x.py:3"): 1}
-    assert health.judge("", received, grown, now_ns) == (
+    assert health.judge("", received, grown, ["fusion: waiting"], now_ns) == (
         "degraded",
         [
             "nothing heard on skin/a/voltages yet",
             "no skin/b/voltages for 3.2 s",
             "refused on skin/c/voltages in the last 30 s: 2 past",
             "faults in the last 30 s: 1 ValueError at x.py:3",
+            "fusion: waiting",
         ],
     )
 
