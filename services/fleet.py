@@ -98,7 +98,7 @@ class Fleet:
     # ---- what is asked for on the bus
 
     def answer(self, parameters: dict[str, str], payload: bytes) -> bytes:
-        """Of the launcher's queryable: `{command: restart, services, id}` (no services: all), `{command: scale, service, number,
+        """Of the launcher's queryable: `{command: restart, services, id}` (a list, `all`, or null for all that can be replaced without a gap), `{command: scale, service, number,
         id}`, `{command: state, id}`, each answered with the change's report. Raises ValueError that says what was expected."""
         try:
             asked = json.loads(payload)
@@ -110,7 +110,7 @@ class Fleet:
                 if name not in self._changes:
                     raise ValueError(f"no change {name} was asked for here")
             elif command == "restart":
-                self._begin(name, self._restart(asked.get("services") or []))
+                self._begin(name, self._restart(asked.get("services")))
             elif command == "scale":
                 self._begin(name, self._scale(asked.get("service"), asked.get("number")))
             else:
@@ -129,12 +129,16 @@ class Fleet:
 
     def _restart(self, services: Any) -> Change:
         running = [name for name, group in self._groups.items() if group]
+        if services is None:
+            services = [name for name in running if self._kinds[name].beside]
+        elif services == "all":
+            services = running
         strangers = [name for name in services if name not in running] if isinstance(services, list) else [services]
         if strangers:
             raise ValueError(
                 f"restart {strangers[0]!s:.60}: one of {', '.join(running) or 'no service'} expected: these run here"
             )
-        chosen = [name for name in running if not services or name in services]
+        chosen = [name for name in running if name in services]
         return Change(f"restart of {', '.join(chosen) or 'nothing'}", self._one_after_another(chosen))
 
     def _scale(self, service: Any, number: Any) -> Change:

@@ -24,12 +24,12 @@ def restart(argv: list[str]) -> int:
         "Restarts services of the running `penumbra up`, one process after another. The new one serves before the old one ends, "
         "except where there can be but one (emulator).",
     )
-    parser.add_argument("service", nargs="*", help="what to restart (default: everything, in the order of the launcher's table)")
-    parser.add_argument("--all", action="store_true", help="everything, as without a name")
+    parser.add_argument("service", nargs="*", help="what to restart (default: all that can be replaced without a gap)")
+    parser.add_argument("--all", action="store_true", help="everything, also what there can be but one of (emulator)")
     options = parser.parse_args(argv)
     if options.all and options.service:
         parser.error(f"--all or names expected, both came: {' '.join(options.service)}")
-    return _change(options, {"command": "restart", "services": options.service})
+    return _change(options, {"command": "restart", "services": "all" if options.all else options.service or None})
 
 
 def scale(argv: list[str]) -> int:

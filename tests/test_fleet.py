@@ -105,6 +105,11 @@ def test_what_there_can_be_only_one_of_ends_before_its_successor_begins_and_the_
     assert up.fewest == {"sensor": 0, "worker": 1}
     assert up.pids("sensor") != before["sensor"]
     assert up.pids("worker") == before["worker"]
+    up.count_from_now()
+    before = {name: up.pids(name) for name in ("sensor", "worker")}
+    assert up.command("restart") == 0
+    assert up.pids("sensor") == before["sensor"], "without a name only what can be replaced without a gap"
+    assert up.pids("worker") != before["worker"]
 
 
 def test_a_successor_that_does_not_start_is_told_and_the_old_one_goes_on(launched, tmp_path, capsys):
