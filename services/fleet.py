@@ -98,9 +98,9 @@ class Fleet:
     # ---- what is asked for on the bus
 
     def answer(self, parameters: dict[str, str], payload: bytes) -> bytes:
-        """Of the launcher's queryable: `{command: restart, services, id}` (a list, `all`, or null for all that can be replaced
-        without a gap), `{command: scale, service, number, id}` and `{command: state, id}`, each answered with the change's report.
-        Raises ValueError that says what was expected."""
+        """Answers the launcher's queryable with a change's report: `{command: restart, services, id}` (a list, `all`, or null for
+        all that can be replaced without a gap), `{command: scale, service, number, id}` or `{command: state, id}`. Raises
+        ValueError that says what was expected."""
         try:
             asked = json.loads(payload)
             command, name = asked["command"], str(asked["id"])[:64]
