@@ -11,13 +11,11 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from shared.service import Node
 
 COMMANDS = {
     "up": "start every process of a cell with a router, and show what they do",
+    "restart": "restart services of the running `penumbra up`, one after another, without losing the pose",
+    "scale": "change the number of replicas of a service of the running `penumbra up`",
     "router": "the meeting point of all processes",
     "emulator": "a simulated cell: frames, joints, skin and truth",
     "segmentation": "frames to masks (`segmentation infer`: of files; `segmentation train`: learn the network again)",
@@ -52,6 +50,8 @@ SWITCH_S = 0.0005
 """A reader thread waits at most this long for a computing one; Python's 5 ms would be half of the skin's period."""
 FUNCTIONS = {
     "up": "services.launch:main",
+    "restart": "services.steer:restart",
+    "scale": "services.steer:scale",
     "pose": "services.client:pose",
     "topics": "services.client:list_topics",
     "sim": "services.client:sim",
@@ -84,7 +84,7 @@ def main(argv: list[str] | None = None) -> int:
         if not _is_ours(error):
             raise
         for line in str(error).splitlines():
-            print(f"penumbra {command}: {line}", file=sys.stderr)
+            _complain(command, line)
         return 2
 
 
@@ -109,18 +109,20 @@ def serve(name: str, argv: list[str]) -> int:
 
     module = importlib.import_module(f"services.{name}.service")
     parser = arguments.parser(name, module.__doc__ or COMMANDS[name])
+    arguments.add_metrics(parser)
     module.arguments(parser)
     options = parser.parse_args(argv)
     options.mode = options.mode or getattr(module, "MODE", None)
-    logs.configure(options.log_level, options.log_json)
+    logs.configure(options.log_level, options.log_format, name)
     node = Node(module.NAME, cell.load(options.cell), bus.connection(options))
-    module.start(node, options)
-    return run(node)
+    with arguments.metrics(parser, options.metrics_port, lambda: [node.health()]):
+        module.start(node, options)
+        node.run()
+    return leave()
 
 
-def run(node: Node) -> int:
-    """Serves until SIGINT or SIGTERM, and lets the process end."""
-    node.run()
+def leave() -> int:
+    """Lets a process end whose node has run."""
     if threading.active_count() > 1:  # something hangs: it must not keep the process, even if Zenoh cannot clean /dev/shm then
         logging.shutdown()
         sys.stdout.flush()
@@ -141,6 +143,15 @@ def _usage() -> str:
     width = max(map(len, COMMANDS))
     rows = "\n".join(f"  {name:{width}}  {about}" for name, about in COMMANDS.items())
     return f"usage: penumbra COMMAND [--help] ...\n\nTracks a forearm beside a robot, also while something hides it.\n\n{rows}"
+
+
+def _complain(command: str, line: str) -> None:
+    from shared import logs
+
+    if logs.is_json():
+        logs.get(command).error(line)
+    else:
+        print(f"penumbra {command}: {line}", file=sys.stderr)
 
 
 def _is_ours(error: Exception) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 
 import zenoh
 
-from services import arguments
+from services import arguments, health
 from shared import access, bus, topics
 from shared import cell as cells
 
@@ -87,7 +87,7 @@ def list_topics(argv: list[str]) -> int:
     from rich.table import Table
 
     parser = arguments.parser("topics", "Lists the table of topics, and with --hz what really arrives.")
-    parser.add_argument("--hz", action="store_true", help="listen to everything and print what arrives")
+    parser.add_argument("--hz", action="store_true", help="listen to everything; print what arrives and how the processes fare")
     parser.add_argument("--seconds", type=float, default=3.0, help="how long to listen (default: %(default)s)")
     options = parser.parse_args(argv)
     cell = cells.load(options.cell)
@@ -100,7 +100,7 @@ def list_topics(argv: list[str]) -> int:
                           f"{topic.stale_s:g} s", topic.publisher, escape(topic.about))  # fmt: skip
         console.print(table)
         return 0
-    report = listen(cell, bus.connection(options), options.seconds)
+    report, instances = listen(cell, bus.connection(options), options.seconds)
     table = Table("key", "Hz", "expected", "delay ms", "dropped", "bad", box=None)
     for key, row in report.items():
         expected = bus.topic_of(key)
@@ -111,19 +111,28 @@ def list_topics(argv: list[str]) -> int:
                 key, f"{row['rate_hz']:.1f}", f"{expected.rate_hz:g}" if expected else "", delay, str(row["dropped"] or 0), bad
             )
     console.print(table)
+    table = Table("process", "instance", "status", "reasons", box=None)
+    for instance in instances:
+        table.add_row(instance.service, instance.instance, instance.status, escape("; ".join(instance.reasons)))
+    console.print()
+    console.print(table)
     return 0
 
 
-def listen(cell: cells.Cell, connection: bus.Connection, seconds: float) -> dict[str, dict[str, Any]]:
-    """The counters of every key of the cell after listening for a while."""
+def listen(
+    cell: cells.Cell, connection: bus.Connection, seconds: float
+) -> tuple[dict[str, dict[str, Any]], list[health.Instance]]:
+    """The counters of every key of the cell after listening for a while, and how its processes fare."""
     from shared.service import Node
 
     node = Node("topics", cell, connection)
     for topic in topics.TOPICS:
         node.subscribe(topic, lambda message, names: None)
     with node.open(PATIENCE_S):
+        assert node.session is not None
         node.stopping.wait(seconds)
-        return node.health()["topics"]
+        instances = [found for found in health.ask(node.session, cell.name) if found.instance != node.instance]
+        return node.health()["topics"], instances
 
 
 def sim(argv: list[str]) -> int:

@@ -1,4 +1,5 @@
-"""`penumbra doctor`: looks at this machine and says how to mend what is wrong; with --skin at the pads of a running cell."""
+"""`penumbra doctor`: looks at this machine and at what runs, and says how to mend what is wrong; with --skin at the pads of a
+running cell."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from services import arguments
+from services import arguments, health
 from services.launch import PROCESSES
 from shared import bus
 from shared import cell as cells
@@ -23,7 +24,7 @@ from shared import cell as cells
 ROOT = Path(__file__).parents[1]
 SHM_BYTES = 128 << 20
 """Frames cross between processes in shared memory; Docker's default of 64 MB is too little for two cameras."""
-CORE = ("eclipse-zenoh", "msgpack", "numpy", "scipy", "pydantic", "pyyaml", "psutil", "rich")
+CORE = ("eclipse-zenoh", "msgpack", "numpy", "scipy", "pydantic", "pyyaml", "prometheus_client", "psutil", "rich")
 EXTRAS = {
     "torch": "segmentation",
     "openvino": "segmentation",
@@ -37,6 +38,7 @@ EXTRAS = {
     "pyserial": "skin",
 }
 STYLES = {"ok": "green", "warn": "yellow", "fail": "red"}
+FOUND = {"ok": "ok", "degraded": "warn", "down": "fail"}
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,10 @@ def findings(cell: str, connection: bus.Connection) -> Iterator[Finding]:
     yield _shared_memory()
     yield from _cell(cell)
     yield from _weights()
-    yield _router(connection)
+    router = _router(connection)
+    yield router
+    if router.status == "ok":
+        yield from _processes(cell, connection)
 
 
 def _python() -> Finding:
@@ -152,3 +157,18 @@ def _router(connection: bus.Connection) -> Finding:
             return Finding("ok", f"router at {connection.where}")
     except bus.BusError as error:
         return Finding("warn", *str(error).split(": ", 1)) if str(error).startswith("no router") else Finding("fail", str(error))
+
+
+def _processes(cell: str, connection: bus.Connection) -> Iterator[Finding]:
+    """How the running processes of the cell fare, with the reasons."""
+    try:
+        name = cells.load(cell).name
+    except cells.CellError:  # told above
+        return
+    with bus.open_session(connection, threading.Event(), lambda: None, 0.0) as session:
+        instances = health.ask(session, name)
+    if not instances:
+        yield Finding("warn", f"no process of cell {name} runs there", f"penumbra up --cell {cell}")
+    for instance in instances:
+        mend = f"penumbra restart {instance.service}" if instance.status == "down" else ""
+        yield Finding(FOUND[instance.status], str(instance), mend)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import socket
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -19,12 +20,12 @@ from shared import bus, geometry, topics
 from shared.messages import BadMessage, FusedPose, Truth, decode
 from shared.service import Node
 
-STYLES = {"running": "green", "starting": "yellow", "tracking": "green", "coasting": "yellow"}
+STYLES = {"running": "green", "starting": "yellow", "degraded": "yellow"}
 
 
 @dataclass(frozen=True)
 class ProcessRow:
-    """One process: `note` says why it is not running."""
+    """One process: `note` says why it is not running, or not as it should."""
 
     name: str
     state: str
@@ -73,15 +74,20 @@ class Watch:
         names = {"cell": node.cell.name, "target": self._target}
         self._fused = session.declare_subscriber(topics.FUSED.at(**names), zenoh.handlers.RingChannel(1))
         self._truth = session.declare_subscriber(topics.TRUTH.at(**names), zenoh.handlers.RingChannel(64))
-        self.health: dict[int, dict[str, Any]] = {}
+        self.health: dict[str, dict[str, Any]] = {}
         self.accuracy: Accuracy | None = None
         self.errors: list[tuple[float, float]] = []
 
     def refresh(self) -> None:
-        """Asks all instances how they are; `health` is then their answers by pid."""
+        """Asks all instances how they are; `health` is then their answers by instance."""
         found = [json.loads(answer) for answer in self._node.query(topics.health(self._node.cell.name), timeout_s=2.0)]
-        self.health = {report["pid"]: report for report in found}
+        self.health = {report["instance"]: report for report in found}
         self._look_at_pose()
+
+    def local(self) -> dict[int, dict[str, Any]]:
+        """The answers of this host's instances by pid."""
+        host = socket.gethostname()
+        return {report["pid"]: report for report in self.health.values() if report["host"] == host}
 
     def _look_at_pose(self) -> None:
         samples = list(_drain(self._fused))

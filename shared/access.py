@@ -1,7 +1,7 @@
 """Who may say what on a secured bus: the router's rules, from the one table of topics.
 
 A certificate's common name is the name of its holder. Sensors and methods publish what the table says, speak for nobody's health
-but their own, and read everything; a viewer only reads and asks; an operator also steers the emulator. What no rule allows, the
+but their own, and read everything; a viewer only reads and asks; an operator also steers the emulator and the launcher. What no rule allows, the
 router drops, without an answer to the sender.
 """
 
@@ -19,7 +19,7 @@ ROUTER, OPERATOR, VIEWER = "router", "operator", "viewer"
 """… the meeting point, which passes on what other routers have let through, and people's commands."""
 HOLDERS = (*SERVICES, ROUTER, OPERATOR, VIEWER)
 
-ANSWERS = {"fusion": topics.current_pose("*", "*"), "emulator": topics.control("*")}
+ANSWERS = {"fusion": topics.current_pose("*", "*"), "emulator": topics.control("*"), "launcher": topics.launcher("*")}
 """Queryables beside the health, by who answers them."""
 EVERYTHING = ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
               "liveliness_token", "liveliness_query", "declare_liveliness_subscriber")  # fmt: skip
@@ -46,7 +46,7 @@ def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES)
         _rule("read", ["declare_subscriber"], keys),
         _rule("see who lives", ["liveliness_query", "declare_liveliness_subscriber"], [topics.alive("*")]),
         _rule("ask", ["query"], [topics.current_pose("*", "*"), topics.health("*")]),
-        _rule("steer", ["query"], [topics.control("*")]),
+        _rule("steer", ["query"], [topics.control("*"), topics.launcher("*")]),
     ]
     reader = ["hear", "read", "see who lives", "ask"]
     policies = {ROUTER: ["hear", "pass on"], OPERATOR: [*reader, "steer"], VIEWER: reader}

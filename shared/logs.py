@@ -1,15 +1,20 @@
-"""Structured logs: a sentence and its fields, as key=value text or as one JSON object a line, on standard error."""
+"""Structured logs: a sentence and its fields, as key=value text or as one JSON object a line, on standard error.
+
+A line of JSON is `{time, level, service, instance, message, fields}`, and `trace` where an exception is told.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
 import sys
+import threading
 from collections.abc import MutableMapping
 from datetime import UTC, datetime
 from typing import Any
 
 LEVELS = ("debug", "info", "warning", "error")
+FORMATS = ("text", "json")
 
 
 class Log(logging.LoggerAdapter):
@@ -29,14 +34,36 @@ def get(service: str, **fields: Any) -> Log:
     return Log(logging.getLogger(f"penumbra.{service}"), fields)
 
 
-def configure(level: str = "info", as_json: bool = False) -> None:
-    """Sends the logs of Penumbra to standard error, from `level` on."""
+def configure(level: str = "info", form: str = "text", service: str = "penumbra") -> None:
+    """Sends the logs of Penumbra to standard error, from `level` on. As JSON, whatever else the process of `service` says there
+    is a line of JSON too: warnings of libraries, and the exception that ends a thread or the process."""
     handler = _ToStandardError()
-    handler.setFormatter(_Json() if as_json else _Text())
+    handler.setFormatter(_Json() if form == "json" else _Text())
     logger = logging.getLogger("penumbra")
     logger.handlers[:] = [handler]
     logger.setLevel(level.upper())
     logger.propagate = False
+    if form == "json":
+        logging.getLogger().handlers[:] = [handler]
+        logging.captureWarnings(True)
+        log = get(service)
+        sys.excepthook = lambda kind, error, trace: log.error(f"{kind.__name__}: {error}", exc_info=(kind, error, trace))
+        threading.excepthook = lambda ended: log.error(
+            f"{ended.exc_type.__name__}: {ended.exc_value}", exc_info=ended.exc_value or True
+        )
+
+
+def is_json() -> bool:
+    """Whether `configure` has chosen JSON."""
+    return any(isinstance(handler.formatter, _Json) for handler in logging.getLogger("penumbra").handlers)
+
+
+def sentence(line: str) -> str:
+    """What a line of a log says, without what is around it where it is one of JSON."""
+    try:
+        return str(json.loads(line)["message"])
+    except (ValueError, TypeError, KeyError):
+        return line
 
 
 class _ToStandardError(logging.Handler):
@@ -65,7 +92,10 @@ class _Text(logging.Formatter):
 class _Json(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         time, level, service = _common(record)
-        line = {"time": time, "level": level, "service": service, "text": record.getMessage(), **getattr(record, "fields", {})}
+        fields = dict(getattr(record, "fields", {}))
+        instance = fields.pop("instance", None)
+        line = {"time": time, "level": level, "service": service, "instance": instance, "message": record.getMessage()}
+        line["fields"] = fields
         if record.exc_info:
             line["trace"] = self.formatException(record.exc_info)
         return json.dumps(line, default=str)

@@ -1,7 +1,8 @@
 """Every message that crosses the bus, and its wire format.
 
-A message is a frozen dataclass; on the wire it is a MessagePack map of its fields, an array being `[dtype, shape, bytes]`.
-`decode` believes nothing: it checks size, type, shape, dtype, finiteness and stamp, and says what it expected and what came.
+A message is a frozen dataclass; on the wire it is a MessagePack map of its fields, an array being `[dtype, shape, bytes]`, led by
+the `version` of this format. `decode` believes nothing: it checks size, version, type, shape, dtype, finiteness and stamp, and
+says what it expected and what came.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ from typing import Any
 import msgpack
 import numpy as np
 
+VERSION = 1
+"""Of the wire format: it counts up with every change of a message's fields or of their meaning. Every version keeps it under
+`version` in a map, so that also a reader of another one can tell what came."""
 MAX_FUTURE_S = 0.5
 """A stamp further ahead of the reader's clock than this is refused: clocks of one cell are kept closer than that."""
 MAX_PAST_S = 5.0
@@ -220,7 +224,7 @@ def _dtype_name(dtype: np.dtype) -> str:
 
 def encode(message: Message) -> bytes:
     """The MessagePack bytes of a message. Raises BadMessage where an array has not the declared dtype and shape."""
-    out: dict[str, Any] = {}
+    out: dict[str, Any] = {"version": VERSION}
     for name, _, metadata in _fields(type(message)):
         value = getattr(message, name)
         spec = metadata.get("array")
@@ -251,6 +255,12 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: f
         raise BadMessage("msgpack", f"{kind.__name__}: MessagePack expected, came {payload[:16]!r}… ({error!s:.100})") from None
     if not isinstance(raw, dict):
         raise BadMessage("map", f"{kind.__name__}: a map of fields expected, a {type(raw).__name__} came")
+    version = raw.pop("version", None)
+    if version != VERSION:
+        raise BadMessage(
+            "version",
+            f"{kind.__name__}: wire version {VERSION} expected, {_short(version)} came: run one release of Penumbra everywhere",
+        )
     specs = _fields(kind)
     if raw.keys() != {name for name, _, _ in specs}:
         raise BadMessage(

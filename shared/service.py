@@ -20,6 +20,7 @@ import string
 import threading
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -31,14 +32,18 @@ from typing import Any, Literal, cast
 import psutil
 import zenoh
 
-from shared import bus, cell, logs, topics
+from shared import bus, cell, health, logs, topics
 from shared.guard import Guard
-from shared.messages import BadMessage, Message, encode
+from shared.messages import VERSION, BadMessage, Message, encode
 from shared.topics import QoS, Topic
 
 CLOSE_S = 0.8
 """Closing a session on a bad network may take much longer; a process that ends does not wait for that."""
 QUERY_DEPTH = 32
+NEWS_S = 0.2
+"""Within this a session has heard which replicas there are."""
+WARM_UP_S = 2.0
+"""How long a replica that joins others may listen before it takes its share."""
 
 Answer = Callable[[dict[str, str], bytes], "bytes | tuple[bytes, str]"]
 
@@ -65,13 +70,20 @@ class Node:
         self._published: dict[str, bus.Traffic] = {}
         self._publishers: dict[tuple[str, ...], tuple[zenoh.Publisher, bus.Traffic, zenoh.EntityGlobalId, itertools.count]] = {}
         self._faults: dict[str, int] = {}
+        self._lately = health.Lately()
         self.report: dict[str, Callable[[], Any]] = {}
+        self.worries: Callable[[], Sequence[str]] = list  # what the service itself suffers from, in words
+        self._counting = threading.Lock()
+        self._token: zenoh.LivelinessToken | None = None
+        self.is_warm: Callable[[], bool] = lambda: True  # whether it could go on with what another replica does
+        self._others: frozenset[str] = frozenset()
         self._replicas = frozenset({self.instance})
         self._owned: dict[str, bool] = {}
         self._process = psutil.Process()
         self._cpu = 0.0
         self._started = time.monotonic()
         self._reachable = False
+        self._other_versions = itertools.count()
 
     # ---- life
 
@@ -79,17 +91,39 @@ class Node:
         """Opens the session, waiting for the router, and declares what was asked for. Raises bus.BusError."""
         self.session = bus.open_session(self.connection, self.stopping, self._tell_waiting, patience_s)
         self._reachable = True
+        if not self.is_warm():
+            self._replicas, self._owned = frozenset(), {}  # it owns nothing before it knows whether others do
         self._watch_replicas()
-        self.answer(topics.health(self.cell.name, self.service, self.instance), lambda _, __: json.dumps(self.health()).encode())
+        self.answer(topics.health(self.cell.name, self.service, self.instance), self._answer_health)
         for declare in self._pending:
             declare()
         self._pending.clear()
-        # the last step: who is alive can be asked and is listening
-        self._token = self.session.liveliness().declare_token(topics.alive(self.cell.name, self.service, self.instance))
+        self._come_alive()
         self._process.cpu_percent()
         self.every(1.0, self._keep_house)
         self.log.info("on the bus", at=", ".join(self.connection.listen) or self.connection.where)
         return self
+
+    def _come_alive(self) -> None:
+        """The last step: who is alive can be asked, is listening, and owns streams. Beside living replicas a service warms up
+        first, for at most WARM_UP_S; alone, a cold one is better than none."""
+        session = cast(zenoh.Session, self.session)
+
+        def declare() -> None:
+            self._token = session.liveliness().declare_token(topics.alive(self.cell.name, self.service, self.instance))
+            self._count_replicas()
+
+        def warm_up() -> None:
+            began = time.monotonic()
+            while not self.is_warm() and time.monotonic() - began < (WARM_UP_S if self._others else NEWS_S):
+                if self.stopping.wait(0.02):
+                    return
+            declare()
+
+        if not self.is_warm():
+            self._spawn(warm_up, "warm up")
+        else:
+            declare()
 
     def run(self) -> None:
         """Opens, and serves until SIGINT or SIGTERM; a second signal ends the process at once. Raises bus.BusError."""
@@ -241,7 +275,7 @@ class Node:
 
     def answer(self, key: str, function: Answer) -> None:
         """Answers queries on `key` with `function(parameters, payload)`: bytes, or bytes and their encoding. A ValueError becomes
-        an error reply with its text."""
+        an error reply with its text. While it warms up beside others, it leaves the answers to them."""
 
         def serve(queryable: Any) -> None:
             while True:
@@ -261,6 +295,8 @@ class Node:
     def _reply(self, key: str, query: zenoh.Query, function: Answer) -> None:
         parameters = dict(cast(Any, query.parameters))
         try:
+            if self._token is None and self._others and not self.is_warm() and function != self._answer_health:
+                raise ValueError(f"{self.service} {self.instance} warms up: ask the others")
             result = function(parameters, query.payload.to_bytes() if query.payload is not None else b"")
         except ValueError as error:
             query.reply_err(str(error).encode())
@@ -297,7 +333,8 @@ class Node:
         news of a replica's coming or going is under way two may own a stream, or none."""
         owned = self._owned.get(stream)
         if owned is None:
-            owned = self.instance == max(self._replicas, key=lambda replica: blake2b(f"{replica} {stream}".encode()).digest())
+            weight = lambda replica: blake2b(f"{replica} {stream}".encode()).digest()  # noqa: E731
+            owned = self.instance == max(self._replicas, key=weight, default=None)
             self._owned[stream] = owned
         return owned
 
@@ -315,20 +352,33 @@ class Node:
                     return
                 instance = str(sample.key_expr).rpartition("/")[2]
                 (living.discard if sample.kind == zenoh.SampleKind.DELETE else living.add)(instance)
-                self._replicas = frozenset(living | {self.instance})
-                self._owned = {}
+                self._others = frozenset(living - {self.instance})
+                self._count_replicas()
 
         self._spawn(watch, "replicas")
 
+    def _count_replicas(self) -> None:
+        """This one counts as soon as the others know of it, or where there are none."""
+        with self._counting:
+            self._replicas = self._others if self._token is None and self._others else self._others | {self.instance}
+            self._owned = {}
+
     def health(self) -> dict[str, Any]:
-        """What this instance is and how it fares, as JSON: CPU in cores, memory in MB, counters of every topic, and what the
-        service tells of itself in `report`: JSON by name, from a function each."""
+        """What this instance is and how it fares, as JSON: its status and the reasons for it (`shared.health`), CPU in cores,
+        memory in MB, counters of every topic, and what the service tells of itself in `report`: JSON by name, from a function
+        each."""
         now = self.now_ns()
+        status, reasons = health.judge(self._away(), self._received, self._look(), self.worries(), now)
         return {
             "service": self.service,
             "instance": self.instance,
+            "status": status,
+            "reasons": reasons,
+            "host": socket.gethostname(),
             "pid": os.getpid(),
             "cell": self.cell.name,
+            "wire_version": VERSION,
+            "ready": self._token is not None,
             "uptime_s": round(time.monotonic() - self._started, 1),
             "cpu": round(self._cpu, 3),
             "memory_mb": round(self._process.memory_info().rss / 1e6, 1),
@@ -340,6 +390,18 @@ class Node:
             **({"report": {name: tell() for name, tell in self.report.items()}} if self.report else {}),
         }
 
+    def _answer_health(self, parameters: dict[str, str], payload: bytes) -> bytes:
+        return json.dumps(self.health()).encode()
+
+    def _look(self) -> Counter[tuple[str, str]]:
+        return self._lately.look(health.counts(self._received, self._faults), time.monotonic())
+
+    def _away(self) -> str:
+        """Why the others cannot be reached; empty where they can."""
+        if self.session is None:
+            return "not on the bus"
+        return "" if self._reachable else f"no router at {self.connection.where}"
+
     def fault(self, where: str, error: Exception) -> None:
         """Counts an exception; the first of its kind and place is logged with its trace."""
         frames = traceback.extract_tb(error.__traceback__)
@@ -350,14 +412,19 @@ class Node:
             self.log.error(f"{type(error).__name__}: {error}", where=where, at=place, exc_info=error)
 
     def _refused(self, key: str, error: BadMessage) -> None:
+        """Told of the first bad message of each kind on a key. Another release speaks on many keys at once: it is told once."""
+        if error.kind == "version" and next(self._other_versions):
+            return
         self.log.warning("message refused; more of this kind are only counted", key=key, kind=error.kind, why=str(error))
 
     def _tell_waiting(self) -> None:
         self.log.warning(f"waiting for the router {self.connection.whereabouts}: start `penumbra router` or `penumbra up`")
 
     def _keep_house(self) -> None:
-        """Once a second: CPU, the state of the link, and the heartbeat file that a container's health check reads."""
+        """Once a second: CPU, what should not happen, the state of the link, and the heartbeat file that a container's health
+        check reads: the status and its reasons, in words."""
         self._cpu = self._process.cpu_percent() / 100
+        grown = self._look()
         session = self.session
         if session is None:
             return
@@ -369,8 +436,11 @@ class Node:
             else:
                 self._tell_waiting()
         heartbeat = os.environ.get("PENUMBRA_HEARTBEAT")
-        if heartbeat and reachable:
-            Path(heartbeat).touch()
+        if heartbeat:
+            status, reasons = health.judge(self._away(), self._received, grown, self.worries(), self.now_ns())
+            fresh = Path(f"{heartbeat}.new")
+            fresh.write_text(": ".join([status, "; ".join(reasons)]).removesuffix(": ") + "\n")
+            fresh.replace(heartbeat)  # nobody reads half of it
 
     def _declare(self, declare: Callable[[], None]) -> None:
         if self.session is None:

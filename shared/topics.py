@@ -83,6 +83,11 @@ def control(cell: str) -> str:
     return f"penumbra/{cell}/sim/control"
 
 
+def launcher(cell: str) -> str:
+    """Queryable of `penumbra up`: what `penumbra restart` and `penumbra scale` ask, JSON in and out."""
+    return f"penumbra/{cell}/launcher/control"
+
+
 def alive(cell: str, service: str = "*", instance: str = "*") -> str:
     """Liveliness token of one running instance."""
     return f"penumbra/{cell}/alive/{service}/{instance}"

@@ -67,10 +67,11 @@ def start(node: Node) -> None:
 
 def main() -> None:
     options = arguments.parser(sys.argv[1], __doc__ or "").parse_args(sys.argv[2:])
-    logs.configure(options.log_level, options.log_json)
+    logs.configure(options.log_level, options.log_format, sys.argv[1])
     node = Node(sys.argv[1], cells.load(options.cell), bus.connection(options))
     start(node)
-    sys.exit(cli.run(node))
+    node.run()
+    sys.exit(cli.leave())
 
 
 if __name__ == "__main__":

@@ -362,16 +362,16 @@ def test_the_switch_is_a_flag_or_the_environment_and_off_without(folder, monkeyp
 def test_the_launcher_stays_on_loopback_unless_secured_and_hands_the_switch_on(folder):
     def options(**changed):
         plain = {"connect": None, "port": 7, "secure": None, "replicas": [], "vision": "procnet", "cell": "table"}
-        flags = {"seed": None, "observer": None, "method": None, "log_level": "info", "log_json": False}
+        flags = {"seed": None, "observer": None, "method": None, "log_level": "info", "log_format": "text"}
         return argparse.Namespace(**{**plain, **flags, **changed})
 
     assert launch.meeting_point(options()) == (bus.Connection("router", listen=("tcp/127.0.0.1:7",)), "tcp/127.0.0.1:7")
     connection, endpoint = launch.meeting_point(options(secure=folder))
     assert (connection.listen, connection.secure, endpoint) == (("tls/0.0.0.0:7",), folder, "tls/127.0.0.1:7")
-    for process in launch.commands(CELL, options(secure=folder), endpoint):
+    for process in launch.fleet(CELL, options(secure=folder), endpoint).processes:
         at = process.command.index("--secure")
         assert process.command[at + 1] == str(folder)
-    assert not any("--secure" in process.command for process in launch.commands(CELL, options(), endpoint))
+    assert not any("--secure" in process.command for process in launch.fleet(CELL, options(), endpoint).processes)
 
 
 def test_every_process_of_the_launcher_and_every_publisher_has_a_certificate():

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 
+import msgpack
 import numpy as np
 import pytest
 import zenoh
@@ -134,6 +135,23 @@ def test_bad_messages_are_counted_by_kind_logged_once_and_do_not_stop_the_reader
     until(lambda: got, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "a good message")
     assert len(log("message refused")) == 3
     assert {record.fields["kind"] for record in log("message refused")} == {"msgpack", "past", "delete"}
+
+
+def test_messages_of_another_version_are_ignored_counted_and_told_once_however_many_keys_they_come_on(node, log):
+    got = []
+    reader, writer = node(), node()
+    for topic in (topics.FUSED, topics.HAPTIC):
+        reader.subscribe(topic, lambda message, names: got.append(message))
+    reader.open(), writer.open()
+    tomorrow = msgpack.packb({"version": messages.VERSION + 1, "stamp_ns": time.time_ns(), "twist": [0.0]})
+    keys = [topic.at(cell="table", target="forearm") for topic in (topics.FUSED, topics.HAPTIC)]
+    refused = lambda: [reader.health()["topics"][key]["bad"].get("version", 0) for key in keys]  # noqa: E731
+    until(lambda: min(refused()) >= 3, lambda: [writer.session.put(key, tomorrow) for key in keys], "three refusals on both")
+    until(lambda: got, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "a message of our version")
+    (told,) = log("message refused")
+    assert told.fields["kind"] == "version"
+    assert f"wire version {messages.VERSION} expected, {messages.VERSION + 1} came" in told.fields["why"]
+    assert reader.health()["wire_version"] == messages.VERSION
 
 
 def test_a_message_for_a_part_that_the_cell_does_not_have_is_refused(node):

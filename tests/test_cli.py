@@ -38,7 +38,7 @@ def endpoint():
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["fly"], "penumbra: no command 'fly': one of up, router, "),
+        (["fly"], "penumbra: no command 'fly': one of up, restart, scale, router, "),
         (
             ["fusion", "--cell", "nowhere"],
             "penumbra fusion: no cell 'nowhere': give one of arm, table, or the path of a YAML file",
@@ -62,6 +62,16 @@ def test_a_wrong_command_is_one_line_that_says_what_to_do_and_exit_code_two(argv
     assert code == 2
     assert err.startswith(line)
     assert len(err.splitlines()) == 1
+
+
+def test_a_service_that_logs_json_tells_its_error_as_json_and_an_unknown_format_is_refused(monkeypatch):
+    out = run("fusion", "--cell", "nowhere", "--log-format", "json")
+    line = json.loads(out.stderr)
+    assert (out.returncode, line["service"], line["level"]) == (2, "fusion", "error")
+    assert line["message"].startswith("no cell 'nowhere': give one of arm, table")
+    monkeypatch.setenv("PENUMBRA_LOG_FORMAT", "xml")
+    out = run("pose")
+    assert (out.returncode, "--log-format: text or json expected, 'xml' came" in out.stderr) == (2, True)
 
 
 def test_a_bad_cell_file_is_told_with_its_line(tmp_path, capsys):

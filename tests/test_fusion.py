@@ -425,6 +425,44 @@ def test_the_service_publishes_and_answers_in_both_formats(observer: str, table:
 
 
 @pytest.mark.parametrize("observer", ["default", "paper"])
+def test_a_replica_that_takes_over_goes_on_with_the_pose(
+    observer: str, table: cell.Cell, router: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it begins before it has heard anything: the old one speaks until it has."""
+    monkeypatch.setattr("shared.service.NEWS_S", 5.0)  # however busy the machine is
+    monkeypatch.setattr("shared.service.WARM_UP_S", 60.0)
+    parser = argparse.ArgumentParser()
+    service.arguments(parser)
+    options = parser.parse_args(["--observer", observer])
+
+    def replica() -> Node:
+        node = Node(service.NAME, table, bus.Connection(connect=(router,)))
+        service.start(node, options)
+        return node
+
+    user = Node("user", table, bus.Connection(connect=(router,)))
+    heard: list[tuple[messages.FusedPose, str]] = []
+    user.subscribe(topics.FUSED, lambda message, names: heard.append((message, names["publisher"])))
+    see = lambda: user.publish(topics.VISION, vision_pose(table), target="forearm")  # noqa: E731
+    with user, replica() as old:
+        wait_for(lambda: see() or (heard and heard[-1][0].state == "tracking"), 10.0, "a tracked pose")
+        with replica() as new:
+            del heard[:]
+            wait_for(lambda: len(heard) > 5, 5.0, "poses while the new one has heard nothing")
+            assert not new.health()["ready"] and not new.owns("forearm")
+            (answer,) = user.query(topics.current_pose("table", "forearm"), "format=json")
+            assert json.loads(answer)["state"] != "lost", "the old one's"
+            assert len(user.query(topics.health("table", service.NAME))) == 2
+            wait_for(lambda: see() or new.health()["ready"], 5.0, "the new one to be ready")
+            speaker = heard[0][1]
+            old.close()
+            taken_over = lambda: see() or {publisher for _, publisher in heard} - {speaker}  # noqa: E731
+            wait_for(taken_over, 5.0, "the new one to publish")
+            assert new.owns("forearm")
+    assert {message.state for message, _ in heard} <= {"tracking", "coasting"}
+
+
+@pytest.mark.parametrize("observer", ["default", "paper"])
 def test_what_the_service_refuses_is_counted_in_its_health_by_kind_and_moves_nothing(
     observer: str, table: cell.Cell, router: str
 ) -> None:

@@ -12,8 +12,9 @@ import psutil
 import pytest
 from rich.console import Console
 
-from services import launch, live
-from services.launch import Supervised
+from services import launch, live, supervised
+from services.fleet import Fleet, Kind
+from services.supervised import Supervised
 from shared import bus, topics
 from shared import cell as cells
 from shared.messages import Truth
@@ -56,7 +57,7 @@ def supervise():
         return until
 
     yield make
-    launch.stop(started)
+    supervised.stop(started)
 
 
 def test_a_killed_process_is_started_again_and_told_why(supervise):
@@ -90,7 +91,7 @@ def test_a_process_that_was_asked_for_nothing_it_has_fails_with_its_last_words_a
 
 
 def test_a_process_that_hangs_is_killed_and_started_again(supervise, monkeypatch):
-    monkeypatch.setattr(launch, "SILENT_S", 0.3)
+    monkeypatch.setattr(supervised, "SILENT_S", 0.3)
     process = python("hanging", SLEEPS)
     until = supervise(process)
     first = process.pid
@@ -111,7 +112,7 @@ def test_stopping_takes_less_than_three_seconds_whatever_the_processes_do(superv
     until = supervise(*processes)
     tree = until(lambda: len(found := family(processes)) >= 4 and found, 5, "a grandchild")
     started = time.monotonic()
-    launch.stop(processes)
+    supervised.stop(processes)
     assert time.monotonic() - started < 3.0
     wait_for(lambda: not any(alive(process) for process in tree), 1, "all of them to be gone")
 
@@ -127,11 +128,12 @@ def alive(process):
 
 def test_the_launcher_shows_a_service_running_and_its_topics(capsys):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    steady = Supervised("steady", [sys.executable, "-m", "tests.nodes", "steady", "--connect", endpoint])
+    fleet = Fleet({"steady": Kind([sys.executable, "-m", "tests.nodes", "steady", "--connect", endpoint])}, {"steady": 1})
+    (steady,) = fleet.processes
     node = Node("launcher", CELL, bus.Connection("router", listen=(endpoint,)))
     with node:
         console = Console(width=400)
-        launcher = launch.Launcher(node, [steady], console)
+        launcher = launch.Launcher(node, fleet, console)
         launcher.watch.refresh()
         node.every(0.1, lambda: node.stopping.set() if is_shown(launcher, steady) else None)
         launcher.run(20)

@@ -10,6 +10,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+import zenoh
 
 from shared import messages, topics
 from tests.live import connect, wait_for
@@ -99,6 +100,23 @@ def test_a_service_that_dies_is_started_again_and_the_pose_comes_back(running):
         wait_for(lambda service=service, before=before: restarted(running, service, before), 10, f"{service} started again")
         killed_ns = time.time_ns()
         wait_for(lambda killed_ns=killed_ns: running.is_tracking(killed_ns), 30, f"the pose after {service} died")
+
+
+def test_a_rolling_restart_of_all_that_estimates_never_loses_the_pose(running):
+    """All but the emulator, which stands for the sensors and holds the arm still for the other tests."""
+    services = ("segmentation", "search", "haptics", "fusion")
+    before = {service: running.processes()[service].pid for service in services}
+    with connect(running.port) as session:
+        fused, states = session.declare_subscriber(topics.FUSED.at(cell="table"), zenoh.handlers.FifoChannel(100_000)), []
+        where = ("--connect", f"tcp/127.0.0.1:{running.port}")
+        result = subprocess.run(
+            [sys.executable, "-m", "services.cli", "restart", *services, *where], capture_output=True, text=True
+        )
+        while (sample := fused.try_recv()) is not None:
+            states.append(messages.decode(messages.FusedPose, sample.payload.to_bytes()).state)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert not set(before.values()) & {running.processes()[service].pid for service in services}
+    assert states and "lost" not in states
 
 
 @pytest.mark.parametrize(("flag", "word"), [("--camera", "camera"), ("--target", "target")])

@@ -101,13 +101,28 @@ def test_a_large_message_of_tiny_objects_does_not_fill_the_memory(tiny, nested):
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize("version", [0, messages.VERSION + 1, 2**63, "1", None, [1], 1.5])
+@ALL
+def test_a_message_of_another_version_is_refused_before_its_fields_are_looked_at(kind, version):
+    error = refused(kind, msgpack.packb({"version": version, "field_of_tomorrow": 1}))
+    assert error.kind == "version"
+    assert f"{kind.__name__}: wire version {messages.VERSION} expected, " in str(error)
+
+
+def test_a_message_without_a_version_is_refused_as_one_of_before_there_were_versions():
+    fields = msgpack.unpackb(encode(pose()))
+    assert fields.pop("version") == messages.VERSION
+    error = refused(messages.FusedPose, msgpack.packb(fields))
+    assert (error.kind, "None came" in str(error)) == ("version", True)
+
+
 def test_a_thousand_levels_of_nesting_are_refused():
     assert refused(messages.Joints, b"\x91" * 60_000).kind == "msgpack"
 
 
 @pytest.mark.parametrize("shape", [[2**62, 2**62, 3], [2**31, 2**31, 3], [0, 0, 3], [1, 1, 3, 1], [], [True, 1, 3], [-1, 1, 3]])
 def test_a_shape_that_does_not_belong_to_the_bytes_is_refused(shape):
-    payload = msgpack.packb({"stamp_ns": 1, "image": ["uint8", shape, b"abc"]})
+    payload = msgpack.packb({"version": messages.VERSION, "stamp_ns": 1, "image": ["uint8", shape, b"abc"]})
     assert refused(messages.Frame, payload).kind == "array"
 
 

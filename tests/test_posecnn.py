@@ -339,12 +339,12 @@ def test_up_starts_one_way_to_see(vision, there):
         cell="table",
         secure=None,
         log_level="info",
-        log_json=False,
+        log_format="text",
         seed=None,
         observer=None,
         method=None,
     )
-    started = {process.name for process in launch.commands(TABLE, options, "tcp/127.0.0.1:1")}
+    started = {process.name for process in launch.fleet(TABLE, options, "tcp/127.0.0.1:1").processes}
     assert started == there | {"emulator", "haptics", "fusion"}
 
 

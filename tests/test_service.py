@@ -184,16 +184,6 @@ def test_a_handler_that_hangs_does_not_keep_the_node_from_closing(router):
     assert time.monotonic() - started < CLOSE_S + 0.5
 
 
-def test_a_heartbeat_file_is_written_while_the_router_can_be_reached(router, process, tmp_path):
-    path = tmp_path / "heartbeat"
-    process(PENUMBRA_HEARTBEAT=str(path))
-    wait_for(path.exists, 10, "the heartbeat")
-    written = path.stat().st_mtime_ns
-    wait_for(lambda: path.stat().st_mtime_ns > written, 3, "the next heartbeat")
-    router.close()
-    wait_for(lambda: time.time() - path.stat().st_mtime > 2.5, 6, "no heartbeat without a router")
-
-
 def test_a_timer_keeps_its_rhythm_and_goes_on_after_an_exception(replica):
     calls = []
 
@@ -236,27 +226,60 @@ def test_a_log_line_is_a_sentence_and_its_fields():
     assert text == '1970-01-01T00:00:00.000Z warning fusion: lost 3 target=forearm why="no sense" gain=0.123457'
 
 
-def test_a_json_log_line_is_an_object_with_every_field():
+def test_a_json_log_line_is_an_object_with_its_fields_apart():
     line = json.loads(logs._Json().format(record("lost", gain=0.5, instance="host-1")))
     assert line == {
         "time": "1970-01-01T00:00:00.000Z",
         "level": "warning",
         "service": "fusion",
-        "text": "lost",
-        "gain": 0.5,
         "instance": "host-1",
+        "message": "lost",
+        "fields": {"gain": 0.5},
     }
 
 
-def test_a_process_logs_json_when_asked_to():
+@pytest.mark.parametrize(
+    ("flags", "environment"), [(["--log-format", "json"], {}), ([], {"PENUMBRA_LOG_FORMAT": "json"})], ids=["flag", "environment"]
+)
+def test_a_process_logs_json_when_asked_to(flags, environment):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    command = [sys.executable, "-m", "tests.nodes", "worker", "--connect", endpoint, "--log-json"]
-    worker = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "tests.nodes", "worker", "--connect", endpoint, *flags]
+    worker = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **environment})
     try:
         line = json.loads(worker.stderr.readline())
     finally:
         worker.kill()
         worker.communicate()
-    assert line["level"] == "warning"
-    assert endpoint in line["text"]
+    assert line.keys() == {"time", "level", "service", "instance", "message", "fields"}
+    assert (line["service"], line["level"]) == ("worker", "warning")
+    assert endpoint in line["message"]
     assert str(worker.pid) in line["instance"]
+
+
+SAYS_ALL_SORTS = """
+import logging, threading, warnings
+from shared import logs
+logs.configure("info", "json", "worker")
+logging.getLogger("library").warning("of a library")
+warnings.warn("of Python")
+thread = threading.Thread(target=lambda: {}["of a thread"])
+thread.start()
+thread.join()
+raise RuntimeError("the end")
+"""
+
+
+def test_as_json_everything_that_a_process_says_is_an_object_a_line_also_its_last_words():
+    err = subprocess.run([sys.executable, "-c", SAYS_ALL_SORTS], capture_output=True, text=True).stderr
+    library, python, thread, end = map(json.loads, err.splitlines())
+    assert (library["service"], library["message"]) == ("library", "of a library")
+    assert "of Python" in python["message"]
+    assert (thread["service"], thread["message"]) == ("worker", "KeyError: 'of a thread'")
+    assert end["message"] == "RuntimeError: the end"
+    assert end["trace"].startswith("Traceback")
+    assert logs.sentence(err.splitlines()[-1]) == "RuntimeError: the end"
+
+
+@pytest.mark.parametrize("line", ["Killed", "3", "[1]", "{}", '{"note": 1}', "{"])
+def test_a_line_that_is_none_of_ours_says_what_it_says(line):
+    assert logs.sentence(line) == line

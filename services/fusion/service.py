@@ -45,6 +45,8 @@ def start(node: Node, options: argparse.Namespace) -> None:
                 fusion.publish(stamp_ns, estimate)
 
     node.every(PERIOD_S, publish)
+    # a replica that takes over goes on with the pose: it does not begin with "lost" while the other one knows it
+    node.is_warm = lambda: all(estimate.state != "lost" for estimate in group.estimates(node.now_ns)[1])
 
 
 def warm_up(kind: type[ErrorStateObserver | PaperObserver]) -> None:

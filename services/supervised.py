@@ -1,0 +1,195 @@
+"""One process that the launcher starts, watches, starts again and ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from typing import Any
+
+import psutil
+
+from services import live
+from shared import logs
+
+BACKOFF_S = (0.2, 10.0)
+STABLE_S = 10.0
+"""A process that ran this long is healthy again: its back-off starts anew."""
+CRASH_LOOP = 3
+SILENT_S = 10.0
+"""A process that answered before and does not for this long hangs: it is killed and started again."""
+TERMINATE_S = 1.5
+ASKED_FOR_NOTHING = 2
+"""Exit code of a process whose flags, cell or installation cannot work: starting it again changes nothing."""
+
+# Every process is one worker: pools of threads that spin would take the two cores from the others.
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "passive",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
+
+
+class Supervised:
+    """One process that is started, watched and started again.
+
+    state: starting, running, waiting (for its next start), failed (it will not be started again), stopping or stopped. is_ready:
+    it does its part for the others.
+    """
+
+    def __init__(self, name: str, command: list[str], restart: str = "always", environment: dict[str, str] | None = None):
+        self.name, self.command, self.restart = name, command, restart
+        self.state, self.note, self.restarts = "stopped", "", 0
+        self.is_ready = False
+        self.popen: subprocess.Popen[str] | None = None
+        self.cpu, self.memory_mb = 0.0, 0.0
+        self._environment = environment or {}
+        self._delay_s = BACKOFF_S[0]
+        self._crashes = 0
+        self._started = self._due = self._heard = 0.0
+        self._hung = ""
+        self._last_words: deque[str] = deque(maxlen=20)
+        self._usage: psutil.Process | None = None
+        self._listener: threading.Thread | None = None
+
+    @property
+    def pid(self) -> int | None:
+        return self.popen.pid if self.popen else None
+
+    @property
+    def is_looping(self) -> bool:
+        """Whether it died again and again, and has not run for STABLE_S since."""
+        return self._crashes >= CRASH_LOOP
+
+    def start(self) -> None:
+        """Starts it, from the launcher's main thread: the kernel ends it when that thread ends."""
+        self._last_words.clear()
+        self.popen = subprocess.Popen(
+            self.command,
+            env={**ONE_THREAD, **os.environ, **self._environment, "PENUMBRA_PARENT": str(os.getpid())},
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            start_new_session=True,  # Ctrl-C reaches the launcher alone, which then stops the others in order
+        )
+        self._started, self._heard, self._hung = time.monotonic(), 0.0, ""
+        self.state, self.is_ready = "starting", False
+        self._usage = psutil.Process(self.popen.pid)
+        self._listener = threading.Thread(target=self._listen, args=(self.popen,), daemon=True)
+        self._listener.start()
+
+    def _listen(self, popen: subprocess.Popen[str]) -> None:
+        assert popen.stderr is not None
+        for line in popen.stderr:
+            self._last_words.append(line.rstrip())
+            sys.stderr.write(line)  # rich moves it above the live table
+        popen.stderr.close()
+
+    def watch(self) -> None:
+        """Looks whether it still runs, and starts it again when it is due."""
+        now = time.monotonic()
+        if self.state == "waiting":
+            if now >= self._due:
+                self.restarts += 1
+                self.start()
+            return
+        if self.popen is None:
+            return
+        if self.state == "stopping":
+            self._stopping(now)
+            return
+        if now - self._started > STABLE_S:
+            self._delay_s, self._crashes, self.note = BACKOFF_S[0], 0, ""
+        code = self.popen.poll()
+        if code is None:
+            if self._heard and now - self._heard > SILENT_S:
+                self._hung = f"no answer for {SILENT_S:.0f} s, "
+                self.signal(signal.SIGKILL)
+            return
+        self._ended(code, now)
+
+    def _ended(self, code: int, now: float) -> None:
+        self._clear()
+        words = next((logs.sentence(line.strip()) for line in reversed(self._last_words) if line.strip()), "")
+        why = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        self.note = f"{self._hung}{why}: {words}".removesuffix(": ")
+        if code == ASKED_FOR_NOTHING or self.restart == "never":
+            self.state = "failed"
+            return
+        self._crashes += 1
+        if self.is_looping:
+            self.note = f"crash loop: {self.note}"
+        self.state, self._due = "waiting", now + self._delay_s
+        self._delay_s = min(2 * self._delay_s, BACKOFF_S[1])
+
+    def _clear(self) -> None:
+        self.signal(signal.SIGKILL)  # whatever it started itself
+        if self._listener is not None:
+            self._listener.join(0.2)
+        self.popen = None
+        self.cpu = self.memory_mb = 0.0
+        self.is_ready = False
+
+    def end(self) -> None:
+        """Asks it to end, for good; `watch` sees to it that it does within TERMINATE_S."""
+        if self.popen is None:
+            self.state = "stopped"
+            return
+        self.signal(signal.SIGTERM)
+        self.state, self._due = "stopping", time.monotonic() + TERMINATE_S
+
+    def _stopping(self, now: float) -> None:
+        assert self.popen is not None
+        if self.popen.poll() is not None:
+            self._clear()
+            self.state, self.note = "stopped", ""
+        elif now > self._due:
+            self.signal(signal.SIGKILL)
+
+    def heard(self, is_ready: bool = True) -> None:
+        """Its health query was answered, and said whether it does its part already."""
+        self._heard, self.is_ready = time.monotonic(), is_ready
+        if self.state == "starting":
+            self.state = "running"
+
+    def measure(self) -> None:
+        """Takes CPU (cores since the last call) and memory."""
+        if self._usage is not None and self.popen is not None:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                self.cpu = self._usage.cpu_percent() / 100
+                self.memory_mb = self._usage.memory_info().rss / 1e6
+
+    def signal(self, number: signal.Signals) -> None:
+        """To its whole process group, which it leads."""
+        if self.popen is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.popen.pid, number)
+
+    def row(self, health: dict[str, Any] | None = None) -> live.ProcessRow:
+        """For the table; health: its own report, where it gave one."""
+        state, note = self.state, self.note
+        if state == "running" and health is not None and health["status"] != "ok":
+            state, note = health["status"], "; ".join([*([note] if note else []), *health["reasons"]])
+        return live.ProcessRow(self.name, state, self.pid, self.cpu, self.memory_mb, self.restarts, note)
+
+
+def stop(processes: list[Supervised]) -> None:
+    """SIGTERM to all, and SIGKILL to what is still there after TERMINATE_S."""
+    for process in processes:
+        process.signal(signal.SIGTERM)
+    deadline = time.monotonic() + TERMINATE_S
+    for process in processes:
+        if process.popen is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.popen.wait(max(0.0, deadline - time.monotonic()))
+            process.signal(signal.SIGKILL)
+            process.popen.wait()
+        process.popen, process.state = None, "failed" if process.state == "failed" else "stopped"
