@@ -183,6 +183,14 @@ def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
     return settings
 
 
+def taken(endpoint: str) -> BusError:
+    """The error of a router whose port is in use."""
+    return BusError(
+        f"the port of {endpoint} is taken: another router runs there; stop it, or give another port "
+        "(penumbra up --port 7448; penumbra router --listen tcp/127.0.0.1:7448)"
+    )
+
+
 def open_session(
     connection: Connection, stopping: threading.Event, waiting: Callable[[], None], patience_s: float = math.inf
 ) -> zenoh.Session:
@@ -200,10 +208,7 @@ def open_session(
             return zenoh.open(config)
         except zenoh.ZError as error:
             if "Address already in use" in str(error):
-                raise BusError(
-                    f"the port of {', '.join(connection.listen) or connection.default} is taken: another router runs there; "
-                    "stop it, or give another port (penumbra up --port 7448; penumbra router --listen tcp/127.0.0.1:7448)"
-                ) from None
+                raise taken(", ".join(connection.listen) or connection.default) from None
             if "Unable to connect" not in str(error):
                 raise BusError(f"the Zenoh session does not open: {_short(error)}") from None
         if stopping.is_set() or time.monotonic() > deadline:
