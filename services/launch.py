@@ -54,7 +54,7 @@ PROCESSES = (
     Process("posecnn", "posecnn", needs="cameras", vision="posecnn"),
     Process("skin", "skin", replicas=0, needs="pads", beside=False),  # belongs to a machine with boards, which name their ports
     Process("haptics", "haptics", needs="pads"),
-    Process("fusion", "fusion", flags=("observer",)),
+    Process("fusion", "fusion", replicas=2, flags=("observer",)),  # the pose must not pause where one of them dies
 )
 
 VISION = ("procnet", "posecnn")
@@ -94,6 +94,7 @@ class Launcher:
                 self._loop(deadline, PLAIN_S, lambda: self.console.print(live.plain(self._rows(), self.watch), highlight=False))
         finally:
             rows = self._rows()
+            self.node.stopping.set()  # it does not miss the router that it ends
             self.fleet.stop()
         self.console.print(live.summary(rows, self.watch), highlight=False)
 

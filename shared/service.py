@@ -257,7 +257,8 @@ class Node:
             self.log.info("nothing to read: the cell has no such part", topic=topic.name)
             return
         expression = next(iter(keys)) if len(keys) == 1 else topic.at(cell=self.cell.name, **names)
-        table = {key: (found, self._count(key, topic.stale_s), Guard(self._rate_hz(topic, found))) for key, found in keys.items()}
+        stale_s = math.inf if from_others else topic.stale_s  # there need not be others
+        table = {key: (found, self._count(key, stale_s), Guard(self._rate_hz(topic, found))) for key, found in keys.items()}
         strangers = (
             bus.Traffic(float("inf")) if len(keys) == 1 else self._received.setdefault(expression, bus.Traffic(float("inf")))
         )

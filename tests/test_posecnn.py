@@ -346,7 +346,7 @@ def test_up_starts_one_way_to_see(vision, there):
         observer=None,
         method=None,
     )
-    started = {process.name for process in launch.fleet(TABLE, options, "tcp/127.0.0.1:1").processes}
+    started = {process.name.partition(" ")[0] for process in launch.fleet(TABLE, options, "tcp/127.0.0.1:1").processes}
     assert started == there | {"router", "emulator", "haptics", "fusion"}
 
 
