@@ -16,6 +16,8 @@ from rich.live import Live
 
 from services import arguments, live
 from services.fleet import Fleet, Kind
+from services.forkserver import ForkServer
+from services.supervised import environment
 from shared import bus, logs, topics
 from shared import cell as cells
 from shared.service import Node
@@ -97,7 +99,8 @@ class Launcher:
 
     def _loop(self, deadline: float, period_s: float, show: Callable[[], None]) -> None:
         due = time.monotonic() + min(period_s, 1.0)
-        while not self.node.stopping.wait(POLL_S) and time.monotonic() < deadline:
+        while not self.node.stopping.is_set() and time.monotonic() < deadline:
+            self.fleet.wait(POLL_S)
             self.fleet.watch()
             if time.monotonic() >= due:
                 show()
@@ -131,7 +134,7 @@ class Launcher:
 
 def fleet(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> Fleet:
     """The processes that this cell needs, ready to start. Raises CellError for an unknown name or an impossible number."""
-    environment = {
+    own = {
         "PENUMBRA_METRICS_PORT": "",  # the launcher's port covers all
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
     }
@@ -145,7 +148,7 @@ def fleet(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> Fleet
         for flag in process.flags:
             if (value := getattr(options, flag)) is not None:
                 command += [f"--{flag}", str(value)]
-        kinds[process.name] = Kind(command, process.restart, environment, process.beside)
+        kinds[process.name] = Kind(command, process.restart, own, process.beside)
         if process.is_needed(cell) and process.vision in (None, options.vision):
             counts[process.name] = process.replicas
     for text in options.replicas:
@@ -157,7 +160,8 @@ def fleet(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> Fleet
         except ValueError as error:
             raise cells.CellError(f"--replicas {error}") from None
         counts[name] = int(number)
-    return Fleet(kinds, counts)
+    modules = [process.module for process in PROCESSES if counts.get(process.name)]
+    return Fleet(kinds, counts, ForkServer(modules, environment(own)) if sys.platform == "linux" else None)
 
 
 def meeting_point(options: argparse.Namespace) -> tuple[bus.Connection, str]:
