@@ -76,9 +76,12 @@ class Fleet:
         """All of them, in the order of the kinds."""
         return [process for group in self._groups.values() for process in tuple(group)]
 
-    def start(self) -> None:
-        for process in self.processes:
+    def start(self, *services: str) -> list[Supervised]:
+        """Starts the processes of these services, or without names all that are not started yet; returns them."""
+        chosen = [process for name in services or self._groups for process in self._groups[name] if process.state == "stopped"]
+        for process in chosen:
             process.start()
+        return chosen
 
     def watch(self) -> None:
         """Looks after every process, and takes a step of the change under way. To be called from the thread that started them."""

@@ -1,9 +1,11 @@
-"""`penumbra up`: the one table of processes, and the launcher that starts, watches and restarts them around its own router."""
+"""`penumbra up`: the one table of processes, and the launcher that starts, watches and restarts them."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
+import socket
 import sys
 import time
 from collections.abc import Callable
@@ -47,14 +49,14 @@ class Process:
 
 
 PROCESSES = (
-    Process("router", "router", replicas=0),  # inside the launcher; a process of its own in containers
+    Process("router", "router", beside=False),
     Process("emulator", "emulator", needs="sim", flags=("seed",), beside=False),
     Process("segmentation", "segmentation", needs="cameras", vision="procnet"),
     Process("search", "search", needs="cameras", vision="procnet", flags=("method",)),
     Process("posecnn", "posecnn", needs="cameras", vision="posecnn"),
     Process("skin", "skin", replicas=0, needs="pads", beside=False),  # belongs to a machine with boards, which name their ports
     Process("haptics", "haptics", needs="pads"),
-    Process("fusion", "fusion", flags=("observer",)),
+    Process("fusion", "fusion", replicas=2, flags=("observer",)),  # the pose must not pause where one of them dies
 )
 
 VISION = ("procnet", "posecnn")
@@ -94,6 +96,7 @@ class Launcher:
                 self._loop(deadline, PLAIN_S, lambda: self.console.print(live.plain(self._rows(), self.watch), highlight=False))
         finally:
             rows = self._rows()
+            self.node.stopping.set()  # it does not miss the router that it ends
             self.fleet.stop()
         self.console.print(live.summary(rows, self.watch), highlight=False)
 
@@ -133,16 +136,18 @@ class Launcher:
 
 
 def fleet(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> Fleet:
-    """The processes that this cell needs, ready to start. Raises CellError for an unknown name or an impossible number."""
+    """The processes that this cell needs, ready to start: the router among them, unless there is one already (--connect). Raises
+    CellError for an unknown name or an impossible number."""
     own = {
         "PENUMBRA_METRICS_PORT": "",  # the launcher's port covers all
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
     }
     kinds, counts = {}, {}
     for process in PROCESSES:
-        if not process.replicas:
+        if not process.replicas or (process.name == "router" and options.connect):
             continue
-        command = [sys.executable, "-m", "services.cli", process.name, "--cell", str(options.cell), "--connect", endpoint]
+        where = ["--listen", listening(options)] if process.name == "router" else ["--connect", endpoint]
+        command = [sys.executable, "-m", "services.cli", process.name, "--cell", str(options.cell), *where]
         command += ["--secure", str(options.secure)] if options.secure else []
         command += ["--log-level", options.log_level, "--log-format", options.log_format]
         for flag in process.flags:
@@ -164,14 +169,32 @@ def fleet(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> Fleet
     return Fleet(kinds, counts, ForkServer(modules, environment(own)) if sys.platform == "linux" else None)
 
 
-def meeting_point(options: argparse.Namespace) -> tuple[bus.Connection, str]:
-    """The launcher's connection, and the endpoint of its processes. Its own router is on loopback, or, secured, on every network
-    of this machine."""
-    if options.connect:
-        return bus.Connection(connect=(options.connect,), secure=options.secure), options.connect
-    protocol, everywhere = ("tls", "0.0.0.0") if options.secure else ("tcp", "127.0.0.1")
-    listen = f"{protocol}/{everywhere}:{options.port}"
-    return bus.Connection("router", listen=(listen,), secure=options.secure), f"{protocol}/127.0.0.1:{options.port}"
+def listening(options: argparse.Namespace) -> str:
+    """Where the launcher's router listens: on loopback, or, secured, on every network of this machine."""
+    return f"tls/0.0.0.0:{options.port}" if options.secure else f"tcp/127.0.0.1:{options.port}"
+
+
+def meeting_point(options: argparse.Namespace) -> str:
+    """The endpoint at which all meet."""
+    return options.connect or f"{'tls' if options.secure else 'tcp'}/127.0.0.1:{options.port}"
+
+
+def start_router(node: Node, fleet: Fleet, port: int) -> None:
+    """Starts the fleet's router and waits until it listens, or the node is stopping, so that nobody has to wait for it. Raises
+    bus.BusError where it cannot start."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            raise bus.taken(node.connection.where) from None
+    (router,) = fleet.start("router")
+    while not node.stopping.wait(0.02):
+        fleet.watch()
+        if router.state == "failed":
+            raise bus.BusError(f"the router does not start: {router.note}")
+        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 0.1):
+            return
 
 
 def main(argv: list[str]) -> int:
@@ -202,11 +225,19 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     logs.configure(options.log_level, options.log_format, "launcher")
     cell = cells.load(options.cell)
-    connection, endpoint = meeting_point(options)
+    endpoint = meeting_point(options)
     processes = fleet(cell, options, endpoint)
-    node = Node("launcher", cell, connection)
+    node = Node("launcher", cell, bus.Connection(connect=(endpoint,), secure=options.secure))
     with node.until_signal():
-        launcher = Launcher(node.open(), processes, Console(width=None if sys.stdout.isatty() else 400))
-        with arguments.metrics(parser, options.metrics_port, lambda: launcher.watch.health.values()):
-            launcher.run(options.seconds)
+        try:
+            if not options.connect:
+                start_router(node, processes, options.port)
+            launcher = Launcher(node.open(), processes, Console(width=None if sys.stdout.isatty() else 400))
+            with arguments.metrics(parser, options.metrics_port, lambda: launcher.watch.health.values()):
+                launcher.run(options.seconds)
+        except bus.BusError:
+            if not node.stopping.is_set():  # else: told to stop before the router came
+                raise
+        finally:
+            processes.stop()  # also where it did not come to run
     return 0

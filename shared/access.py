@@ -1,8 +1,8 @@
 """Who may say what on a secured bus: the router's rules, from the one table of topics.
 
 A certificate's common name is the name of its holder. Sensors and methods publish what the table says, speak for nobody's health
-but their own, and read everything; a viewer only reads and asks; an operator also steers the emulator and the launcher. What no rule allows, the
-router drops, without an answer to the sender.
+but their own, and read everything; a viewer only reads and asks; an operator also steers the emulator and the launcher. What no
+rule allows, the router drops, without an answer to the sender.
 """
 
 from __future__ import annotations

@@ -183,6 +183,14 @@ def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
     return settings
 
 
+def taken(endpoint: str) -> BusError:
+    """The error of a router whose port is in use."""
+    return BusError(
+        f"the port of {endpoint} is taken: another router runs there; stop it, or give another port "
+        "(penumbra up --port 7448; penumbra router --listen tcp/127.0.0.1:7448)"
+    )
+
+
 def open_session(
     connection: Connection, stopping: threading.Event, waiting: Callable[[], None], patience_s: float = math.inf
 ) -> zenoh.Session:
@@ -200,10 +208,7 @@ def open_session(
             return zenoh.open(config)
         except zenoh.ZError as error:
             if "Address already in use" in str(error):
-                raise BusError(
-                    f"the port of {', '.join(connection.listen) or connection.default} is taken: another router runs there; "
-                    "stop it, or give another port (penumbra up --port 7448; penumbra router --listen tcp/127.0.0.1:7448)"
-                ) from None
+                raise taken(", ".join(connection.listen) or connection.default) from None
             if "Unable to connect" not in str(error):
                 raise BusError(f"the Zenoh session does not open: {_short(error)}") from None
         if stopping.is_set() or time.monotonic() > deadline:
@@ -267,7 +272,8 @@ class Rate:
 @dataclass
 class Traffic:
     """What came (or went) on one key. `bad`: refused messages by kind; `dropped`: gaps in the publishers' own count, None for
-    what cannot be known; `delay_s`: from the measurement to here, of the last message."""
+    what cannot be known; `delay_s`: from the measurement to here, of the last message; `is_read`: whether anybody here reads it
+    now: what another replica reads is never stale."""
 
     stale_s: float
     count: int = 0
@@ -275,6 +281,7 @@ class Traffic:
     dropped: int | None = None
     stamp_ns: int | None = None
     delay_s: float = math.nan
+    is_read: bool = True
     rate: Rate = field(default_factory=Rate)
 
     def took(self, stamp_ns: int, now_ns: int) -> None:
@@ -295,7 +302,7 @@ class Traffic:
 
     def is_stale(self, now_ns: int) -> bool:
         age = self.age_s(now_ns)
-        return math.isfinite(self.stale_s) and (age is None or age > self.stale_s)
+        return self.is_read and math.isfinite(self.stale_s) and (age is None or age > self.stale_s)
 
     def report(self, now_ns: int) -> dict[str, Any]:
         """The counters as JSON."""
@@ -316,7 +323,7 @@ class Reader:
 
     keys: every concrete key that the cell knows, with its names, counters and guard; a sample on any other key is refused, so
     that nobody can grow the table. `refused` is told of the first bad message of each kind on a key, `failed` of every exception
-    of the handler.
+    of the handler. from_others: leaves out what this session publishes itself.
     """
 
     def __init__(
@@ -331,18 +338,25 @@ class Reader:
         now_ns: Callable[[], int],
         refused: Callable[[str, BadMessage], None],
         failed: Callable[[str, Exception], None],
+        from_others: bool = False,
     ):
         self._topic, self._keys, self._strangers = topic, keys, strangers
         self._handler, self._now_ns, self._refused, self._failed = handler, now_ns, refused, failed
-        self._subscriber = session.declare_subscriber(expression, zenoh.handlers.RingChannel(depth))
+        origin = zenoh.Locality.REMOTE if from_others else zenoh.Locality.ANY
+        self._subscriber = session.declare_subscriber(expression, zenoh.handlers.RingChannel(depth), allowed_origin=origin)
+        self._ring = self._subscriber.handler  # the subscriber itself cannot be closed while a thread waits in it
         self.thread = threading.Thread(target=self._run, name=f"read {expression}", daemon=True)
         self.thread.start()
+
+    def close(self) -> None:
+        """Ends the subscription; the message that is under way is still handed on."""
+        self._subscriber.undeclare()
 
     def _run(self) -> None:
         while True:
             try:
-                sample = self._subscriber.recv()
-            except zenoh.ZError:  # the session was closed
+                sample = self._ring.recv()
+            except zenoh.ZError:  # the subscription, or the session, was closed
                 return
             self._take(sample)
 

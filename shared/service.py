@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 import re
 import secrets
@@ -23,7 +24,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 from types import TracebackType
@@ -44,6 +45,27 @@ NEWS_S = 0.2
 """Within this a session has heard which replicas there are."""
 WARM_UP_S = 2.0
 """How long a replica that joins others may listen before it takes its share."""
+
+
+@dataclass
+class Share:
+    """A subscription that is there only while one of `streams` is this replica's. traffic: of its keys; read: opens it."""
+
+    streams: tuple[str, ...]
+    traffic: list[bus.Traffic]
+    read: Callable[[], bus.Reader]
+    reader: bus.Reader | None = None
+
+    def follow(self, is_own: bool) -> None:
+        """Opens or closes the subscription where that has changed."""
+        for traffic in self.traffic:
+            traffic.is_read = is_own
+        if is_own and self.reader is None:
+            self.reader = self.read()
+        elif not is_own and self.reader is not None:
+            self.reader.close()
+            self.reader = None
+
 
 Answer = Callable[[dict[str, str], bytes], "bytes | tuple[bytes, str]"]
 
@@ -78,7 +100,8 @@ class Node:
         self.is_warm: Callable[[], bool] = lambda: True  # whether it could go on with what another replica does
         self._others: frozenset[str] = frozenset()
         self._replicas = frozenset({self.instance})
-        self._owned: dict[str, bool] = {}
+        self._ranks: dict[str, float] = {}
+        self._shares: list[Share] = []
         self._process = psutil.Process()
         self._cpu = 0.0
         self._started = time.monotonic()
@@ -92,7 +115,7 @@ class Node:
         self.session = bus.open_session(self.connection, self.stopping, self._tell_waiting, patience_s)
         self._reachable = True
         if not self.is_warm():
-            self._replicas, self._owned = frozenset(), {}  # it owns nothing before it knows whether others do
+            self._replicas, self._ranks = frozenset(), {}  # it owns nothing before it knows whether others do
         self._watch_replicas()
         self.answer(topics.health(self.cell.name, self.service, self.instance), self._answer_health)
         for declare in self._pending:
@@ -155,7 +178,8 @@ class Node:
         deadline = time.monotonic() + CLOSE_S
         closing = threading.Thread(target=session.close, name="close", daemon=True)
         closing.start()
-        for thread in (closing, *self._threads):
+        readers = [reader.thread for share in self._shares if (reader := share.reader) is not None]
+        for thread in (closing, *self._threads, *readers):
             if thread is not threading.current_thread():
                 thread.join(max(0.0, deadline - time.monotonic()))
 
@@ -209,26 +233,38 @@ class Node:
         traffic = self._published.setdefault(key, bus.Traffic(topic.stale_s))
         return publisher, traffic, publisher.id, itertools.count()
 
-    def subscribe(self, topic: Topic, handler: Callable[[Any, dict[str, str]], None], **names: str) -> None:
+    def subscribe(
+        self,
+        topic: Topic,
+        handler: Callable[[Any, dict[str, str]], None],
+        streams: Sequence[str] = (),
+        from_others: bool = False,
+        **names: str,
+    ) -> None:
         """Calls `handler(message, names)` for every good message, in a thread of this subscription.
 
         names: fix some of the topic's {names}; the others take every value that the cell has. The handler is told them all, and
         as `publisher` who sent the message (empty where nobody says), which tells two processes on one key apart. While the
         handler is busy the newest `topic.depth` messages per key are kept. Bad messages are counted and logged once per kind; so
         are exceptions of the handler. Raises CellError for a name that the cell does not have.
+
+        streams: the subscription is there only while this replica owns one of these streams (see `owns`); so the replicas of a
+        service divide the messages, and none receives what another one works on. from_others: leaves out what this node
+        publishes itself.
         """
         keys = self.keys(topic, names)
         if not keys:
             self.log.info("nothing to read: the cell has no such part", topic=topic.name)
             return
         expression = next(iter(keys)) if len(keys) == 1 else topic.at(cell=self.cell.name, **names)
-        table = {key: (found, self._count(key, topic.stale_s), Guard(self._rate_hz(topic, found))) for key, found in keys.items()}
+        stale_s = math.inf if from_others else topic.stale_s  # there need not be others
+        table = {key: (found, self._count(key, stale_s), Guard(self._rate_hz(topic, found))) for key, found in keys.items()}
         strangers = (
             bus.Traffic(float("inf")) if len(keys) == 1 else self._received.setdefault(expression, bus.Traffic(float("inf")))
         )
 
-        def declare() -> None:
-            reader = bus.Reader(
+        def read() -> bus.Reader:
+            return bus.Reader(
                 cast(zenoh.Session, self.session),
                 expression,
                 topic.depth * len(keys),
@@ -239,10 +275,24 @@ class Node:
                 self.now_ns,
                 self._refused,
                 self.fault,
+                from_others,
             )
-            self._threads.append(reader.thread)
 
-        self._declare(declare)
+        if streams:
+            share = Share(tuple(streams), [traffic for _, traffic, _ in table.values()], read)
+            self._declare(lambda: self._join(share))
+        else:
+            self._declare(lambda: self._threads.append(read().thread))
+
+    def _join(self, share: Share) -> None:
+        with self._counting:
+            self._shares.append(share)
+            self._take_shares()
+
+    def _take_shares(self) -> None:
+        """Begins to read the streams that have become this replica's, and leaves those that have gone."""
+        for share in self._shares:
+            share.follow(any(map(self.owns, share.streams)))
 
     def _rate_hz(self, topic: Topic, names: dict[str, str]) -> float:
         """How often a key's publisher sends: as the table says, but for what follows the cameras' own rates."""
@@ -328,15 +378,22 @@ class Node:
         self._declare(lambda: self._spawn(loop, f"every {period_s} s"))
 
     def owns(self, stream: str) -> bool:
-        """Whether this replica is the one of the living replicas of its service that handles `stream`. Rendezvous hashing
-        (Thaler and Ravishankar 1998, doi:10.1109/90.663936): a replica that goes away moves only its own streams. While the
-        news of a replica's coming or going is under way two may own a stream, or none."""
-        owned = self._owned.get(stream)
-        if owned is None:
+        """Whether this replica is the one of the living replicas of its service that handles `stream`. While the news of a
+        replica's coming or going is under way two may own a stream, or none."""
+        return self.rank(stream) == 0
+
+    def rank(self, stream: str) -> float:
+        """How many living replicas of this service are before this one to handle `stream`: 0 for its owner, 1 for the one that
+        will own it when the owner goes away; infinity where this one has no part yet. Rendezvous hashing (Thaler and
+        Ravishankar 1998, doi:10.1109/90.663936): a replica that comes or goes moves only its own streams."""
+        rank = self._ranks.get(stream)
+        if rank is None:
+            ranks, replicas = self._ranks, self._replicas
             weight = lambda replica: blake2b(f"{replica} {stream}".encode()).digest()  # noqa: E731
-            owned = self.instance == max(self._replicas, key=weight, default=None)
-            self._owned[stream] = owned
-        return owned
+            own = weight(self.instance)
+            rank = sum(weight(each) > own for each in replicas) if self.instance in replicas else math.inf
+            ranks[stream] = rank
+        return rank
 
     def _watch_replicas(self) -> None:
         session = cast(zenoh.Session, self.session)
@@ -348,20 +405,23 @@ class Node:
             while True:
                 try:
                     sample = tokens.recv()
-                except zenoh.ZError:
+                    instance = str(sample.key_expr).rpartition("/")[2]
+                    (living.discard if sample.kind == zenoh.SampleKind.DELETE else living.add)(instance)
+                    self._others = frozenset(living - {self.instance})
+                    self._count_replicas()
+                except zenoh.ZError:  # the session was closed
                     return
-                instance = str(sample.key_expr).rpartition("/")[2]
-                (living.discard if sample.kind == zenoh.SampleKind.DELETE else living.add)(instance)
-                self._others = frozenset(living - {self.instance})
-                self._count_replicas()
 
         self._spawn(watch, "replicas")
 
     def _count_replicas(self) -> None:
         """This one counts as soon as the others know of it, or where there are none."""
         with self._counting:
+            self._ranks = {}
             self._replicas = self._others if self._token is None and self._others else self._others | {self.instance}
-            self._owned = {}
+            self._ranks = {}
+            if self.session is not None:
+                self._take_shares()
 
     def health(self) -> dict[str, Any]:
         """What this instance is and how it fares, as JSON: its status and the reasons for it (`shared.health`), CPU in cores,

@@ -24,7 +24,7 @@ def running() -> Running:
         wait_for(lambda: in_reach(truths.recv()), 60, "the arm above the pads", 0.0)
         wait_for(lambda: running.control({"command": "motion", "value": "off"}), 10, "the emulator's answer")
         truths.undeclare()
-        wait_for(running.is_tracking, 20, "a tracked pose of the resting arm", 0.2)
+        wait_for(lambda: running.is_tracking() and len(running.pose()["sources"]) == 2, 60, "a tracked pose of both senses", 0.2)
         yield running
 
 

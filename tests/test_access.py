@@ -365,13 +365,13 @@ def test_the_launcher_stays_on_loopback_unless_secured_and_hands_the_switch_on(f
         flags = {"seed": None, "observer": None, "method": None, "log_level": "info", "log_format": "text"}
         return argparse.Namespace(**{**plain, **flags, **changed})
 
-    assert launch.meeting_point(options()) == (bus.Connection("router", listen=("tcp/127.0.0.1:7",)), "tcp/127.0.0.1:7")
-    connection, endpoint = launch.meeting_point(options(secure=folder))
-    assert (connection.listen, connection.secure, endpoint) == (("tls/0.0.0.0:7",), folder, "tls/127.0.0.1:7")
-    for process in launch.fleet(CELL, options(secure=folder), endpoint).processes:
+    assert (launch.listening(options()), launch.meeting_point(options())) == ("tcp/127.0.0.1:7", "tcp/127.0.0.1:7")
+    secured = options(secure=folder)
+    assert (launch.listening(secured), launch.meeting_point(secured)) == ("tls/0.0.0.0:7", "tls/127.0.0.1:7")
+    for process in launch.fleet(CELL, secured, launch.meeting_point(secured)).processes:
         at = process.command.index("--secure")
         assert process.command[at + 1] == str(folder)
-    assert not any("--secure" in process.command for process in launch.fleet(CELL, options(), endpoint).processes)
+    assert not any("--secure" in process.command for process in launch.fleet(CELL, options(), "tcp/127.0.0.1:7").processes)
 
 
 def test_every_process_of_the_launcher_and_every_publisher_has_a_certificate():

@@ -5,17 +5,24 @@ Needs a Docker engine and builds the images, so it runs by `pytest -m containers
 
 import json
 import os
+import shutil
 import signal
 import subprocess
+import threading
 import time
+from contextlib import contextmanager
 
 import pytest
 
-from shared import topics
+from services import certs
+from shared import bus, topics
 from tests.live import connect, wait_for
 
 pytestmark = pytest.mark.containers
 SERVICES = {"router", "emulator", "segmentation", "search", "haptics", "fusion"}
+
+
+SECURE = ("-f", "compose.yaml", "-f", "docker/secure.yaml")
 
 
 def compose(*arguments: str) -> str:
@@ -27,16 +34,23 @@ def containers(service: str) -> list[dict]:
     return json.loads(subprocess.run(["docker", "inspect", *ids], check=True, capture_output=True, text=True).stdout)
 
 
-@pytest.fixture(scope="module")
-def running():
-    compose("up", "--build", "--detach", "--wait", "--wait-timeout", "600")
+@contextmanager
+def up(*files: str):
+    """The whole cell in containers."""
+    compose(*files, "up", "--build", "--detach", "--wait", "--wait-timeout", "600")
     try:
         yield
     except BaseException:
-        print(compose("logs", "--tail", "40"))
+        print(compose(*files, "logs", "--tail", "40"))
         raise
     finally:
-        compose("down", "--volumes", "--timeout", "5")
+        compose(*files, "down", "--volumes", "--timeout", "5")
+
+
+@pytest.fixture(scope="module")
+def running():
+    with up():
+        yield
 
 
 @pytest.fixture
@@ -69,19 +83,14 @@ def test_no_container_can_write_its_image_or_runs_as_root(running):
             assert container["Config"]["User"].startswith("10001"), service
 
 
-def test_no_service_reaches_beyond_the_cell(running):
-    code = """
-import socket
-try:
-    socket.create_connection(("1.1.1.1", 53), 3)
-except OSError:
-    print("isolated")
-"""
-    for service in SERVICES - {"router"}:
-        assert compose("exec", "-T", service, "python", "-c", code).strip() == "isolated", service
+def test_only_the_router_s_network_has_a_way_out(running):
+    """A container without a default route reaches nothing beyond its networks."""
+    code = "print(any(line.split()[1] == '00000000' for line in list(open('/proc/net/route'))[1:]))"
+    for service in SERVICES:
+        assert compose("exec", "-T", service, "python", "-c", code).strip() == str(service == "router"), service
 
 
-@pytest.mark.parametrize("service", ["fusion", "segmentation"])
+@pytest.mark.parametrize("service", ["fusion", "segmentation", "router"])
 def test_a_service_that_is_killed_comes_back(session, service):
     wait_for(lambda: is_tracking_now(session), 60, "a tracked pose before the kill")
     before = containers(service)[0]["State"]
@@ -97,3 +106,28 @@ def test_a_second_segmentation_stands_by_and_takes_over(session):
     tokens = topics.alive("table", "segmentation")
     wait_for(lambda: sum(1 for reply in session.liveliness().get(tokens, timeout=1.0) if reply.ok) == 2, 30, "two tokens")
     wait_for(lambda: is_tracking_now(session), 60, "a tracked pose with two")
+
+
+@pytest.fixture
+def certificates(tmp_path, monkeypatch):
+    """Two folders of the same certificates: this user's, and the containers'."""
+    own, theirs = tmp_path / "own", tmp_path / "containers"
+    certs.make(own)
+    shutil.copytree(own, theirs)
+    for path in (theirs, *theirs.iterdir()):
+        os.chown(path, 10001, 10001)
+    monkeypatch.setenv("CERTS", str(theirs))
+    return own
+
+
+def test_with_certificates_the_cell_is_tracked_and_nobody_without_one_sees_it(certificates):
+    """Last, because it starts the containers anew."""
+    secured = bus.Connection(connect=("tls/127.0.0.1:7447",), secure=certificates)
+    with up(*SECURE):
+        with bus.open_session(secured, threading.Event(), lambda: None, 20.0) as session:
+            wait_for(lambda: is_tracking_now(session), 120, "a tracked pose from the secured containers")
+        with pytest.raises(bus.BusError, match="no router"):
+            bus.open_session(bus.Connection(connect=("tcp/127.0.0.1:7447",)), threading.Event(), lambda: None, 2.0)
+        for service in SERVICES:
+            listed = compose(*SECURE, "exec", "-T", service, "ls", "/certs").split()
+            assert set(listed) == {"ca.pem", f"{service}.pem", f"{service}-key.pem"}

@@ -19,7 +19,7 @@ from shared import bus, topics
 from shared import cell as cells
 from shared.messages import Truth
 from shared.service import Node
-from tests.live import free_port, wait_for
+from tests.live import connect, free_port, wait_for
 from tests.nodes import pose
 
 CELL = cells.load("table")
@@ -173,7 +173,12 @@ def up(*arguments, **kwargs):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs)
 
 
-NOTHING = [word for process in launch.PROCESSES if process.replicas for word in ("--replicas", f"{process.name}=0")]
+NOTHING = [
+    word
+    for process in launch.PROCESSES
+    if process.replicas and process.name != "router"
+    for word in ("--replicas", f"{process.name}=0")
+]
 
 
 def test_up_stops_by_itself_with_exit_code_zero_and_a_summary():
@@ -199,7 +204,7 @@ def test_up_refuses_replicas_of_what_does_not_exist():
     process = up("--replicas", "magic=2")
     _, err = process.communicate(timeout=20)
     assert process.returncode == 2
-    assert "NAME one of emulator, segmentation" in err
+    assert "NAME one of router, emulator, segmentation" in err
 
 
 def started_by(process):
@@ -212,15 +217,14 @@ def started_by(process):
 @pytest.mark.parametrize(("number", "seconds"), [(signal.SIGINT, 3.0), (signal.SIGKILL, 1.0)])
 def test_nothing_is_left_behind_however_the_launcher_ends(number, seconds):
     port = free_port()
-    only_routers = ["--replicas", "fusion=2"]
-    process = up("--port", str(port), *NOTHING, *only_routers)
+    process = up("--port", str(port), *NOTHING, "--replicas", "fusion=2")
     node = Node("test", CELL, bus.Connection(connect=(f"tcp/127.0.0.1:{port}",)))
     try:
         with node.open(patience_s=10):
             tokens = lambda: [r for r in node.session.liveliness().get(topics.alive("table", "fusion"), timeout=1.0) if r.ok]  # noqa: E731
             wait_for(lambda: len(tokens()) == 2, 20, "both replicas on the bus", 0.1)
         children = started_by(process)
-        assert len(children) == 2
+        assert len(children) == 3, "and the router"
         started = time.monotonic()
         process.send_signal(number)
         wait_for(lambda: process.poll() is not None and not any(alive(child) for child in children), seconds, "the end of all")
@@ -229,6 +233,28 @@ def test_nothing_is_left_behind_however_the_launcher_ends(number, seconds):
     finally:
         process.kill()
         process.communicate()
+
+
+def test_a_router_that_dies_is_started_again_and_everybody_comes_back():
+    port = free_port()
+    process = up("--port", str(port), *NOTHING, "--replicas", "fusion=1")
+    try:
+        with connect(port) as session:
+            services = ("fusion", "launcher")
+
+            def alive() -> bool:
+                found = [r.ok.key_expr for r in session.liveliness().get(topics.alive("table", "*"), timeout=1.0) if r.ok]
+                return {str(key).split("/")[-2] for key in found} >= set(services)
+
+            wait_for(alive, 30, "both on the bus")
+            (router,) = (child for child in started_by(process) if "router" in child.cmdline())
+            router.kill()
+            wait_for(lambda: not alive(), 10, "nobody to be reached")
+            wait_for(alive, 30, "both on the bus again")
+        assert process.poll() is None
+    finally:
+        process.terminate()
+        process.communicate(timeout=20)
 
 
 def test_every_line_of_the_table_is_a_package_and_every_service_is_in_the_table():

@@ -338,14 +338,16 @@ def test_up_starts_one_way_to_see(vision, there):
         vision=vision,
         cell="table",
         secure=None,
+        connect=None,
+        port=1,
         log_level="info",
         log_format="text",
         seed=None,
         observer=None,
         method=None,
     )
-    started = {process.name for process in launch.fleet(TABLE, options, "tcp/127.0.0.1:1").processes}
-    assert started == there | {"emulator", "haptics", "fusion"}
+    started = {process.name.partition(" ")[0] for process in launch.fleet(TABLE, options, "tcp/127.0.0.1:1").processes}
+    assert started == there | {"router", "emulator", "haptics", "fusion"}
 
 
 def test_the_command_s_train_writes_weights_that_the_service_reads(tmp_path, monkeypatch):

@@ -427,6 +427,30 @@ def clear(states, measurements, ring):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def adopt(model, states, measurements, rings, target, stamp_ns, T, velocity, covariance, believed_ns, weight):  # type: ignore[no-untyped-def]
+    """Makes a history of one entry: a pose T (4, 4) at a stamp, with velocity (6,), the pose's covariance (6, 6), stamps (n,) of
+    what was last believed of each sense, and the weights (n,). The velocity may be off by as much as one that is unknown."""
+    clear(states[target], measurements[target], rings[target])
+    state = states[target, 0]
+    measurements[target, 0].stamp_ns = state.stamp_ns = stamp_ns
+    for i in range(3):
+        state.p[i] = T[i, 3]
+        for j in range(3):
+            state.R[i, j] = T[i, j]
+    so3.orthonormalise(state.R)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            state.P[i, j] = 0.5 * (covariance[i, j] + covariance[j, i]) if i < POSE and j < POSE else 0.0
+        if i >= POSE:
+            state.P[i, i] = model.velocity_spread[(i - POSE) // 3] ** 2 if i < MOTION else 1.0
+    for i in range(POSE):
+        state.velocity[i] = velocity[i]
+    for s in range(SENSES):
+        state.believed_ns[s], state.gain[s] = believed_ns[s], weight[s]
+        state.accepted_ns = max(state.accepted_ns, believed_ns[s])
+
+
+@njit(cache=True)
 def insert(model, states, measurements, ring, m):  # type: ignore[no-untyped-def]
     """Takes a measurement: ACCEPTED or GATED, LATE (older than the history: not applied) or DUPLICATE (not applied). A full ring
     gives up its oldest entry before the horizon does."""

@@ -26,7 +26,7 @@ from services.fusion.estimate import (
 from services.fusion.filter import Settings, model
 from services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, STATE
 from shared import geometry
-from shared.messages import Source
+from shared.messages import FusedPose, Source
 
 
 class Bank:
@@ -72,6 +72,19 @@ class Bank:
         for target, source, stamp_ns, fate in zip(*columns, strict=True):
             self.logs[target].took(SOURCES[source], stamp_ns, fate)
         return fates
+
+    def adopt(self, target: int, message: FusedPose) -> None:
+        """As `ErrorStateObserver.adopt`, of one target."""
+        believed_ns, weight = np.full(len(SOURCES), NEVER), np.zeros(len(SOURCES))
+        for s, name in enumerate(SOURCES):
+            if (source := message.sources.get(name)) is not None:
+                believed_ns[s], weight[s] = message.stamp_ns - int(1e9 * source.age_s), source.weight
+                self.logs[target].heard(name, int(believed_ns[s]))
+        T = geometry.transform(message.position, message.orientation)
+        kernel.adopt(
+            *(self._models[target], self._states, self._measurements, self._rings, target),
+            *(message.stamp_ns, T, message.velocity, message.covariance, believed_ns, weight),
+        )
 
     def estimate(self, stamp_ns: int, targets: slice = slice(None)) -> NDArray[np.void]:
         """The ESTIMATE of every target (n,) at a stamp, or of some of them; otherwise as `ErrorStateObserver.estimate`."""
@@ -133,6 +146,11 @@ class ErrorStateObserver:
         if fate >= FUTURE:
             raise refusal(fate, stamp_ns, T, information, now_ns)
         return fate == ACCEPTED
+
+    def adopt(self, message: FusedPose) -> None:
+        """Goes on from a pose that another observer of this target has published; what was known here is forgotten. Measurements
+        before its stamp are in it already, and count as late."""
+        self._bank.adopt(self._target, message)
 
     def innovation(self) -> tuple[float, int]:
         """Squared Mahalanobis distance of the newest measurement's innovation (NIS) and its degrees of freedom: 0 and 0 where it

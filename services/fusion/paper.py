@@ -37,7 +37,7 @@ import numpy as np
 from services.fusion import so3
 from services.fusion.estimate import Array, Estimate, Limits, Log
 from shared import geometry
-from shared.messages import Source
+from shared.messages import FusedPose, Source
 
 STEP_S = 0.01
 SENSES = {"vision": slice(0, 6), "haptic": slice(6, 12)}
@@ -152,6 +152,9 @@ class PaperObserver:
         self._weigh()
         self.log.counts[source].accepted += 1
         return True
+
+    def adopt(self, message: FusedPose) -> None:
+        """Nothing: the paper's state is bound to the measurements in use. It waits for its own."""
 
     def estimate(self, stamp_ns: int) -> Estimate:
         """The pose at a stamp, not before the newest measurement. Disturbs nothing."""

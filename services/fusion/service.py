@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from services.fusion import so3
-from services.fusion.estimate import Array, Estimate, Refused, information
+from services.fusion.estimate import Array, Estimate, Refused, information, latest
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
 from shared import cell, geometry, messages, topics
@@ -21,6 +22,8 @@ from shared.service import Node
 NAME = "fusion"
 OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
 PERIOD_S = 1.0 / topics.FUSED.rate_hz
+SILENCE_S = 0.025
+"""A replica speaks for the one before it in rank after so long a silence: a frozen process counts as alive for another second."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,14 +42,13 @@ def start(node: Node, options: argparse.Namespace) -> None:
     fusions = [Fusion(node, name, group, observer) for name, observer in zip(names, group.observers, strict=True)]
 
     def publish() -> None:
-        if any(node.owns(name) for name in names):
-            stamp_ns, estimates = group.estimates(node.now_ns)
-            for fusion, estimate in zip(fusions, estimates, strict=True):
-                fusion.publish(stamp_ns, estimate)
+        stamp_ns, estimates = group.estimates(node.now_ns)
+        for fusion, estimate in zip(fusions, estimates, strict=True):
+            fusion.publish(stamp_ns, estimate)
 
     node.every(PERIOD_S, publish)
     # a replica that takes over goes on with the pose: it does not begin with "lost" while the other one knows it
-    node.is_warm = lambda: all(estimate.state != "lost" for estimate in group.estimates(node.now_ns)[1])
+    node.is_warm = lambda: all(fusion.state != "lost" for fusion in fusions)
 
 
 def warm_up(kind: type[ErrorStateObserver | PaperObserver]) -> None:
@@ -101,15 +103,18 @@ class Publishers:
 
 
 class Fusion:
-    """One target: its observer, what it hears and what it says. Every replica listens, the stream's owner publishes."""
+    """One target: its observer, what it hears and what it says. Every replica listens, the stream's owner publishes, and the next
+    in rank where it is silent. One that knows nothing yet goes on from what the others publish."""
 
     def __init__(self, node: Node, target: str, group: Group, observer: ErrorStateObserver | PaperObserver):
         self.node, self.target, self.group, self.observer = node, target, group, observer
         self._publishers = Publishers()
         self._told: set[tuple[str, str]] = set()
-        self._state = "lost"
+        self.state = "lost"
+        self._heard_s = time.monotonic()  # another replica
         node.subscribe(topics.VISION, self.on_vision, target=target)
         node.subscribe(topics.HAPTIC, self.on_haptic, target=target)
+        node.subscribe(topics.FUSED, self.on_fused, from_others=True, target=target)
         node.answer(topics.current_pose(node.cell.name, target), self.answer)
         node.report[target] = self.describe
 
@@ -120,6 +125,14 @@ class Fusion:
     def on_haptic(self, message: messages.HapticPose, names: dict[str, str]) -> None:
         """The skin's pose."""
         self._take("haptic", message, lambda now_ns: self._felt(message, names["publisher"], now_ns), None)
+
+    def on_fused(self, message: messages.FusedPose, names: dict[str, str]) -> None:
+        """The pose as another replica knows it."""
+        self._heard_s = time.monotonic()
+        is_usable = message.state != "lost" and message.stamp_ns <= latest(self.node.now_ns())
+        if self.state == "lost" and is_usable and not self.node.owns(self.target):
+            with self.group.lock:
+                self.observer.adopt(message)
 
     def _seen(self, message: messages.VisionPose, publisher: str, now_ns: int) -> Array | None:
         """The information (6, 6) of a camera's pose, None where it is not to be used. Raises Refused."""
@@ -168,12 +181,12 @@ class Fusion:
 
     def describe(self) -> dict[str, Any]:
         """For the health report: the state, and what became of the measurements of each source."""
-        return {"state": self._state, **{source: asdict(counts) for source, counts in self.observer.log.counts.items()}}
+        return {"state": self.state, **{source: asdict(counts) for source, counts in self.observer.log.counts.items()}}
 
     def publish(self, stamp_ns: int, estimate: Estimate) -> None:
-        """Publishes an estimate, where this replica owns the target."""
-        changed, self._state = (estimate.state == "lost") != (self._state == "lost"), estimate.state
-        if not self.node.owns(self.target):
+        """Publishes an estimate, where it is this replica's turn."""
+        changed, self.state = (estimate.state == "lost") != (self.state == "lost"), estimate.state
+        if time.monotonic() - self._heard_s < self.node.rank(self.target) * SILENCE_S:
             return
         self.node.publish(topics.FUSED, estimate.message(stamp_ns, self.target, self.node.cell.frame), target=self.target)
         if changed:

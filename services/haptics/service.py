@@ -82,9 +82,10 @@ def start(node: Node, options: argparse.Namespace) -> None:
             node.publish(HAPTIC, _message(estimate, window, target, cell.frame), target=target)
         told.update(faults, window.stamp_ns)
 
+    streams = [f"haptic/{target}" for target in estimators]
     node.subscribe(FUSED, on_fused)
-    node.subscribe(JOINTS, on_joints)
-    node.subscribe(VOLTAGES, on_voltages)
+    node.subscribe(JOINTS, on_joints, streams)
+    node.subscribe(VOLTAGES, on_voltages, streams)
 
 
 def estimator(node: Node, options: argparse.Namespace, skin: Skin, target: str) -> Estimator:

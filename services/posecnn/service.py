@@ -54,4 +54,4 @@ def start(node: Node, options: argparse.Namespace) -> None:
 
     node.subscribe(FUSED, on_fused)
     for camera in cameras:
-        node.subscribe(FRAME, on_frame, camera=camera)
+        node.subscribe(FRAME, on_frame, streams=[f"{camera}/{target}" for target in targets], camera=camera)

@@ -66,5 +66,6 @@ def start(node: Node, options: argparse.Namespace) -> None:
     for target in targets:
         node.subscribe(FUSED, on_fused, target=target)
     for camera in cameras:
-        node.subscribe(FRAME, on_frame, camera=camera)
-        node.subscribe(MASK, on_mask, camera=camera)
+        streams = [f"{camera}/{target}" for target in targets]
+        node.subscribe(FRAME, on_frame, streams, camera=camera)
+        node.subscribe(MASK, on_mask, streams, camera=camera)

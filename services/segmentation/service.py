@@ -37,8 +37,6 @@ def start(node: Node, options: argparse.Namespace) -> None:
             lookout.hear(message)
 
         def on_frame(frame: Frame, _: dict[str, str]) -> None:
-            if not node.owns(f"camera/{name}"):
-                return
             if frame.image.shape[:2] != (camera.height, camera.width):
                 came = f"{frame.image.shape[1]} x {frame.image.shape[0]}"
                 raise ValueError(
@@ -51,7 +49,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
             node.publish(MASK, mask, camera=name)
 
         node.subscribe(FUSED, on_pose)
-        node.subscribe(FRAME, on_frame, camera=name)
+        node.subscribe(FRAME, on_frame, streams=[f"camera/{name}"], camera=name)
 
     for name in cameras:
         watch(name, cell.cameras[name], load_segmenter(options.weights))
