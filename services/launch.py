@@ -23,6 +23,7 @@ from services.supervised import environment
 from shared import bus, logs, topics
 from shared import cell as cells
 from shared.service import Node
+from shared.turn import HANG_S
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Launcher:
         """Starts everything, and returns after `seconds` or when the node is stopping; then nothing is left."""
         title = f"Penumbra, cell {self.node.cell.name}: penumbra pose --cell {self.node.cell.name} in another terminal"
         deadline = time.monotonic() + seconds
-        self.node.every(1.0, self._refresh)
+        self.node.every(1.0, self._refresh, live.ANSWER_S + HANG_S)
         try:
             self.fleet.start()
             if self.console.is_terminal:
@@ -115,7 +116,7 @@ class Launcher:
         for process in self.fleet.processes:
             process.measure()
             if (report := local.get(process.pid or 0)) is not None:
-                process.heard(report["ready"])
+                process.heard(report["ready"], report["hangs"])
 
         self._tell_of_loops()
 

@@ -26,7 +26,7 @@ STABLE_S = 10.0
 """A process that ran this long is healthy: when it dies it is started again at once."""
 CRASH_LOOP = 3
 SILENT_S = 10.0
-"""A process that answered before and does not for this long hangs: it is killed and started again."""
+"""A process that was well before and hangs for this long, or does not answer, is killed and started again."""
 TERMINATE_S = 1.5
 ASKED_FOR_NOTHING = 2
 """Exit code of a process whose flags, cell or installation cannot work: starting it again changes nothing."""
@@ -66,7 +66,7 @@ class Supervised:
         self._delay_s = BACKOFF_S[0]
         self._crashes = 0
         self._started = self._due = self._heard = 0.0
-        self._hung = ""
+        self._hangs = self._hung = ""
         self._last_words: deque[str] = deque(maxlen=20)
         self._usage: psutil.Process | None = None
         self._listener: threading.Thread | None = None
@@ -107,7 +107,8 @@ class Supervised:
         with contextlib.suppress(OSError, AttributeError):  # only Linux has them; without, its end is noticed a little later
             self.pidfd = os.pidfd_open(popen.pid)
         self._last_words.clear()
-        self._started, self._heard, self._hung = time.monotonic(), 0.0, ""
+        self._started, self._heard = time.monotonic(), 0.0
+        self._hangs = self._hung = ""
         self.state, self.is_ready = "starting", False
         self._usage = psutil.Process(popen.pid)
         self._listener = threading.Thread(target=self._listen, args=(popen,), daemon=True)
@@ -137,7 +138,7 @@ class Supervised:
         code = popen.poll()
         if code is None:
             if self._heard and now - self._heard > SILENT_S:
-                self._hung = f"no answer for {SILENT_S:.0f} s, "
+                self._hung = f"{self._hangs or f'no answer for {SILENT_S:.0f} s'}, "
                 self.signal(signal.SIGKILL)
             return
         self._ended(code, now)
@@ -187,9 +188,11 @@ class Supervised:
         elif now > self._due:
             self.signal(signal.SIGKILL)
 
-    def heard(self, is_ready: bool = True) -> None:
-        """Its health query was answered, and said whether it does its part already."""
-        self._heard, self.is_ready = time.monotonic(), is_ready
+    def heard(self, is_ready: bool = True, hangs: str = "") -> None:
+        """Its health query was answered, and said whether it does its part, and what in it hangs."""
+        if not hangs or not self._heard:
+            self._heard = time.monotonic()
+        self.is_ready, self._hangs = is_ready, hangs
         if self.state == "starting":
             self.state = "running"
 
