@@ -101,7 +101,7 @@ def _run(command: str, argv: list[str]) -> int:
 
 def serve(name: str, argv: list[str]) -> int:
     """One service until SIGINT or SIGTERM."""
-    _die_with_parent()
+    die_with_parent()
     sys.setswitchinterval(SWITCH_S)
     from services import arguments
     from shared import bus, cell, logs
@@ -175,7 +175,7 @@ def _explain_import(command: str, error: ImportError) -> int:
     return 2
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
     """Ties a service to the launcher that started it: it must not stay behind, even if the launcher is killed with SIGKILL."""
     parent = os.environ.get("PENUMBRA_PARENT")
     if parent is None:

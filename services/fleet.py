@@ -14,7 +14,8 @@ from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from services.supervised import Supervised, stop
+from services.forkserver import ForkServer
+from services.supervised import Supervised, stop, wait
 
 READY_S = 120.0
 """How long a change waits for a process that it started: a first start compiles."""
@@ -60,10 +61,11 @@ class Change:
 
 
 class Fleet:
-    """kinds: every service that may run; counts: how many of each, none where it is not named."""
+    """kinds: every service that may run; counts: how many of each, none where it is not named; forkserver: where a service that
+    died comes from, while there is one."""
 
-    def __init__(self, kinds: Mapping[str, Kind], counts: Mapping[str, int]):
-        self._kinds = kinds
+    def __init__(self, kinds: Mapping[str, Kind], counts: Mapping[str, int], forkserver: ForkServer | None = None):
+        self._kinds, self._forkserver = kinds, forkserver
         self._groups = {name: [self._make(name) for _ in range(counts.get(name, 0))] for name in kinds}
         self._lock = threading.Lock()
         self._changes: OrderedDict[str, Change] = OrderedDict()
@@ -85,6 +87,8 @@ class Fleet:
         """Looks after every process, and takes a step of the change under way. To be called from the thread that started them."""
         for process in self.processes:
             process.watch()
+        if self._forkserver is not None:
+            self._forkserver.watch(all(process.is_ready or process.popen is None for process in self.processes))
         change = self._under_way()
         if change is None:
             return
@@ -95,7 +99,13 @@ class Fleet:
         except (ChangeFailed, OSError) as error:
             change.error, change.is_done = str(error), True
 
+    def wait(self, seconds: float) -> None:
+        """Returns when there is something to look after, or after `seconds`."""
+        wait(self.processes, seconds)
+
     def stop(self) -> None:
+        if self._forkserver is not None:
+            self._forkserver.stop()
         stop(self.processes)
 
     # ---- what is asked for on the bus
@@ -157,6 +167,8 @@ class Fleet:
         for service in services:
             for old in tuple(self._groups[service]):
                 yield from self._replace(service, old)
+        if self._forkserver is not None:
+            self._forkserver.renew()  # what was restarted may have been installed anew
 
     def _replace(self, service: str, old: Supervised) -> Iterator[str]:
         if self._kinds[service].beside:  # the old one serves until the new one does
@@ -212,7 +224,7 @@ class Fleet:
 
     def _make(self, service: str) -> Supervised:
         kind = self._kinds[service]
-        return Supervised(service, kind.command, kind.restart, kind.environment)
+        return Supervised(service, kind.command, kind.restart, kind.environment, self._forkserver)
 
     def _name(self) -> None:
         """One is called as its service, several are numbered."""

@@ -18,9 +18,12 @@ from rich.live import Live
 
 from services import arguments, live
 from services.fleet import Fleet, Kind
+from services.forkserver import ForkServer
+from services.supervised import environment
 from shared import bus, logs, topics
 from shared import cell as cells
 from shared.service import Node
+from shared.turn import HANG_S
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ class Launcher:
         """Starts everything, and returns after `seconds` or when the node is stopping; then nothing is left."""
         title = f"Penumbra, cell {self.node.cell.name}: penumbra pose --cell {self.node.cell.name} in another terminal"
         deadline = time.monotonic() + seconds
-        self.node.every(1.0, self._refresh)
+        self.node.every(1.0, self._refresh, live.ANSWER_S + HANG_S)
         try:
             self.fleet.start()
             if self.console.is_terminal:
@@ -100,7 +103,8 @@ class Launcher:
 
     def _loop(self, deadline: float, period_s: float, show: Callable[[], None]) -> None:
         due = time.monotonic() + min(period_s, 1.0)
-        while not self.node.stopping.wait(POLL_S) and time.monotonic() < deadline:
+        while not self.node.stopping.is_set() and time.monotonic() < deadline:
+            self.fleet.wait(POLL_S)
             self.fleet.watch()
             if time.monotonic() >= due:
                 show()
@@ -112,7 +116,7 @@ class Launcher:
         for process in self.fleet.processes:
             process.measure()
             if (report := local.get(process.pid or 0)) is not None:
-                process.heard(report["ready"])
+                process.heard(report["ready"], report["hangs"])
 
         self._tell_of_loops()
 
@@ -135,7 +139,7 @@ class Launcher:
 def fleet(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> Fleet:
     """The processes that this cell needs, ready to start: the router among them, unless there is one already (--connect). Raises
     CellError for an unknown name or an impossible number."""
-    environment = {
+    own = {
         "PENUMBRA_METRICS_PORT": "",  # the launcher's port covers all
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
     }
@@ -150,7 +154,7 @@ def fleet(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> Fleet
         for flag in process.flags:
             if (value := getattr(options, flag)) is not None:
                 command += [f"--{flag}", str(value)]
-        kinds[process.name] = Kind(command, process.restart, environment, process.beside)
+        kinds[process.name] = Kind(command, process.restart, own, process.beside)
         if process.is_needed(cell) and process.vision in (None, options.vision):
             counts[process.name] = process.replicas
     for text in options.replicas:
@@ -162,7 +166,8 @@ def fleet(cell: cells.Cell, options: argparse.Namespace, endpoint: str) -> Fleet
         except ValueError as error:
             raise cells.CellError(f"--replicas {error}") from None
         counts[name] = int(number)
-    return Fleet(kinds, counts)
+    modules = [process.module for process in PROCESSES if counts.get(process.name)]
+    return Fleet(kinds, counts, ForkServer(modules, environment(own)) if sys.platform == "linux" else None)
 
 
 def listening(options: argparse.Namespace) -> str:

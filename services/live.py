@@ -20,6 +20,8 @@ from shared import bus, geometry, topics
 from shared.messages import BadMessage, FusedPose, Truth, decode
 from shared.service import Node
 
+ANSWER_S = 2.0
+"""How long an instance may take to say how it is."""
 STYLES = {"running": "green", "starting": "yellow", "degraded": "yellow"}
 
 
@@ -80,7 +82,7 @@ class Watch:
 
     def refresh(self) -> None:
         """Asks all instances how they are; `health` is then their answers by instance."""
-        found = [json.loads(answer) for answer in self._node.query(topics.health(self._node.cell.name), timeout_s=2.0)]
+        found = [json.loads(answer) for answer in self._node.query(topics.health(self._node.cell.name), timeout_s=ANSWER_S)]
         self.health = {report["instance"]: report for report in found}
         self._look_at_pose()
 

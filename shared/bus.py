@@ -23,6 +23,7 @@ from shared import access
 from shared.guard import Guard
 from shared.messages import BadMessage, Message, decode
 from shared.topics import TOPICS, Topic
+from shared.turn import Turn
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 SECURE_ENDPOINT = "tls/127.0.0.1:7447"
@@ -323,7 +324,8 @@ class Reader:
 
     keys: every concrete key that the cell knows, with its names, counters and guard; a sample on any other key is refused, so
     that nobody can grow the table. `refused` is told of the first bad message of each kind on a key, `failed` of every exception
-    of the handler. from_others: leaves out what this session publishes itself.
+    of the handler. from_others: leaves out what this session publishes itself. turn: is told when the handler begins and
+    returns.
     """
 
     def __init__(
@@ -338,10 +340,11 @@ class Reader:
         now_ns: Callable[[], int],
         refused: Callable[[str, BadMessage], None],
         failed: Callable[[str, Exception], None],
-        from_others: bool = False,
+        from_others: bool,
+        turn: Turn,
     ):
         self._topic, self._keys, self._strangers = topic, keys, strangers
-        self._handler, self._now_ns, self._refused, self._failed = handler, now_ns, refused, failed
+        self._handler, self._now_ns, self._refused, self._failed, self._turn = handler, now_ns, refused, failed, turn
         origin = zenoh.Locality.REMOTE if from_others else zenoh.Locality.ANY
         self._subscriber = session.declare_subscriber(expression, zenoh.handlers.RingChannel(depth), allowed_origin=origin)
         self._ring = self._subscriber.handler  # the subscriber itself cannot be closed while a thread waits in it
@@ -377,7 +380,8 @@ class Reader:
             return
         traffic.took(message.stamp_ns, self._now_ns())
         try:
-            self._handler(message, names | {"publisher": publisher})
+            with self._turn:
+                self._handler(message, names | {"publisher": publisher})
         except Exception as error:
             self._failed(f"reader of {key}", error)
 

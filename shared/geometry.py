@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -19,7 +18,7 @@ Array = NDArray[np.float64]
 def transform(position: ArrayLike, orientation: ArrayLike = (0.0, 0.0, 0.0, 1.0)) -> Array:
     """The 4 x 4 transform of a position [m] (3,) and a unit quaternion (4,)."""
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(orientation).as_matrix()
+    T[:3, :3] = _from_quaternion(orientation)
     T[:3, 3] = position
     return T
 
@@ -27,19 +26,26 @@ def transform(position: ArrayLike, orientation: ArrayLike = (0.0, 0.0, 0.0, 1.0)
 def from_rpy(position: ArrayLike, rpy: ArrayLike) -> Array:
     """The 4 x 4 transform of a position [m] (3,) and roll, pitch, yaw [rad] (3,) about the fixed x, y, z axes."""
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
+    roll, pitch, yaw = np.asarray(rpy, float).tolist()
+    T[:3, :3] = rotation((0.0, 0.0, yaw)) @ rotation((0.0, pitch, 0.0)) @ rotation((roll, 0.0, 0.0))
     T[:3, 3] = position
     return T
 
 
 def position_orientation(T: Array) -> tuple[Array, Array]:
     """Position [m] (3,) and unit quaternion (4,) with w >= 0 of a transform."""
-    return T[:3, 3].copy(), Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+    return T[:3, 3].copy(), _quaternion(T[:3, :3])
 
 
 def rpy(orientation: ArrayLike) -> Array:
-    """Roll, pitch, yaw [rad] (3,) about the fixed x, y, z axes of a quaternion (4,)."""
-    return Rotation.from_quat(orientation).as_euler("xyz")
+    """Roll, pitch, yaw [rad] (3,) about the fixed x, y, z axes of a quaternion (4,). The pitch is within a quarter turn; there,
+    where only the sum or the difference of roll and yaw is defined, the yaw is zero."""
+    (a, b, _), (d, e, _), (g, h, i) = _from_quaternion(orientation).tolist()
+    cosine = math.hypot(a, d)
+    pitch = math.atan2(-g, cosine)
+    if cosine < 1e-7:
+        return np.array([math.atan2(b if g < 0.0 else -b, e), pitch, 0.0])
+    return np.array([math.atan2(h, i), pitch, math.atan2(d, a)])
 
 
 def inverse(T: Array) -> Array:
@@ -60,7 +66,7 @@ def perturb(T: Array, error: ArrayLike) -> Array:
     """T moved by a pose error (6,): translation [m] added, rotation vector [rad] applied from the left (fixed axes)."""
     error = np.asarray(error, dtype=float)
     out = T.copy()
-    out[:3, :3] = _rotation(error[3:]) @ T[:3, :3]
+    out[:3, :3] = rotation(error[3:]) @ T[:3, :3]
     out[:3, 3] += error[:3]
     return out
 
@@ -70,10 +76,9 @@ def pose_error(T_true: Array, T: Array) -> Array:
     return np.concatenate([T_true[:3, 3] - T[:3, 3], _rotation_vector(T_true[:3, :3] @ T[:3, :3].T)])
 
 
-def _rotation(vector: Array) -> Array:
-    """The rotation matrix of a rotation vector (3,) [rad] (Rodrigues). A search calls it thousands of times a second, and
-    it takes a tenth of what scipy's does."""
-    x, y, z = vector.tolist()
+def rotation(vector: ArrayLike) -> Array:
+    """The rotation matrix of a rotation vector (3,) [rad] (Rodrigues)."""
+    x, y, z = np.asarray(vector, float).tolist()
     square = x * x + y * y + z * z
     angle = math.sqrt(square)
     a, b = (
@@ -89,15 +94,44 @@ def _rotation(vector: Array) -> Array:
 
 
 def _rotation_vector(R: Array) -> Array:
-    """The rotation vector (3,) [rad] of a rotation matrix; near a half turn, where the formula is ill conditioned, by scipy."""
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    x, y, z = h - f, c - g, d - b  # twice the axis times the sine
-    sine, cosine = 0.5 * math.sqrt(x * x + y * y + z * z), 0.5 * (a + e + i - 1.0)
-    angle = math.atan2(sine, cosine)
-    if angle > 3.0:
-        return Rotation.from_matrix(R).as_rotvec()
-    scale = 0.5 * angle / sine if sine > 1e-6 else 0.5
+    """The rotation vector (3,) [rad] of a rotation matrix (3, 3)."""
+    x, y, z, w = _quaternion(R).tolist()
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-9 else 2.0
     return np.array([scale * x, scale * y, scale * z])
+
+
+def _from_quaternion(orientation: ArrayLike) -> Array:
+    """The rotation matrix (3, 3) of a quaternion (4,) of any length but zero, for which it raises ValueError."""
+    x, y, z, w = np.asarray(orientation, float).tolist()
+    square = x * x + y * y + z * z + w * w
+    if not square > 0.0:
+        raise ValueError(f"orientation: a unit quaternion (x, y, z, w) expected, ({x}, {y}, {z}, {w}) came")
+    s = 2.0 / square
+    return np.array(
+        [
+            [1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+            [s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)],
+            [s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)],
+        ]
+    )
+
+
+def _quaternion(R: Array) -> Array:
+    """The unit quaternion (4,) with w >= 0 of a rotation matrix (3, 3), from its greatest component, by which the others are
+    divided (Shepperd 1978, doi:10.2514/3.55767b)."""
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    w = a + e + i
+    greatest = max(a, e, i, w)
+    if greatest == w:
+        q = np.array([h - f, c - g, d - b, 1.0 + w])
+    elif greatest == a:
+        q = np.array([1.0 + a - e - i, b + d, c + g, h - f])
+    elif greatest == e:
+        q = np.array([b + d, 1.0 - a + e - i, f + h, c - g])
+    else:
+        q = np.array([c + g, f + h, 1.0 - a - e + i, d - b])
+    return q / math.copysign(math.sqrt(q @ q), q[3])
 
 
 def axis_angle_error(T_true: Array, T: Array, axis: int = 0) -> float:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import functools
 import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pybullet
 import pybullet_data
-import trimesh
 from numpy.typing import ArrayLike
 
 from shared import cell as cells
@@ -22,6 +22,9 @@ from shared.body import Mesh
 from shared.classes import Label
 from shared.geometry import Array
 
+if TYPE_CHECKING:
+    import trimesh
+
 _PYBULLET = threading.Lock()  # connecting and loading share state inside pybullet
 
 
@@ -29,7 +32,7 @@ class RobotModel:
     """A robot of the cell.
 
     joints: names of the joints that move, in the order of every `q`; lower, upper: their limits (n,), infinite where the URDF
-    sets none. links: names of all links. meshes: the collision mesh of each link that has one, in the link's frame.
+    sets none. links: names of all links.
 
     Raises CellError where the URDF cannot be read or does not have a joint.
     """
@@ -91,9 +94,12 @@ class RobotModel:
                 s, c = (q, 0.0) if self._prismatic[i] else (np.sin(q), 1.0 - np.cos(q))
                 self._origin[i] = still[i] @ (np.eye(4) + s * generator + c * generator @ generator)
         self._origin[0] = self.T_world_base
-        self.meshes = {
-            name: mesh for i, name in enumerate(self.links) if (mesh := _collision_mesh(body, i - 1, client)) is not None
-        }
+        self._shapes = {name: shapes for i, name in enumerate(self.links) if (shapes := _collision_shapes(body, i - 1, client))}
+
+    @functools.cached_property
+    def meshes(self) -> dict[str, Mesh]:
+        """The collision mesh of each link that has one, in the link's frame. Kinematics need none: made when asked for."""
+        return {name: _mesh(shapes) for name, shapes in self._shapes.items()}
 
     def link_transforms(self, q: ArrayLike) -> dict[str, Array]:
         """T_world_link (..., 4, 4) of every link at joint angles [rad] or displacements [m] q (..., n).
@@ -160,22 +166,31 @@ def _relative_transforms(body: int, client: int, parent: list[int]) -> Array:
     return relative
 
 
-def _collision_mesh(body: int, link: int, client: int) -> Mesh | None:
-    """All collision shapes of a link as one mesh in the link's frame, None where it has none."""
+Solid = tuple[int, tuple[float, float, float], str]
+"""A collision shape: pybullet's kind, its dimensions [m] or, of a mesh, its scale, and the mesh's file."""
+
+
+def _collision_shapes(body: int, link: int, client: int) -> list[tuple[Solid, Array]]:
+    """The collision shapes of a link, each with its transform to the link's frame."""
     T_link_inertial = geometry.transform(*pybullet.getDynamicsInfo(body, link, client)[3:5])
-    parts = []
-    for _, _, kind, dimensions, file, position, orientation in pybullet.getCollisionShapeData(body, link, client):
-        part = _shape(kind, dimensions, file.decode())
-        parts.append(part.apply_transform(T_link_inertial @ geometry.transform(position, orientation)))
-    if not parts:
-        return None
+    return [
+        ((kind, dimensions, file.decode()), T_link_inertial @ geometry.transform(position, orientation))
+        for _, _, kind, dimensions, file, position, orientation in pybullet.getCollisionShapeData(body, link, client)
+    ]
+
+
+def _mesh(shapes: list[tuple[Solid, Array]]) -> Mesh:
+    """All shapes of a link as one mesh in the link's frame."""
+    parts = [_solid(*solid).apply_transform(T) for solid, T in shapes]
     counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + first for part, first in zip(parts, counts, strict=False)]).astype(np.int32)
     return Mesh(vertices, faces, np.full(len(faces), Label.ROBOT, np.uint8))
 
 
-def _shape(kind: int, dimensions: tuple[float, float, float], file: str) -> trimesh.Trimesh:
+def _solid(kind: int, dimensions: tuple[float, float, float], file: str) -> trimesh.Trimesh:
+    import trimesh
+
     if kind == pybullet.GEOM_MESH:
         return trimesh.load_mesh(file).apply_scale(dimensions)
     if kind == pybullet.GEOM_BOX:

@@ -37,12 +37,15 @@ from shared import bus, cell, health, logs, topics
 from shared.guard import Guard
 from shared.messages import VERSION, BadMessage, Message, encode
 from shared.topics import QoS, Topic
+from shared.turn import HANG_S, Turn
 
 CLOSE_S = 0.8
 """Closing a session on a bad network may take much longer; a process that ends does not wait for that."""
 QUERY_DEPTH = 32
 NEWS_S = 0.2
 """Within this a session has heard which replicas there are."""
+LOOK_S = 0.2
+"""How often it is looked whether a handler hangs."""
 WARM_UP_S = 2.0
 """How long a replica that joins others may listen before it takes its share."""
 
@@ -97,6 +100,8 @@ class Node:
         self.worries: Callable[[], Sequence[str]] = list  # what the service itself suffers from, in words
         self._counting = threading.Lock()
         self._token: zenoh.LivelinessToken | None = None
+        self._turns: list[Turn] = []
+        self._hang = ""  # the handler that hangs, in words
         self.is_warm: Callable[[], bool] = lambda: True  # whether it could go on with what another replica does
         self._others: frozenset[str] = frozenset()
         self._replicas = frozenset({self.instance})
@@ -124,6 +129,7 @@ class Node:
         self._come_alive()
         self._process.cpu_percent()
         self.every(1.0, self._keep_house)
+        self._spawn(self._watch_turns, "watch turns")
         self.log.info("on the bus", at=", ".join(self.connection.listen) or self.connection.where)
         return self
 
@@ -133,7 +139,10 @@ class Node:
         session = cast(zenoh.Session, self.session)
 
         def declare() -> None:
-            self._token = session.liveliness().declare_token(topics.alive(self.cell.name, self.service, self.instance))
+            with self._counting:
+                if self._token is None:
+                    key = topics.alive(self.cell.name, self.service, self.instance)
+                    self._token = session.liveliness().declare_token(key)
             self._count_replicas()
 
         def warm_up() -> None:
@@ -263,6 +272,8 @@ class Node:
             bus.Traffic(float("inf")) if len(keys) == 1 else self._received.setdefault(expression, bus.Traffic(float("inf")))
         )
 
+        turn = self._turn(f"reader of {expression}")
+
         def read() -> bus.Reader:
             return bus.Reader(
                 cast(zenoh.Session, self.session),
@@ -276,6 +287,7 @@ class Node:
                 self._refused,
                 self.fault,
                 from_others,
+                turn,
             )
 
         if streams:
@@ -283,6 +295,10 @@ class Node:
             self._declare(lambda: self._join(share))
         else:
             self._declare(lambda: self._threads.append(read().thread))
+
+    def _turn(self, what: str, patience_s: float = HANG_S) -> Turn:
+        self._turns.append(turn := Turn(what, patience_s))
+        return turn
 
     def _join(self, share: Share) -> None:
         with self._counting:
@@ -325,7 +341,7 @@ class Node:
 
     def answer(self, key: str, function: Answer) -> None:
         """Answers queries on `key` with `function(parameters, payload)`: bytes, or bytes and their encoding. A ValueError becomes
-        an error reply with its text. While it warms up beside others, it leaves the answers to them."""
+        an error reply with its text. While it warms up or hangs beside others, it leaves the answers to them."""
 
         def serve(queryable: Any) -> None:
             while True:
@@ -345,8 +361,8 @@ class Node:
     def _reply(self, key: str, query: zenoh.Query, function: Answer) -> None:
         parameters = dict(cast(Any, query.parameters))
         try:
-            if self._token is None and self._others and not self.is_warm() and function != self._answer_health:
-                raise ValueError(f"{self.service} {self.instance} warms up: ask the others")
+            if self._token is None and self._others and function != self._answer_health:
+                raise ValueError(f"{self.service} {self.instance} {'hangs' if self._hang else 'warms up'}: ask the others")
             result = function(parameters, query.payload.to_bytes() if query.payload is not None else b"")
         except ValueError as error:
             query.reply_err(str(error).encode())
@@ -363,19 +379,45 @@ class Node:
 
     # ---- time, replicas, health
 
-    def every(self, period_s: float, function: Callable[[], None]) -> None:
-        """Calls `function` every `period_s` in a thread of its own; turns that are missed are left out, not made up for."""
+    def every(self, period_s: float, function: Callable[[], None], patience_s: float = HANG_S) -> None:
+        """Calls `function` every `period_s` in a thread of its own; turns that are missed are left out, not made up for. A turn
+        hangs that takes `patience_s` longer than usual: infinite for one that returns when the node stops."""
+        what = f"timer {getattr(getattr(function, 'func', function), '__name__', '')} of {period_s} s"
+        turn = self._turn(what, patience_s)
 
         def loop() -> None:
             due = time.monotonic()
             while not self.stopping.wait(max(0.0, due - time.monotonic())):
                 try:
-                    function()
+                    with turn:
+                        function()
                 except Exception as error:
-                    self.fault(f"timer {getattr(function, '__name__', '')} of {period_s} s", error)
+                    self.fault(what, error)
                 due = max(due + period_s, time.monotonic() - period_s)
 
         self._declare(lambda: self._spawn(loop, f"every {period_s} s"))
+
+    def _watch_turns(self) -> None:
+        """While a handler hangs, this replica has no part: its streams go to others, and come back when the handler returns."""
+        looked_s = time.monotonic()
+        while not self.stopping.wait(LOOK_S):
+            now_s = time.monotonic()
+            late_s, looked_s = now_s - looked_s - LOOK_S, now_s
+            if late_s > LOOK_S:  # the whole process stood still
+                continue
+            longest_s, what = max(((turn.hangs_s(now_s), turn.what) for turn in self._turns), default=(0.0, ""))
+            was, self._hang = self._hang, f"{what} hangs for {longest_s:.0f} s" if longest_s else ""
+            try:
+                if self._hang and self._token is not None:
+                    self.log.error("a handler hangs: the other replicas take over", handler=what)
+                    token, self._token = self._token, None
+                    token.undeclare()
+                    self._count_replicas()
+                elif was and not self._hang:
+                    self.log.info("the handler that hung has returned")
+                    self._come_alive()
+            except zenoh.ZError:  # the session was closed
+                return
 
     def owns(self, stream: str) -> bool:
         """Whether this replica is the one of the living replicas of its service that handles `stream`. While the news of a
@@ -428,7 +470,7 @@ class Node:
         memory in MB, counters of every topic, and what the service tells of itself in `report`: JSON by name, from a function
         each."""
         now = self.now_ns()
-        status, reasons = health.judge(self._away(), self._received, self._look(), self.worries(), now)
+        status, reasons = health.judge(self._away(), self._received, self._look(), self._suffers(), now)
         return {
             "service": self.service,
             "instance": self.instance,
@@ -439,6 +481,7 @@ class Node:
             "cell": self.cell.name,
             "wire_version": VERSION,
             "ready": self._token is not None,
+            "hangs": self._hang,
             "uptime_s": round(time.monotonic() - self._started, 1),
             "cpu": round(self._cpu, 3),
             "memory_mb": round(self._process.memory_info().rss / 1e6, 1),
@@ -452,6 +495,9 @@ class Node:
 
     def _answer_health(self, parameters: dict[str, str], payload: bytes) -> bytes:
         return json.dumps(self.health()).encode()
+
+    def _suffers(self) -> list[str]:
+        return [*([self._hang] if self._hang else []), *self.worries()]
 
     def _look(self) -> Counter[tuple[str, str]]:
         return self._lately.look(health.counts(self._received, self._faults), time.monotonic())
@@ -497,7 +543,7 @@ class Node:
                 self._tell_waiting()
         heartbeat = os.environ.get("PENUMBRA_HEARTBEAT")
         if heartbeat:
-            status, reasons = health.judge(self._away(), self._received, grown, self.worries(), self.now_ns())
+            status, reasons = health.judge(self._away(), self._received, grown, self._suffers(), self.now_ns())
             fresh = Path(f"{heartbeat}.new")
             fresh.write_text(": ".join([status, "; ".join(reasons)]).removesuffix(": ") + "\n")
             fresh.replace(heartbeat)  # nobody reads half of it

@@ -1,13 +1,14 @@
 """A small real service for the tests of the runtime: `python -m tests.nodes SERVICE --connect ENDPOINT`.
 
 It publishes the fused pose of the table's forearm at 100 Hz (where it owns it), answers the pose query, and counts frames; as
-`camera` it sends them.
+`camera` it sends them; as `hanging` its timer hangs after a second.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 
 import numpy as np
@@ -52,7 +53,11 @@ def pose_json(target: str = "forearm") -> bytes:
 
 
 def start(node: Node) -> None:
+    began = time.monotonic()
+
     def publish() -> None:
+        if node.service == "hanging" and time.monotonic() - began > 1.0:
+            threading.Event().wait()
         if node.owns("pose/forearm"):
             node.publish(topics.FUSED, pose(), target="forearm")
 

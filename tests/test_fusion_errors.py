@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from services.fusion.filter import Sense, Settings
+from services.fusion.filter import Sense, Settings, _quantile
 from services.fusion.observer import ErrorStateObserver
 from shared import geometry
 from shared.geometry import Array, perturb, pose_error
@@ -182,3 +182,9 @@ def test_a_sense_that_is_noisier_than_it_says_is_doubted_and_not_refused() -> No
     assert observer.log.counts["haptic"].gated - at_first < 10
     assert np.median(errors) < 0.007  # a single measurement is 10 mm off
     assert np.sqrt(estimate.covariance[0, 0]) > 0.004
+
+
+@pytest.mark.parametrize("share", [0.5, 0.95, 0.999, 0.9999])
+@pytest.mark.parametrize("rank", range(1, 7))
+def test_gates_are_quantiles_of_chi_square(rank: int, share: float) -> None:
+    assert _quantile(rank, share) == pytest.approx(chi2.ppf(share, rank), rel=1e-9)

@@ -1,5 +1,7 @@
 """Conventions of poses and their errors."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -20,6 +22,40 @@ def test_position_and_quaternion_round_trip(rng):
     for _ in range(100):
         T = random_transform(rng)
         np.testing.assert_allclose(geometry.transform(*geometry.position_orientation(T)), T, atol=1e-12)
+
+
+def test_rotations_are_those_of_scipy_near_every_half_turn_too(rng):
+    axes = [*np.eye(3), *rng.normal(size=(20, 3))]
+    angles = [0.0, 1e-12, 1e-6, 0.3, 1.5, 3.0, np.pi - 1e-3, np.pi - 1e-7, np.pi]
+    for axis, angle in itertools.product(axes, angles):
+        vector = angle * axis / np.linalg.norm(axis)
+        expected = Rotation.from_rotvec(vector)
+        np.testing.assert_allclose(geometry.rotation(vector), expected.as_matrix(), atol=1e-12)
+        T = geometry.transform((0, 0, 0), 3.0 * expected.as_quat())
+        np.testing.assert_allclose(T[:3, :3], expected.as_matrix(), atol=1e-12)
+        found = geometry.position_orientation(T)[1]
+        assert found[3] >= 0.0
+        np.testing.assert_allclose(Rotation.from_quat(found).as_matrix(), expected.as_matrix(), atol=1e-12)
+        error = geometry.pose_error(T, np.eye(4))[3:]
+        assert np.linalg.norm(error) <= np.pi + 1e-12
+        np.testing.assert_allclose(geometry.rotation(error), expected.as_matrix(), atol=1e-9)
+
+
+def test_euler_angles_are_those_of_scipy_and_defined_where_the_pitch_is_a_quarter_turn(rng):
+    for angles in rng.uniform(-1.5, 1.5, (50, 3)):
+        T = geometry.from_rpy((0, 0, 0), angles)
+        np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("xyz", angles).as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(geometry.rpy(geometry.position_orientation(T)[1]), angles, atol=1e-9)
+    for pitch, roll, yaw in itertools.product((-np.pi / 2, np.pi / 2), (0.0, 0.4, 2.0), (0.0, -0.7, 3.0)):
+        R = geometry.from_rpy((0, 0, 0), (roll, pitch, yaw))[:3, :3]
+        angles = geometry.rpy(Rotation.from_matrix(R).as_quat())
+        assert angles[2] == 0.0
+        np.testing.assert_allclose(geometry.from_rpy((0, 0, 0), angles)[:3, :3], R, atol=1e-7)
+
+
+def test_a_quaternion_of_no_length_is_refused():
+    with pytest.raises(ValueError, match=r"a unit quaternion \(x, y, z, w\) expected, \(0.0, 0.0, 0.0, 0.0\) came"):
+        geometry.transform((0, 0, 0), (0, 0, 0, 0))
 
 
 def test_roll_pitch_yaw_turn_about_the_fixed_axes_in_that_order():

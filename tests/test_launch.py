@@ -1,6 +1,7 @@
 """The launcher with real processes, some of them misbehaving."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -100,6 +101,17 @@ def test_a_process_that_hangs_is_killed_and_started_again(supervise, monkeypatch
     assert "no answer" in process.note
     with pytest.raises(AssertionError):
         until(lambda: process.restarts > 1, 0.6, "a kill while it was never heard: it may still be loading")
+
+
+def test_a_process_whose_handler_hangs_is_killed_and_started_again_although_it_answers(router, monkeypatch):
+    monkeypatch.setattr(supervised, "SILENT_S", 1.5)
+    fleet = Fleet({"hanging": Kind([sys.executable, "-m", "tests.nodes", "hanging", "--connect", router])}, {"hanging": 1})
+    (process,) = fleet.processes
+    with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
+        node.every(0.1, lambda: node.stopping.set() if process.restarts else None)
+        launch.Launcher(node, fleet, Console(quiet=True)).run(60)
+    assert process.restarts == 1
+    assert re.fullmatch(r"timer publish of 0.01 s hangs for \d+ s, killed by SIGKILL.*", process.note)
 
 
 def test_stopping_takes_less_than_three_seconds_whatever_the_processes_do(supervise):

@@ -239,6 +239,32 @@ def test_masks_of_the_compiled_network_are_torch_s_but_for_rounding(monkeypatch)
     assert len(np.unique(a)) > 1
 
 
+def test_a_converted_network_is_kept_for_the_next_start_and_made_anew_where_its_file_is_spoilt(monkeypatch, tmp_path):
+    pytest.importorskip("openvino")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    net = prednet.PredNet(prednet.Settings()).eval()
+    image = torch.rand(1, 3, 64, 96)
+    state = net.initial_state(1, 64, 96)
+    converted = []
+    convert = compiled.Compiled._convert
+    monkeypatch.setattr(compiled.Compiled, "_convert", lambda self, net: converted.append(net) or convert(self, net))
+
+    def logits():
+        return compiled.Compiled(net, torch.float32, is_kept=True)(image, state)[0]
+
+    first = logits()
+    (path,) = tmp_path.glob("*.xml")
+    assert sorted(each.suffix for each in tmp_path.iterdir()) == [".bin", ".xml"]
+    assert torch.equal(logits(), first)
+    assert len(converted) == 1
+    path.write_text(path.read_text()[:1000])
+    assert torch.equal(logits(), first)
+    assert len(converted) == 2
+    assert compiled.kept_at(prednet.PredNet(prednet.Settings()), torch.float32, "1") != path, "other weights, another file"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/proc/nowhere")
+    assert torch.equal(logits(), first), "also where nothing can be written"
+
+
 def test_two_cameras_share_what_is_compiled_and_not_what_they_remember():
     first, second, window = scene(3), scene(3)[:, ::-1].copy(), Window(0, 0, 96, 96)
     stamps = [(t + 1) * 50_000_000 for t in range(3)]

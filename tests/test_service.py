@@ -4,10 +4,12 @@ import contextlib
 import itertools
 import json
 import logging
+import math
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -16,7 +18,9 @@ import pytest
 from shared import bus, logs, topics
 from shared import cell as cells
 from shared.service import CLOSE_S, Node
+from shared.turn import Turn
 from tests.live import free_port, wait_for
+from tests.nodes import pose
 
 CELL = cells.load("table")
 STREAMS = [f"stream/{k}" for k in range(60)]
@@ -317,3 +321,45 @@ def test_as_json_everything_that_a_process_says_is_an_object_a_line_also_its_las
 @pytest.mark.parametrize("line", ["Killed", "3", "[1]", "{}", '{"note": 1}', "{"])
 def test_a_line_that_is_none_of_ours_says_what_it_says(line):
     assert logs.sentence(line) == line
+
+
+@pytest.mark.parametrize("where", ["timer", "reader"])
+def test_a_replica_with_a_hanging_handler_leaves_its_streams_to_the_others_until_it_returns(replica, where):
+    hanging, other = nodes = [replica(), replica()]
+    before = wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    let_go = threading.Event()
+    if where == "timer":
+        hanging.every(0.01, let_go.wait)
+    else:
+        hanging.subscribe(topics.FUSED, lambda message, names: let_go.wait())
+        other.every(0.05, lambda: other.publish(topics.FUSED, pose(), target="forearm"))
+    wait_for(lambda: owners(nodes) == [other] * len(STREAMS), 10, "all streams to be the other one's")
+    assert living(other) == {other.instance}
+    (report,) = [report for report in health(other) if report["instance"] == hanging.instance]
+    assert not report["ready"] and report["status"] == "degraded"
+    assert any(where in reason and "hangs for" in reason for reason in report["reasons"])
+    let_go.set()
+    wait_for(lambda: owners(nodes) == before, 10, "the streams to come back")
+    assert hanging.health()["hangs"] == ""
+
+
+def test_a_replica_that_hangs_alone_keeps_its_streams(replica):
+    alone, let_go = replica(), threading.Event()
+    alone.every(0.01, let_go.wait)
+    wait_for(lambda: alone.health()["hangs"], 10, "the hang to be noticed")
+    assert all(map(alone.owns, STREAMS))
+    let_go.set()
+
+
+def test_a_handler_that_always_takes_long_does_not_hang(replica):
+    patient = replica()
+    patient.every(0.01, patient.stopping.wait, math.inf)
+    slow = Turn("slow", 0.1)
+    for _ in range(30):
+        with slow:
+            time.sleep(0.05)
+    with slow:
+        assert slow.hangs_s(time.monotonic() + 0.12) == 0.0, "0.1 s longer than usual"
+        wait_for(lambda: slow.hangs_s(time.monotonic()), 10, "a turn that hangs")
+    assert slow.hangs_s(time.monotonic() + 100.0) == 0.0
+    assert patient.health()["hangs"] == "", "it may take as long as it likes"

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -58,7 +59,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
         serial = SerialBoards(world, pads, options.serial_folder, sensors.epoch_ns, TICK_NS * 1e-9, AHEAD_S)
         for name, device in serial.devices.items():
             node.log.info("board on a pseudo-terminal", board=name, device=device)
-        node.every(AGAIN_S, partial(serial.serve, node.stopping))
+        node.every(AGAIN_S, partial(serial.serve, node.stopping), math.inf)
     served = serial.pads if serial else ()
 
     def answer(_: dict[str, str], payload: bytes) -> tuple[bytes, str]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import astuple, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from services.fusion.estimate import SOURCES, Array, Limits
 from services.fusion.records import MODEL, POSE
@@ -79,7 +79,21 @@ def model(settings: Settings, home: Array, spread: tuple[float, float]) -> NDArr
             out[name] = values[name]
     for name in ("lasting", "time_constant", "floor"):
         out[name] = [getattr(settings.senses[source], name) for source in SOURCES]
-    ranks = np.maximum(np.arange(POSE + 1), 1)
-    out["threshold"] = 2.0 * gammaincinv(0.5 * ranks, np.array(settings.gate)[:, None])  # chi-square quantiles
+    out["threshold"] = [[_quantile(max(rank, 1), share) for rank in range(POSE + 1)] for share in settings.gate]
     out["home_covariance"] = np.diag(np.repeat(np.square(spread), 3))
     return out
+
+
+def _quantile(rank: int, share: float) -> float:
+    """The chi-square quantile of `rank` degrees of freedom: `share` of the squares are below it."""
+    low, high = 0.0, 1e3
+    for _ in range(64):
+        middle = 0.5 * (low + high)
+        # the upper tail, from that of 1 or 2 degrees of freedom in steps of 2 (Abramowitz and Stegun 26.4.4, 26.4.5, 26.4.8)
+        half = 0.5 * middle
+        tail, reached = (math.erfc(math.sqrt(half)), 1) if rank % 2 else (math.exp(-half), 2)
+        while reached < rank:
+            tail += half ** (0.5 * reached) * math.exp(-half) / math.gamma(0.5 * reached + 1.0)
+            reached += 2
+        low, high = (middle, high) if tail > 1.0 - share else (low, middle)
+    return 0.5 * (low + high)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from services.posecnn import network, patch, voting
 from services.posecnn.network import REFERENCE_PX, STRIDE, Network
@@ -162,7 +161,7 @@ class PoseCNN:
         T[:3, 3] = depth * np.array([*(centre - square.centre) / square.focal, 1.0])
         pooled = torch.from_numpy(centre[None].astype(np.float32)), torch.tensor([length_px])
         quaternion = self._net.rotations(out.features, *pooled)[0].numpy()
-        T[:3, :3] = patch.facing(T[:3, 3]) @ Rotation.from_quat(quaternion).as_matrix()
+        T[:3, :3] = patch.facing(T[:3, 3]) @ geometry.transform((0.0, 0.0, 0.0), quaternion)[:3, :3]
         return labels, self._found(T, vote, labels, seen, square)
 
     def _found(

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from services.posecnn.patch import facing
 from shared import geometry
@@ -93,6 +92,8 @@ def errors(T_true: Array, T: Array, length: float) -> dict[str, Array]:
 def fitted(signs: list[Signs], missed: list[dict[str, Array]]) -> Uncertainty:
     """The uncertainty under which errors (`errors`) are most probable, with a weak prior against steep coefficients. Outliers
     count in full: the observer shall rather believe too little than too much."""
+    from scipy.optimize import minimize  # here, because estimating needs none of it
+
     features = np.array([one.features for one in signs])
     coefficients = {}
     for kind in KINDS:

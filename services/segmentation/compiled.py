@@ -2,7 +2,8 @@
 
 It is compiled for every size of the picture apart: for all sizes at once a step takes two thirds longer, as little can be fused.
 Compiling takes some tenths of a second, so the sizes that may come next are compiled ahead, in a thread of low priority. A size
-that is not there yet is waited for: what comes out depends on pictures alone and not on time.
+that is not there yet is waited for: what comes out depends on pictures alone and not on time. Converting the network takes as
+long again, so what comes of it can be kept in a file, beside what Python and numba keep.
 """
 
 from __future__ import annotations
@@ -10,13 +11,17 @@ from __future__ import annotations
 import contextlib
 import copy
 import os
+import tempfile
 import threading
 import warnings
+from hashlib import blake2b
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from services.segmentation import prednet
 from services.segmentation.prednet import PredNet, State
 
 MOST = 16
@@ -24,19 +29,20 @@ MOST = 16
 
 
 class Compiled:
-    """One time step of a network for pictures of any size. `dtype`, bfloat16 or float32: of the state and the computation.
+    """One time step of a network for pictures of any size. `dtype`, bfloat16 or float32: of the state and the computation;
+    `is_kept`: whether the converted network is kept in a file for the next start.
 
     Not for two threads at once: see `twin`. Raises ImportError where OpenVINO is not installed.
     """
 
-    def __init__(self, net: PredNet, dtype: torch.dtype):
+    def __init__(self, net: PredNet, dtype: torch.dtype, is_kept: bool = False):
         import openvino
 
         self._ov = openvino
         self._net, self._dtype = net, dtype
         self._core = openvino.Core()
         self._type = openvino.Type.bf16 if dtype is torch.bfloat16 else openvino.Type.f32
-        self._model = self._convert(copy.deepcopy(net).float().eval())
+        self._model = self._kept(net) if is_kept else self._convert(net)
         self._compiled: dict[tuple[int, int], Any] = {}
         self._requests: dict[tuple[int, int], Any] = {}
         self._asked: set[tuple[int, int]] = set()
@@ -61,13 +67,16 @@ class Compiled:
         return torch.from_numpy(request.get_output_tensor(0).data.copy()), new
 
     def prepare(self, sizes: list[tuple[int, int]]) -> None:
-        """Compile for pictures of these sizes (height, width) in the background, in this order."""
+        """Compile for pictures of these sizes (height, width) in the background, in this order: that of the next picture, and
+        others that may follow."""
         fresh = [size for size in sizes if size not in self._asked]
         if fresh:
             self._asked.update(fresh)
-            threading.Thread(target=self._compile_ahead, args=(fresh,), name="compile").start()
+            threading.Thread(target=self._compile_ahead, args=(fresh, fresh[0] == sizes[0]), name="compile").start()
 
-    def _compile_ahead(self, sizes: list[tuple[int, int]]) -> None:
+    def _compile_ahead(self, sizes: list[tuple[int, int]], is_first_due: bool) -> None:
+        if is_first_due:  # a frame may wait for it
+            self._model_of(sizes[0])
         with contextlib.suppress(OSError, AttributeError):  # not everywhere has a thread a priority
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
         for size in sizes:
@@ -105,12 +114,28 @@ class Compiled:
         }
         return self._core.compile_model(model, "CPU", settings)
 
+    def _kept(self, net: PredNet) -> Any:
+        """The network as OpenVINO's model: from its file, else converted, and put there where that can be written."""
+        path = kept_at(net, self._dtype, self._ov.__version__)
+        with contextlib.suppress(RuntimeError):  # none, or not one that can be read
+            return self._core.read_model(path)
+        model = self._convert(net)
+        with contextlib.suppress(OSError, RuntimeError):
+            path.parent.mkdir(exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+                fresh = Path(folder) / path.name
+                self._ov.save_model(model, fresh, compress_to_fp16=False)
+                for suffix in (".bin", ".xml"):  # whoever finds the second finds the first
+                    fresh.with_suffix(suffix).replace(path.with_suffix(suffix))
+        return model
+
     def _convert(self, net: PredNet) -> Any:
         """The network as OpenVINO's model; not by `openvino.convert_model`, which reports its use over the internet."""
         from openvino.frontend import FrontEndManager
         from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
         from openvino.preprocess import PrePostProcessor
 
+        net = copy.deepcopy(net).float().eval()
         side = 4 * net.multiple
         inputs = [_rows(t) for t in (torch.zeros(1, 3, side, side), *net.initial_state(1, side, side))]
         with torch.inference_mode(), warnings.catch_warnings():
@@ -132,6 +157,17 @@ class Compiled:
         """OpenVINO's view of a tensor's memory; numpy has no bfloat16, so it sees integers of its size."""
         memory = rows.view(torch.int16) if rows.dtype is torch.bfloat16 else rows
         return self._ov.Tensor(memory.numpy(), self._ov.Shape(list(rows.shape)), self._type)
+
+
+def kept_at(net: PredNet, dtype: torch.dtype, version: str) -> Path:
+    """The file of a converted network: another one for other weights, another computation, release or source."""
+    digest = blake2b(f"{dtype} {version} {torch.__version__}".encode(), digest_size=8)
+    for source in (__file__, prednet.__file__):
+        digest.update(Path(source).read_bytes())
+    for name, value in net.state_dict().items():
+        digest.update(name.encode() + value.float().numpy().tobytes())
+    folder = os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent / "__pycache__"
+    return Path(folder) / f"prednet-{digest.hexdigest()}.xml"
 
 
 class _Rows(nn.Module):

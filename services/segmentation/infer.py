@@ -30,11 +30,12 @@ TARGET_LABELS = (Label.FOREARM, Label.HAND)
 
 class Segmenter:
     """Masks of one camera's frames, in order. `offset`: added to the logits of forearm and hand, calibrated so that their masks
-    are on average as large as they should be (the search would take a mask too large for an arm too near)."""
+    are on average as large as they should be (the search would take a mask too large for an arm too near). `is_kept`: as in
+    `Compiled`."""
 
-    def __init__(self, net: PredNet, offset: float = 0.0, dtype: torch.dtype | None = None):
+    def __init__(self, net: PredNet, offset: float = 0.0, dtype: torch.dtype | None = None, is_kept: bool = False):
         self._dtype = fastest_dtype() if dtype is None else dtype
-        self._compiled = _compiled(net, self._dtype)
+        self._compiled = _compiled(net, self._dtype, is_kept)
         self._net = net.to(self._dtype).eval()
         self._offset = torch.zeros(1, len(Label), 1, 1)
         self._offset[:, list(TARGET_LABELS)] = offset
@@ -92,9 +93,9 @@ def classes(logits: torch.Tensor) -> NDArray[np.uint8]:
     return index.numpy()
 
 
-def _compiled(net: PredNet, dtype: torch.dtype) -> Compiled | None:
+def _compiled(net: PredNet, dtype: torch.dtype, is_kept: bool) -> Compiled | None:
     try:
-        return Compiled(net, dtype)
+        return Compiled(net, dtype, is_kept)
     except ImportError:
         log.info("OpenVINO is not installed: torch takes more than twice as long for a frame")
         return None
@@ -119,7 +120,7 @@ def load_segmenter(path: Path = WEIGHTS, dtype: torch.dtype | None = None) -> Se
 @functools.lru_cache(maxsize=1)
 def _loaded(path: Path, changed_ns: int, dtype: torch.dtype | None) -> Segmenter:
     net, card = prednet.load(path)
-    return Segmenter(net, float(card["calibration"]["target_logit_offset"]), dtype)
+    return Segmenter(net, float(card["calibration"]["target_logit_offset"]), dtype, is_kept=True)
 
 
 def fastest_dtype() -> torch.dtype:

@@ -8,6 +8,7 @@ type, on channels 0 to 2 and 3 to 5: c and r on the first board, l and t on the 
 from __future__ import annotations
 
 import argparse
+import math
 from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any
@@ -43,7 +44,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
     for pad, readers in pads(node.cell, options.port, options.pad).items():
         session = Session(node, pad, readers, options.cycles)
         node.report[pad] = session.describe
-        node.every(BACKOFF_S[0], partial(Session.run, session))
+        node.every(BACKOFF_S[0], partial(Session.run, session), math.inf)
 
 
 def pads(cell: cells.Cell, ports: list[str] | None, pad: str | None) -> dict[str, tuple[cells.Reader, ...]]:

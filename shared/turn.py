@@ -1,0 +1,38 @@
+"""How long the handlers of a process take: one that hangs is noticed while other threads still answer as if all were well."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+HANG_S = 1.0
+"""A handler hangs that takes so much longer than usual."""
+SHARE = 0.05
+"""Of one call in what is usual: twenty calls are remembered."""
+
+
+class Turn:
+    """The calls of one handler, one at a time: `with turn: handler(...)`.
+
+    what: the handler in words. patience_s: how much longer than usual a call may take; infinite for one that never returns.
+    """
+
+    def __init__(self, what: str, patience_s: float = HANG_S):
+        self.what = what
+        self._patience_s = patience_s
+        self._began_s: float | None = None
+        self._usual_s = 0.0
+
+    def __enter__(self) -> None:
+        self._began_s = time.monotonic()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._began_s is not None:
+            self._usual_s += SHARE * (time.monotonic() - self._began_s - self._usual_s)
+        self._began_s = None
+
+    def hangs_s(self, now_s: float) -> float:
+        """For how long the call under way has been, where that is too long; else 0. `now_s`: of time.monotonic."""
+        began_s = self._began_s
+        lasts_s = 0.0 if began_s is None else now_s - began_s
+        return lasts_s if lasts_s > self._patience_s + self._usual_s else 0.0
