@@ -1,4 +1,4 @@
-"""The meeting point of all processes: a Zenoh session in router mode. Nothing is computed here.
+"""The meeting point of a host's processes: a Zenoh session in router mode. Nothing is computed here.
 
-`penumbra up` holds one inside the launcher; `penumbra router` is one on its own, for containers and several machines.
+`penumbra up` holds one inside the launcher; `penumbra router` is one on its own, for containers and for hosts that are linked.
 """
