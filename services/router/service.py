@@ -20,8 +20,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """The service's own flags."""
     group = parser.add_argument_group(
         "several hosts",
-        "A router a host, linked: `--listen tcp/0.0.0.0:7447` on one, `--connect tcp/THAT-HOST:7447` on the others. Processes connect "
-        "to the router of their own host.",
+        "A router a host, linked: `--listen tcp/0.0.0.0:7447` on one, `--connect tcp/THAT-HOST:7447` on the others. Processes "
+        "connect to the router of their own host.",
     )
     group.add_argument(
         "--slow",
