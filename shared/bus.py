@@ -355,7 +355,7 @@ class Reader:
 
     def _take(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
-        names, traffic, guard = self._keys.get(key, ({}, self._strangers, None))
+        names, traffic, guard = self._keys.get(key) or ({}, self._strangers, None)
         publisher, number = _publisher(sample.source_info)
         try:
             if guard is None:

@@ -53,6 +53,10 @@ class _ArraySpec:
     shape: tuple[int | None, ...]  # None: any positive length
     check: Callable[[np.ndarray], str | None] | None = None  # what else is wrong with the values
 
+    @functools.cached_property
+    def numpy(self) -> np.dtype:
+        return np.dtype(self.dtype)
+
 
 def _array(dtype: str, *shape: int | None, check: Callable[[np.ndarray], str | None] | None = None) -> Any:
     return field(metadata={"array": _ArraySpec(dtype, shape, check)})
@@ -217,6 +221,11 @@ _fields = typing.cast(Callable[[type[Message]], Fields], functools.cache(_read_f
 
 
 @functools.cache
+def _field_names(kind: type[Message]) -> frozenset[str]:
+    return frozenset(field.name for field in dataclasses.fields(kind))
+
+
+@functools.cache
 def _dtype_name(dtype: np.dtype) -> str:
     """numpy puts the name together anew each time, which takes longer than the rest of an array."""
     return dtype.name
@@ -262,7 +271,7 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: f
             f"{kind.__name__}: wire version {VERSION} expected, {_short(version)} came: run one release of Penumbra everywhere",
         )
     specs = _fields(kind)
-    if raw.keys() != {name for name, _, _ in specs}:
+    if raw.keys() != _field_names(kind):
         raise BadMessage(
             "fields", f"{kind.__name__}: fields {[n for n, _, _ in specs]} expected, {sorted(map(_short, raw))} came"
         )
@@ -351,11 +360,12 @@ def _array_from_wire(where: str, spec: _ArraySpec, value: Any) -> np.ndarray:
         raise BadMessage("array", f"{where}: [dtype, shape, bytes] expected, {_short(value)} came")
     dtype, shape, data = value
     _check_array(where, spec, dtype, tuple(shape))
-    expected = int(np.dtype(dtype).itemsize) * math.prod(shape)
+    expected = spec.numpy.itemsize * math.prod(shape)
     if len(data) != expected:
         raise BadMessage("array", f"{where}: {expected} bytes for {dtype} {shape} expected, {len(data)} came")
-    array = np.frombuffer(data, dtype=dtype).reshape(shape)
-    if array.dtype.kind == "f" and not np.abs(array).max() <= LARGEST:  # also where it is NaN
+    array = np.frombuffer(data, spec.numpy).reshape(shape)
+    # the sum of squares is soon made, and small where all is well; else each number is looked at, also where it is NaN
+    if spec.numpy.kind == "f" and not np.vdot(array, array) <= LARGEST and not np.abs(array).max() <= LARGEST:
         count = int((~(np.abs(array) <= LARGEST)).sum())
         raise BadMessage("finite", f"{where}: finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not")
     fault = spec.check(array) if spec.check else None

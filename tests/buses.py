@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Thread
+from threading import Condition, Thread
 
 import numpy as np
 import zenoh
@@ -27,6 +27,8 @@ CELL = cells.load("arm")
 NAMES = {"robot": "panda", "camera": "side"}
 DEPTH = 16
 KINDS = ("ours", "raw")
+ACK = "raw/ack"
+ACK_EVERY = DEPTH // 2
 QUIET_S = 0.15
 """What has not come after so long without anything does not come any more."""
 PATIENCE_S = 30.0
@@ -89,6 +91,9 @@ class Link:
 
     def __init__(self, node: Node, receiver: subprocess.Popen):
         self._receiver = receiver
+        self._read, self._news = 0, Condition()
+        assert node.session is not None
+        self._acks = node.session.declare_subscriber(ACK, self._on_ack)
         self.senders = {size: Sender(node, payload) for size, payload in PAYLOADS.items()}
         for sender in self.senders.values():
             for kind in KINDS:
@@ -103,13 +108,22 @@ class Link:
         return np.array([(came - sent) * 1e-9 for came, sent in self._ask("end")])
 
     def per_s(self, size: int, kind: str, seconds: float) -> float:
-        """Messages a second that are read where they are sent as fast as can be."""
+        """Messages a second that are sent and read without losing one: as many are under way as the reader keeps."""
         self._ask("begin")
-        ends = time.monotonic() + seconds
+        self._read, sent, ends = 0, 0, time.monotonic() + seconds
         while time.monotonic() < ends:
+            with self._news:
+                if not self._news.wait_for(lambda: sent < self._read + DEPTH, PATIENCE_S):  # noqa: B023 (called at once)
+                    raise AssertionError(f"{sent} messages were sent, {self._read} read: one was lost")
             self.senders[size].send(kind)
+            sent += 1
         came = self._ask("end")
         return (len(came) - 1) / ((came[-1][0] - came[0][0]) * 1e-9)
+
+    def _on_ack(self, sample: zenoh.Sample) -> None:
+        with self._news:
+            self._read = int.from_bytes(sample.payload.to_bytes(), "little")
+            self._news.notify()
 
     def _until_heard(self, sender: Sender, kind: str) -> None:
         deadline = time.monotonic() + PATIENCE_S
@@ -146,17 +160,24 @@ def receive(endpoint: str) -> None:
     came: list[tuple[int, int]] = []
     node = Node("receiver", CELL, bus.Connection(connect=(endpoint,)))
 
+    def take(sent_ns: int) -> None:
+        came.append((time.time_ns(), sent_ns))
+        if len(came) % ACK_EVERY == 0:
+            acks.put(len(came).to_bytes(8, "little"))
+
     def hear(message: messages.Message, names: dict[str, str]) -> None:
-        came.append((time.time_ns(), message.stamp_ns))
+        take(message.stamp_ns)
 
     def hear_raw(subscriber: zenoh.Subscriber) -> None:
         for sample in subscriber:
             sample.payload.to_bytes()
-            came.append((time.time_ns(), int.from_bytes(sample.attachment.to_bytes(), "little")))
+            take(int.from_bytes(sample.attachment.to_bytes(), "little"))
 
     for payload in PAYLOADS.values():
         node.subscribe(payload.topic, hear, **payload.names)
     with node:
+        assert node.session is not None
+        acks = node.session.declare_publisher(ACK)
         for payload in PAYLOADS.values():
             subscriber = node.session.declare_subscriber(payload.raw_key, zenoh.handlers.RingChannel(DEPTH))
             Thread(target=hear_raw, args=(subscriber,), daemon=True).start()
