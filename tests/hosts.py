@@ -19,6 +19,7 @@ from types import TracebackType
 import zenoh
 
 from shared import bus
+from shared import cell as cells
 from tests.live import wait_for
 
 ROOT = Path(__file__).parents[1]
@@ -122,8 +123,8 @@ class Link:
 
 @dataclass
 class Hosts:
-    """A cell on three hosts: the camera's, linked to the one that computes and to the robot's. The sensors are on the camera's.
-    sessions: a client's at each host's router, by the host's name."""
+    """A cell, by its name, on three hosts: the camera's, linked to the one that computes and to the robot's. The sensors are on
+    the camera's. sessions: a client's at each host's router, by the host's name."""
 
     cell: str
     hosts: dict[str, Host]
@@ -160,7 +161,7 @@ def three_hosts(folder: Path, cell: str, seed: int, slow: int | None = None) -> 
         started = [host.start(service, "--cell", cell, *(["--seed", str(seed)] if service == "emulator" else []))
                    for name, host in found.items() for service in SERVICES[name]]  # fmt: skip
         assert not any(process.poll() for process in started)
-        yield Hosts(cell, found, links, sessions)
+        yield Hosts(cells.load(cell).name, found, links, sessions)
 
 
 def client(socket: Path) -> zenoh.Session:
