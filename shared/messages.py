@@ -11,8 +11,9 @@ import dataclasses
 import functools
 import itertools
 import math
+import struct
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,6 +44,10 @@ UNIT_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from one."""
 ROUNDING = 1e-6
 """What shares and matrices may be off by rounding, relative."""
+LARGE = 65_536
+"""Bytes of an array from which it is worth while not to copy it twice."""
+BIN32 = 0xC6
+"""MessagePack's head of bytes with their number in 32 bits."""
 _STRUCTURE = {"max_array_len": 16, "max_map_len": 32, "max_str_len": 256, "max_ext_len": 0}
 """What MessagePack may hold: more than any message needs, less than fills a memory."""
 
@@ -234,6 +239,7 @@ def _dtype_name(dtype: np.dtype) -> str:
 def encode(message: Message) -> bytes:
     """The MessagePack bytes of a message. Raises BadMessage where an array has not the declared dtype and shape."""
     out: dict[str, Any] = {"version": VERSION}
+    large = False
     for name, _, metadata in _fields(type(message)):
         value = getattr(message, name)
         spec = metadata.get("array")
@@ -241,14 +247,30 @@ def encode(message: Message) -> bytes:
             value = np.ascontiguousarray(value)
             dtype = _dtype_name(value.dtype)
             _check_array(name, spec, dtype, value.shape)
-            out[name] = [dtype, value.shape, value.data.cast("B")]  # a view: the only copy is MessagePack's
+            out[name] = [dtype, value.shape, value.data.cast("B")]  # a view: nothing is copied yet
+            large |= value.nbytes >= LARGE
         elif isinstance(value, dict):
             out[name] = {key: dict(vars(item)) for key, item in value.items()}
         elif isinstance(value, np.generic):
             out[name] = value.item()
         else:
             out[name] = value
-    return msgpack.packb(out)
+    return b"".join(_pieces(out)) if large else msgpack.packb(out)
+
+
+def _pieces(fields: dict[str, Any]) -> Iterator[bytes | memoryview]:
+    """What MessagePack makes of a message's fields, with the bytes of arrays as they are: `packb` would copy them twice."""
+    packer = msgpack.Packer()
+    yield packer.pack_map_header(len(fields))
+    for name, value in fields.items():
+        yield packer.pack(name)
+        if isinstance(value, list):
+            dtype, shape, view = value
+            yield packer.pack_array_header(3) + packer.pack(dtype) + packer.pack(shape)
+            yield struct.pack(">BI", BIN32, view.nbytes)
+            yield view
+        else:
+            yield packer.pack(value)
 
 
 def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: float = MAX_PAST_S) -> M:

@@ -71,6 +71,7 @@ class Sender:
     def __init__(self, node: Node, payload: Payload):
         self._node, self._payload = node, payload
         self._bytes = messages.encode(payload.make(0))
+        self.bytes = len(self._bytes)
         assert node.session is not None
         self._publisher = node.session.declare_publisher(
             payload.raw_key,
