@@ -225,9 +225,11 @@ def _read_fields(kind: Any) -> Fields:
 _fields = typing.cast(Callable[[type[Message]], Fields], functools.cache(_read_fields))
 
 
-@functools.cache
-def _field_names(kind: type[Message]) -> frozenset[str]:
+def _read_names(kind: Any) -> frozenset[str]:
     return frozenset(field.name for field in dataclasses.fields(kind))
+
+
+_field_names = typing.cast(Callable[[type[Message]], frozenset[str]], functools.cache(_read_names))
 
 
 @functools.cache

@@ -146,7 +146,7 @@ class World:
         the target's name), ROBOT/LINK, pads, table and occluder."""
         links = {"world": np.eye(4), **link_names(state.links)}
         model = self.model(camera)
-        out = {}
+        out: dict[str, tuple[Mesh, Array]] = {}
         for name in dict.fromkeys((model, *self._shown[camera])):
             person, T = self.actors[name].person, state.targets[name].T_world_target
             parts = zip(("target", "upper_arm", "torso"), person.meshes, person.poses(T), strict=False)

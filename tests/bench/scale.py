@@ -175,9 +175,9 @@ def ratio(found: dict[str, list[float]]) -> float:
 def show(result: dict[str, Any], console: Console) -> None:
     table = Table("size", "replicas", "frames", "masks", "vision", "haptic", "fused", "age p95", "CPU", "MB/s", "links MB/s",
                   title=f"Cells of 1 to {max(result['sizes'])} work places, seed {result['seed']}, on {result['cores']} cores",
-                  caption="size: cameras and targets; messages a second of each topic in all; age [ms]: from the exposure to the "
-                  "first fused pose that has taken the frame in; CPU [cores]; MB/s: published payloads; links: all that processes "
-                  "exchange with the router")  # fmt: skip
+                  caption="size: cameras and targets; messages a second of each topic; age [ms]: from the exposure to the "
+                  "first fused pose that has taken the frame in; CPU [cores]; MB/s: published payloads; links: all that "
+                  "processes exchange with the router")  # fmt: skip
     for each in result["rows"]:
         rates = (each[name] for name in ("offered_per_s", "masks_per_s", "frames_per_s", "haptic_per_s", "fused_per_s"))
         megabytes = (sum(each[name].values()) / 1e6 for name in ("published_bytes_per_s", "link_bytes_per_s"))
