@@ -237,7 +237,7 @@ class Node:
         publisher = session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK if topic.qos is QoS.NEVER_DROP else zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.INTERACTIVE_HIGH if topic.qos is QoS.NEVER_DROP else zenoh.Priority.DATA,
+            priority=getattr(zenoh.Priority, topic.priority.value),
         )
         traffic = self._published.setdefault(key, bus.Traffic(topic.stale_s))
         return publisher, traffic, publisher.id, itertools.count()

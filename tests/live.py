@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 import zenoh
 
+from shared import cell as cells
 from shared import topics
 
 
@@ -95,13 +96,13 @@ class Running:
 
 @contextmanager
 def penumbra_up(cell: str, seed: int, *arguments: str) -> Iterator[Running]:
-    """The whole chain as real processes on a free port, stopped as by Ctrl-C at the end."""
+    """The whole chain of a built-in cell or a file as real processes on a free port, stopped as by Ctrl-C at the end."""
     port = free_port()
     command = [sys.executable, "-m", "services.cli", "up", "--cell", cell, "--seed", str(seed), "--port", str(port), *arguments]
     launcher = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
         with connect(port) as session:
-            yield Running(cell, port, launcher, session)
+            yield Running(cells.load(cell).name, port, launcher, session)
     finally:
         launcher.terminate()
         launcher.wait(10)
