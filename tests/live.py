@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -94,11 +95,17 @@ class Running:
 
 
 @contextmanager
-def penumbra_up(cell: str, seed: int, *arguments: str) -> Iterator[Running]:
-    """The whole chain as real processes on a free port, stopped as by Ctrl-C at the end."""
-    port = free_port()
+def penumbra_up(
+    cell: str, seed: int, *arguments: str, port: int | None = None, environment: Mapping[str, str] | None = None, **streams: Any
+) -> Iterator[Running]:
+    """The whole chain as real processes, stopped as by Ctrl-C at the end.
+
+    port: of the router on loopback, a free one if none is given. environment: beside that of this process. streams: where stdout
+    (default: nowhere) and stderr of the launcher go.
+    """
+    port = port or free_port()
     command = [sys.executable, "-m", "services.cli", "up", "--cell", cell, "--seed", str(seed), "--port", str(port), *arguments]
-    launcher = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    launcher = subprocess.Popen(command, env={**os.environ, **(environment or {})}, **({"stdout": subprocess.DEVNULL} | streams))
     try:
         with connect(port) as session:
             yield Running(cell, port, launcher, session)

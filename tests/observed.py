@@ -1,0 +1,234 @@
+"""What a fault does to a running chain, as any client of the bus sees it: gaps, recovery, repeats and false tracking."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from shared import geometry, messages, topics
+from tests.live import Running
+
+READ = (topics.FUSED, topics.VISION, topics.HAPTIC, topics.TRUTH, topics.MASK, topics.FRAME, topics.VOLTAGES)
+DECODED = {topics.FUSED.name, topics.VISION.name, topics.HAPTIC.name, topics.TRUTH.name}
+"""Of the others only the time of arrival is kept: a frame is a megabyte."""
+OUTPUTS = {
+    "emulator": (topics.FRAME, topics.VOLTAGES, topics.TRUTH),
+    "segmentation": (topics.MASK,),
+    "search": (topics.VISION,),
+    "haptics": (topics.HAPTIC,),
+    "fusion": (topics.FUSED,),
+}
+"""What each service says."""
+USABLE = {topics.VISION.name: "tracking", topics.HAPTIC.name: "in_range"}
+"""The state of a sense's pose that fusion takes."""
+CHI2_3_SIGMA = 20.06
+"""Squared Mahalanobis distance of six dimensions that 99.73 % of all errors stay within: three standard deviations of one."""
+SHARE, WINDOW_S = 0.75, 0.5
+"""A rate is back when so much of it is seen in two windows of this length, one after the other: below is no hiccup."""
+FAR_S = 0.5
+"""A pose stamped further from the truth of its time of arrival is not of that time."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One message: when it came [s, steady clock] and what it was, None where only its arrival counts."""
+
+    at_s: float
+    message: Any = None
+
+
+class Outside:
+    """Listens to a chain from outside. Everything is decoded afterwards."""
+
+    def __init__(self, session: zenoh.Session, cell: str, target: str, pad: str):
+        self._rows: dict[str, list[tuple[float, bytes]]] = {}
+        self._subscribers = []
+        for topic in READ:
+            rows = self._rows.setdefault(topic.name, [])
+            key = topic.at(cell=cell, target=target, pad=pad)
+            subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1024))
+            threading.Thread(target=self._read, args=(subscriber, rows, topic.name in DECODED), daemon=True).start()
+            self._subscribers.append(subscriber)
+
+    @staticmethod
+    def _read(subscriber: Any, rows: list[tuple[float, bytes]], is_decoded: bool) -> None:
+        for sample in subscriber:
+            rows.append((time.monotonic(), sample.payload.to_bytes() if is_decoded else b""))
+
+    def __enter__(self) -> Outside:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+
+    def seen(self, topic: topics.Topic, begin_s: float, end_s: float) -> list[Seen]:
+        """What came on a topic between two times of the steady clock."""
+        rows = [row for row in list(self._rows[topic.name]) if begin_s <= row[0] <= end_s]
+        if topic.name not in DECODED:
+            return [Seen(at_s) for at_s, _ in rows]
+        return [Seen(at_s, messages.decode(topic.message, payload)) for at_s, payload in rows]
+
+    def forget(self) -> None:
+        """Drops what came until now."""
+        for rows in self._rows.values():
+            rows.clear()
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """What a fault did. gap_ms: longest time without a fused pose that is not lost while a sense was alive; recovery_s: until all
+    of a service's topics had their old rate, None where they never had; reused: measurements used twice; false_tracking: poses
+    called tracking, of `tracking` in all, whose error was beyond three sigma of their own covariance."""
+
+    gap_ms: float
+    recovery_s: float | None
+    reused: int
+    false_tracking: int
+    tracking: int
+
+
+def gap_s(fused: Sequence[Seen], senses: Iterable[tuple[topics.Topic, Sequence[Seen]]], end_s: float) -> float:
+    """The longest time between two fused poses that are not lost, not counting what no sense was alive of it: a sense is alive
+    until its last pose that can be used is stale."""
+    alive = _union(
+        (seen.at_s, min(seen.at_s + topic.stale_s, end_s))
+        for topic, all_seen in senses
+        for seen in all_seen
+        if seen.message.state == USABLE[topic.name]
+    )
+    times = [seen.at_s for seen in fused if seen.message.state != "lost"]
+    if not alive:
+        return 0.0
+    edges = [alive[0][0], *(t for t in times if t > alive[0][0]), end_s]
+    starts, ends = np.array(alive).T
+    overlap = lambda a, b: float(np.clip(np.minimum(ends, b) - np.maximum(starts, a), 0.0, None).sum())  # noqa: E731
+    return max(overlap(a, b) for a, b in itertools.pairwise(edges))
+
+
+def _union(spans: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    out: list[tuple[float, float]] = []
+    for begin, end in sorted(spans):
+        if out and begin <= out[-1][1]:
+            out[-1] = out[-1][0], max(end, out[-1][1])
+        else:
+            out.append((begin, end))
+    return out
+
+
+def recovery_s(times: Sequence[float], rate_hz: float, fault_s: float, end_s: float) -> float | None:
+    """Seconds from a fault until a stream of messages with these times of arrival has its old rate, and keeps it for two windows;
+    None where it has not by the end."""
+    wanted = SHARE * rate_hz * WINDOW_S
+    after = np.array([t for t in times if t >= fault_s])
+    for t in (fault_s, *after.tolist()):
+        if t + 2 * WINDOW_S > end_s:
+            return None
+        first, second, last = np.searchsorted(after, [t, t + WINDOW_S, t + 2 * WINDOW_S])
+        if min(second - first, last - second) >= wanted:
+            return t - fault_s
+    return None
+
+
+def repeats(seen: Iterable[Seen]) -> int:
+    """How many messages tell again what was told: the same stamp, of the same camera where they are of cameras."""
+    counts = Counter((getattr(each.message, "camera", ""), each.message.stamp_ns) for each in seen)
+    return sum(n - 1 for n in counts.values())
+
+
+def false_tracking(fused: Iterable[Seen], truth: Sequence[Seen]) -> tuple[int, int]:
+    """How many poses are called tracking though their error against the truth at their stamp is beyond three sigma of their own
+    covariance, or though they are stamped with another time than that of the truth that came with them; and how many were looked
+    at. Poses without a truth beside them are left out."""
+    wrong = looked_at = 0
+    if not truth:
+        return 0, 0
+    order = sorted(truth, key=lambda each: each.message.stamp_ns)
+    stamps = np.array([each.message.stamp_ns for each in order])
+    arrivals = np.array([each.at_s for each in truth])
+    for each in fused:
+        pose = each.message
+        if pose.state != "tracking":
+            continue
+        beside = int(np.argmin(np.abs(arrivals - each.at_s)))
+        if abs(arrivals[beside] - each.at_s) > topics.TRUTH.stale_s:
+            continue
+        looked_at += 1
+        if abs(truth[beside].message.stamp_ns - pose.stamp_ns) > FAR_S * 1e9:
+            wrong += 1
+            continue
+        nearest = order[int(np.argmin(np.abs(stamps - pose.stamp_ns)))].message
+        moved = nearest.velocity * ((pose.stamp_ns - nearest.stamp_ns) * 1e-9)
+        T_true = geometry.perturb(geometry.transform(nearest.position, nearest.orientation), moved)
+        error = geometry.pose_error(T_true, geometry.transform(pose.position, pose.orientation))
+        wrong += float(error @ np.linalg.solve(pose.covariance, error)) > CHI2_3_SIGMA
+    return wrong, looked_at
+
+
+# ---- fusion's own counters
+
+
+def health(running: Running) -> list[dict[str, Any]]:
+    """The health of every instance that answers."""
+    replies = running.session.get(topics.health(running.cell), timeout=1.0)
+    return [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
+
+
+@dataclass
+class Refusals:
+    """How many repeated measurements the instances of fusion have refused since the beginning: the least of all instances."""
+
+    _before: dict[str, int] = field(default_factory=dict)
+
+    def begin(self, reports: Iterable[dict[str, Any]]) -> None:
+        self._before = self._counts(reports)
+
+    def since(self, reports: Iterable[dict[str, Any]]) -> int:
+        """A fusion that began since has refused what it says; one that has ended says nothing."""
+        return min((n - self._before.get(name, 0) for name, n in self._counts(reports).items()), default=0)
+
+    @staticmethod
+    def _counts(reports: Iterable[dict[str, Any]]) -> dict[str, int]:
+        out = {}
+        for report in reports:
+            if report["service"] == "fusion":
+                sources = [s for target in report.get("report", {}).values() for s in target.values() if isinstance(s, dict)]
+                by_observer = sum(s["duplicate"] + s["refused"].get("publisher", 0) for s in sources)
+                out[report["instance"]] = by_observer + sum(sum(row["bad"].values()) for row in report["topics"].values())
+        return out
+
+
+def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: float, end_s: float, refused: int) -> Numbers:
+    """What was seen from just before a fault of a service until end_s; old_hz: by topic, before it; refused: repeats that fusion
+    says it did not use."""
+    begin_s = fault_s - WINDOW_S
+    fused, truth = outside.seen(topics.FUSED, begin_s, end_s), outside.seen(topics.TRUTH, begin_s, end_s)
+    senses = [(topic, outside.seen(topic, begin_s, end_s)) for topic in (topics.VISION, topics.HAPTIC)]
+    told_again = sum(repeats(seen for seen in all_seen if seen.message.state == USABLE[topic.name]) for topic, all_seen in senses)
+    recoveries = [
+        recovery_s([seen.at_s for seen in outside.seen(topic, fault_s, end_s)], old_hz[topic.name], fault_s, end_s)
+        for topic in OUTPUTS.get(service, (topics.FUSED,))
+    ]
+    known = [each for each in recoveries if each is not None]
+    wrong, tracking = false_tracking(fused, truth)
+    return Numbers(
+        round(1e3 * gap_s(fused, senses, end_s), 1),
+        round(max(known), 3) if len(known) == len(recoveries) else None,
+        max(0, told_again - refused) + repeats(fused),
+        wrong,
+        tracking,
+    )
+
+
+def rates_hz(outside: Outside, begin_s: float, end_s: float) -> dict[str, float]:
+    """By topic, the messages a second of all its keys that are listened to."""
+    return {topic.name: len(outside.seen(topic, begin_s, end_s)) / (end_s - begin_s) for topic in READ}
