@@ -205,24 +205,25 @@ Stream = list[tuple[Topic, dict[str, str], Message]]
 
 class Sensors:
     """The messages that a world gives off. Time zero of the world is `epoch_ns`; tick k of the skin ends at epoch + k TICK_NS,
-    frame k is exposed at epoch + k periods of its camera. Ticks and frames may be left out; what is left has the same values."""
+    frame k is exposed at epoch + k periods of its camera. Ticks and frames may be left out; what is left has the same values.
+    The epoch may be moved at any time, where a clock is set: stamps follow it, the world does not."""
 
     def __init__(self, world: World, epoch_ns: int):
         self.world, self.epoch_ns = world, epoch_ns
         self._logs: tuple[int, Array] | None = None  # tick and its log changes, for the samples up to the next
-        self._hidden: deque[tuple[int, float]] = deque([(epoch_ns, 0.0)], maxlen=4)  # stamp of a frame and what was hidden in it
+        self._hidden: deque[tuple[int, float]] = deque([(0, 0.0)], maxlen=4)  # world's time of a frame, what was hidden
 
-    def frame_stamp_ns(self, camera: str, k: int) -> int:
-        """When frame k of a camera is exposed."""
-        return self.epoch_ns + round(k * 1e9 / self.world.cell.cameras[camera].rate_hz)
+    def frame_ns(self, camera: str, k: int) -> int:
+        """When frame k of a camera is exposed, since the epoch."""
+        return round(k * 1e9 / self.world.cell.cameras[camera].rate_hz)
 
     def frame(self, camera: str, k: int) -> Stream:
         """Frame k of a camera."""
-        stamp_ns = self.frame_stamp_ns(camera, k)
-        view = self.world.view(camera, (stamp_ns - self.epoch_ns) * 1e-9)
+        at_ns = self.frame_ns(camera, k)
+        view = self.world.view(camera, at_ns * 1e-9)
         if camera == next(iter(self.world.cell.cameras)):
-            self._hidden.append((stamp_ns, view.hidden))
-        return [(FRAME, {"camera": camera}, Frame(stamp_ns=stamp_ns, image=view.image))]
+            self._hidden.append((at_ns, view.hidden))
+        return [(FRAME, {"camera": camera}, Frame(stamp_ns=self.epoch_ns + at_ns, image=view.image))]
 
     def tick(self, k: int) -> Stream:
         """Voltages of every pad, joints of every robot and the truth at tick k >= 1."""
@@ -252,7 +253,7 @@ class Sensors:
             position=state.pose[:3],
             orientation=Rotation.from_euler("xyz", state.pose[3:]).as_quat(canonical=True),
             velocity=state.velocity,
-            hidden=next((hidden for stamp, hidden in reversed(self._hidden) if stamp <= stamp_ns), 0.0),
+            hidden=next((hidden for at_ns, hidden in reversed(tuple(self._hidden)) if at_ns <= k * TICK_NS), 0.0),
             gap=float(gaps.min(initial=FAR)),
         )
         return [*out, (TRUTH, {"target": world.target_name}, truth)]
@@ -277,7 +278,7 @@ def stream(
     counts = dict.fromkeys(world.cell.cameras if frames else (), 0)
     for k in range(1, (ends_ns - epoch_ns) // TICK_NS + 1):
         for camera in counts:
-            while sensors.frame_stamp_ns(camera, counts[camera]) <= epoch_ns + k * TICK_NS:
+            while sensors.frame_ns(camera, counts[camera]) <= k * TICK_NS:
                 yield from sensors.frame(camera, counts[camera])
                 counts[camera] += 1
         yield from sensors.tick(k)

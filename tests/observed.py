@@ -27,7 +27,7 @@ OUTPUTS = {
     "haptics": (topics.HAPTIC,),
     "fusion": (topics.FUSED,),
 }
-"""What each service says."""
+"""What each service says; all of it where all are meant."""
 USABLE = {topics.VISION.name: "tracking", topics.HAPTIC.name: "in_range"}
 """The state of a sense's pose that fusion takes."""
 CHI2_3_SIGMA = 20.06
@@ -215,8 +215,8 @@ def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: f
     senses = [(topic, outside.seen(topic, begin_s, end_s)) for topic in (topics.VISION, topics.HAPTIC)]
     told_again = sum(repeats(seen for seen in all_seen if seen.message.state == USABLE[topic.name]) for topic, all_seen in senses)
     recoveries = [
-        recovery_s([seen.at_s for seen in outside.seen(topic, fault_s, end_s)], old_hz[topic.name], fault_s, end_s)
-        for topic in OUTPUTS.get(service, (topics.FUSED,))
+        recovery_s([seen.at_s for seen in known_poses(outside.seen(topic, fault_s, end_s))], old_hz[topic.name], fault_s, end_s)
+        for topic in OUTPUTS.get(service, READ)
     ]
     known = [each for each in recoveries if each is not None]
     wrong, tracking = false_tracking(fused, truth)
@@ -231,4 +231,9 @@ def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: f
 
 def rates_hz(outside: Outside, begin_s: float, end_s: float) -> dict[str, float]:
     """By topic, the messages a second of all its keys that are listened to."""
-    return {topic.name: len(outside.seen(topic, begin_s, end_s)) / (end_s - begin_s) for topic in READ}
+    return {topic.name: len(known_poses(outside.seen(topic, begin_s, end_s))) / (end_s - begin_s) for topic in READ}
+
+
+def known_poses(seen: Iterable[Seen]) -> list[Seen]:
+    """Without the fused poses that are lost: saying so is no service."""
+    return [each for each in seen if not (isinstance(each.message, messages.FusedPose) and each.message.state == "lost")]

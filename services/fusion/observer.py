@@ -49,6 +49,12 @@ class Bank:
     def __len__(self) -> int:
         return len(self.logs)
 
+    def forget(self, targets: slice = slice(None)) -> None:
+        """Begins anew with every target, or with some of them; their counts go on."""
+        kernel.clear_all(self._states[targets], self._measurements[targets], self._rings[targets])
+        for log in self.logs[targets]:
+            log.heard_ns.clear()
+
     def measure(
         self,
         targets: NDArray[np.int64],
@@ -133,6 +139,10 @@ class ErrorStateObserver:
         if fate >= FUTURE:
             raise refusal(fate, stamp_ns, T, information, now_ns)
         return fate == ACCEPTED
+
+    def forget(self) -> None:
+        """Begins anew; the counts go on."""
+        self._bank.forget(slice(self._target, self._target + 1))
 
     def innovation(self) -> tuple[float, int]:
         """Squared Mahalanobis distance of the newest measurement's innovation (NIS) and its degrees of freedom: 0 and 0 where it
