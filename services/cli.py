@@ -114,6 +114,7 @@ def serve(name: str, argv: list[str]) -> int:
     options = parser.parse_args(argv)
     options.mode = options.mode or getattr(module, "MODE", None)
     logs.configure(options.log_level, options.log_format, name)
+    _die_with_thread()
     node = Node(module.NAME, cell.load(options.cell), bus.connection(options))
     with arguments.metrics(parser, options.metrics_port, lambda: [node.health()]):
         module.start(node, options)
@@ -185,6 +186,20 @@ def _die_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != int(parent):  # it died before we asked
         sys.exit(1)
+
+
+def _die_with_thread() -> None:
+    """Ends the process with the first of its threads that fails: it would look alive and do a part of its work only. Whoever
+    started it starts it again."""
+    tell = threading.excepthook
+
+    def end(failed: threading.ExceptHookArgs) -> None:
+        try:
+            tell(failed)
+        finally:  # also without memory for words
+            os._exit(1)
+
+    threading.excepthook = end
 
 
 if __name__ == "__main__":
