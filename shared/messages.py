@@ -284,6 +284,8 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: f
         raise BadMessage("size", f"{kind.__name__}: at most {kind.MAX_BYTES} bytes expected, {len(payload)} came")
     try:
         raw = _unpack(payload)
+    except MemoryError:  # the reader's fault
+        raise
     except Exception as error:
         raise BadMessage("msgpack", f"{kind.__name__}: MessagePack expected, came {payload[:16]!r}… ({error!s:.100})") from None
     if not isinstance(raw, dict):

@@ -229,7 +229,8 @@ Stream = list[tuple[Topic, dict[str, str], Message]]
 
 class Sensors:
     """The messages that a world gives off. Time zero of the world is `epoch_ns`; tick k of the skin ends at epoch + k TICK_NS,
-    frame k is exposed at epoch + k periods of its camera. Ticks and frames may be left out; what is left has the same values."""
+    frame k is exposed at epoch + k periods of its camera. Ticks and frames may be left out; what is left has the same values.
+    The epoch may be moved at any time, where a clock is set: stamps follow it, the world does not."""
 
     def __init__(self, world: World, epoch_ns: int):
         self.world, self.epoch_ns = world, epoch_ns
@@ -238,20 +239,20 @@ class Sensors:
         for camera in world.cell.cameras:
             if (name := world.model(camera)) not in self._watch.values():
                 self._watch[camera] = name
-        # stamps of its frames, and what was hidden in them
-        self._hidden = {name: deque([(epoch_ns, 0.0)], maxlen=4) for name in world.actors}
+        # world's times of its frames, and what was hidden in them
+        self._hidden = {name: deque([(0, 0.0)], maxlen=4) for name in world.actors}
 
-    def frame_stamp_ns(self, camera: str, k: int) -> int:
-        """When frame k of a camera is exposed."""
-        return self.epoch_ns + round(k * 1e9 / self.world.cell.cameras[camera].rate_hz)
+    def frame_ns(self, camera: str, k: int) -> int:
+        """When frame k of a camera is exposed, since the epoch."""
+        return round(k * 1e9 / self.world.cell.cameras[camera].rate_hz)
 
     def frame(self, camera: str, k: int) -> Stream:
         """Frame k of a camera."""
-        stamp_ns = self.frame_stamp_ns(camera, k)
-        view = self.world.view(camera, (stamp_ns - self.epoch_ns) * 1e-9)
+        at_ns = self.frame_ns(camera, k)
+        view = self.world.view(camera, at_ns * 1e-9)
         if camera in self._watch:
-            self._hidden[self._watch[camera]].append((stamp_ns, view.hidden))
-        return [(FRAME, {"camera": camera}, Frame(stamp_ns=stamp_ns, image=view.image))]
+            self._hidden[self._watch[camera]].append((at_ns, view.hidden))
+        return [(FRAME, {"camera": camera}, Frame(stamp_ns=self.epoch_ns + at_ns, image=view.image))]
 
     def tick(self, k: int) -> Stream:
         """Voltages of every pad, joints of every robot and the truths at tick k >= 1."""
@@ -273,10 +274,10 @@ class Sensors:
                 out.append((VOLTAGES, {"pad": pad}, Voltages(stamp_ns=stamp_ns, period_ns=SAMPLE_NS, volts=samples)))
             self._logs = (k, logs)
         out += [(JOINTS, {"robot": name}, Joints(stamp_ns=stamp_ns, position=q)) for name, q in state.joints.items()]
-        truths = [(TRUTH, {"target": name}, self._truth(name, state, stamp_ns)) for name in world.actors]
+        truths = [(TRUTH, {"target": name}, self._truth(name, state, stamp_ns, k * TICK_NS)) for name in world.actors]
         return [*out, *truths]
 
-    def _truth(self, target: str, state: WorldState, stamp_ns: int) -> Truth:
+    def _truth(self, target: str, state: WorldState, stamp_ns: int, at_ns: int) -> Truth:
         placed = state.targets[target]
         return Truth(
             stamp_ns=stamp_ns,
@@ -285,7 +286,7 @@ class Sensors:
             position=placed.pose[:3],
             orientation=Rotation.from_euler("xyz", placed.pose[3:]).as_quat(canonical=True),
             velocity=placed.velocity,
-            hidden=next((hidden for stamp, hidden in reversed(self._hidden[target]) if stamp <= stamp_ns), 0.0),
+            hidden=next((hidden for seen_ns, hidden in reversed(tuple(self._hidden[target])) if seen_ns <= at_ns), 0.0),
             gap=float(self.world.gaps(state, target).min(initial=FAR)),
         )
 
@@ -309,7 +310,7 @@ def stream(
     counts = dict.fromkeys(world.cell.cameras if frames else (), 0)
     for k in range(1, (ends_ns - epoch_ns) // TICK_NS + 1):
         for camera in counts:
-            while sensors.frame_stamp_ns(camera, counts[camera]) <= epoch_ns + k * TICK_NS:
+            while sensors.frame_ns(camera, counts[camera]) <= k * TICK_NS:
                 yield from sensors.frame(camera, counts[camera])
                 counts[camera] += 1
         yield from sensors.tick(k)
