@@ -33,6 +33,8 @@ from sim.skin_faults import SkinFaults
 
 FAR = 10.0
 """What the truth calls the gap [m] where the cell has no pads."""
+FAINTEST = 1e-9
+"""Least change of capacitance [fF]: a pad that nobody comes near has a logarithm too."""
 MAX_SPEED = 4.0
 """Fastest scene: more would leave the cameras and the planner behind."""
 
@@ -135,7 +137,7 @@ class World:
         change = np.array(self.skin.rest(joints))
         for name, actor in self.actors.items():
             change[actor.near.electrodes] += actor.change(state.targets[name], T_world_pads)
-        return change
+        return np.maximum(change, FAINTEST)
 
     def view(self, camera: str, time_s: float) -> View:
         """What a camera sees at a time."""

@@ -10,7 +10,7 @@ from shared import cell as cells
 from shared import geometry
 from shared.classes import Label
 from shared.surface import Surface
-from shared.topics import TRUTH
+from shared.topics import TRUTH, VOLTAGES
 from sim.clearance import hull_points
 from sim.motion import Clock
 from sim.occluder import AWAY, OcclusionSchedule
@@ -240,6 +240,14 @@ def test_a_pad_feels_only_who_is_near_it_and_a_camera_sees_only_who_is_before_it
     for name, truth in truths.items():
         np.testing.assert_allclose(truth.position, state.targets[name].pose[:3])
         assert truth.gap == pytest.approx(world.gaps(state, name).min())
+
+
+def test_a_pad_that_nobody_comes_near_reads_its_rest():
+    table = CELLS["table"]
+    far = table.pads["p0"].model_copy(update={"position": (9.0, 0.0, 0.0)})
+    world = World(table.model_copy(update={"pads": {**table.pads, "far": far}}), 1)
+    (volts,) = (m.volts for topic, names, m in Sensors(world, 10**18).tick(3) if topic is VOLTAGES and names["pad"] == "far")
+    np.testing.assert_allclose(volts, table.pad_types[far.type].rest.a3, atol=6 * table.pad_types[far.type].rest.noise ** 0.5)
 
 
 def test_cameras_around_one_place_all_look_at_its_target(tmp_path):
