@@ -108,6 +108,7 @@ def serve(name: str, argv: list[str]) -> int:
     from shared.service import Node
 
     module = importlib.import_module(f"services.{name}.service")
+    _compile_on_full_disk()
     parser = arguments.parser(name, module.__doc__ or COMMANDS[name])
     arguments.add_metrics(parser)
     module.arguments(parser)
@@ -200,6 +201,23 @@ def _die_with_thread() -> None:
             os._exit(1)
 
     threading.excepthook = end
+
+
+def _compile_on_full_disk() -> None:
+    """Lets numba go on where there is no room to keep what it has compiled: it would fail, and the service with it."""
+    if "numba" not in sys.modules:
+        return
+    from numba.core.caching import IndexDataCacheFile
+
+    from shared import logs
+
+    save = IndexDataCacheFile.save
+
+    def save_where_there_is_room(*arguments: object) -> None:
+        with logs.lost_where_full():
+            save(*arguments)
+
+    IndexDataCacheFile.save = save_where_there_is_room
 
 
 if __name__ == "__main__":

@@ -82,17 +82,18 @@ class Lossy:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        with _lost_where_full():
+        with lost_where_full():
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        with _lost_where_full():
+        with lost_where_full():
             self._stream.flush()
 
 
 @contextlib.contextmanager
-def _lost_where_full() -> Iterator[None]:
+def lost_where_full() -> Iterator[None]:
+    """What is written in it is lost where the disk is full."""
     try:
         yield
     except OSError as error:

@@ -9,15 +9,17 @@ import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
 import zenoh
 
-from tests.live import free_port
+from tests.live import Running, free_port, penumbra_up
 
 CLOCK_SOURCE = Path(__file__).parent / "clock_shift.c"
 PIDS = 1 << 22
@@ -182,13 +184,13 @@ class Link:
 class Router:
     """`penumbra router` as a process of its own, to be killed and started again."""
 
-    def __init__(self) -> None:
-        self.port = free_port()
+    def __init__(self, environment: Mapping[str, str]):
+        self.port, self._environment = free_port(), environment
         self.start()
 
     def start(self) -> None:
         command = [sys.executable, "-m", "services.cli", "router", "--listen", f"tcp/127.0.0.1:{self.port}"]
-        self.popen = subprocess.Popen(command)
+        self.popen = subprocess.Popen(command, env={**os.environ, **self._environment})
 
     def kill(self) -> None:
         self.popen.kill()
@@ -255,6 +257,52 @@ def storm(session: zenoh.Session, key: str, times: int = 10) -> Iterator[list[in
             subscriber.undeclare()
         thread.join(2)
         publisher.undeclare()
+
+
+# ---- a chain that can be broken
+
+
+@dataclass(frozen=True)
+class Breakable:
+    """`penumbra up --connect` to a router of its own through a link that can be cut, with clocks that can be set, and with its
+    logs, caches, temporary files and heartbeat on a disk that can be filled; None where this user may not mount one.
+
+    The link is a proxy on loopback: it cuts one running process off at any time and needs no rights, where network namespaces
+    would cut off whole hosts."""
+
+    running: Running
+    router: Router
+    link: Link
+    clocks: Clocks
+    disk: Path | None
+
+
+DISK_MB = 64
+
+
+@contextmanager
+def breakable(cell: str, seed: int, *arguments: str) -> Iterator[Breakable]:
+    """The chain on `cell`; arguments: of `penumbra up`."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        disk: Path | None = folder / "disk"
+        try:
+            stack.enter_context(small_disk(folder / "disk", DISK_MB))
+        except PermissionError:
+            disk = None
+        files = folder / "disk"  # a folder like others where nothing is mounted
+        clocks = Clocks(folder)
+        stack.callback(clocks.close)
+        router = Router(clocks.environment)
+        stack.callback(router.kill)
+        link = Link(router.port)
+        stack.callback(link.close)
+        kept = {"PENUMBRA_HEARTBEAT": str(files / "heartbeat"), "TMPDIR": str(files), "XDG_CACHE_HOME": str(files)}
+        streams = {name: stack.enter_context((files / name).open("w")) for name in ("stdout", "stderr")}
+        through = ("--connect", f"tcp/127.0.0.1:{link.port}", *arguments)
+        environment = {**clocks.environment, **kept}
+        with penumbra_up(cell, seed, *through, port=router.port, environment=environment, **streams) as running:
+            yield Breakable(running, router, link, clocks, disk)
 
 
 # ---- who is struck

@@ -10,10 +10,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -40,7 +39,8 @@ AFTER_S, LONGEST_S = 4.0, 30.0
 READY_S = 180.0
 """A first start compiles."""
 HOUR_S = 3600.0
-DISK_MB = 64
+STARVED_S = 10.0
+"""How long a process may go on without new memory; most end at the first that they are refused."""
 GOAL_GAP_MS, GOAL_ALONE_S, GOAL_REPLICA_S = 50.0, 1.5, 0.5
 
 
@@ -51,14 +51,16 @@ class Chain:
     running: Running
     cell: cells.Cell
     replicas: int
+    broken: injected.Breakable | None = None
     outside: observed.Outside = field(init=False)
-    router: injected.Router | None = None
-    link: injected.Link | None = None
-    clocks: injected.Clocks | None = None
-    disk: Path | None = None
 
     def instances(self, service: str) -> list[psutil.Process]:
         return injected.instances(psutil.Process(self.running.launcher.pid), service)
+
+    @property
+    def parts(self) -> injected.Breakable:
+        assert self.broken is not None, "a chain of `breakable` expected"
+        return self.broken
 
     def owner(self, service: str) -> psutil.Process:
         """The replica that does the most."""
@@ -87,41 +89,10 @@ def plain(cell: str, seed: int, replicas: int) -> Iterator[Chain]:
 
 
 @contextmanager
-def network(cell: str, seed: int, replicas: int) -> Iterator[Chain]:
-    """`penumbra up --connect` to a router of its own, through a link that can be cut: a proxy on loopback, because it cuts one
-    running process off at any time and needs no rights; network namespaces would cut off whole hosts."""
-    router = injected.Router()
-    link = injected.Link(router.port)
-    try:
-        through = ("--connect", f"tcp/127.0.0.1:{link.port}")
-        with penumbra_up(cell, seed, *through, *_replicas(replicas), port=router.port) as running:
-            yield Chain(running, cells.load(cell), replicas, router=router, link=link)
-    finally:
-        link.close()
-        router.kill()
-
-
-@contextmanager
-def clocks(cell: str, seed: int, replicas: int) -> Iterator[Chain]:
-    """`penumbra up` with wall clocks that can be set."""
-    with tempfile.TemporaryDirectory() as folder:
-        shifts = injected.Clocks(Path(folder))
-        with penumbra_up(cell, seed, *_replicas(replicas), environment=shifts.environment) as running:
-            yield Chain(running, cells.load(cell), replicas, clocks=shifts)
-        shifts.close()
-
-
-@contextmanager
-def disk(cell: str, seed: int, replicas: int) -> Iterator[Chain]:
-    """`penumbra up` whose logs, caches, temporary files and heartbeat are on a disk of DISK_MB."""
-    with tempfile.TemporaryDirectory() as parent:
-        folder = Path(parent) / "disk"
-        with injected.small_disk(folder, DISK_MB):
-            environment = {"PENUMBRA_HEARTBEAT": str(folder / "heartbeat"), "TMPDIR": str(folder), "XDG_CACHE_HOME": str(folder)}
-            with (folder / "out").open("w") as out, (folder / "log").open("w") as log:
-                extra = {"environment": environment, "stdout": out, "stderr": log}
-                with penumbra_up(cell, seed, *_replicas(replicas), **extra) as running:
-                    yield Chain(running, cells.load(cell), replicas, disk=folder)
+def breakable(cell: str, seed: int, replicas: int) -> Iterator[Chain]:
+    """`injected.breakable`."""
+    with injected.breakable(cell, seed, *_replicas(replicas)) as broken:
+        yield Chain(broken.running, cells.load(cell), replicas, broken)
 
 
 def _replicas(number: int) -> list[str]:
@@ -137,29 +108,27 @@ class Fault:
     services: whom it strikes, ALL where it is everybody at once; quick: whether it belongs to the short run."""
 
     setup: Callable[[str, int, int], AbstractContextManager[Chain]]
-    strike: Callable[[Chain, psutil.Process | None], AbstractContextManager[Any]]
+    strike: Callable[[Chain, Any], AbstractContextManager[Any]]
     lasts_s: float = 0.0
     services: tuple[str, ...] = SERVICES
     quick: bool = False
 
 
-def _kill(chain: Chain, process: psutil.Process | None) -> AbstractContextManager[None]:
-    assert process is not None
+def _kill(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
     injected.kill(process)
     return nullcontext()
 
 
 @contextmanager
-def _kill_on_full_disk(chain: Chain, process: psutil.Process | None) -> Iterator[None]:
-    assert process is not None and chain.disk is not None
-    with injected.full(chain.disk):
-        injected.kill(process)
+def _memory(chain: Chain, process: psutil.Process) -> Iterator[None]:
+    with injected.starved(process):
+        with suppress(psutil.TimeoutExpired):
+            process.wait(STARVED_S)
         yield
 
 
 @contextmanager
-def _crash_loop(chain: Chain, process: psutil.Process | None) -> Iterator[None]:
-    assert process is not None
+def _crash_loop(chain: Chain, process: psutil.Process) -> Iterator[None]:
     words = process.cmdline()
     service = words[words.index("services.cli") + 1]
     spared = {each.pid for each in chain.instances(service)} - {process.pid}
@@ -167,44 +136,49 @@ def _crash_loop(chain: Chain, process: psutil.Process | None) -> Iterator[None]:
         yield
 
 
-def _router(chain: Chain, process: psutil.Process | None) -> AbstractContextManager[None]:
-    assert chain.router is not None
-    chain.router.kill()
-    chain.router.start()
-    return nullcontext()
-
-
-def _cut(chain: Chain, process: psutil.Process | None) -> AbstractContextManager[None]:
-    assert process is not None and chain.link is not None
-    return chain.link.cut(process)
-
-
-def _own_clock(seconds: float, chain: Chain, process: psutil.Process | None) -> AbstractContextManager[None]:
-    assert process is not None and chain.clocks is not None
-    return chain.clocks.shifted(seconds, process)
-
-
-def _all_clocks(seconds: float, chain: Chain, process: psutil.Process | None) -> AbstractContextManager[None]:
-    assert chain.clocks is not None
-    chain.clocks.jump(seconds)
-    return nullcontext()
-
-
 def _on(inject: Callable[[psutil.Process], AbstractContextManager[None]]) -> Callable[..., AbstractContextManager[None]]:
     return lambda chain, process: inject(process)
 
 
-def _storm(topic: Topic, chain: Chain, process: psutil.Process | None) -> AbstractContextManager[Any]:
+def _storm(topic: Topic, chain: Chain, process: None) -> AbstractContextManager[Any]:
     names = {"camera": next(iter(chain.cell.cameras)), "pad": next(iter(chain.cell.pads))}
     names |= {"target": chain.cell.one("targets", None), "robot": next(iter(chain.cell.robots), "")}
     return injected.storm(chain.running.session, topic.at(cell=chain.running.cell, **names))
+
+
+def _router(chain: Chain, process: None) -> AbstractContextManager[None]:
+    chain.parts.router.kill()
+    chain.parts.router.start()
+    return nullcontext()
+
+
+def _cut(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
+    return chain.parts.link.cut(process)
+
+
+def _own_clock(seconds: float, chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
+    return chain.parts.clocks.shifted(seconds, process)
+
+
+def _all_clocks(seconds: float, chain: Chain, process: None) -> AbstractContextManager[None]:
+    chain.parts.clocks.jump(seconds)
+    return nullcontext()
+
+
+@contextmanager
+def _kill_on_full_disk(chain: Chain, process: psutil.Process) -> Iterator[None]:
+    if chain.parts.disk is None:
+        raise PermissionError("full disk: a user who may mount a disk for it expected (root)")
+    with injected.full(chain.parts.disk):
+        injected.kill(process)
+        yield
 
 
 FAULTS = {
     "none": Fault(plain, lambda chain, process: nullcontext(), 5.0, (ALL,), quick=True),
     "kill": Fault(plain, _kill, quick=True),
     "freeze": Fault(plain, _on(injected.frozen), 3.0, quick=True),
-    "memory": Fault(plain, _on(injected.starved), 1.0, quick=True),
+    "memory": Fault(plain, _memory, quick=True),
     "crash loop": Fault(plain, _crash_loop, 5.0),
     "slow": Fault(plain, _on(injected.slowed), 5.0),
     **{
@@ -212,14 +186,14 @@ FAULTS = {
         for topic in topics.TOPICS
         if topic not in (topics.TRUTH, topics.JOINTS)  # nobody reads the one, and the table has no robot
     },
-    "router": Fault(network, _router, 0.0, (ALL,), quick=True),
-    "cut 5 s": Fault(network, _cut, 5.0),
-    "cut 30 s": Fault(network, _cut, 30.0),
-    "clock +1 h": Fault(clocks, partial(_all_clocks, HOUR_S), 0.0, (ALL,), quick=True),
-    "clock -1 h": Fault(clocks, partial(_all_clocks, -HOUR_S), 0.0, (ALL,), quick=True),
-    "own clock +1 h": Fault(clocks, partial(_own_clock, HOUR_S), 3.0),
-    "own clock -1 h": Fault(clocks, partial(_own_clock, -HOUR_S), 3.0),
-    "full disk": Fault(disk, _kill_on_full_disk, 5.0),
+    "router": Fault(breakable, _router, 0.0, (ALL,), quick=True),
+    "cut 5 s": Fault(breakable, _cut, 5.0),
+    "cut 30 s": Fault(breakable, _cut, 30.0),
+    "clock +1 h": Fault(breakable, partial(_all_clocks, HOUR_S), 0.0, (ALL,), quick=True),
+    "clock -1 h": Fault(breakable, partial(_all_clocks, -HOUR_S), 0.0, (ALL,), quick=True),
+    "own clock +1 h": Fault(breakable, partial(_own_clock, HOUR_S), 3.0),
+    "own clock -1 h": Fault(breakable, partial(_own_clock, -HOUR_S), 3.0),
+    "full disk": Fault(breakable, _kill_on_full_disk, 5.0),
 }
 
 
@@ -276,7 +250,7 @@ def run(options: argparse.Namespace, done: Callable[[Row], None]) -> None:
     """Goes through the plan, and hands every row to `done`."""
     chosen = options.fault or [name for name, fault in FAULTS.items() if fault.quick or not options.quick]
     replicas = options.replicas or ([1] if options.quick else [1, 2])
-    setups = {each.__name__: each for each in (plain, network, clocks, disk)}
+    setups = {each.__name__: each for each in (plain, breakable)}
     groups = plan(chosen, options.service or SERVICES, replicas)
     for setup, number, rows in groups:
         with ExitStack() as stack:
