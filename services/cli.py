@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 COMMANDS = {
     "up": "start every process of a cell with a router, and show what they do",
@@ -213,11 +214,11 @@ def _compile_on_full_disk() -> None:
 
     save = IndexDataCacheFile.save
 
-    def save_where_there_is_room(*arguments: object) -> None:
+    def save_where_there_is_room(file: IndexDataCacheFile, key: Any, data: Any) -> None:
         with logs.lost_where_full():
-            save(*arguments)
+            save(file, key, data)
 
-    IndexDataCacheFile.save = save_where_there_is_room
+    IndexDataCacheFile.save = save_where_there_is_room  # type: ignore[method-assign]
 
 
 if __name__ == "__main__":

@@ -88,13 +88,15 @@ class Outside:
 class Numbers:
     """What a fault did. gap_ms: longest time without a fused pose that is not lost while a sense was alive; recovery_s: until all
     of a service's topics had their old rate, None where they never had; reused: measurements used twice; false_tracking: poses
-    called tracking, of `tracking` in all, whose error was beyond three sigma of their own covariance."""
+    called tracking, of `tracking` in all, whose error was beyond three sigma of their own covariance; worst_cm: the largest error of
+    their positions."""
 
     gap_ms: float
     recovery_s: float | None
     reused: int
     false_tracking: int
     tracking: int
+    worst_cm: float
 
 
 def gap_s(fused: Sequence[Seen], senses: Iterable[tuple[topics.Topic, Sequence[Seen]]], end_s: float) -> float:
@@ -145,33 +147,40 @@ def repeats(seen: Iterable[Seen]) -> int:
     return sum(n - 1 for n in counts.values())
 
 
-def false_tracking(fused: Iterable[Seen], truth: Sequence[Seen]) -> tuple[int, int]:
-    """How many poses are called tracking though their error against the truth at their stamp is beyond three sigma of their own
-    covariance, or though they are stamped with another time than that of the truth that came with them; and how many were looked
-    at. Poses without a truth beside them are left out."""
-    wrong = looked_at = 0
-    if not truth:
-        return 0, 0
+def reused(senses: Iterable[tuple[topics.Topic, Sequence[Seen]]]) -> int:
+    """How many measurements that fusion could use came again."""
+    return sum(repeats(seen for seen in all_seen if seen.message.state == USABLE[topic.name]) for topic, all_seen in senses)
+
+
+def tracking_errors(fused: Iterable[Seen], truth: Sequence[Seen], epoch_ns: int) -> np.ndarray:
+    """Of every pose that is called tracking while the truth is heard (n, 2): the squared Mahalanobis distance of its error by its
+    own covariance, and the error of its position [m], at its own stamp; both infinite where that is of another time than the
+    truth that came with it. Where it is the truth that is stamped with another time than ours, nothing is said.
+
+    epoch_ns: what our wall clock says when the steady clock says zero."""
+    rows = []
     order = sorted(truth, key=lambda each: each.message.stamp_ns)
-    stamps = np.array([each.message.stamp_ns for each in order])
-    arrivals = np.array([each.at_s for each in truth])
-    for each in fused:
+    stamps, arrivals = np.array([each.message.stamp_ns for each in order]), np.array([each.at_s for each in truth])
+    for each in fused if truth else ():
         pose = each.message
-        if pose.state != "tracking":
-            continue
         beside = int(np.argmin(np.abs(arrivals - each.at_s)))
-        if abs(arrivals[beside] - each.at_s) > topics.TRUTH.stale_s:
+        if pose.state != "tracking" or abs(arrivals[beside] - each.at_s) > topics.TRUTH.stale_s:
             continue
-        looked_at += 1
         if abs(truth[beside].message.stamp_ns - pose.stamp_ns) > FAR_S * 1e9:
-            wrong += 1
+            if abs(epoch_ns + each.at_s * 1e9 - pose.stamp_ns) > FAR_S * 1e9:
+                rows.append((np.inf, np.inf))
             continue
         nearest = order[int(np.argmin(np.abs(stamps - pose.stamp_ns)))].message
         moved = nearest.velocity * ((pose.stamp_ns - nearest.stamp_ns) * 1e-9)
         T_true = geometry.perturb(geometry.transform(nearest.position, nearest.orientation), moved)
         error = geometry.pose_error(T_true, geometry.transform(pose.position, pose.orientation))
-        wrong += float(error @ np.linalg.solve(pose.covariance, error)) > CHI2_3_SIGMA
-    return wrong, looked_at
+        rows.append((float(error @ np.linalg.solve(pose.covariance, error)), float(np.linalg.norm(error[:3]))))
+    return np.array(rows).reshape(-1, 2)
+
+
+def epoch_ns() -> int:
+    """What the wall clock says when the steady clock says zero."""
+    return time.time_ns() - time.monotonic_ns()
 
 
 # ---- fusion's own counters
@@ -213,19 +222,19 @@ def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: f
     begin_s = fault_s - WINDOW_S
     fused, truth = outside.seen(topics.FUSED, begin_s, end_s), outside.seen(topics.TRUTH, begin_s, end_s)
     senses = [(topic, outside.seen(topic, begin_s, end_s)) for topic in (topics.VISION, topics.HAPTIC)]
-    told_again = sum(repeats(seen for seen in all_seen if seen.message.state == USABLE[topic.name]) for topic, all_seen in senses)
     recoveries = [
         recovery_s([seen.at_s for seen in known_poses(outside.seen(topic, fault_s, end_s))], old_hz[topic.name], fault_s, end_s)
         for topic in OUTPUTS.get(service, READ)
     ]
     known = [each for each in recoveries if each is not None]
-    wrong, tracking = false_tracking(fused, truth)
+    errors = tracking_errors(fused, truth, epoch_ns())
     return Numbers(
         round(1e3 * gap_s(fused, senses, end_s), 1),
         round(max(known), 3) if len(known) == len(recoveries) else None,
-        max(0, told_again - refused) + repeats(fused),
-        wrong,
-        tracking,
+        max(0, reused(senses) - refused) + repeats(fused),
+        int((errors[:, 0] > CHI2_3_SIGMA).sum()),
+        len(errors),
+        round(100 * float(errors[:, 1].max(initial=0.0)), 2),
     )
 
 

@@ -209,6 +209,7 @@ class Row:
     reused: int
     false_tracking: int
     tracking: int
+    worst_cm: float
 
 
 def measure(chain: Chain, name: str, service: str) -> Row:
@@ -268,7 +269,9 @@ def goal_s(row: Row) -> float:
 
 def show(rows: Sequence[Row], console: Console) -> None:
     goals = ("", "", "", f"gap ms\n<= {GOAL_GAP_MS:g}", f"recovery s\n<= {GOAL_ALONE_S:g}, with a replica {GOAL_REPLICA_S:g}")
-    table = Table(*(goals[:3]), *goals[3:], "reused\n0", "false tracking\n0", "of poses", title="faults; misses are red")
+    table = Table(
+        *(goals[:3]), *goals[3:], "reused\n0", "false tracking\n0", "of poses", "worst\ncm", title="faults; misses are red"
+    )
     for row in rows:
         recovery = "never" if row.recovery_s is None else f"{row.recovery_s:.2f}"
         cells = [
@@ -278,7 +281,7 @@ def show(rows: Sequence[Row], console: Console) -> None:
             (str(row.false_tracking), row.false_tracking == 0),
         ]
         marked = [text if met else f"[red]{text} ![/red]" for text, met in cells]
-        table.add_row(row.fault, row.service, str(row.replicas), *marked, str(row.tracking))
+        table.add_row(row.fault, row.service, str(row.replicas), *marked, str(row.tracking), f"{row.worst_cm:.1f}")
     console.print(table)
 
 
