@@ -11,14 +11,17 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import psutil
 import zenoh
 
+from shared import messages, topics
 from tests.live import Running, free_port, penumbra_up
 
 CLOCK_SOURCE = Path(__file__).parent / "clock_shift.c"
@@ -77,13 +80,20 @@ def _signalled(process: psutil.Process, number: signal.Signals) -> Iterator[None
 
 @contextmanager
 def starved(process: psutil.Process) -> Iterator[None]:
-    """Out of memory: from now on the kernel refuses it every further page (RLIMIT_AS at less than it has already)."""
+    """Out of memory: from now on the kernel refuses it every further page (RLIMIT_AS at less than it has already). It may go on for
+    long with what it has."""
     before = resource.prlimit(process.pid, resource.RLIMIT_AS, (1 << 20, resource.RLIM_INFINITY))
     try:
         yield
     finally:
         with suppress(ProcessLookupError):
             resource.prlimit(process.pid, resource.RLIMIT_AS, before)
+
+
+def large_frame(session: zenoh.Session, cell: str, camera: str) -> None:
+    """A picture of 18 MB, more than a reader has at hand: it needs new memory, though it will not use a picture of this size."""
+    frame = messages.Frame(stamp_ns=time.time_ns(), image=np.zeros((2000, 3000, 3), np.uint8))
+    session.put(topics.FRAME.at(cell=cell, camera=camera), messages.encode(frame))
 
 
 @contextmanager

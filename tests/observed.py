@@ -88,8 +88,8 @@ class Outside:
 class Numbers:
     """What a fault did. gap_ms: longest time without a fused pose that is not lost while a sense was alive; recovery_s: until all
     of a service's topics had their old rate, None where they never had; reused: measurements used twice; false_tracking: poses
-    called tracking, of `tracking` in all, whose error was beyond three sigma of their own covariance; worst_cm: the largest error of
-    their positions."""
+    called tracking, of `tracking` in all, whose error was beyond three sigma of their own covariance; worst_cm: the largest error
+    of their positions."""
 
     gap_ms: float
     recovery_s: float | None
