@@ -355,7 +355,7 @@ class Reader:
                 raise BadMessage("key", f"one of the cell's {len(self._keys)} keys expected, {key!r:.120} came")
             traffic.missed(guard.admit(publisher, number, time.monotonic()))  # before anything that takes long
             message = self._decode(sample)
-            guard.believe(publisher, message.stamp_ns, time.monotonic())
+            guard.believe(publisher, message.stamp_ns, time.monotonic(), getattr(message, "camera", ""))
         except BadMessage as error:
             traffic.bad[error.kind] = traffic.bad.get(error.kind, 0) + 1
             if traffic.bad[error.kind] == 1:

@@ -80,8 +80,8 @@ def _signalled(process: psutil.Process, number: signal.Signals) -> Iterator[None
 
 @contextmanager
 def starved(process: psutil.Process) -> Iterator[None]:
-    """Out of memory: from now on the kernel refuses it every further page (RLIMIT_AS at less than it has already). It may go on for
-    long with what it has."""
+    """Out of memory: from now on the kernel refuses it every further page (RLIMIT_AS at less than it has already). It may go on
+    for long with what it has."""
     before = resource.prlimit(process.pid, resource.RLIMIT_AS, (1 << 20, resource.RLIM_INFINITY))
     try:
         yield
