@@ -78,16 +78,20 @@ def _signalled(process: psutil.Process, number: signal.Signals) -> Iterator[None
             process.send_signal(number)
 
 
-@contextmanager
-def starved(process: psutil.Process) -> Iterator[None]:
-    """Out of memory: from now on the kernel refuses it every further page (RLIMIT_AS at less than it has already). It may go on
-    for long with what it has."""
+def starve(process: psutil.Process, need: Callable[[], None], seconds: float) -> bool:
+    """Out of memory: the kernel refuses it every further page (RLIMIT_AS at less than it has already), until it has ended, at
+    most for so long; whether it has. It may go on for ever with what it has: need() is called again and again, so that it wants
+    more."""
     before = resource.prlimit(process.pid, resource.RLIMIT_AS, (1 << 20, resource.RLIM_INFINITY))
-    try:
-        yield
-    finally:
-        with suppress(ProcessLookupError):
-            resource.prlimit(process.pid, resource.RLIMIT_AS, before)
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        need()
+        with suppress(psutil.TimeoutExpired):
+            process.wait(0.5)
+            return True
+    with suppress(ProcessLookupError):
+        resource.prlimit(process.pid, resource.RLIMIT_AS, before)
+    return False
 
 
 def large_frame(session: zenoh.Session, cell: str, camera: str) -> None:
@@ -328,8 +332,3 @@ def instances(launcher: psutil.Process, service: str) -> list[psutil.Process]:
                 if "services.cli" in words and words[words.index("services.cli") + 1] == service:
                     found.append(child)
     return found
-
-
-def shared_memory() -> set[str]:
-    """The names of what is in /dev/shm."""
-    return set(os.listdir("/dev/shm"))

@@ -6,9 +6,8 @@ import itertools
 import json
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,8 +27,8 @@ OUTPUTS = {
     "fusion": (topics.FUSED,),
 }
 """What each service says; all of it where all are meant."""
-USABLE = {topics.VISION.name: "tracking", topics.HAPTIC.name: "in_range"}
-"""The state of a sense's pose that fusion takes."""
+SENSES = ((topics.VISION, "tracking"), (topics.HAPTIC, "in_range"))
+"""The senses, and the state of their poses that fusion takes."""
 CHI2_3_SIGMA = 20.06
 """Squared Mahalanobis distance of six dimensions that 99.73 % of all errors stay within: three standard deviations of one."""
 SHARE, WINDOW_S = 0.75, 0.5
@@ -40,17 +39,20 @@ FAR_S = 0.5
 
 @dataclass(frozen=True)
 class Seen:
-    """One message: when it came [s, steady clock] and what it was, None where only its arrival counts."""
+    """One message: when it came [s, steady clock], what it was, None where only its arrival counts, and who sent it as which of
+    all that it has sent, None where it does not say."""
 
     at_s: float
     message: Any = None
+    publisher: str = ""
+    number: int | None = None
 
 
 class Outside:
     """Listens to a chain from outside. Everything is decoded afterwards."""
 
     def __init__(self, session: zenoh.Session, cell: str, target: str, pad: str):
-        self._rows: dict[str, list[tuple[float, bytes]]] = {}
+        self._rows: dict[str, list[tuple[float, bytes, zenoh.SourceInfo | None]]] = {}
         self._subscribers = []
         for topic in READ:
             rows = self._rows.setdefault(topic.name, [])
@@ -60,9 +62,9 @@ class Outside:
             self._subscribers.append(subscriber)
 
     @staticmethod
-    def _read(subscriber: Any, rows: list[tuple[float, bytes]], is_decoded: bool) -> None:
+    def _read(subscriber: Any, rows: list[tuple[float, bytes, zenoh.SourceInfo | None]], is_decoded: bool) -> None:
         for sample in subscriber:
-            rows.append((time.monotonic(), sample.payload.to_bytes() if is_decoded else b""))
+            rows.append((time.monotonic(), sample.payload.to_bytes() if is_decoded else b"", sample.source_info))
 
     def __enter__(self) -> Outside:
         return self
@@ -71,12 +73,16 @@ class Outside:
         for subscriber in self._subscribers:
             subscriber.undeclare()
 
-    def seen(self, topic: topics.Topic, begin_s: float, end_s: float) -> list[Seen]:
+    def seen(self, topic: topics.Topic, begin_s: float = -np.inf, end_s: float = np.inf) -> list[Seen]:
         """What came on a topic between two times of the steady clock."""
-        rows = [row for row in list(self._rows[topic.name]) if begin_s <= row[0] <= end_s]
-        if topic.name not in DECODED:
-            return [Seen(at_s) for at_s, _ in rows]
-        return [Seen(at_s, messages.decode(topic.message, payload)) for at_s, payload in rows]
+        out = []
+        for at_s, payload, source in list(self._rows[topic.name]):
+            if not begin_s <= at_s <= end_s:
+                continue
+            message = messages.decode(topic.message, payload) if topic.name in DECODED else None
+            publisher = "" if source is None else f"{source.source_id.zid}/{source.source_id.eid}"
+            out.append(Seen(at_s, message, publisher, None if source is None else source.source_sn))
+        return out
 
     def forget(self) -> None:
         """Drops what came until now."""
@@ -102,11 +108,12 @@ class Numbers:
 def gap_s(fused: Sequence[Seen], senses: Iterable[tuple[topics.Topic, Sequence[Seen]]], end_s: float) -> float:
     """The longest time between two fused poses that are not lost, not counting what no sense was alive of it: a sense is alive
     until its last pose that can be used is stale."""
+    usable = {topic.name: state for topic, state in SENSES}
     alive = _union(
         (seen.at_s, min(seen.at_s + topic.stale_s, end_s))
         for topic, all_seen in senses
         for seen in all_seen
-        if seen.message.state == USABLE[topic.name]
+        if seen.message.state == usable[topic.name]
     )
     times = [seen.at_s for seen in fused if seen.message.state != "lost"]
     if not alive:
@@ -142,14 +149,22 @@ def recovery_s(times: Sequence[float], rate_hz: float, fault_s: float, end_s: fl
 
 
 def repeats(seen: Iterable[Seen]) -> int:
-    """How many messages tell again what was told: the same stamp, of the same camera where they are of cameras."""
-    counts = Counter((getattr(each.message, "camera", ""), each.message.stamp_ns) for each in seen)
-    return sum(n - 1 for n in counts.values())
+    """How many messages tell again what was told: the same stamp."""
+    stamps = [each.message.stamp_ns for each in seen]
+    return len(stamps) - len(set(stamps))
 
 
-def reused(senses: Iterable[tuple[topics.Topic, Sequence[Seen]]]) -> int:
-    """How many measurements that fusion could use came again."""
-    return sum(repeats(seen for seen in all_seen if seen.message.state == USABLE[topic.name]) for topic, all_seen in senses)
+def offered(seen: Sequence[Seen], usable: str) -> int:
+    """How many measurements that can be used there were, each once, with those that were lost on their way to us: where the count
+    of a publisher, which numbers all that it says, has gaps."""
+    numbers: dict[str, list[int]] = {}
+    for each in seen:
+        if each.number is not None:
+            numbers.setdefault(each.publisher, []).append(each.number)
+    missed = sum(max(of) - min(of) + 1 - len(set(of)) for of in numbers.values())
+    return missed + len(
+        {(getattr(each.message, "camera", ""), each.message.stamp_ns) for each in seen if each.message.state == usable}
+    )
 
 
 def tracking_errors(fused: Iterable[Seen], truth: Sequence[Seen], epoch_ns: int) -> np.ndarray:
@@ -186,39 +201,31 @@ def epoch_ns() -> int:
 # ---- fusion's own counters
 
 
-def health(running: Running) -> list[dict[str, Any]]:
-    """The health of every instance that answers."""
-    replies = running.session.get(topics.health(running.cell), timeout=1.0)
+def health(running: Running, service: str = "*") -> list[dict[str, Any]]:
+    """The health of every instance that answers, or of those of one service."""
+    replies = running.session.get(topics.health(running.cell, service), timeout=1.0)
     return [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
 
 
-@dataclass
-class Refusals:
-    """How many repeated measurements the instances of fusion have refused since the beginning: the least of all instances."""
-
-    _before: dict[str, int] = field(default_factory=dict)
-
-    def begin(self, reports: Iterable[dict[str, Any]]) -> None:
-        self._before = self._counts(reports)
-
-    def since(self, reports: Iterable[dict[str, Any]]) -> int:
-        """A fusion that began since has refused what it says; one that has ended says nothing."""
-        return min((n - self._before.get(name, 0) for name, n in self._counts(reports).items()), default=0)
-
-    @staticmethod
-    def _counts(reports: Iterable[dict[str, Any]]) -> dict[str, int]:
-        out = {}
-        for report in reports:
-            if report["service"] == "fusion":
-                sources = [s for target in report.get("report", {}).values() for s in target.values() if isinstance(s, dict)]
-                by_observer = sum(s["duplicate"] + s["refused"].get("publisher", 0) for s in sources)
-                out[report["instance"]] = by_observer + sum(sum(row["bad"].values()) for row in report["topics"].values())
-        return out
+def taken(running: Running) -> dict[tuple[str, str], int]:
+    """How many measurements each instance of fusion has accepted of each sense."""
+    return {
+        (report["instance"], sense): target[sense]["accepted"]
+        for report in health(running, "fusion")
+        for target in report.get("report", {}).values()
+        for sense in ("vision", "haptic")
+    }
 
 
-def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: float, end_s: float, refused: int) -> Numbers:
-    """What was seen from just before a fault of a service until end_s; old_hz: by topic, before it; refused: repeats that fusion
-    says it did not use."""
+def reused(outside: Outside, before: dict[tuple[str, str], int], after: dict[tuple[str, str], int]) -> int:
+    """How many measurements an instance of fusion has accepted more than there were: by its own counters, between two times,
+    before the first of which we listened already."""
+    there_were = {topic.name: offered(outside.seen(topic), usable) for topic, usable in SENSES}
+    return sum(max(0, n - before.get((instance, sense), 0) - there_were[sense]) for (instance, sense), n in after.items())
+
+
+def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: float, end_s: float, reused: int) -> Numbers:
+    """What was seen of a fault of a service until end_s; old_hz: by topic, before it; reused: what fusion has used again."""
     begin_s = fault_s - WINDOW_S
     fused, truth = outside.seen(topics.FUSED, begin_s, end_s), outside.seen(topics.TRUTH, begin_s, end_s)
     senses = [(topic, outside.seen(topic, begin_s, end_s)) for topic in (topics.VISION, topics.HAPTIC)]
@@ -231,7 +238,7 @@ def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: f
     return Numbers(
         round(1e3 * gap_s(fused, senses, end_s), 1),
         round(max(known), 3) if len(known) == len(recoveries) else None,
-        max(0, reused(senses) - refused) + repeats(fused),
+        reused + repeats(fused),
         int((errors[:, 0] > CHI2_3_SIGMA).sum()),
         len(errors),
         round(100 * float(errors[:, 1].max(initial=0.0)), 2),

@@ -73,11 +73,13 @@ def test_a_rate_is_back_when_it_stays():
     assert observed.recovery_s(steady[::2], 50.0, 1.0, 6.0) is None
 
 
-def test_the_same_stamp_twice_is_a_repeat_and_that_of_two_cameras_is_none():
-    assert observed.repeats([haptic(t) for t in (0.1, 0.2, 0.2, 0.2, 0.3)]) == 2
-    front, side = (Seen(0.0, messages.VisionPose(**vision(camera))) for camera in ("front", "side"))
-    assert observed.repeats([front, side]) == 0
-    assert observed.repeats([front, side, front]) == 1
+def test_a_measurement_counts_once_however_often_it_is_told_and_also_where_it_did_not_reach_us():
+    numbered = [Seen(0.1 * n, haptic(0.1 * stamp).message, "skin", n) for n, stamp in ((5, 1), (6, 2), (9, 3), (10, 3))]
+    assert observed.repeats(numbered) == 1
+    assert observed.offered(numbered, "in_range") == 3 + 2
+    assert observed.offered(numbered, "out_of_range") == 2
+    cameras = [Seen(0.0, messages.VisionPose(**vision(camera))) for camera in ("front", "side", "front")]
+    assert observed.offered(cameras, "tracking") == 2
 
 
 def vision(camera):

@@ -12,7 +12,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -119,13 +119,10 @@ def _kill(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]
     return nullcontext()
 
 
-@contextmanager
-def _memory(chain: Chain, process: psutil.Process) -> Iterator[None]:
-    with injected.starved(process):
-        injected.large_frame(chain.running.session, chain.running.cell, next(iter(chain.cell.cameras)))
-        with suppress(psutil.TimeoutExpired):
-            process.wait(STARVED_S)
-        yield
+def _memory(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
+    camera = next(iter(chain.cell.cameras))
+    injected.starve(process, lambda: injected.large_frame(chain.running.session, chain.running.cell, camera), STARVED_S)
+    return nullcontext()
 
 
 @contextmanager
@@ -222,16 +219,17 @@ def measure(chain: Chain, name: str, service: str) -> Row:
     time.sleep(BEFORE_S)
     old_hz = observed.rates_hz(chain.outside, begin_s, time.monotonic())
     process = None if service == ALL else chain.owner(service)
-    refusals = observed.Refusals()
-    refusals.begin(observed.health(chain.running))
+    chain.outside.forget()
+    taken = observed.taken(chain.running)
     fault_s = time.monotonic()
     with fault.strike(chain, process):
         time.sleep(fault.lasts_s)
     over_s = time.monotonic()
     while True:
         time.sleep(AFTER_S)
-        refused, now_s = refusals.since(observed.health(chain.running)), time.monotonic()
-        found = observed.numbers(chain.outside, service, old_hz, fault_s, now_s, refused)
+        reused = observed.reused(chain.outside, taken, observed.taken(chain.running))
+        now_s = time.monotonic()
+        found = observed.numbers(chain.outside, service, old_hz, fault_s, now_s, reused)
         if found.recovery_s is not None or now_s - over_s > LONGEST_S:
             return Row(name, service, chain.replicas, **asdict(found))
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -161,25 +162,31 @@ EVENTS: dict[str, tuple[float, Callable[[Life], None]]] = {
 
 
 class Gauge:
-    """The series of samples of every process of a chain, by service and pid, and the files in /dev/shm."""
+    """The series of samples of every process of a chain, by service and pid, and their files in /dev/shm."""
 
     def __init__(self, launcher: psutil.Process, router: injected.Router):
         self._launcher, self._router = launcher, router
         self.series: defaultdict[tuple[str, int], list[Sample]] = defaultdict(list)
-        self.files: list[int] = []
+        self.names: set[str] = set()  # of files in /dev/shm that one of them has mapped at any time
+        self.files: list[int] = []  # how many of these there were
 
     def look(self) -> None:
         """Takes a sample of each."""
         now_s = time.monotonic()
-        self.files.append(len(injected.shared_memory()))
         for name, process in self._processes():
             with suppress(psutil.NoSuchProcess, FileNotFoundError, ProcessLookupError):
                 memory = process.memory_info()
                 maps = Path(f"/proc/{process.pid}/maps").read_text()
-                mapped = len({line.split()[-1] for line in maps.splitlines() if "/dev/shm/" in line})
+                mapped = set(re.findall(r"/dev/shm/(\S+)", maps))
+                self.names |= mapped
                 own_mb = (memory.rss - memory.shared) / 1e6
-                sample = Sample(now_s, own_mb, process.num_threads(), process.num_fds(), mapped)
+                sample = Sample(now_s, own_mb, process.num_threads(), process.num_fds(), len(mapped))
                 self.series[name, process.pid].append(sample)
+        self.files.append(self.left())
+
+    def left(self) -> int:
+        """How many files that one of them has mapped are in /dev/shm now."""
+        return len(self.names & set(os.listdir("/dev/shm")))
 
     def _processes(self) -> Iterator[tuple[str, psutil.Process]]:
         yield "launcher", self._launcher
@@ -239,7 +246,6 @@ def chain(cell: str, seed: int) -> Iterator[tuple[Running, injected.Router]]:
 
 def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
     """Lives through it; the numbers."""
-    files_before = injected.shared_memory()
     with chain(cell, seed) as (running, router):
         wait_for(running.is_tracking, 180, "a tracked pose", 0.5)
         life, gauge = Life(running, router, cells.load(cell), seed), Gauge(psutil.Process(running.launcher.pid), router)
@@ -275,7 +281,7 @@ def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
         "speed": speed,
         "events": dict(happened),
         "tracking_at_end": is_back,
-        "shm_files": {"first": gauge.files[0], "last": gauge.files[-1], "left": len(injected.shared_memory() - files_before)},
+        "shm_files": {"first": gauge.files[0], "last": gauge.files[-1], "left": gauge.left()},
         "rows": [asdict(row) for row in gauge.rows(min(WARM_UP_S, 12 * minutes))],
     }
 
