@@ -192,8 +192,8 @@ def _die_with_parent() -> None:
 
 def _die_with_thread() -> None:
     """Ends the process with the first of its threads that fails: it would look alive and do a part of its work only. Whoever
-    started it starts it again."""
-    tell = threading.excepthook
+    started it starts it again. A thread without the memory to begin is one, for which its starter would wait for ever."""
+    tell, tell_unraisable = threading.excepthook, sys.unraisablehook
 
     def end(failed: threading.ExceptHookArgs) -> None:
         try:
@@ -201,7 +201,14 @@ def _die_with_thread() -> None:
         finally:  # also without memory for words
             os._exit(1)
 
-    threading.excepthook = end
+    def end_without_memory(failed: sys.UnraisableHookArgs) -> None:
+        try:
+            tell_unraisable(failed)
+        finally:
+            if failed.exc_type is MemoryError:
+                os._exit(1)
+
+    threading.excepthook, sys.unraisablehook = end, end_without_memory
 
 
 def _compile_on_full_disk() -> None:

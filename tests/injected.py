@@ -29,6 +29,13 @@ PIDS = 1 << 22
 """More than Linux gives out."""
 
 
+@contextmanager
+def at_once(fault: Callable[[], object]) -> Iterator[None]:
+    """A fault that needs no ending."""
+    fault()
+    yield
+
+
 # ---- one process
 
 
@@ -209,6 +216,11 @@ class Router:
     def kill(self) -> None:
         self.popen.kill()
         self.popen.wait()
+
+    def replace(self) -> None:
+        """It is killed, and the next one takes its place."""
+        self.kill()
+        self.start()
 
 
 # ---- the clock

@@ -115,14 +115,13 @@ class Fault:
 
 
 def _kill(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
-    injected.kill(process)
-    return nullcontext()
+    return injected.at_once(partial(injected.kill, process))
 
 
 def _memory(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
     camera = next(iter(chain.cell.cameras))
-    injected.starve(process, lambda: injected.large_frame(chain.running.session, chain.running.cell, camera), STARVED_S)
-    return nullcontext()
+    need = partial(injected.large_frame, chain.running.session, chain.running.cell, camera)
+    return injected.at_once(partial(injected.starve, process, need, STARVED_S))
 
 
 @contextmanager
@@ -145,9 +144,7 @@ def _storm(topic: Topic, chain: Chain, process: None) -> AbstractContextManager[
 
 
 def _router(chain: Chain, process: None) -> AbstractContextManager[None]:
-    chain.parts.router.kill()
-    chain.parts.router.start()
-    return nullcontext()
+    return injected.at_once(chain.parts.router.replace)
 
 
 def _cut(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
@@ -159,8 +156,7 @@ def _own_clock(seconds: float, chain: Chain, process: psutil.Process) -> Abstrac
 
 
 def _all_clocks(seconds: float, chain: Chain, process: None) -> AbstractContextManager[None]:
-    chain.parts.clocks.jump(seconds)
-    return nullcontext()
+    return injected.at_once(partial(chain.parts.clocks.jump, seconds))
 
 
 @contextmanager

@@ -127,8 +127,7 @@ class Life:
 
     def router_loss(self) -> None:
         """The router dies, and another one takes its place."""
-        self.router.kill()
-        self.router.start()
+        self.router.replace()
 
     def turn(self) -> None:
         """Ends what has lasted."""
