@@ -16,7 +16,7 @@ from typing import Any
 import psutil
 import zenoh
 
-from shared import topics
+from shared import messages, topics
 
 
 def wait_for(condition: Callable[[], Any], seconds: float, what: str, interval: float = 0.02) -> Any:
@@ -112,3 +112,19 @@ def penumbra_up(
     finally:
         launcher.terminate()
         launcher.wait(10)
+
+
+def hold_in_reach(running: Running) -> None:
+    """Waits until the arm is tracked in sight of the camera and above the pads, and stops it there: what happens to the pose from
+    then on is the test's doing."""
+    wait_for(running.is_tracking, 180, "a tracked pose", 0.2)
+    wait_for(lambda: running.control({"command": "occlude", "value": 0}), 10, "the emulator's answer")
+    truths = running.session.declare_subscriber(topics.TRUTH.at(cell=running.cell))
+    wait_for(lambda: _is_in_reach(truths.recv()), 60, "the arm above the pads", 0.0)
+    wait_for(lambda: running.control({"command": "motion", "value": "off"}), 10, "the emulator's answer")
+    truths.undeclare()
+    wait_for(running.is_tracking, 20, "a tracked pose of the resting arm", 0.2)
+
+
+def _is_in_reach(sample: zenoh.Sample) -> bool:
+    return 0.04 < messages.decode(messages.Truth, sample.payload.to_bytes()).gap < 0.09
