@@ -37,7 +37,7 @@ from tests.live import Running, connect, penumbra_up, wait_for
 DAY_S = 86_400.0
 SAMPLE_S = 5.0
 WARM_UP_S = 60.0
-"""Of every process: caches fill and code is compiled. A fifth of a shorter run."""
+"""Of every process: caches fill and code is compiled. A third of a shorter run."""
 LOOK_S, AWAY_S = 2.0, 4.0
 """How long a viewer watches, and an arm is away."""
 
@@ -281,7 +281,7 @@ def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
         "events": dict(happened),
         "tracking_at_end": is_back,
         "shm_files": {"first": gauge.files[0], "last": gauge.files[-1], "left": gauge.left()},
-        "rows": [asdict(row) for row in gauge.rows(min(WARM_UP_S, 12 * minutes))],
+        "rows": [asdict(row) for row in gauge.rows(min(WARM_UP_S, 20 * minutes))],
     }
 
 
