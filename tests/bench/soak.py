@@ -38,8 +38,6 @@ DAY_S = 86_400.0
 SAMPLE_S = 5.0
 WARM_UP_S = 60.0
 """Of every process: caches fill and code is compiled. A third of a shorter run."""
-TIDY_S = 15.0
-"""How long the next process may take to remove what killed ones left in /dev/shm."""
 ANSWER_S = 60.0
 LOOK_S, AWAY_S = 2.0, 4.0
 """How long a viewer watches, and an arm is away."""
@@ -178,7 +176,7 @@ class Gauge:
         self._launcher, self._router = launcher, router
         self.series: defaultdict[tuple[str, int], list[Sample]] = defaultdict(list)
         self.names: set[str] = set()  # of files in /dev/shm that one of them has mapped at any time
-        self.files: list[int] = []  # how many of these there were
+        self.shm_mb: list[float] = []  # what those took that were there
 
     def look(self) -> None:
         """Takes a sample of each."""
@@ -192,15 +190,12 @@ class Gauge:
                 own_mb = (memory.rss - memory.shared) / 1e6
                 sample = Sample(now_s, own_mb, process.num_threads(), process.num_fds(), len(mapped))
                 self.series[name, process.pid].append(sample)
-        self.files.append(len(self.left_mb()))
+        self.shm_mb.append(round(sum(self._sizes_mb()), 1))
 
-    def left_mb(self) -> list[float]:
-        """The sizes of those files that are in /dev/shm now."""
-        sizes = []
+    def _sizes_mb(self) -> Iterator[float]:
         for name in self.names:
             with suppress(FileNotFoundError):
-                sizes.append(os.path.getsize(f"/dev/shm/{name}") / 1e6)
-        return sizes
+                yield os.path.getsize(f"/dev/shm/{name}") / 1e6
 
     def _processes(self) -> Iterator[tuple[str, psutil.Process]]:
         yield "launcher", self._launcher
@@ -288,28 +283,15 @@ def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
             life.end()
         is_back = wait_for(running.is_tracking, 120, "a tracked pose at the end", 0.5)
         gauge.look()
-    left_mb = after_the_next(gauge)
-    files = {"first": gauge.files[0], "last": gauge.files[-1], "left": len(left_mb), "left_mb": round(sum(left_mb), 3)}
     return {
         "seed": seed,
         "minutes": minutes,
         "speed": speed,
         "events": dict(happened),
         "tracking_at_end": is_back,
-        "shm_files": files,
+        "shm_mb": {"first": gauge.shm_mb[0], "last": gauge.shm_mb[-1]},
         "rows": [asdict(row) for row in gauge.rows(min(WARM_UP_S, 20 * minutes))],
     }
-
-
-def after_the_next(gauge: Gauge) -> list[float]:
-    """The sizes [MB] of the files that are left when another process has opened a session: what was killed could not tidy up, and
-    Zenoh removes it then."""
-    router = injected.Router(os.environ)
-    deadline = time.monotonic() + TIDY_S
-    while sum(gauge.left_mb()) > 0.1 and time.monotonic() < deadline:
-        time.sleep(0.1)
-    router.kill()
-    return gauge.left_mb()
 
 
 def show(result: dict, console: Console) -> None:
@@ -323,10 +305,7 @@ def show(result: dict, console: Console) -> None:
         gains = [f"{row[name]:+d}" for name in ("threads", "handles", "mapped")]
         table.add_row(row["service"], str(row["processes"]), f"{row['memory_mb']:.0f}", grown, *gains)
     console.print(table)
-    files = result["shm_files"]
-    console.print(
-        f"files in /dev/shm: {files['first']} at first, {files['last']} at last, {files['left']} left when all had ended"
-    )
+    console.print("in /dev/shm: {first} MB at first, {last} MB at last".format(**result["shm_mb"]))
 
 
 def main(argv: list[str] | None = None) -> int:
