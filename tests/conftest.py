@@ -1,5 +1,6 @@
 """Fixtures that several files share."""
 
+import logging
 import threading
 from collections.abc import Iterator
 
@@ -12,6 +13,16 @@ from tests.live import Running, free_port, hold_in_reach, penumbra_up
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests of the running chain come last: it would take the cores from all others until the session ends."""
     items.sort(key=lambda item: "running" in getattr(item, "fixturenames", ()))
+
+
+@pytest.fixture(autouse=True)
+def logs_as_before() -> Iterator[None]:
+    """A command that a test runs in this process configures the logs of the process; the next test finds them as they were."""
+    logger = logging.getLogger("penumbra")
+    handlers, level, propagate = logger.handlers[:], logger.level, logger.propagate
+    yield
+    logger.handlers[:], logger.propagate = handlers, propagate
+    logger.setLevel(level)
 
 
 @pytest.fixture(scope="session")

@@ -94,7 +94,7 @@ def starve(process: psutil.Process, need: Callable[[], None], seconds: float) ->
     while time.monotonic() < deadline:
         need()
         with suppress(psutil.TimeoutExpired):
-            process.wait(0.5)
+            process.wait(1.0)
             return True
     with suppress(ProcessLookupError):
         resource.prlimit(process.pid, resource.RLIMIT_AS, before)
@@ -102,8 +102,9 @@ def starve(process: psutil.Process, need: Callable[[], None], seconds: float) ->
 
 
 def large_frame(session: zenoh.Session, cell: str, camera: str) -> None:
-    """A picture of 18 MB, more than a reader has at hand: it needs new memory, though it will not use a picture of this size."""
-    frame = messages.Frame(stamp_ns=time.time_ns(), image=np.zeros((2000, 3000, 3), np.uint8))
+    """A picture as large as a message may be: its reader needs new memory for it (malloc has nothing of 32 MB or more at hand),
+    though it will not use a picture of this size."""
+    frame = messages.Frame(stamp_ns=time.time_ns(), image=np.zeros((4600, 4600, 3), np.uint8))
     session.put(topics.FRAME.at(cell=cell, camera=camera), messages.encode(frame))
 
 

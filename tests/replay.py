@@ -11,7 +11,7 @@ import heapq
 import importlib
 import itertools
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,8 +119,17 @@ class ReplayNode:
     def publish(self, topic: Topic, message: Message, **names: str) -> None:
         self._replay.send(topic, names, message, self._replay.now_ns)
 
-    def subscribe(self, topic: Topic, handler: Callable[[Any, dict[str, str]], None], **names: str) -> None:
-        self._replay.listen(topic, names, handler)
+    def subscribe(
+        self,
+        topic: Topic,
+        handler: Callable[[Any, dict[str, str]], None],
+        streams: Sequence[str] = (),
+        from_others: bool = False,
+        **names: str,
+    ) -> None:
+        """There is one replica of each service: all streams are its own, and there are no others."""
+        if not from_others:
+            self._replay.listen(topic, names, handler)
 
     def every(self, period_s: float, function: Callable[[], None]) -> None:
         self._replay.every(round(period_s * 1e9), function)
@@ -130,6 +139,9 @@ class ReplayNode:
 
     def owns(self, stream: str) -> bool:
         return True
+
+    def rank(self, stream: str) -> int:
+        return 0
 
 
 def digest(heard: list[Heard], period_s: float = 1.0) -> dict[str, list[Any]]:

@@ -55,7 +55,7 @@ def endpoint():
             "penumbra pose: --config /nowhere.json5: a Zenoh configuration (JSON5) expected",
         ),
         (["router", "--fly"], "penumbra router: unrecognized arguments: --fly (see penumbra router --help)"),
-        (["bench", "nothing"], "penumbra bench: one of ablation, fusion, haptics, live"),
+        (["bench", "nothing"], "penumbra bench: one of ablation, faults, fusion, haptics, live"),
     ],
 )
 def test_a_wrong_command_is_one_line_that_says_what_to_do_and_exit_code_two(argv, line, capsys):

@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 from rich.console import Console
 
@@ -128,6 +129,7 @@ def test_from_outside_every_instance_is_told_and_one_that_hangs_is_down(router, 
     assert (found["worker"].status, found["worker"].reasons) == ("degraded", ("nothing heard on camera/front/frame yet",))
     monkeypatch.setattr(cell_health, "ANSWER_S", 0.2)
     worker.send_signal(signal.SIGSTOP)  # its token is there until its lease ends
+    wait_for(lambda: psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED, 5, "it to stop")
     hung = next(each for each in seen(router) if each.service == "worker")
     worker.send_signal(signal.SIGCONT)
     assert hung.status == "down"

@@ -37,7 +37,8 @@ from tests.live import Running, connect, penumbra_up, wait_for
 DAY_S = 86_400.0
 SAMPLE_S = 5.0
 WARM_UP_S = 60.0
-"""Of every process: caches fill and code is compiled. A fifth of a shorter run."""
+"""Of every process: caches fill and code is compiled. A third of a shorter run."""
+ANSWER_S = 60.0
 LOOK_S, AWAY_S = 2.0, 4.0
 """How long a viewer watches, and an arm is away."""
 
@@ -98,7 +99,7 @@ class Life:
     def occlusion(self) -> None:
         """Something hides a share of the arm, or nothing does."""
         if self._away_until_s is None:
-            self.running.control({"command": "occlude", "value": float(self._rng.choice([0.0, 0.0, 0.5, 1.0]))})
+            self._control("occlude", float(self._rng.choice([0.0, 0.0, 0.5, 1.0])))
 
     def absence(self) -> None:
         """The arm is neither seen nor felt for a while, then it is back."""
@@ -135,16 +136,24 @@ class Life:
             self._away_until_s = None
             self._set_away(False)
 
+    def settle(self) -> None:
+        """The arm is back, in sight."""
+        self._set_away(False)
+
     def end(self) -> None:
+        """Nothing happens any more."""
         if self._restart is not None:
             self._restart.kill()
             self._restart.wait()
 
     def _set_away(self, is_away: bool) -> None:
-        self.running.control({"command": "occlude", "value": 1.0 if is_away else 0.0})
-        faults = [f"{pad} dead" for pad in self.cell.pads] if is_away else ["all none"]
-        for words in faults:
-            self.running.control({"command": "skin", "value": words})
+        self._control("occlude", 1.0 if is_away else 0.0)
+        for words in [f"{pad} dead" for pad in self.cell.pads] if is_away else ["all none"]:
+            self._control("skin", words)
+
+    def _control(self, command: str, value: float | str) -> None:
+        """Asks again while the emulator is away."""
+        wait_for(lambda: self.running.control({"command": command, "value": value}), ANSWER_S, "the emulator's answer", 0.2)
 
 
 EVENTS: dict[str, tuple[float, Callable[[Life], None]]] = {
@@ -167,7 +176,7 @@ class Gauge:
         self._launcher, self._router = launcher, router
         self.series: defaultdict[tuple[str, int], list[Sample]] = defaultdict(list)
         self.names: set[str] = set()  # of files in /dev/shm that one of them has mapped at any time
-        self.files: list[int] = []  # how many of these there were
+        self.shm_mb: list[float] = []  # what those took that were there
 
     def look(self) -> None:
         """Takes a sample of each."""
@@ -181,11 +190,12 @@ class Gauge:
                 own_mb = (memory.rss - memory.shared) / 1e6
                 sample = Sample(now_s, own_mb, process.num_threads(), process.num_fds(), len(mapped))
                 self.series[name, process.pid].append(sample)
-        self.files.append(self.left())
+        self.shm_mb.append(round(sum(self._sizes_mb()), 1))
 
-    def left(self) -> int:
-        """How many files that one of them has mapped are in /dev/shm now."""
-        return len(self.names & set(os.listdir("/dev/shm")))
+    def _sizes_mb(self) -> Iterator[float]:
+        for name in self.names:
+            with suppress(FileNotFoundError):
+                yield os.path.getsize(f"/dev/shm/{name}") / 1e6
 
     def _processes(self) -> Iterator[tuple[str, psutil.Process]]:
         yield "launcher", self._launcher
@@ -268,11 +278,10 @@ def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
                         EVENTS[name][1](life)
                         happened[name] += 1
                         due_s[name] += periods_s[name]
+            life.settle()
         finally:
             life.end()
-        running.control({"command": "skin", "value": "all none"})
-        running.control({"command": "occlude", "value": 0})
-        is_back = wait_for(running.is_tracking, 60, "a tracked pose at the end", 0.5)
+        is_back = wait_for(running.is_tracking, 120, "a tracked pose at the end", 0.5)
         gauge.look()
     return {
         "seed": seed,
@@ -280,8 +289,8 @@ def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
         "speed": speed,
         "events": dict(happened),
         "tracking_at_end": is_back,
-        "shm_files": {"first": gauge.files[0], "last": gauge.files[-1], "left": gauge.left()},
-        "rows": [asdict(row) for row in gauge.rows(min(WARM_UP_S, 12 * minutes))],
+        "shm_mb": {"first": gauge.shm_mb[0], "last": gauge.shm_mb[-1]},
+        "rows": [asdict(row) for row in gauge.rows(min(WARM_UP_S, 20 * minutes))],
     }
 
 
@@ -296,10 +305,7 @@ def show(result: dict, console: Console) -> None:
         gains = [f"{row[name]:+d}" for name in ("threads", "handles", "mapped")]
         table.add_row(row["service"], str(row["processes"]), f"{row['memory_mb']:.0f}", grown, *gains)
     console.print(table)
-    files = result["shm_files"]
-    console.print(
-        f"files in /dev/shm: {files['first']} at first, {files['last']} at last, {files['left']} left when all had ended"
-    )
+    console.print("in /dev/shm: {first} MB at first, {last} MB at last".format(**result["shm_mb"]))
 
 
 def main(argv: list[str] | None = None) -> int:
