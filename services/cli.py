@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 COMMANDS = {
     "up": "start every process of a cell with a router, and show what they do",
@@ -108,12 +109,14 @@ def serve(name: str, argv: list[str]) -> int:
     from shared.service import Node
 
     module = importlib.import_module(f"services.{name}.service")
+    _compile_on_full_disk()
     parser = arguments.parser(name, module.__doc__ or COMMANDS[name])
     arguments.add_metrics(parser)
     module.arguments(parser)
     options = parser.parse_args(argv)
     options.mode = options.mode or getattr(module, "MODE", None)
     logs.configure(options.log_level, options.log_format, name)
+    _die_with_thread()
     node = Node(module.NAME, cell.load(options.cell), bus.connection(options))
     with arguments.metrics(parser, options.metrics_port, lambda: [node.health()]):
         module.start(node, options)
@@ -185,6 +188,44 @@ def die_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != int(parent):  # it died before we asked
         sys.exit(1)
+
+
+def _die_with_thread() -> None:
+    """Ends the process with the first of its threads that fails: it would look alive and do a part of its work only. Whoever
+    started it starts it again. A thread without the memory to begin is one, for which its starter would wait for ever."""
+    tell, tell_unraisable = threading.excepthook, sys.unraisablehook
+
+    def end(failed: threading.ExceptHookArgs) -> None:
+        try:
+            tell(failed)
+        finally:  # also without memory for words
+            os._exit(1)
+
+    def end_without_memory(failed: sys.UnraisableHookArgs) -> None:
+        try:
+            tell_unraisable(failed)
+        finally:
+            if failed.exc_type is MemoryError:
+                os._exit(1)
+
+    threading.excepthook, sys.unraisablehook = end, end_without_memory
+
+
+def _compile_on_full_disk() -> None:
+    """Lets numba go on where there is no room to keep what it has compiled: it would fail, and the service with it."""
+    if "numba" not in sys.modules:
+        return
+    from numba.core.caching import IndexDataCacheFile
+
+    from shared import logs
+
+    save = IndexDataCacheFile.save
+
+    def save_where_there_is_room(file: IndexDataCacheFile, key: Any, data: Any) -> None:
+        with logs.lost_where_full():
+            save(file, key, data)
+
+    IndexDataCacheFile.save = save_where_there_is_room  # type: ignore[method-assign]
 
 
 if __name__ == "__main__":

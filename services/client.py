@@ -93,11 +93,13 @@ def list_topics(argv: list[str]) -> int:
     cell = cells.load(options.cell)
     console = Console(width=None if sys.stdout.isatty() else 200)
     if not options.hz:
-        table = Table("topic", "key", "message", "Hz", "quality of service", "stale after", "from", "what", box=None)
+        table = Table("topic", "key", "message", "Hz", "slow link", "quality of service", "priority", "stale after", "from",
+                      "what", box=None)  # fmt: skip
         for topic in topics.TOPICS:
             key = topic.key.replace("{cell}", cell.name)
-            table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", topic.qos.name.lower().replace("_", " "),
-                          f"{topic.stale_s:g} s", topic.publisher, escape(topic.about))  # fmt: skip
+            table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", f"{topic.slow_hz:g}",
+                          topic.qos.name.lower().replace("_", " "), topic.priority.name.lower(), f"{topic.stale_s:g} s",
+                          topic.publisher, escape(topic.about))  # fmt: skip
         console.print(table)
         return 0
     report, instances = listen(cell, bus.connection(options), options.seconds)

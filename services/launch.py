@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TextIO, cast
 
 from rich.console import Console
 from rich.live import Live
@@ -224,6 +224,7 @@ def main(argv: list[str]) -> int:
     arguments.add_log(parser)
     arguments.add_metrics(parser)
     options = parser.parse_args(argv)
+    sys.stdout, sys.stderr = cast(TextIO, logs.Lossy(sys.stdout)), cast(TextIO, logs.Lossy(sys.stderr))
     logs.configure(options.log_level, options.log_format, "launcher")
     cell = cells.load(options.cell)
     endpoint = meeting_point(options)

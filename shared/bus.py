@@ -22,6 +22,7 @@ import zenoh
 from shared import access
 from shared.guard import Guard
 from shared.messages import BadMessage, Message, decode
+from shared.slow import SlowLinks
 from shared.topics import TOPICS, Topic
 from shared.turn import Turn
 
@@ -47,7 +48,7 @@ class Connection:
     """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
     tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise; `secure`: a
     folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part; `service`: who
-    this is, and so whose certificate it shows."""
+    this is, and so whose certificate it shows; `slow`: a router's links that carry little."""
 
     mode: str | None = None
     connect: tuple[str, ...] = ()
@@ -55,6 +56,7 @@ class Connection:
     config: Path | None = None
     secure: Path | None = None
     service: str = access.VIEWER
+    slow: SlowLinks | None = None
 
     @property
     def default(self) -> str:
@@ -148,6 +150,11 @@ def configuration(connection: Connection) -> zenoh.Config:
             )
     if connection.secure is not None:
         settings |= _secure(connection.secure, access.holder(connection.service, mode == "router"), mode)
+    if connection.slow is not None:
+        settings |= connection.slow.settings()
+        for side in ("connect", "listen"):
+            if (found := settings.get(f"{side}/endpoints")) is not None:
+                settings[f"{side}/endpoints"] = connection.slow.bounded(found, side == "listen")
     for key, value in settings.items():
         try:
             config.insert_json5(key, json.dumps(value))
@@ -365,14 +372,14 @@ class Reader:
 
     def _take(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
-        names, traffic, guard = self._keys.get(key, ({}, self._strangers, None))
+        names, traffic, guard = self._keys.get(key) or ({}, self._strangers, None)
         publisher, number = _publisher(sample.source_info)
         try:
             if guard is None:
                 raise BadMessage("key", f"one of the cell's {len(self._keys)} keys expected, {key!r:.120} came")
             traffic.missed(guard.admit(publisher, number, time.monotonic()))  # before anything that takes long
             message = self._decode(sample)
-            guard.believe(publisher, message.stamp_ns, time.monotonic())
+            guard.believe(publisher, message.stamp_ns, time.monotonic(), getattr(message, "camera", ""))
         except BadMessage as error:
             traffic.bad[error.kind] = traffic.bad.get(error.kind, 0) + 1
             if traffic.bad[error.kind] == 1:

@@ -1,11 +1,13 @@
 """What a reader takes from a publisher: every message once, and no more of them than belong to its topic.
 
 A replayed message carries a number that was here before, or a stamp too old for its topic (`Topic.oldest_s`). A publisher is
-forgotten only when whatever it has sent is too old by its stamp.
+forgotten only when whatever it has sent is too old by its stamp. What another publisher says again, as where two replicas both
+take themselves for the owner, carries a stamp that was here before.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 from shared.messages import MAX_FUTURE_S, MAX_PAST_S, BadMessage
@@ -17,6 +19,8 @@ PUBLISHERS = 16
 FORGET_S = MAX_PAST_S + MAX_FUTURE_S
 WINDOW = 64
 """Numbers that may arrive out of order."""
+MEASUREMENTS = 64
+"""Measurements of a key that are remembered: of the slowest stream more than its oldest that is taken."""
 NUMBERS = 1 << 32
 """Publishers count modulo this: at 200 Hz it comes around after eight months."""
 
@@ -75,6 +79,7 @@ class Guard:
     def __init__(self, rate_hz: float):
         self._limit_hz = RATE_TIMES * rate_hz
         self._publishers: dict[str, _Publisher] = {}
+        self._measurements: deque[tuple[int, str]] = deque(maxlen=MEASUREMENTS)
 
     def admit(self, publisher: str, number: int | None, now_s: float) -> int | None:
         """How many more numbers of this publisher are missing than before; None where it does not count. `now_s` must not run
@@ -92,14 +97,18 @@ class Guard:
             raise BadMessage("rate", f"at most {self._limit_hz:g} messages a second of a publisher expected, more came")
         return missing
 
-    def believe(self, publisher: str, stamp_ns: int, now_s: float) -> None:
-        """Takes a good message that was admitted. Raises BadMessage where a publisher that does not number its messages sends one
-        that is not newer; one that does may, as where a pose of one camera is older than the last of another."""
+    def believe(self, publisher: str, stamp_ns: int, now_s: float, camera: str = "") -> None:
+        """Takes a good message that was admitted; camera: of whose picture it tells, where it tells of one. Raises BadMessage for
+        a measurement that somebody has told already, and where a publisher that does not number its messages sends one that is
+        not newer; one that does may, as where a pose of one camera is older than the last of another."""
         found = self._publishers[publisher]
         if found.window is None:
             if found.stamp_ns is not None and stamp_ns <= found.stamp_ns:
                 raise BadMessage("replayed", f"without numbers, a stamp after {found.stamp_ns} expected, {stamp_ns} came")
             found.stamp_ns = stamp_ns
+        if (stamp_ns, camera) in self._measurements:
+            raise BadMessage("repeated", f"every measurement once expected, that of stamp {stamp_ns} came again")
+        self._measurements.append((stamp_ns, camera))
         found.heard_s = now_s
 
     def _newcomer(self, publisher: str, now_s: float) -> _Publisher:

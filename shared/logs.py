@@ -5,13 +5,15 @@ A line of JSON is `{time, level, service, instance, message, fields}`, and `trac
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import logging
 import sys
 import threading
-from collections.abc import MutableMapping
+from collections.abc import Iterator, MutableMapping
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, TextIO
 
 LEVELS = ("debug", "info", "warning", "error")
 FORMATS = ("text", "json")
@@ -64,6 +66,39 @@ def sentence(line: str) -> str:
         return str(json.loads(line)["message"])
     except (ValueError, TypeError, KeyError):
         return line
+
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Why a disk takes no more."""
+
+
+class Lossy:
+    """A text stream that goes on while its disk is full: what cannot be written is lost. Otherwise the stream that it is of."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with lost_where_full():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with lost_where_full():
+            self._stream.flush()
+
+
+@contextlib.contextmanager
+def lost_where_full() -> Iterator[None]:
+    """What is written in it is lost where the disk is full."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
 
 
 class _ToStandardError(logging.Handler):

@@ -11,8 +11,9 @@ import dataclasses
 import functools
 import itertools
 import math
+import struct
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,6 +44,10 @@ UNIT_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from one."""
 ROUNDING = 1e-6
 """What shares and matrices may be off by rounding, relative."""
+LARGE = 65_536
+"""Bytes of an array from which it is worth while not to copy it twice."""
+BIN32 = 0xC6
+"""MessagePack's head of bytes with their number in 32 bits."""
 _STRUCTURE = {"max_array_len": 16, "max_map_len": 32, "max_str_len": 256, "max_ext_len": 0}
 """What MessagePack may hold: more than any message needs, less than fills a memory."""
 
@@ -52,6 +57,10 @@ class _ArraySpec:
     dtype: str
     shape: tuple[int | None, ...]  # None: any positive length
     check: Callable[[np.ndarray], str | None] | None = None  # what else is wrong with the values
+
+    @functools.cached_property
+    def numpy(self) -> np.dtype:
+        return np.dtype(self.dtype)
 
 
 def _array(dtype: str, *shape: int | None, check: Callable[[np.ndarray], str | None] | None = None) -> Any:
@@ -216,6 +225,13 @@ def _read_fields(kind: Any) -> Fields:
 _fields = typing.cast(Callable[[type[Message]], Fields], functools.cache(_read_fields))
 
 
+def _read_names(kind: Any) -> frozenset[str]:
+    return frozenset(field.name for field in dataclasses.fields(kind))
+
+
+_field_names = typing.cast(Callable[[type[Message]], frozenset[str]], functools.cache(_read_names))
+
+
 @functools.cache
 def _dtype_name(dtype: np.dtype) -> str:
     """numpy puts the name together anew each time, which takes longer than the rest of an array."""
@@ -225,6 +241,7 @@ def _dtype_name(dtype: np.dtype) -> str:
 def encode(message: Message) -> bytes:
     """The MessagePack bytes of a message. Raises BadMessage where an array has not the declared dtype and shape."""
     out: dict[str, Any] = {"version": VERSION}
+    large = False
     for name, _, metadata in _fields(type(message)):
         value = getattr(message, name)
         spec = metadata.get("array")
@@ -232,14 +249,30 @@ def encode(message: Message) -> bytes:
             value = np.ascontiguousarray(value)
             dtype = _dtype_name(value.dtype)
             _check_array(name, spec, dtype, value.shape)
-            out[name] = [dtype, value.shape, value.data.cast("B")]  # a view: the only copy is MessagePack's
+            out[name] = [dtype, value.shape, value.data.cast("B")]  # a view: nothing is copied yet
+            large |= value.nbytes >= LARGE
         elif isinstance(value, dict):
             out[name] = {key: dict(vars(item)) for key, item in value.items()}
         elif isinstance(value, np.generic):
             out[name] = value.item()
         else:
             out[name] = value
-    return msgpack.packb(out)
+    return b"".join(_pieces(out)) if large else msgpack.packb(out)
+
+
+def _pieces(fields: dict[str, Any]) -> Iterator[bytes | memoryview]:
+    """What MessagePack makes of a message's fields, with the bytes of arrays as they are: `packb` would copy them twice."""
+    packer = msgpack.Packer()
+    yield packer.pack_map_header(len(fields))
+    for name, value in fields.items():
+        yield packer.pack(name)
+        if isinstance(value, list):
+            dtype, shape, view = value
+            yield packer.pack_array_header(3) + packer.pack(dtype) + packer.pack(shape)
+            yield struct.pack(">BI", BIN32, view.nbytes)
+            yield view
+        else:
+            yield packer.pack(value)
 
 
 def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: float = MAX_PAST_S) -> M:
@@ -251,6 +284,8 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: f
         raise BadMessage("size", f"{kind.__name__}: at most {kind.MAX_BYTES} bytes expected, {len(payload)} came")
     try:
         raw = _unpack(payload)
+    except MemoryError:  # the reader's fault
+        raise
     except Exception as error:
         raise BadMessage("msgpack", f"{kind.__name__}: MessagePack expected, came {payload[:16]!r}… ({error!s:.100})") from None
     if not isinstance(raw, dict):
@@ -262,7 +297,7 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: f
             f"{kind.__name__}: wire version {VERSION} expected, {_short(version)} came: run one release of Penumbra everywhere",
         )
     specs = _fields(kind)
-    if raw.keys() != {name for name, _, _ in specs}:
+    if raw.keys() != _field_names(kind):
         raise BadMessage(
             "fields", f"{kind.__name__}: fields {[n for n, _, _ in specs]} expected, {sorted(map(_short, raw))} came"
         )
@@ -351,11 +386,12 @@ def _array_from_wire(where: str, spec: _ArraySpec, value: Any) -> np.ndarray:
         raise BadMessage("array", f"{where}: [dtype, shape, bytes] expected, {_short(value)} came")
     dtype, shape, data = value
     _check_array(where, spec, dtype, tuple(shape))
-    expected = int(np.dtype(dtype).itemsize) * math.prod(shape)
+    expected = spec.numpy.itemsize * math.prod(shape)
     if len(data) != expected:
         raise BadMessage("array", f"{where}: {expected} bytes for {dtype} {shape} expected, {len(data)} came")
-    array = np.frombuffer(data, dtype=dtype).reshape(shape)
-    if array.dtype.kind == "f" and not np.abs(array).max() <= LARGEST:  # also where it is NaN
+    array = np.frombuffer(data, spec.numpy).reshape(shape)
+    # the sum of squares is soon made, and small where all is well; else each number is looked at, also where it is NaN
+    if spec.numpy.kind == "f" and not np.vdot(array, array) <= LARGEST and not np.abs(array).max() <= LARGEST:
         count = int((~(np.abs(array) <= LARGEST)).sum())
         raise BadMessage("finite", f"{where}: finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not")
     fault = spec.check(array) if spec.check else None

@@ -237,7 +237,7 @@ class Node:
         publisher = session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK if topic.qos is QoS.NEVER_DROP else zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.INTERACTIVE_HIGH if topic.qos is QoS.NEVER_DROP else zenoh.Priority.DATA,
+            priority=getattr(zenoh.Priority, topic.priority.value),
         )
         traffic = self._published.setdefault(key, bus.Traffic(topic.stale_s))
         return publisher, traffic, publisher.id, itertools.count()
@@ -509,7 +509,10 @@ class Node:
         return "" if self._reachable else f"no router at {self.connection.where}"
 
     def fault(self, where: str, error: Exception) -> None:
-        """Counts an exception; the first of its kind and place is logged with its trace."""
+        """Counts an exception; the first of its kind and place is logged with its trace. Raises a MemoryError again: what is out
+        of memory does nothing well any more, and ends to begin anew (`services.cli.serve`)."""
+        if isinstance(error, MemoryError):
+            raise error
         frames = traceback.extract_tb(error.__traceback__)
         place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "?"
         kind = f"{type(error).__name__} at {place}"

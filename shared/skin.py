@@ -9,16 +9,22 @@ only the gap d to the skin is known: v = a3 + polarity * a1 / (1 + a2 d^2).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from shared import body
 from shared import cell as cells
 
 Array = NDArray[np.float64]
 
 GAIN_GAPS = (0.02, 0.05, 0.10)
 """Gaps [m] at which a calibrated law is compared with the designed one."""
+HOME_SIGMAS = 3.0
+"""A target is within so many standard deviations of its home …"""
+RANGES = 2.0
+"""… and is felt from less than so many times a pad's range."""
 
 
 def electrode_positions(pad_type: cells.PadType) -> Array:
@@ -98,6 +104,32 @@ class Skin:
         """Noise-free amplitudes (..., n) [V] that the response law has at gaps (..., n) [m]; a negative gap counts as contact."""
         d = np.maximum(gaps, 0.0)
         return self.a3 + self.polarity * self.peak / (1.0 + self.a2 * d * d)
+
+
+@dataclass(frozen=True)
+class Near:
+    """The pads of a cell that one of its targets may come near: those on robots, and of the others those around its home. `cell`:
+    with these pads alone; pads (k,) and electrodes (m,): which ones they are in the whole cell's `Skin`."""
+
+    cell: cells.Cell
+    pads: NDArray[np.int64]
+    electrodes: NDArray[np.int64]
+
+    @staticmethod
+    def of(cell: cells.Cell, target: str) -> Near:
+        found = cell.targets[target]
+        limb = float(np.linalg.norm(body.target_mesh(found, cell).vertices, axis=1).max())
+        reach = HOME_SIGMAS * found.home_spread.position + limb
+
+        def is_near(pad: cells.Pad) -> bool:
+            away = np.linalg.norm(np.subtract(pad.position, found.home.position))
+            return pad.link != "world" or bool(away < reach + RANGES * cell.pad_types[pad.type].range)
+
+        pads = {name: pad for name, pad in cell.pads.items() if is_near(pad)}
+        places = np.array([place for place, name in enumerate(cell.pads) if name in pads], dtype=np.int64)
+        counts = [len(cell.pad_types[pad.type].electrodes) for pad in cell.pads.values()]
+        whose = np.repeat(np.arange(len(counts)), counts)
+        return Near(cell.model_copy(update={"pads": pads}), places, np.flatnonzero(np.isin(whose, places)))
 
 
 def link_names(robots: Mapping[str, Mapping[str, Array]]) -> dict[str, Array]:

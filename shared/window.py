@@ -79,7 +79,7 @@ def whole_frame(camera: Sized) -> Window:
 
 class Lookout:
     """Where to look in the frames of one camera: around the targets of its cell as fusion predicts them, and around the homes of
-    those that are lost."""
+    those that are lost. targets: those that it can see, by what its picture shows of the region around their homes."""
 
     def __init__(self, cell: Cell, camera: str):
         self._camera = cell.cameras[camera]
@@ -90,12 +90,16 @@ class Lookout:
             corners = corners_of(body.target_mesh(target, cell).vertices)
             home, spread = geometry.apply(target.home.transform, corners), target.home_spread
             room = HOME_SIGMAS * np.hypot(spread.position, spread.rotation * np.abs(corners).max())
-            self._boxes[name], self._homes[name] = corners, (np.eye(4), corners_of(np.vstack([home - room, home + room])))
+            region = corners_of(np.vstack([home - room, home + room]))
+            if _is_in_picture(self._camera, region):
+                self._boxes[name], self._homes[name] = corners, (np.eye(4), region)
+        self.targets = tuple(self._boxes)
         self._window = self._wide()
 
     def hear(self, pose: FusedPose) -> None:
-        """Takes the newest fused pose of a target."""
-        self._poses[pose.target] = pose
+        """Takes the newest fused pose of a target; of one that it cannot see nothing is kept."""
+        if pose.target in self._boxes:
+            self._poses[pose.target] = pose
 
     @property
     def window(self) -> Window:
@@ -113,6 +117,15 @@ class Lookout:
     def _wide(self, lost: Iterable[str] = (), sure: Iterable[tuple[Array, Array]] = ()) -> Window:
         homes = [self._homes[name] for name in lost or self._homes]
         return window_around(self._camera, [*homes, *sure], None, MAX_PIXELS_WIDE) or whole_frame(self._camera)
+
+
+def _is_in_picture(camera: Camera, region: Array) -> bool:
+    """Whether a camera may see something of a box, given as its corners (8, 3) in the world: unless all of them lie beyond one
+    side of what it sees."""
+    x, y, z = geometry.apply(geometry.inverse(camera.T_world_camera), region).T
+    u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
+    sides = (z - NEAR_M, u, camera.width * z - u, v, camera.height * z - v)
+    return all((side >= 0.0).any() for side in sides)
 
 
 def window_around(

@@ -27,8 +27,15 @@ class SkinModel:
 
     def change(self, T_world_pads: Array, T_world_target: Array, joints: ArrayLike = ()) -> Array:
         """Changes of capacitance (n,) [fF] by the target and by the robots at all their joint angles (j,), for pads (p, 4, 4)."""
-        T_pads_target = np.stack([inverse(T) for T in T_world_pads]) @ T_world_target
-        return self._response.change(T_pads_target) + self._response.rest(joints)
+        return self.limb(T_world_pads, T_world_target) + self.rest(joints)
+
+    def limb(self, T_world_pads: Array, T_world_target: Array) -> Array:
+        """The target's part of the changes (n,) [fF]."""
+        return self._response.change(np.stack([inverse(T) for T in T_world_pads]) @ T_world_target)
+
+    def rest(self, joints: ArrayLike) -> Array:
+        """The robots' part of the changes (n,) [fF]."""
+        return self._response.rest(joints)
 
     def volts(self, change: ArrayLike, rng: np.random.Generator) -> Array:
         """Amplitudes (..., n) [V] of samples of a millisecond, for changes (..., n) [fF]: signal chain, white noise of the

@@ -1,7 +1,8 @@
 """The simulated cell: where everything is at a time, what the cameras see and what the skin feels.
 
-`World(cell, seed).state(t)` is a function of time, seed and the commands given (occlude, motion, pause, speed). The target
-moves by reaches that never touch robot, pads or table; upper arm and torso follow it.
+`World(cell, seed).state(t)` is a function of time, seed and the commands given (occlude, motion, pause, speed). Each target is a
+person's (`sim.actor`), who moves by reaches that never touch robot, pads or table. Persons do not make way for one another: their
+homes should be as far apart as people work.
 """
 
 from __future__ import annotations
@@ -15,16 +16,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from shared import cell as cells
-from shared import geometry
 from shared.body import Mesh
 from shared.geometry import Array
 from shared.messages import Frame, Joints, Message, Truth, Voltages
 from shared.robot import robot_models
 from shared.skin import link_names
-from shared.surface import Surface
 from shared.topics import FRAME, JOINTS, TRUTH, VOLTAGES, Topic
-from sim.clearance import Clearance
-from sim.motion import Clock, LimbMotion, angular_velocity, joint_motions
+from shared.window import Lookout
+from sim.actor import Actor, Placed
+from sim.motion import Clock, joint_motions
 from sim.occluder import OcclusionSchedule, Panel
 from sim.person import Person
 from sim.scene import Cameras, View, furniture
@@ -39,16 +39,29 @@ MAX_SPEED = 4.0
 
 @dataclass(frozen=True)
 class WorldState:
-    """Where everything is. time_s: real time; T_world_target (4, 4), the same as pose (6,): x, y, z [m], roll, pitch, yaw [rad];
-    velocity (6,): linear [m/s] and angular [rad/s] along the world's axes; joints by robot (n,); links: T_world_link by robot and
-    link."""
+    """Where everything is. time_s: real time; targets by name; joints by robot (n,); links: T_world_link by robot and link."""
 
     time_s: float
-    T_world_target: Array
-    pose: Array
-    velocity: Array
+    targets: dict[str, Placed]
     joints: dict[str, Array]
     links: dict[str, dict[str, Array]]
+
+    @property
+    def T_world_target(self) -> Array:
+        """Of the cell's first target, as the next two."""
+        return self._first.T_world_target
+
+    @property
+    def pose(self) -> Array:
+        return self._first.pose
+
+    @property
+    def velocity(self) -> Array:
+        return self._first.velocity
+
+    @property
+    def _first(self) -> Placed:
+        return next(iter(self.targets.values()))
 
 
 class World:
@@ -60,75 +73,84 @@ class World:
     def __init__(self, cell: cells.Cell, seed: int = 0):
         if cell.sim is None:
             raise cells.CellError(f"cell {cell.name} has no `sim`: the emulator needs its motion, shoulder and joint bounds")
-        if len(cell.targets) != 1:
-            raise cells.CellError(
-                f"cell {cell.name}: the emulator moves one target, {len(cell.targets)} came: {', '.join(cell.targets)}"
-            )
         self.cell, self.sim, self.seed = cell, cell.sim, seed
-        self.target_name, self.target = next(iter(cell.targets.items()))
-        self.person = Person(cell, cell.sim, self.target)
         self.robots = robot_models(cell)
-        self.skin = SkinModel(cell, self.target_name) if cell.pads else None
-        self._surface = Surface(self.person.meshes[0].vertices, self.person.meshes[0].faces)
+        self._joint_motions = joint_motions(cell, cell.sim, seed)
+        self.actors = {
+            name: Actor(cell, cell.sim, name, seed + i, self.robots, self._joint_motions) for i, name in enumerate(cell.targets)
+        }
+        self.skin = SkinModel(cell, next(iter(cell.targets))) if cell.pads else None
         self.skin_faults = SkinFaults(self.skin.skin) if self.skin else None
         self._furniture = furniture(cell, cell.sim)
         self._cameras = Cameras(cell, seed)
+        self._shown = {camera: Lookout(cell, camera).targets for camera in cell.cameras}
         self.clock, self.occlusion_clock = Clock(), Clock()
         self.occlusion = OcclusionSchedule(seed)
         self.panel = Panel(seed)
         self._motion, self._paused, self._speed = True, False, 1.0
-        self._joint_motions = joint_motions(cell, cell.sim, seed)
-        clearance = Clearance(
-            self.person, self.robots, self._joint_motions, self.skin.skin if self.skin else None, cell.sim.table is not None
-        )
-        self._limb = LimbMotion(cell.sim.motion, seed, clearance)
+
+    @property
+    def person(self) -> Person:
+        """Whose the cell's first target is."""
+        return next(iter(self.actors.values())).person
+
+    def model(self, camera: str) -> str:
+        """The target whose picture in a camera is measured, and hidden: the first that it sees."""
+        return next(iter(self._shown[camera] or self.actors))
 
     def state(self, time_s: float) -> WorldState:
         """Where everything is at a time."""
         scene_s = self.clock.at(time_s)
-        pose, rate = self._limb.at(scene_s)
         joints = {name: motion.at(scene_s) for name, motion in self._joint_motions.items()}
         return WorldState(
             time_s=time_s,
-            T_world_target=geometry.from_rpy(pose[:3], pose[3:]),
-            pose=pose,
-            velocity=self.clock.rate(time_s) * np.concatenate([rate[:3], angular_velocity(pose[3:], rate[3:])]),
+            targets={name: actor.at(scene_s, self.clock.rate(time_s)) for name, actor in self.actors.items()},
             joints=joints,
             links={name: self.robots[name].link_transforms(q) for name, q in joints.items()},
         )
 
     def plan(self, until_s: float) -> None:
-        """Plan the limb's motion up to a time at the present speed, so that `state` answers at once."""
-        self._limb.plan(self.clock.at(until_s))
+        """Plan the limbs' motion up to a time at the present speed, so that `state` answers at once."""
+        for actor in self.actors.values():
+            actor.plan(self.clock.at(until_s))
 
     def electrodes(self, state: WorldState) -> Array:
         """Electrode centroids (n, 3) [m] in the world, in the order of `shared.skin.Skin`."""
         assert self.skin is not None
         return self.skin.skin.positions(self.skin.skin.T_world_pads(link_names(state.links)))
 
-    def gaps(self, state: WorldState) -> Array:
-        """Distance [m] (n,) from every electrode to the target's skin; empty where the cell has no pads."""
-        if self.skin is None:
+    def gaps(self, state: WorldState, target: str | None = None) -> Array:
+        """Distances [m] from the electrodes that a target may come near to its skin; of the first target where none is named."""
+        target = self.cell.one("targets", target)
+        actor = self.actors[target]
+        if self.skin is None or not len(actor.near.electrodes):
             return np.empty(0)
-        local = geometry.apply(geometry.inverse(state.T_world_target), self.electrodes(state))
-        return np.maximum(self._surface.nearest(local)[0], 0.0)
+        return actor.gaps(state.targets[target], self.electrodes(state)[actor.near.electrodes])
 
     def change(self, state: WorldState) -> Array:
-        """Changes of capacitance (n,) [fF] by the target and the robots."""
+        """Changes of capacitance (n,) [fF] by the targets and the robots."""
         assert self.skin is not None
         joints = np.concatenate([*state.joints.values(), np.zeros(0)])
-        return self.skin.change(self.skin.skin.T_world_pads(link_names(state.links)), state.T_world_target, joints)
+        T_world_pads = self.skin.skin.T_world_pads(link_names(state.links))
+        change = np.array(self.skin.rest(joints))
+        for name, actor in self.actors.items():
+            change[actor.near.electrodes] += actor.change(state.targets[name], T_world_pads)
+        return change
 
     def view(self, camera: str, time_s: float) -> View:
         """What a camera sees at a time."""
         return self._cameras.view(camera, self.bodies(camera, self.state(time_s)), time_s)
 
     def bodies(self, camera: str, state: WorldState) -> dict[str, tuple[Mesh, Array]]:
-        """Everything that a camera may see by name, with its T_world_mesh: target, upper_arm, torso, ROBOT/LINK, pads, table and
-        occluder."""
+        """Everything that a camera may see by name, with its T_world_mesh: target, upper_arm, torso (of other persons followed by
+        the target's name), ROBOT/LINK, pads, table and occluder."""
         links = {"world": np.eye(4), **link_names(state.links)}
-        person = zip(("target", "upper_arm", "torso"), self.person.meshes, self.person.poses(state.T_world_target), strict=False)
-        out = {name: (mesh, T) for name, mesh, T in person}
+        model = self.model(camera)
+        out: dict[str, tuple[Mesh, Array]] = {}
+        for name in dict.fromkeys((model, *self._shown[camera])):
+            person, T = self.actors[name].person, state.targets[name].T_world_target
+            parts = zip(("target", "upper_arm", "torso"), person.meshes, person.poses(T), strict=False)
+            out |= {part if name == model else f"{part} {name}": (mesh, T) for part, mesh, T in parts}
         out |= {
             f"{robot}/{link}": (mesh, state.links[robot][link])
             for robot, model in self.robots.items()
@@ -141,12 +163,14 @@ class World:
     def occluder(self, camera: str, state: WorldState) -> Array | None:
         """T_world_panel (4, 4) before a camera, None where it is away."""
         level = self.occlusion.at(self.occlusion_clock.at(state.time_s))
-        return self.panel.pose(level, self.cell.cameras[camera], self.person.meshes[0], state.T_world_target)
+        model = self.model(camera)
+        mesh, T_world_target = self.actors[model].person.meshes[0], state.targets[model].T_world_target
+        return self.panel.pose(level, self.cell.cameras[camera], mesh, T_world_target)
 
     # Commands
 
     def occlude(self, level: float | None, time_s: float) -> None:
-        """Hide a share [0, 1] of the target's pixels from the first camera (above 0.95: all), or follow the schedule (None)."""
+        """Hide a share [0, 1] of the target's pixels from each camera (above 0.95: all), or follow the schedule (None)."""
         if level is not None and not 0.0 <= level <= 1.0:
             raise ValueError(f"occlude: a share from 0 to 1 or auto expected, {level} came")
         self.occlusion.command(self.occlusion_clock.at(time_s), level)
@@ -205,31 +229,36 @@ Stream = list[tuple[Topic, dict[str, str], Message]]
 
 class Sensors:
     """The messages that a world gives off. Time zero of the world is `epoch_ns`; tick k of the skin ends at epoch + k TICK_NS,
-    frame k is exposed at epoch + k periods of its camera. Ticks and frames may be left out; what is left has the same values."""
+    frame k is exposed at epoch + k periods of its camera. Ticks and frames may be left out; what is left has the same values.
+    The epoch may be moved at any time, where a clock is set: stamps follow it, the world does not."""
 
     def __init__(self, world: World, epoch_ns: int):
         self.world, self.epoch_ns = world, epoch_ns
         self._logs: tuple[int, Array] | None = None  # tick and its log changes, for the samples up to the next
-        self._hidden: deque[tuple[int, float]] = deque([(epoch_ns, 0.0)], maxlen=4)  # stamp of a frame and what was hidden in it
+        self._watch: dict[str, str] = {}  # the first camera that is on a target, and this target
+        for camera in world.cell.cameras:
+            if (name := world.model(camera)) not in self._watch.values():
+                self._watch[camera] = name
+        # world's times of its frames, and what was hidden in them
+        self._hidden = {name: deque([(0, 0.0)], maxlen=4) for name in world.actors}
 
-    def frame_stamp_ns(self, camera: str, k: int) -> int:
-        """When frame k of a camera is exposed."""
-        return self.epoch_ns + round(k * 1e9 / self.world.cell.cameras[camera].rate_hz)
+    def frame_ns(self, camera: str, k: int) -> int:
+        """When frame k of a camera is exposed, since the epoch."""
+        return round(k * 1e9 / self.world.cell.cameras[camera].rate_hz)
 
     def frame(self, camera: str, k: int) -> Stream:
         """Frame k of a camera."""
-        stamp_ns = self.frame_stamp_ns(camera, k)
-        view = self.world.view(camera, (stamp_ns - self.epoch_ns) * 1e-9)
-        if camera == next(iter(self.world.cell.cameras)):
-            self._hidden.append((stamp_ns, view.hidden))
-        return [(FRAME, {"camera": camera}, Frame(stamp_ns=stamp_ns, image=view.image))]
+        at_ns = self.frame_ns(camera, k)
+        view = self.world.view(camera, at_ns * 1e-9)
+        if camera in self._watch:
+            self._hidden[self._watch[camera]].append((at_ns, view.hidden))
+        return [(FRAME, {"camera": camera}, Frame(stamp_ns=self.epoch_ns + at_ns, image=view.image))]
 
     def tick(self, k: int) -> Stream:
-        """Voltages of every pad, joints of every robot and the truth at tick k >= 1."""
+        """Voltages of every pad, joints of every robot and the truths at tick k >= 1."""
         world, cell = self.world, self.world.cell
         stamp_ns = self.epoch_ns + k * TICK_NS
         state = world.state(k * TICK_NS * 1e-9)
-        gaps = world.gaps(state)
         out: Stream = []
         faults = world.skin_faults
         if world.skin is not None and faults is not None:
@@ -245,17 +274,21 @@ class Sensors:
                 out.append((VOLTAGES, {"pad": pad}, Voltages(stamp_ns=stamp_ns, period_ns=SAMPLE_NS, volts=samples)))
             self._logs = (k, logs)
         out += [(JOINTS, {"robot": name}, Joints(stamp_ns=stamp_ns, position=q)) for name, q in state.joints.items()]
-        truth = Truth(
+        truths = [(TRUTH, {"target": name}, self._truth(name, state, stamp_ns, k * TICK_NS)) for name in world.actors]
+        return [*out, *truths]
+
+    def _truth(self, target: str, state: WorldState, stamp_ns: int, at_ns: int) -> Truth:
+        placed = state.targets[target]
+        return Truth(
             stamp_ns=stamp_ns,
-            target=world.target_name,
-            frame=cell.frame,
-            position=state.pose[:3],
-            orientation=Rotation.from_euler("xyz", state.pose[3:]).as_quat(canonical=True),
-            velocity=state.velocity,
-            hidden=next((hidden for stamp, hidden in reversed(self._hidden) if stamp <= stamp_ns), 0.0),
-            gap=float(gaps.min(initial=FAR)),
+            target=target,
+            frame=self.world.cell.frame,
+            position=placed.pose[:3],
+            orientation=Rotation.from_euler("xyz", placed.pose[3:]).as_quat(canonical=True),
+            velocity=placed.velocity,
+            hidden=next((hidden for seen_ns, hidden in reversed(tuple(self._hidden[target])) if seen_ns <= at_ns), 0.0),
+            gap=float(self.world.gaps(state, target).min(initial=FAR)),
         )
-        return [*out, (TRUTH, {"target": world.target_name}, truth)]
 
 
 def record(
@@ -277,7 +310,7 @@ def stream(
     counts = dict.fromkeys(world.cell.cameras if frames else (), 0)
     for k in range(1, (ends_ns - epoch_ns) // TICK_NS + 1):
         for camera in counts:
-            while sensors.frame_stamp_ns(camera, counts[camera]) <= epoch_ns + k * TICK_NS:
+            while sensors.frame_ns(camera, counts[camera]) <= k * TICK_NS:
                 yield from sensors.frame(camera, counts[camera])
                 counts[camera] += 1
         yield from sensors.tick(k)

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from shared import bus, messages, topics
-from tests.live import Running, free_port, penumbra_up, wait_for
+from shared import bus
+from tests.live import Running, free_port, hold_in_reach, penumbra_up
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -18,13 +18,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def running() -> Running:
     """The whole chain on the table cell, held still in sight and in reach: what happens to the pose is the test's doing."""
     with penumbra_up("table", 5) as running:
-        wait_for(running.is_tracking, 180, "a tracked pose", 0.2)
-        wait_for(lambda: running.control({"command": "occlude", "value": 0}), 10, "the emulator's answer")
-        truths = running.session.declare_subscriber(topics.TRUTH.at(cell="table"))
-        wait_for(lambda: in_reach(truths.recv()), 60, "the arm above the pads", 0.0)
-        wait_for(lambda: running.control({"command": "motion", "value": "off"}), 10, "the emulator's answer")
-        truths.undeclare()
-        wait_for(lambda: running.is_tracking() and len(running.pose()["sources"]) == 2, 60, "a tracked pose of both senses", 0.2)
+        hold_in_reach(running)
         yield running
 
 
@@ -35,7 +29,3 @@ def router() -> Iterator[str]:
     session = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)
     yield endpoint
     session.close()
-
-
-def in_reach(sample) -> bool:
-    return 0.04 < messages.decode(messages.Truth, sample.payload.to_bytes()).gap < 0.09

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +16,8 @@ from typing import Any
 import psutil
 import zenoh
 
-from shared import topics
+from shared import cell as cells
+from shared import messages, topics
 
 
 def wait_for(condition: Callable[[], Any], seconds: float, what: str, interval: float = 0.02) -> Any:
@@ -94,14 +96,37 @@ class Running:
 
 
 @contextmanager
-def penumbra_up(cell: str, seed: int, *arguments: str) -> Iterator[Running]:
-    """The whole chain as real processes on a free port, stopped as by Ctrl-C at the end."""
-    port = free_port()
+def penumbra_up(
+    cell: str, seed: int, *arguments: str, port: int | None = None, environment: Mapping[str, str] | None = None, **streams: Any
+) -> Iterator[Running]:
+    """The whole chain as real processes, stopped as by Ctrl-C at the end.
+
+    port: of the router on loopback, a free one if none is given. environment: beside that of this process. streams: where stdout
+    (default: nowhere) and stderr of the launcher go.
+    """
+    port = port or free_port()
     command = [sys.executable, "-m", "services.cli", "up", "--cell", cell, "--seed", str(seed), "--port", str(port), *arguments]
-    launcher = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    launcher = subprocess.Popen(command, env={**os.environ, **(environment or {})}, **({"stdout": subprocess.DEVNULL} | streams))
     try:
         with connect(port) as session:
-            yield Running(cell, port, launcher, session)
+            yield Running(cells.load(cell).name, port, launcher, session)
     finally:
         launcher.terminate()
         launcher.wait(10)
+
+
+def hold_in_reach(running: Running) -> None:
+    """Waits until the arm is tracked in sight of the camera and above the pads, and stops it there: what happens to the pose from
+    then on is the test's doing."""
+    wait_for(running.is_tracking, 180, "a tracked pose", 0.2)
+    wait_for(lambda: running.control({"command": "occlude", "value": 0}), 10, "the emulator's answer")
+    truths = running.session.declare_subscriber(topics.TRUTH.at(cell=running.cell))
+    wait_for(lambda: _is_in_reach(truths.recv()), 60, "the arm above the pads", 0.0)
+    wait_for(lambda: running.control({"command": "motion", "value": "off"}), 10, "the emulator's answer")
+    truths.undeclare()
+    both = lambda: running.is_tracking() and len(running.pose()["sources"]) == 2  # noqa: E731
+    wait_for(both, 60, "a tracked pose of the resting arm, by both senses", 0.2)
+
+
+def _is_in_reach(sample: zenoh.Sample) -> bool:
+    return 0.04 < messages.decode(messages.Truth, sample.payload.to_bytes()).gap < 0.09

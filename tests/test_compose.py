@@ -37,8 +37,8 @@ def containers(service: str) -> list[dict]:
 @contextmanager
 def up(*files: str):
     """The whole cell in containers."""
-    compose(*files, "up", "--build", "--detach", "--wait", "--wait-timeout", "600")
     try:
+        compose(*files, "up", "--build", "--detach", "--wait", "--wait-timeout", "900")
         yield
     except BaseException:
         print(compose(*files, "logs", "--tail", "40"))

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from services.emulator.control import COMMANDS, control
-from services.emulator.pace import Pacer
+from services.emulator.pace import Pacer, Time
 from services.skin.driver import Line
 from services.skin.port import SerialPort
 from shared import bus, topics
@@ -97,6 +98,21 @@ def test_a_pacer_gives_every_tick_once_while_turns_are_in_time():
         assert pacer.ready() == pytest.approx((1000 + 10 * expected - now) * 1e-9)
         now = 1000 + 10 * expected + 2  # sent, a little late
     assert pacer.dropped == 0
+
+
+def test_the_world_goes_on_where_the_wall_clock_is_set_and_only_its_stamps_jump():
+    wall_ns = lambda: time.monotonic_ns() + shift_ns  # noqa: E731
+    shift_ns = 10**18
+    world_time = Time(wall_ns)
+    began_ns = world_time.epoch_ns()
+    assert 0 <= world_time.now_ns() < 10**10
+    assert began_ns == world_time.epoch_ns()
+    for step_ns in (-3_600 * 10**9, 7_200 * 10**9):
+        shift_ns += step_ns
+        before_ns = world_time.now_ns()
+        assert world_time.epoch_ns() - began_ns == pytest.approx(step_ns, abs=10**7)
+        assert 0 <= world_time.now_ns() - before_ns < 10**10
+        began_ns += step_ns
 
 
 def test_a_pacer_drops_what_is_overdue_and_keeps_the_rhythm():

@@ -591,14 +591,38 @@ def test_what_the_service_refuses_is_counted_in_its_health_by_kind_and_moves_not
 
 def test_another_publisher_of_a_stream_is_heard_after_the_silence_of_the_first_and_beside_another_stream() -> None:
     publishers = service.Publishers()
-    publishers.check("front", "a", ns(0.0), 0.3)
-    publishers.check("side", "b", ns(0.1), 0.3)
-    publishers.check("front", "a", ns(0.2), 0.3)
+    publishers.check("front", "a", 0.0, 0.3)
+    publishers.check("side", "b", 0.1, 0.3)
+    publishers.check("front", "a", 0.2, 0.3)
     with pytest.raises(Refused, match="front: one publisher expected, b came beside a: two processes publish the same poses"):
-        publishers.check("front", "b", ns(0.4), 0.3)
-    publishers.check("front", "b", ns(0.6), 0.3)
+        publishers.check("front", "b", 0.4, 0.3)
+    publishers.check("front", "b", 0.6, 0.3)
     with pytest.raises(Refused, match="a came beside b"):
-        publishers.check("front", "a", ns(0.7), 0.3)
+        publishers.check("front", "a", 0.7, 0.3)
+
+
+@pytest.mark.parametrize("kind", sorted(service.OBSERVERS))
+def test_a_clock_that_is_set_makes_the_pose_lost_until_the_next_measurement_and_never_an_old_one_tracking(
+    table: cell.Cell, kind: str
+) -> None:
+    now_ns = ns(10_000.0)
+    group = service.Group(kind, list(table.targets.values()), lambda: now_ns)
+
+    def state(measured: bool) -> str:
+        with group.lock:
+            if measured:
+                group.observers[0].measure("vision", group.now_ns(), np.eye(4), 1e6 * np.eye(6), 0.0, now_ns)
+        return group.estimates()[1][0].state
+
+    assert state(measured=False) == "lost"
+    assert state(measured=True) == "tracking"
+    now_ns -= 10**7
+    assert state(measured=False) == "tracking", "clocks that are kept together by small steps lose nothing"
+    for jump in (-3600.0, -1.0, 3600.0):
+        now_ns += int(jump * 1e9)
+        assert state(measured=False) == "lost"
+        assert group.observers[0].estimate(now_ns + 7200 * 10**9).state == "lost"
+        assert state(measured=True) == "tracking"
 
 
 def test_a_target_that_the_cell_does_not_have_is_told(table: cell.Cell) -> None:

@@ -242,7 +242,7 @@ def test_the_service_answers_every_window_within_milliseconds_and_goes_on_withou
 def test_a_turned_pad_stands_out_by_its_misfit_in_the_health(table: cells.Cell, skin: Skin) -> None:
     """Its electrodes read what the ones opposite should; its estimate goes on without it."""
     node = Node("haptics", table, bus.Connection(connect=("tcp/127.0.0.1:1",)))
-    misfits, which = service.Misfits(node, skin), service.estimator(node, argparse.Namespace(**OPTIONS), skin, "forearm")
+    misfits, which = service.Misfits(node), service.estimator(node, argparse.Namespace(**OPTIONS), table, "forearm")
     T = geometry.from_rpy((0.02, -0.02, 0.075), (0.0, 0.05, 0.1))
     T_pads_target = np.stack([geometry.inverse(pad) for pad in skin.T_world_pads()]) @ T
     signals = skin.gain * skin.sensitivity * Response(table, "forearm").change(T_pads_target)
@@ -253,7 +253,7 @@ def test_a_turned_pad_stands_out_by_its_misfit_in_the_health(table: cells.Cell, 
         amplitude = skin.amplitude(signals / skin.gain / skin.sensitivity) + np.sqrt(skin.noise / 10) * rng.standard_normal(40)
         window = Window((i + 1) * 10 * MS, (i + 1) * 10 * MS, amplitude, np.full(40, 10), {})
         estimate = which.update(window.stamp_ns, window.amplitude, window.samples, skin.T_world_pads())
-        misfits.update(estimate, window)
+        misfits.update(estimate, skin, window.samples)
     told = {name: tell() for name, tell in node.report.items()}
     assert max(told, key=told.__getitem__) == "misfit/p1" and told["misfit/p1"] > 6.0
     assert np.abs(geometry.pose_error(T, which.pose)[:3]).max() < 0.01

@@ -193,3 +193,15 @@ def test_a_negative_stamp_is_refused_by_a_reader_with_a_clock():
 def test_encoding_an_array_of_the_wrong_shape_says_what_was_expected():
     with pytest.raises(BadMessage, match=r"position: float64 of shape 3 expected, float32 of shape \(2,\) came"):
         encode(dataclasses.replace(pose(), position=np.zeros(2, np.float32)))
+
+
+def test_a_large_array_is_packed_without_a_copy_into_the_same_bytes(monkeypatch):
+    rng = np.random.default_rng(0)
+    sent = [
+        messages.Frame(stamp_ns=5, image=rng.integers(0, 255, (300, 400, 3), np.uint8)),
+        messages.Mask(stamp_ns=5, labels=rng.integers(0, 6, (300, 400), np.uint8), x0=-3, y0=700, scale=2),
+    ]
+    large = [messages.encode(message) for message in sent]
+    monkeypatch.setattr(messages, "LARGE", 1 << 40)
+    assert large == [messages.encode(message) for message in sent]
+    assert (messages.decode(messages.Mask, large[1]).labels == sent[1].labels).all()

@@ -360,6 +360,9 @@ def test_joints_are_interpolated_at_the_stamp_and_never_invented():
     assert history.at(7_500_000) == pytest.approx(1.5)
     assert history.at(12_000_000) == pytest.approx(2.0)
     assert history.at(10_000_000_000) is None
+    history.add(-3_600_000_000_000, np.array([5.0]))
+    assert history.at(-3_600_000_000_000) == pytest.approx(5.0), "the clock was set back"
+    assert history.at(10_000_000) is None
 
 
 def test_the_prediction_moves_with_the_velocity_and_ends_with_the_track():

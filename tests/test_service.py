@@ -363,3 +363,35 @@ def test_a_handler_that_always_takes_long_does_not_hang(replica):
         wait_for(lambda: slow.hangs_s(time.monotonic()), 10, "a turn that hangs")
     assert slow.hangs_s(time.monotonic() + 100.0) == 0.0
     assert patient.health()["hangs"] == "", "it may take as long as it likes"
+
+
+def test_whoever_runs_out_of_memory_in_a_handler_does_not_go_on_as_if_it_were_the_message(router):
+    node = Node("worker", CELL, bus.Connection(connect=router.connection.listen))
+    node.fault("reader", ValueError("a bad picture"))
+    with pytest.raises(MemoryError):
+        node.fault("reader", MemoryError("18 MB"))
+    assert sum(node.health()["faults"].values()) == 1
+
+
+def test_a_log_on_a_full_disk_loses_lines_and_a_closed_one_is_told():
+    with open("/dev/full", "w") as full:
+        stream = logs.Lossy(full)
+        for _ in range(10_000):
+            assert stream.write("a line that does not fit\n") == 25
+        stream.flush()
+        assert not stream.isatty()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())  # room again
+    reading, writing = os.pipe()
+    os.close(reading)
+    with pytest.raises(BrokenPipeError), os.fdopen(writing, "w") as gone:
+        stream = logs.Lossy(gone)
+        stream.write("nobody reads\n")
+        stream.flush()
+
+
+def test_a_process_whose_thread_fails_ends_and_says_why():
+    code = "import threading, time; from services import cli; cli._die_with_thread(); "
+    code += "threading.Thread(target=lambda: 1 / 0).start(); time.sleep(60)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    assert ended.returncode == 1
+    assert "ZeroDivisionError" in ended.stderr

@@ -12,9 +12,11 @@ from shared import cell as cells
 from shared import geometry, skin
 from shared.body import forearm_mesh
 from shared.response import Response
+from shared.skin import Near, Skin
 from shared.surface import Surface
 from sim.field import PadField, limb
 from sim.skin import SkinModel
+from tests.cells import derive
 
 
 @dataclass(frozen=True)
@@ -185,3 +187,14 @@ def test_a_limb_that_was_not_fitted_is_told_how_to_be(table: cells.Cell) -> None
     thick = table.model_copy(update={"body": table.body.model_copy(update={"forearm_circumference": 0.5})})
     with pytest.raises(cells.CellError, match="penumbra skin model --cell"):
         Response(thick, "forearm")
+
+
+def test_the_pads_near_a_target_are_those_at_its_home_and_all_on_robots(tmp_path):
+    side_by_side = cells.load(derive("table", 1, 3, tmp_path))
+    whole = Skin(side_by_side)
+    for place, name in enumerate(side_by_side.targets):
+        near = Near.of(side_by_side, name)
+        assert list(near.pads) == list(range(8 * place, 8 * place + 8))
+        assert [whole.names[k] for k in near.electrodes] == list(Skin(near.cell).names)
+    arm = cells.load("arm")
+    assert Near.of(arm, "forearm").cell == arm

@@ -6,6 +6,7 @@ import pytest
 from shared import body, cell, geometry
 from shared.messages import FusedPose
 from shared.window import MAX_PIXELS_WIDE, Lookout, Window, corners_of, whole_frame, window_around
+from tests.cells import derive
 
 S = 1_000_000_000
 
@@ -81,3 +82,19 @@ def test_a_home_out_of_the_picture_is_looked_for_everywhere(far):
     away = far.targets["forearm"].model_copy(update={"home": cell.Placement(position=(0.0, -20.0, 0.2))})
     lookout = Lookout(far.model_copy(update={"targets": {"forearm": away}}), "front")
     assert lookout.window == whole_frame(far.cameras["front"])
+
+
+def test_a_camera_is_on_those_targets_whose_home_may_be_in_its_picture(tmp_path):
+    side_by_side = cell.load(derive("table", 5, 4, tmp_path))
+    on = {camera: Lookout(side_by_side, camera).targets for camera in side_by_side.cameras}
+    assert list(on.values()) == [("forearm",), ("forearm1",), ("forearm2",), ("forearm3",), ("forearm",)]
+    lookout = Lookout(side_by_side, "camera1")
+    alone = Lookout(cell.load(derive("table", 1, 1, tmp_path)), "camera0")
+    assert lookout.window == alone.window, "what is elsewhere widens no window"
+
+
+def test_a_home_beside_the_camera_is_not_in_its_picture_and_one_around_it_may_be(far):
+    front, forearm = far.cameras["front"], far.targets["forearm"]
+    beside = forearm.model_copy(update={"home": cell.Placement(position=(front.position[0] + 6.0, *front.position[1:]))})
+    around = forearm.model_copy(update={"home": cell.Placement(position=front.position)})
+    assert Lookout(far.model_copy(update={"targets": {"beside": beside, "around": around}}), "front").targets == ("around",)

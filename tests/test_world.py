@@ -10,10 +10,12 @@ from shared import cell as cells
 from shared import geometry
 from shared.classes import Label
 from shared.surface import Surface
+from shared.topics import TRUTH
 from sim.clearance import hull_points
 from sim.motion import Clock
 from sim.occluder import AWAY, OcclusionSchedule
-from sim.world import BATCH, TICK_NS, World, record
+from sim.world import BATCH, TICK_NS, Sensors, World, record
+from tests.cells import derive
 
 CELLS = {name: cells.load(name) for name in ("table", "arm")}
 SECONDS = 60.0
@@ -200,8 +202,6 @@ def test_a_cell_that_the_emulator_cannot_move_in_is_told():
     table = CELLS["table"]
     with pytest.raises(cells.CellError, match="cell table has no `sim`: the emulator needs its motion"):
         World(table.model_copy(update={"sim": None}))
-    with pytest.raises(cells.CellError, match="the emulator moves one target, 2 came: forearm, other"):
-        World(table.model_copy(update={"targets": {**table.targets, "other": table.targets["forearm"]}}))
     below = table.sim.motion.model_copy(update={"low": (0.0, 0.0, -0.3), "high": (0.1, 0.1, -0.2)})
     with pytest.raises(
         cells.CellError, match=r"no pose of the region .* keeps clear of the robot and the table: move the region"
@@ -209,6 +209,43 @@ def test_a_cell_that_the_emulator_cannot_move_in_is_told():
         World(with_sim("table", motion=below))
     with pytest.raises(cells.CellError, match="7 values expected, one for each joint of panda; 2 and 7 came"):
         World(with_sim("arm", joints_low=(0.0, 0.0)))
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory):
+    return cells.load(derive("table", 3, 3, tmp_path_factory.mktemp("cells")))
+
+
+def test_several_persons_move_each_at_home_and_the_first_as_if_alone(three):
+    world, alone = World(three, 4), World(CELLS["table"], 4)
+    for t in (0.0, 3.0, 7.5):
+        targets = world.state(t).targets
+        np.testing.assert_array_equal(targets["forearm"].T_world_target, alone.state(t).T_world_target)
+        for name, placed in targets.items():
+            away = placed.pose[:3] - three.targets[name].home.position
+            assert np.abs(away).max() < 0.4, "within the region around its own home"
+    assert not np.allclose(targets["forearm"].pose[1:], targets["forearm1"].pose[1:]), "they move differently"
+
+
+def test_a_pad_feels_only_who_is_near_it_and_a_camera_sees_only_who_is_before_it(three):
+    world, alone = World(three, 4), World(CELLS["table"], 4)
+    state = world.state(5.0)
+    change, first = world.change(state), alone.change(alone.state(5.0))
+    np.testing.assert_allclose(change[: len(first)], first)
+    assert len(change) == 3 * len(first) and (change[len(first) :] > 0).all()
+    for place, camera in enumerate(three.cameras):
+        assert world.model(camera) == list(three.targets)[place]
+        assert [name for name in world.bodies(camera, state) if name.startswith("target")] == ["target"]
+    truths = {names["target"]: m for topic, names, m in Sensors(world, 10**18).tick(250) if topic is TRUTH}
+    for name, truth in truths.items():
+        np.testing.assert_allclose(truth.position, state.targets[name].pose[:3])
+        assert truth.gap == pytest.approx(world.gaps(state, name).min())
+
+
+def test_cameras_around_one_place_all_look_at_its_target(tmp_path):
+    world = World(cells.load(derive("arm", 3, 1, tmp_path)), 2)
+    for camera in world.cell.cameras:
+        assert (world.view(camera, 1.0).labels == Label.FOREARM).sum() > 500
 
 
 def test_a_recording_is_what_the_emulator_publishes_in_order_and_again_the_same():

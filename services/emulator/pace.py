@@ -3,10 +3,37 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 
 SMOOTHING = 0.25
 """Weight of the newest turn in the mean of how long preparing takes: one that was held up must not thin out the next ones."""
+
+SET_NS = 1_000_000
+"""By so much the wall clock may run away from the steady one before it counts as set."""
+
+
+class Time:
+    """The time of the world: it begins now and goes on steadily, whatever happens to the wall clock wall_ns(), as reality does.
+
+    began_ns: when it began by the steady clock, which is the same one for all processes of the machine.
+    """
+
+    def __init__(self, wall_ns: Callable[[], int]):
+        self._wall_ns = wall_ns
+        self.began_ns = time.monotonic_ns()
+        self._epoch_ns = wall_ns()
+
+    def now_ns(self) -> int:
+        """Since the beginning."""
+        return time.monotonic_ns() - self.began_ns
+
+    def epoch_ns(self) -> int:
+        """The beginning by the wall clock as it is set now."""
+        epoch_ns = self._wall_ns() - self.now_ns()
+        if abs(epoch_ns - self._epoch_ns) > SET_NS:
+            self._epoch_ns = epoch_ns
+        return self._epoch_ns
 
 
 class Pacer:

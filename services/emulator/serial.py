@@ -151,11 +151,11 @@ def _chosen(feed: Feed, pad: int, own: list[int], time_s: float) -> Array:
     return feed.amplitude(pad, time_s)[own]
 
 
-def _serve(link: Connection, cell: cells.Cell, pads: Sequence[str], seed: int, epoch_ns: int, tick_s: float) -> None:
+def _serve(link: Connection, cell: cells.Cell, pads: Sequence[str], seed: int, began_ns: int, tick_s: float) -> None:
     """The boards' process, until the emulator closes its end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the emulator's to hear
     feed = Feed(Skin(cell), tick_s)
-    terminals = Terminals(pad_boards(cell, pads, seed, feed), lambda: (time.time_ns() - epoch_ns) * 1e-9)
+    terminals = Terminals(pad_boards(cell, pads, seed, feed), lambda: (time.monotonic_ns() - began_ns) * 1e-9)
     link.send(terminals.devices)
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
@@ -171,19 +171,19 @@ def _serve(link: Connection, cell: cells.Cell, pads: Sequence[str], seed: int, e
 
 
 class SerialBoards:
-    """The emulator's end. pads: whose boards are served; folder: where links to their devices are made; epoch_ns: time zero of
-    the world; tick_s: how often the boards are told what the skin feels; ahead_s: how long before it does.
+    """The emulator's end. pads: whose boards are served; folder: where links to their devices are made; began_ns: time zero of
+    the world by the steady clock; tick_s: how often the boards are told what the skin feels; ahead_s: how long before it does.
 
     devices: the paths of the pseudo-terminals by name, such as p0-2 for the third board of pad p0. Raises CellError for an
     unknown pad, OSError where a link cannot be made.
     """
 
-    def __init__(self, world: World, pads: Sequence[str], folder: Path | None, epoch_ns: int, tick_s: float, ahead_s: float):
-        self._world, self._epoch_ns, self._tick_s, self._ahead_s = world, epoch_ns, tick_s, ahead_s
+    def __init__(self, world: World, pads: Sequence[str], folder: Path | None, began_ns: int, tick_s: float, ahead_s: float):
+        self._world, self._began_ns, self._tick_s, self._ahead_s = world, began_ns, tick_s, ahead_s
         self.pads = tuple(world.cell.one("pads", pad) for pad in pads)
         self._link, theirs = multiprocessing.Pipe()
         self._lock = threading.Lock()
-        arguments = (theirs, world.cell, self.pads, world.seed, epoch_ns, tick_s)
+        arguments = (theirs, world.cell, self.pads, world.seed, began_ns, tick_s)
         # Not a fork: it would inherit the threads' locks, but not the threads.
         self._process = multiprocessing.get_context("spawn").Process(target=_serve, args=arguments, daemon=True)
         self._process.start()
@@ -206,7 +206,7 @@ class SerialBoards:
         """Tells the boards what the skin feels, until the emulator stops."""
         try:
             while not stopping.wait(self._tick_s):
-                now_s = (time.time_ns() - self._epoch_ns) * 1e-9
+                now_s = (time.monotonic_ns() - self._began_ns) * 1e-9
                 for k in range(max(self._told + 1, int(now_s / self._tick_s)), int((now_s + self._ahead_s) / self._tick_s) + 1):
                     log_change = np.log(self._world.change(self._world.state(k * self._tick_s)))
                     self._send((k, log_change, self._world.skin_faults))

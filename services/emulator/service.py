@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from services.emulator.control import control
-from services.emulator.pace import Pacer
+from services.emulator.pace import Pacer, Time
 from services.emulator.serial import SerialBoards
 from shared import topics
 from shared.service import Node
@@ -48,15 +48,15 @@ def start(node: Node, options: argparse.Namespace) -> None:
     for camera in cell.cameras:  # compiles what the first turn would wait for
         sensors.frame(camera, 0)
     sensors.tick(1)
-    sensors.epoch_ns = node.now_ns()
+    world_time = Time(node.now_ns)
 
     def time_s() -> float:
-        return (node.now_ns() - sensors.epoch_ns) * 1e-9
+        return world_time.now_ns() * 1e-9
 
     serial = None
     if options.serial is not None:
         pads = options.serial or list(cell.pads)
-        serial = SerialBoards(world, pads, options.serial_folder, sensors.epoch_ns, TICK_NS * 1e-9, AHEAD_S)
+        serial = SerialBoards(world, pads, options.serial_folder, world_time.began_ns, TICK_NS * 1e-9, AHEAD_S)
         for name, device in serial.devices.items():
             node.log.info("board on a pseudo-terminal", board=name, device=device)
         node.every(AGAIN_S, partial(serial.serve, node.stopping), math.inf)
@@ -67,6 +67,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
 
     def turn(pacer: Pacer, prepare: Callable[[int], Stream]) -> None:
         k = pacer.next()
+        sensors.epoch_ns = world_time.epoch_ns()
         messages = prepare(k)
         if not node.stopping.wait(pacer.ready()):
             for topic, names, message in messages:
@@ -79,9 +80,9 @@ def start(node: Node, options: argparse.Namespace) -> None:
 
     control(world, json.dumps({"command": "occlude", "value": options.occlude}).encode(), 0.0)
     node.answer(topics.control(cell.name), answer)
-    skin = Pacer(sensors.epoch_ns, TICK_NS, node.now_ns, late_ns=TICK_NS)
+    skin = Pacer(0, TICK_NS, world_time.now_ns, late_ns=TICK_NS)
     node.every(AGAIN_S, partial(turn, skin, sensors.tick))
     for camera, description in cell.cameras.items():
         period_ns = 1e9 / description.rate_hz
-        pacer = Pacer(sensors.epoch_ns, period_ns, node.now_ns, late_ns=period_ns / 10)
+        pacer = Pacer(0, period_ns, world_time.now_ns, late_ns=period_ns / 10)
         node.every(AGAIN_S, partial(turn, pacer, partial(frame, camera)))

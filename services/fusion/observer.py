@@ -49,6 +49,12 @@ class Bank:
     def __len__(self) -> int:
         return len(self.logs)
 
+    def forget(self, targets: slice = slice(None)) -> None:
+        """Begins anew with every target, or with some of them; their counts go on."""
+        kernel.clear_all(self._states[targets], self._measurements[targets], self._rings[targets])
+        for log in self.logs[targets]:
+            log.heard_ns.clear()
+
     def measure(
         self,
         targets: NDArray[np.int64],
@@ -151,6 +157,10 @@ class ErrorStateObserver:
         """Goes on from a pose that another observer of this target has published; what was known here is forgotten. Measurements
         before its stamp are in it already, and count as late."""
         self._bank.adopt(self._target, message)
+
+    def forget(self) -> None:
+        """Begins anew; the counts go on."""
+        self._bank.forget(slice(self._target, self._target + 1))
 
     def innovation(self) -> tuple[float, int]:
         """Squared Mahalanobis distance of the newest measurement's innovation (NIS) and its degrees of freedom: 0 and 0 where it

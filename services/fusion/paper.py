@@ -114,10 +114,15 @@ class PaperObserver:
         self._Q = self.settings.rate**2 * self._W_v
         self._nobody = np.linalg.inv(1e3 * self._W_v)  # R^-1 of a sense that says next to nothing
         self._hold_ns = {source: int(1e9 * seconds) for source, seconds in self.settings.hold}
+        self.forget()
+
+    def forget(self) -> None:
+        """Begins anew; the counts go on."""
         self._held: dict[str, _Held] = {}
         self._ahead: list[_State] = []  # the state at the newest measurement, and as far ahead as somebody asked
         self._covariance = self._home_covariance
         self._weights: dict[str, float] = {}
+        self.log.heard_ns.clear()
 
     def measure(
         self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None, now_ns: int | None = None

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from services.fusion import so3
-from services.fusion.estimate import Array, Estimate, Refused, information, latest
+from services.fusion.estimate import AHEAD_S, Array, Estimate, Refused, information, latest
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
 from shared import cell, geometry, messages, topics
@@ -38,11 +38,11 @@ def start(node: Node, options: argparse.Namespace) -> None:
     """Wires one observer per target, and one timer for all. Raises CellError for a target that the cell does not have."""
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
     warm_up(OBSERVERS[options.observer])
-    group = Group(options.observer, [node.cell.targets[name] for name in names])
+    group = Group(options.observer, [node.cell.targets[name] for name in names], node.now_ns)
     fusions = [Fusion(node, name, group, observer) for name, observer in zip(names, group.observers, strict=True)]
 
     def publish() -> None:
-        stamp_ns, estimates = group.estimates(node.now_ns)
+        stamp_ns, estimates = group.estimates()
         for fusion, estimate in zip(fusions, estimates, strict=True):
             fusion.publish(stamp_ns, estimate)
 
@@ -60,12 +60,13 @@ def warm_up(kind: type[ErrorStateObserver | PaperObserver]) -> None:
 
 
 class Group:
-    """The observers of the cell's targets, of which all can be asked at once."""
+    """The observers of the cell's targets, of which all can be asked at once, and their clock now_ns()."""
 
-    def __init__(self, kind: str, targets: list[cell.Target]):
+    def __init__(self, kind: str, targets: list[cell.Target], now_ns: Callable[[], int]):
         homes = [target.home.transform for target in targets]
         spreads = [(target.home_spread.position, target.home_spread.rotation) for target in targets]
         self.lock = threading.Lock()
+        self._now_ns, self._last_ns = now_ns, now_ns()
         self.observers: Sequence[ErrorStateObserver | PaperObserver]
         if kind == "paper":
             self.observers = [PaperObserver(home, spread) for home, spread in zip(homes, spreads, strict=True)]
@@ -74,10 +75,20 @@ class Group:
             self._bank = Bank(np.array(homes), spreads)
             self.observers = [ErrorStateObserver.of(self._bank, i) for i in range(len(targets))]
 
-    def estimates(self, now_ns: Callable[[], int]) -> tuple[int, list[Estimate]]:
+    def now_ns(self) -> int:
+        """The time, asked with the lock held. Where the clock was set back, all that is known is of a time to come, of which
+        nothing can be told now: it is forgotten. Where it was set forward, it is too old."""
+        stamp_ns = self._now_ns()
+        if stamp_ns < self._last_ns - AHEAD_S * 1e9:
+            for observer in self.observers:
+                observer.forget()
+        self._last_ns = stamp_ns
+        return stamp_ns
+
+    def estimates(self) -> tuple[int, list[Estimate]]:
         """The time [ns] and the estimates of all."""
         with self.lock:
-            stamp_ns = now_ns()
+            stamp_ns = self.now_ns()
             if self._bank is not None:
                 return stamp_ns, self._bank.estimates(stamp_ns)
             return stamp_ns, [observer.estimate(stamp_ns) for observer in self.observers]
@@ -88,18 +99,19 @@ class Publishers:
     replica that takes over is heard as soon as the one before it has been silent for a while."""
 
     def __init__(self) -> None:
-        self._speaks: dict[str, tuple[str, int]] = {}
+        self._speaks: dict[str, tuple[str, float]] = {}
 
-    def check(self, stream: str, publisher: str, now_ns: int, silence_s: float) -> None:
-        """Raises Refused for a publisher while another one of this stream was heard in the last silence_s."""
-        speaker, heard_ns = self._speaks.get(stream, (publisher, now_ns))
-        if speaker != publisher and now_ns - heard_ns < silence_s * 1e9:
+    def check(self, stream: str, publisher: str, now_s: float, silence_s: float) -> None:
+        """Raises Refused for a publisher while another one of this stream was heard in the last silence_s. now_s: the time of a
+        clock that nobody sets."""
+        speaker, heard_s = self._speaks.get(stream, (publisher, now_s))
+        if speaker != publisher and now_s - heard_s < silence_s:
             raise Refused(
                 "publisher",
                 f"{stream}: one publisher expected, {publisher} came beside {speaker}: two processes publish the same poses; "
                 "end one of them",
             )
-        self._speaks[stream] = publisher, now_ns
+        self._speaks[stream] = publisher, now_s
 
 
 class Fusion:
@@ -120,45 +132,46 @@ class Fusion:
 
     def on_vision(self, message: messages.VisionPose, names: dict[str, str]) -> None:
         """A camera's pose; each camera of the cell is a stream of its own."""
-        self._take("vision", message, lambda now_ns: self._seen(message, names["publisher"], now_ns), message.hidden)
+        self._take("vision", message, lambda: self._seen(message, names["publisher"]), message.hidden)
 
     def on_haptic(self, message: messages.HapticPose, names: dict[str, str]) -> None:
         """The skin's pose."""
-        self._take("haptic", message, lambda now_ns: self._felt(message, names["publisher"], now_ns), None)
+        self._take("haptic", message, lambda: self._felt(message, names["publisher"]), None)
 
     def on_fused(self, message: messages.FusedPose, names: dict[str, str]) -> None:
         """The pose as another replica knows it."""
         self._heard_s = time.monotonic()
-        is_usable = message.state != "lost" and message.stamp_ns <= latest(self.node.now_ns())
-        if self.state == "lost" and is_usable and not self.node.owns(self.target):
+        if self.state == "lost" and message.state != "lost" and not self.node.owns(self.target):
             with self.group.lock:
-                self.observer.adopt(message)
+                if message.stamp_ns <= latest(self.group.now_ns()):
+                    self.observer.adopt(message)
 
-    def _seen(self, message: messages.VisionPose, publisher: str, now_ns: int) -> Array | None:
+    def _seen(self, message: messages.VisionPose, publisher: str) -> Array | None:
         """The information (6, 6) of a camera's pose, None where it is not to be used. Raises Refused."""
         if message.camera not in self.node.cell.cameras:
             known = ", ".join(self.node.cell.cameras)
             raise Refused("camera", f"vision: a camera of the cell ({known}) expected, {message.camera!r:.60} came")
-        self._publishers.check(f"vision of camera {message.camera}", publisher, now_ns, topics.VISION.stale_s)
+        self._publishers.check(f"vision of camera {message.camera}", publisher, time.monotonic(), topics.VISION.stale_s)
         return information(message.covariance) if message.state == "tracking" else None
 
-    def _felt(self, message: messages.HapticPose, publisher: str, now_ns: int) -> Array | None:
+    def _felt(self, message: messages.HapticPose, publisher: str) -> Array | None:
         """The information (6, 6) of the skin's pose, None where it is not to be used. Raises Refused."""
-        self._publishers.check("haptic", publisher, now_ns, topics.HAPTIC.stale_s)
+        self._publishers.check("haptic", publisher, time.monotonic(), topics.HAPTIC.stale_s)
         return message.information if message.state == "in_range" else None
 
-    def _take(self, source: str, message: Any, read: Callable[[int], Array | None], hidden: float | None) -> None:
+    def _take(self, source: str, message: Any, read: Callable[[], Array | None], hidden: float | None) -> None:
         """Hands a measurement on to the observer, or the news that a sense is there but has nothing to say; what is refused is
         counted, and told once of each kind."""
-        now_ns, log = self.node.now_ns(), self.observer.log
+        log = self.observer.log
         try:
             self._check_place(source, message)
-            information = read(now_ns)
+            information = read()
         except Refused as error:
             log.refused(source, error.kind)
             self._tell(source, error)
             return
         with self.group.lock:
+            now_ns = self.group.now_ns()
             if information is None:
                 log.heard(source, message.stamp_ns)
                 return
@@ -200,7 +213,7 @@ class Fusion:
         if form not in ("msgpack", "json"):
             raise ValueError(f"format: msgpack or json expected, {form!r} came")
         with self.group.lock:
-            stamp_ns = self.node.now_ns()
+            stamp_ns = self.group.now_ns()
             if "stamp_ns" in parameters:
                 stamp_ns = _within(parameters["stamp_ns"], self.observer.earliest_ns, stamp_ns)
             estimate = self.observer.estimate(stamp_ns)

@@ -7,19 +7,21 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.haptics import network
 from services.haptics.estimator import FOREIGN, Estimate, Estimator
 from services.haptics.kinematics import PadPoses
 from services.haptics.window import Backlog, Collector, Window
 from shared.body import target_mesh
+from shared.cell import Cell
 from shared.geometry import position_orientation
 from shared.messages import FusedPose, HapticPose, Joints, Voltages
 from shared.prediction import predict
 from shared.response import Response
 from shared.robot import robot_models
 from shared.service import Node
-from shared.skin import Skin
+from shared.skin import Near, Skin
 from shared.surface import Surface
 from shared.topics import FUSED, HAPTIC, JOINTS, VOLTAGES
 
@@ -45,10 +47,13 @@ def start(node: Node, options: argparse.Namespace) -> None:
     skin = Skin(cell)
     poses = PadPoses(cell, skin, robot_models(cell))
     collector = Collector(skin, length_ns=int(options.window_ms * 1e6))
-    estimators = {name: estimator(node, options, skin, name) for name in cell.targets}
+    near = {name: found for name in cell.targets if len((found := Near.of(cell, name)).pads)}
+    for name in cell.targets.keys() - near.keys():
+        node.log.info("never felt: no pad is where it may come", target=name)
+    estimators = {name: estimator(node, options, found.cell, name) for name, found in near.items()}
     backlog = Backlog()
     told = Faults(node)
-    misfits = Misfits(node, skin)
+    misfits = Misfits(node)
     fused: dict[str, FusedPose] = {}
 
     def on_fused(message: FusedPose, names: dict[str, str]) -> None:
@@ -75,10 +80,12 @@ def start(node: Node, options: argparse.Namespace) -> None:
             else:
                 T, covariance = predict(fused.get(target), window.stamp_ns)
                 expected = None if T is None or covariance is None else (T, covariance)
-                estimate = which.update(window.stamp_ns, window.amplitude, window.samples, *found, expected)
+                (T_world_pads, joints), own = found, near[target]
+                amplitude, samples = window.amplitude[own.electrodes], window.samples[own.electrodes]
+                estimate = which.update(window.stamp_ns, amplitude, samples, T_world_pads[own.pads], joints, expected)
+                misfits.update(estimate, which.skin, samples)
             if estimate.why == FOREIGN:
                 faults[target] = FOREIGN
-            misfits.update(estimate, window)
             node.publish(HAPTIC, _message(estimate, window, target, cell.frame), target=target)
         told.update(faults, window.stamp_ns)
 
@@ -88,9 +95,8 @@ def start(node: Node, options: argparse.Namespace) -> None:
     node.subscribe(VOLTAGES, on_voltages, streams)
 
 
-def estimator(node: Node, options: argparse.Namespace, skin: Skin, target: str) -> Estimator:
-    """Ready to run: weights loaded where they fit the cell, code compiled."""
-    cell = node.cell
+def estimator(node: Node, options: argparse.Namespace, cell: Cell, target: str) -> Estimator:
+    """Ready to run on the pads of a cell: weights loaded where they fit it, code compiled."""
     path = options.weights / f"{cell.name}-{target}.npz"
     weights = None
     try:
@@ -100,7 +106,7 @@ def estimator(node: Node, options: argparse.Namespace, skin: Skin, target: str) 
     mesh = target_mesh(cell.targets[target], cell)
     spread = cell.targets[target].home_spread
     made = Estimator(
-        skin,
+        Skin(cell),
         Response(cell, target),
         Surface(mesh.vertices, mesh.faces),
         cell.targets[target].home.transform,
@@ -117,18 +123,18 @@ class Misfits:
     """Per pad, what the limb leaves unexplained, in the health's report as misfit/PAD: mean squared residual in variances, of
     windows in which a limb is in range. A pad that is turned, or has another pad's calibration, stands out."""
 
-    def __init__(self, node: Node, skin: Skin):
-        self._node, self._skin = node, skin
+    def __init__(self, node: Node):
+        self._node = node
         self._means: dict[str, float] = {}
 
-    def update(self, estimate: Estimate, window: Window) -> None:
-        """Takes the residuals of a window."""
+    def update(self, estimate: Estimate, skin: Skin, samples: NDArray[np.int64]) -> None:
+        """Takes the residuals (n,) of a window on a skin, with so many samples (n,) each."""
         if not estimate.in_range:
             return
         squares = np.minimum(estimate.residuals**2, WORST**2)
-        for k, pad in enumerate(self._skin.pads):
-            own = self._skin.of(k)
-            used = window.samples[own] > 0
+        for k, pad in enumerate(skin.pads):
+            own = skin.of(k)
+            used = samples[own] > 0
             if used.any():
                 now = float(squares[own][used].mean())
                 before = self._means.get(pad, now)

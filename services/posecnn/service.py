@@ -25,16 +25,21 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: Node, options: argparse.Namespace) -> None:
-    """Subscribes; every frame of the cell's cameras is searched for every target that this replica owns."""
+    """Subscribes; every frame is searched for every target that its camera can see and this replica owns."""
     torch.set_num_threads(1)
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
     targets = [cell.one("targets", options.target)] if options.target else list(cell.targets)
     net, uncertainty = load(options.weights)
-    estimators = {(c, t): PoseCNN(cell, c, t, net, uncertainty) for c in cameras for t in targets}
+    lookouts = {camera: Lookout(cell, camera) for camera in cameras}
+    estimators = {
+        (camera, target): PoseCNN(cell, camera, target, net, uncertainty)
+        for camera, lookout in lookouts.items()
+        for target in targets
+        if target in lookout.targets
+    }
     for estimator in estimators.values():
         estimator.prepare()
-    lookouts = {camera: Lookout(cell, camera) for camera in cameras}
     fused: dict[str, FusedPose] = {}
 
     def on_fused(message: FusedPose, names: dict[str, str]) -> None:
@@ -45,11 +50,11 @@ def start(node: Node, options: argparse.Namespace) -> None:
     def on_frame(frame: Frame, names: dict[str, str]) -> None:
         camera = names["camera"]
         window = lookouts[camera].look(frame.stamp_ns)
-        for target in targets:
-            if not node.owns(f"{camera}/{target}"):
+        for (own, target), estimator in estimators.items():
+            if own != camera or not node.owns(f"{camera}/{target}"):
                 continue
             T_prior, _ = predict(fused.get(target), frame.stamp_ns)
-            estimate = estimators[camera, target].update(frame.image, window, T_prior)
+            estimate = estimator.update(frame.image, window, T_prior)
             node.publish(VISION, estimate.message(frame.stamp_ns, target, camera, cell.frame), target=target)
 
     node.subscribe(FUSED, on_fused)

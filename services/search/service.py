@@ -11,6 +11,7 @@ from shared.messages import Frame, FusedPose, Joints, Mask
 from shared.prediction import predict
 from shared.service import Node
 from shared.topics import FRAME, FUSED, JOINTS, MASK, VISION
+from shared.window import Lookout
 
 NAME = "search"
 FRAMES_KEPT = 4
@@ -27,11 +28,15 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: Node, options: argparse.Namespace) -> None:
-    """Subscribes; every mask is searched for every target that this replica owns."""
+    """Subscribes; every mask is searched for every target that its camera can see and this replica owns."""
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
     targets = [cell.one("targets", options.target)] if options.target else list(cell.targets)
-    searches = {(c, t): Search(cell, c, t, options.method) for c in cameras for t in targets}
+    seen = {camera: Lookout(cell, camera).targets for camera in cameras}
+    searches = {(c, t): Search(cell, c, t, options.method) for c in cameras for t in targets if t in seen[c]}
+    for camera in cameras:
+        if not seen[camera]:
+            node.log.warning("no target's home is in the picture: nothing is searched there", camera=camera)
     for search in searches.values():
         search.prepare()
     history = {robot: JointHistory() for robot in cell.robots}

@@ -29,12 +29,14 @@ def start(node: Node, options: argparse.Namespace) -> None:
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
 
-    def watch(name: str, camera: Camera, segmenter: Segmenter) -> None:
-        lookout = Lookout(cell, name)
-        segmenter.prepare(lookout.window)
+    lookouts = {name: Lookout(cell, name) for name in cameras}
 
-        def on_pose(message: FusedPose, _: dict[str, str]) -> None:
+    def on_pose(message: FusedPose, _: dict[str, str]) -> None:
+        for lookout in lookouts.values():
             lookout.hear(message)
+
+    def watch(name: str, camera: Camera, lookout: Lookout, segmenter: Segmenter) -> None:
+        segmenter.prepare(lookout.window)
 
         def on_frame(frame: Frame, _: dict[str, str]) -> None:
             if frame.image.shape[:2] != (camera.height, camera.width):
@@ -48,8 +50,9 @@ def start(node: Node, options: argparse.Namespace) -> None:
             mask = Mask(stamp_ns=frame.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=window.scale)
             node.publish(MASK, mask, camera=name)
 
-        node.subscribe(FUSED, on_pose)
         node.subscribe(FRAME, on_frame, streams=[f"camera/{name}"], camera=name)
 
-    for name in cameras:
-        watch(name, cell.cameras[name], load_segmenter(options.weights))
+    for target in dict.fromkeys(target for lookout in lookouts.values() for target in lookout.targets):
+        node.subscribe(FUSED, on_pose, target=target)
+    for name, lookout in lookouts.items():
+        watch(name, cell.cameras[name], lookout, load_segmenter(options.weights))

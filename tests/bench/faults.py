@@ -1,0 +1,307 @@
+"""`penumbra bench faults`: every fault for every service of the running chain, measured from outside over the bus.
+
+The arm moves in sight of the camera; a fault strikes the replica that owns the stream. A client of the bus, which knows nothing
+of the fault, counts: the longest time without a fused pose while a sense was alive, how long the service's topics were not what
+they had been, measurements used twice, and poses called tracking that were wrong by more than three sigma.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import psutil
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from shared import cell as cells
+from shared import topics
+from shared.topics import Topic
+from tests import injected, observed
+from tests.live import Running, penumbra_up, wait_for
+
+SERVICES = ("emulator", "segmentation", "search", "haptics", "fusion")
+REPLICATED = SERVICES[1:]
+ALL = "all"
+BEFORE_S = 3.0
+"""How long the old rates are measured."""
+AFTER_S, LONGEST_S = 4.0, 30.0
+"""How long the chain is watched when a fault is over: at least, and at most while the old rate is not back."""
+READY_S = 180.0
+"""A first start compiles."""
+HOUR_S = 3600.0
+STARVED_S = 10.0
+"""How long a process is watched that goes on without new memory; it ends when it needs some."""
+GOAL_GAP_MS, GOAL_ALONE_S, GOAL_REPLICA_S = 50.0, 1.5, 0.5
+
+
+@dataclass
+class Chain:
+    """A running chain, who listens to it, and what its setup has that can be broken."""
+
+    running: Running
+    cell: cells.Cell
+    replicas: int
+    broken: injected.Breakable | None = None
+    outside: observed.Outside = field(init=False)
+
+    def instances(self, service: str) -> list[psutil.Process]:
+        return injected.instances(psutil.Process(self.running.launcher.pid), service)
+
+    @property
+    def parts(self) -> injected.Breakable:
+        assert self.broken is not None, "a chain of `breakable` expected"
+        return self.broken
+
+    def owner(self, service: str) -> psutil.Process:
+        """The replica that does the most."""
+        reports = [report for report in observed.health(self.running) if report["service"] == service]
+        busiest = max(reports, key=lambda report: sum(row["rate_hz"] for row in report["published"].values()))
+        return psutil.Process(busiest["pid"])
+
+    def is_settled(self) -> bool:
+        """Whether everybody is there and the arm is tracked in sight of the camera."""
+        if self.running.control({"command": "occlude", "value": 0}) is None:
+            return False
+        ready = [report["service"] for report in observed.health(self.running) if report["ready"]]
+        wanted = {service: self.replicas if service in REPLICATED else 1 for service in SERVICES}
+        pose = self.running.pose()
+        return all(ready.count(name) == n for name, n in wanted.items()) and pose is not None and pose["state"] == "tracking"
+
+
+# ---- setups
+
+
+@contextmanager
+def plain(cell: str, seed: int, replicas: int) -> Iterator[Chain]:
+    """`penumbra up`."""
+    with penumbra_up(cell, seed, *_replicas(replicas)) as running:
+        yield Chain(running, cells.load(cell), replicas)
+
+
+@contextmanager
+def breakable(cell: str, seed: int, replicas: int) -> Iterator[Chain]:
+    """`injected.breakable`."""
+    with injected.breakable(cell, seed, *_replicas(replicas)) as broken:
+        yield Chain(broken.running, cells.load(cell), replicas, broken)
+
+
+def _replicas(number: int) -> list[str]:
+    return [word for name in REPLICATED for word in ("--replicas", f"{name}={number}")] if number > 1 else []
+
+
+# ---- faults
+
+
+@dataclass(frozen=True)
+class Fault:
+    """setup: the chain that it needs; strike: begins the fault of a service's process, and ends it; lasts_s: in between;
+    services: whom it strikes, ALL where it is everybody at once; quick: whether it belongs to the short run."""
+
+    setup: Callable[[str, int, int], AbstractContextManager[Chain]]
+    strike: Callable[[Chain, Any], AbstractContextManager[Any]]
+    lasts_s: float = 0.0
+    services: tuple[str, ...] = SERVICES
+    quick: bool = False
+
+
+def _kill(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
+    return injected.at_once(partial(injected.kill, process))
+
+
+def _memory(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
+    camera = next(iter(chain.cell.cameras))
+    need = partial(injected.large_frame, chain.running.session, chain.running.cell, camera)
+    return injected.at_once(partial(injected.starve, process, need, STARVED_S))
+
+
+@contextmanager
+def _crash_loop(chain: Chain, process: psutil.Process) -> Iterator[None]:
+    words = process.cmdline()
+    service = words[words.index("services.cli") + 1]
+    spared = {each.pid for each in chain.instances(service)} - {process.pid}
+    with injected.crash_loop(lambda: [each for each in chain.instances(service) if each.pid not in spared]):
+        yield
+
+
+def _on(inject: Callable[[psutil.Process], AbstractContextManager[None]]) -> Callable[..., AbstractContextManager[None]]:
+    return lambda chain, process: inject(process)
+
+
+def _storm(topic: Topic, chain: Chain, process: None) -> AbstractContextManager[Any]:
+    names = {"camera": next(iter(chain.cell.cameras)), "pad": next(iter(chain.cell.pads))}
+    names |= {"target": chain.cell.one("targets", None), "robot": next(iter(chain.cell.robots), "")}
+    return injected.storm(chain.running.session, topic.at(cell=chain.running.cell, **names))
+
+
+def _router(chain: Chain, process: None) -> AbstractContextManager[None]:
+    return injected.at_once(chain.parts.router.replace)
+
+
+def _cut(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
+    return chain.parts.link.cut(process)
+
+
+def _own_clock(seconds: float, chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
+    return chain.parts.clocks.shifted(seconds, process)
+
+
+def _all_clocks(seconds: float, chain: Chain, process: None) -> AbstractContextManager[None]:
+    return injected.at_once(partial(chain.parts.clocks.jump, seconds))
+
+
+@contextmanager
+def _kill_on_full_disk(chain: Chain, process: psutil.Process) -> Iterator[None]:
+    if chain.parts.disk is None:
+        raise PermissionError("full disk: a user who may mount a disk for it expected (root)")
+    with injected.full(chain.parts.disk):
+        injected.kill(process)
+        yield
+
+
+FAULTS = {
+    "none": Fault(plain, lambda chain, process: nullcontext(), 5.0, (ALL,), quick=True),
+    "kill": Fault(plain, _kill, quick=True),
+    "freeze": Fault(plain, _on(injected.frozen), 3.0, quick=True),
+    "memory": Fault(plain, _memory, quick=True),
+    "crash loop": Fault(plain, _crash_loop, 5.0),
+    "slow": Fault(plain, _on(injected.slowed), 5.0),
+    **{
+        f"storm of {topic.name}": Fault(plain, partial(_storm, topic), 5.0, (ALL,))
+        for topic in topics.TOPICS
+        if topic not in (topics.TRUTH, topics.JOINTS)  # nobody reads the one, and the table has no robot
+    },
+    "router": Fault(breakable, _router, 0.0, (ALL,), quick=True),
+    "cut 5 s": Fault(breakable, _cut, 5.0),
+    "cut 30 s": Fault(breakable, _cut, 30.0),
+    "clock +1 h": Fault(breakable, partial(_all_clocks, HOUR_S), 0.0, (ALL,), quick=True),
+    "clock -1 h": Fault(breakable, partial(_all_clocks, -HOUR_S), 0.0, (ALL,), quick=True),
+    "own clock +1 h": Fault(breakable, partial(_own_clock, HOUR_S), 3.0),
+    "own clock -1 h": Fault(breakable, partial(_own_clock, -HOUR_S), 3.0),
+    "full disk": Fault(breakable, _kill_on_full_disk, 5.0),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fault of one service; otherwise as `observed.Numbers`."""
+
+    fault: str
+    service: str
+    replicas: int
+    gap_ms: float
+    recovery_s: float | None
+    reused: int
+    false_tracking: int
+    tracking: int
+    worst_cm: float
+
+
+def measure(chain: Chain, name: str, service: str) -> Row:
+    """Strikes once, and watches until the old rate is back."""
+    fault = FAULTS[name]
+    wait_for(chain.is_settled, READY_S, "a chain that tracks the arm", 0.3)
+    chain.outside.forget()
+    begin_s = time.monotonic()
+    time.sleep(BEFORE_S)
+    old_hz = observed.rates_hz(chain.outside, begin_s, time.monotonic())
+    process = None if service == ALL else chain.owner(service)
+    chain.outside.forget()
+    taken = observed.taken(chain.running)
+    fault_s = time.monotonic()
+    with fault.strike(chain, process):
+        time.sleep(fault.lasts_s)
+    over_s = time.monotonic()
+    while True:
+        time.sleep(AFTER_S)
+        reused = observed.reused(chain.outside, taken, observed.taken(chain.running))
+        now_s = time.monotonic()
+        found = observed.numbers(chain.outside, service, old_hz, fault_s, now_s, reused)
+        if found.recovery_s is not None or now_s - over_s > LONGEST_S:
+            return Row(name, service, chain.replicas, **asdict(found))
+
+
+def plan(faults: Sequence[str], services: Sequence[str], replicas: Sequence[int]) -> list[tuple[str, int, list[tuple[str, str]]]]:
+    """The setups to start, with their numbers of replicas, and the faults and services to go through in each."""
+    out: dict[tuple[str, int], list[tuple[str, str]]] = {}
+    for number in replicas:
+        for name in faults:
+            for service in FAULTS[name].services:
+                able = service in REPLICATED or (number == 1 and service in (*services, ALL))
+                if able and (service == ALL or service in services):
+                    out.setdefault((FAULTS[name].setup.__name__, number), []).append((name, service))
+    return [(setup, number, rows) for (setup, number), rows in out.items()]
+
+
+def run(options: argparse.Namespace, done: Callable[[Row], None]) -> None:
+    """Goes through the plan, and hands every row to `done`."""
+    chosen = options.fault or [name for name, fault in FAULTS.items() if fault.quick or not options.quick]
+    replicas = options.replicas or ([1] if options.quick else [1, 2])
+    setups = {each.__name__: each for each in (plain, breakable)}
+    groups = plan(chosen, options.service or SERVICES, replicas)
+    for setup, number, rows in groups:
+        with ExitStack() as stack:
+            chain = stack.enter_context(setups[setup](options.cell, options.seed, number))
+            names = (chain.cell.one("targets", None), next(iter(chain.cell.pads)))
+            wait_for(chain.is_settled, READY_S, "a chain that tracks the arm", 0.3)
+            chain.outside = stack.enter_context(observed.Outside(chain.running.session, options.cell, *names))
+            for name, service in track(rows, f"{setup}, {number} of each", console=Console(stderr=True)):
+                done(measure(chain, name, service))
+
+
+def goal_s(row: Row) -> float:
+    return GOAL_REPLICA_S if row.replicas > 1 else GOAL_ALONE_S
+
+
+def show(rows: Sequence[Row], console: Console) -> None:
+    recovery_goal = f"recovery s\n<= {GOAL_ALONE_S:g}, with a replica {GOAL_REPLICA_S:g}"
+    names = ("fault", "service", "replicas", f"gap ms\n<= {GOAL_GAP_MS:g}", recovery_goal, "reused\n0", "false tracking\n0")
+    table = Table(*names, "of poses", "worst cm", title="faults; misses are red")
+    for row in rows:
+        recovery = "never" if row.recovery_s is None else f"{row.recovery_s:.2f}"
+        cells = [
+            (f"{row.gap_ms:.0f}", row.gap_ms <= GOAL_GAP_MS),
+            (recovery, row.recovery_s is not None and row.recovery_s <= goal_s(row)),
+            (str(row.reused), row.reused == 0),
+            (str(row.false_tracking), row.false_tracking == 0),
+        ]
+        marked = [text if met else f"[red]{text} ![/red]" for text, met in cells]
+        table.add_row(row.fault, row.service, str(row.replicas), *marked, str(row.tracking), f"{row.worst_cm:.1f}")
+    console.print(table)
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="penumbra bench faults", description=__doc__)
+    parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
+    parser.add_argument("--seed", type=int, default=1, help="draws motion and appearance")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file, after every row")
+    parser.add_argument("--quick", action="store_true", help="the faults that show most, without replicas")
+    parser.add_argument("--fault", action="append", choices=FAULTS, help="this fault only; may be repeated")
+    parser.add_argument("--service", action="append", choices=SERVICES, help="strike this service only; may be repeated")
+    parser.add_argument("--replicas", action="append", type=int, choices=(1, 2), help="so many of each service; may be repeated")
+    options = parser.parse_args(argv)
+    rows: list[Row] = []
+
+    def done(row: Row) -> None:
+        rows.append(row)
+        if options.json:
+            options.json.write_text(json.dumps({"seed": options.seed, "rows": [asdict(each) for each in rows]}, indent=1))
+
+    try:
+        run(options, done)
+    finally:
+        show(rows, Console())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

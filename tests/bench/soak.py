@@ -1,0 +1,321 @@
+"""`penumbra bench soak`: what a cell lives through in a day, in half an hour, and what has grown by then.
+
+Clients come, ask and go, viewers watch, things hide the arm, it leaves and comes back, processes are killed, all are replaced one
+after another, the router goes away, nonsense is published: each as often as on a day, `--speed` times as fast. The sensors are
+not sped up. Clocks could be made to run faster in every process, but the services do not take more: on a machine whose cores are
+busy a camera's frames are already left out, and a delay would only count for more of the faster seconds. So a leak of an event
+shows as in a day, one of a message as in `--minutes`; growth is given per hour of these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import psutil
+import zenoh
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from shared import cell as cells
+from shared import topics
+from tests import injected
+from tests.live import Running, connect, penumbra_up, wait_for
+
+DAY_S = 86_400.0
+SAMPLE_S = 5.0
+WARM_UP_S = 60.0
+"""Of every process: caches fill and code is compiled. A fifth of a shorter run."""
+LOOK_S, AWAY_S = 2.0, 4.0
+"""How long a viewer watches, and an arm is away."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One process at one time. memory_mb: what is its own; mapped: files of /dev/shm that it maps."""
+
+    at_s: float
+    memory_mb: float
+    threads: int
+    handles: int
+    mapped: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """All processes of one service that lived long enough: how many; the memory of the last; the median slope of their memory,
+    None where none lived long; the most that one gained of the others between its first and its last third."""
+
+    service: str
+    processes: int
+    memory_mb: float
+    mb_per_hour: float | None
+    threads: int
+    handles: int
+    mapped: int
+
+
+class Life:
+    """What happens to a chain. Every event is a method, in EVENTS with how often it happens on a day."""
+
+    def __init__(self, running: Running, router: injected.Router, cell: cells.Cell, seed: int):
+        self.running, self.router, self.cell = running, router, cell
+        self._rng = np.random.default_rng(seed)
+        self._restart: subprocess.Popen | None = None
+        self._away_until_s: float | None = None
+        self._publishers: list[zenoh.Publisher] = []
+
+    def client(self) -> None:
+        """Comes, asks for the pose, and goes."""
+        with connect(self.router.port) as session:
+            key = topics.current_pose(self.running.cell, self.cell.one("targets", None))
+            for _ in range(3):
+                list(session.get(f"{key}?format=json", timeout=1.0))
+
+    def viewer(self) -> None:
+        """Watches pictures, masks and poses for a while."""
+        with connect(self.router.port) as session:
+            rings = [
+                session.declare_subscriber(topic.at(cell=self.running.cell), zenoh.handlers.RingChannel(1))
+                for topic in (topics.FRAME, topics.MASK, topics.FUSED)
+            ]
+            time.sleep(LOOK_S)
+            for ring in rings:
+                ring.undeclare()
+
+    def occlusion(self) -> None:
+        """Something hides a share of the arm, or nothing does."""
+        if self._away_until_s is None:
+            self.running.control({"command": "occlude", "value": float(self._rng.choice([0.0, 0.0, 0.5, 1.0]))})
+
+    def absence(self) -> None:
+        """The arm is neither seen nor felt for a while, then it is back."""
+        self._away_until_s = time.monotonic() + AWAY_S
+        self._set_away(True)
+
+    def nonsense(self) -> None:
+        """Bytes that are no message, on every topic that is read."""
+        for topic in topics.TOPICS:
+            names = {"camera": next(iter(self.cell.cameras)), "pad": next(iter(self.cell.pads))}
+            names |= {"target": self.cell.one("targets", None), "robot": next(iter(self.cell.robots), "robot")}
+            self.running.session.put(topic.at(cell=self.running.cell, **names), self._rng.bytes(100))
+
+    def kill(self) -> None:
+        """SIGKILL to one of the services."""
+        service = str(self._rng.choice(["emulator", "segmentation", "search", "haptics", "fusion"]))
+        for process in injected.instances(psutil.Process(self.running.launcher.pid), service)[:1]:
+            injected.kill(process)
+
+    def restart(self) -> None:
+        """`penumbra restart`: all that can be, one after another."""
+        if self._restart is None or self._restart.poll() is not None:
+            endpoint = f"tcp/127.0.0.1:{self.router.port}"
+            command = [sys.executable, "-m", "services.cli", "restart", "--cell", self.running.cell, "--connect", endpoint]
+            self._restart = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+
+    def router_loss(self) -> None:
+        """The router dies, and another one takes its place."""
+        self.router.replace()
+
+    def turn(self) -> None:
+        """Ends what has lasted."""
+        if self._away_until_s is not None and time.monotonic() > self._away_until_s:
+            self._away_until_s = None
+            self._set_away(False)
+
+    def end(self) -> None:
+        if self._restart is not None:
+            self._restart.kill()
+            self._restart.wait()
+
+    def _set_away(self, is_away: bool) -> None:
+        self.running.control({"command": "occlude", "value": 1.0 if is_away else 0.0})
+        faults = [f"{pad} dead" for pad in self.cell.pads] if is_away else ["all none"]
+        for words in faults:
+            self.running.control({"command": "skin", "value": words})
+
+
+EVENTS: dict[str, tuple[float, Callable[[Life], None]]] = {
+    "client": (288, Life.client),
+    "viewer": (48, Life.viewer),
+    "occlusion": (720, Life.occlusion),
+    "absence": (144, Life.absence),
+    "nonsense": (1440, Life.nonsense),
+    "kill": (24, Life.kill),
+    "restart": (4, Life.restart),
+    "router loss": (8, Life.router_loss),
+}
+"""How often on a day, and what."""
+
+
+class Gauge:
+    """The series of samples of every process of a chain, by service and pid, and their files in /dev/shm."""
+
+    def __init__(self, launcher: psutil.Process, router: injected.Router):
+        self._launcher, self._router = launcher, router
+        self.series: defaultdict[tuple[str, int], list[Sample]] = defaultdict(list)
+        self.names: set[str] = set()  # of files in /dev/shm that one of them has mapped at any time
+        self.files: list[int] = []  # how many of these there were
+
+    def look(self) -> None:
+        """Takes a sample of each."""
+        now_s = time.monotonic()
+        for name, process in self._processes():
+            with suppress(psutil.NoSuchProcess, FileNotFoundError, ProcessLookupError):
+                memory = process.memory_info()
+                maps = Path(f"/proc/{process.pid}/maps").read_text()
+                mapped = set(re.findall(r"/dev/shm/(\S+)", maps))
+                self.names |= mapped
+                own_mb = (memory.rss - memory.shared) / 1e6
+                sample = Sample(now_s, own_mb, process.num_threads(), process.num_fds(), len(mapped))
+                self.series[name, process.pid].append(sample)
+        self.files.append(self.left())
+
+    def left(self) -> int:
+        """How many files that one of them has mapped are in /dev/shm now."""
+        return len(self.names & set(os.listdir("/dev/shm")))
+
+    def _processes(self) -> Iterator[tuple[str, psutil.Process]]:
+        yield "launcher", self._launcher
+        with suppress(psutil.NoSuchProcess):
+            yield "router", psutil.Process(self._router.popen.pid)
+        with suppress(psutil.NoSuchProcess):
+            for child in self._launcher.children():
+                with suppress(psutil.NoSuchProcess):
+                    words = child.cmdline()
+                    if "services.cli" in words:
+                        yield words[words.index("services.cli") + 1], child
+
+    def rows(self, warm_up_s: float) -> list[Row]:
+        """By service, what grew after the warm-up of each process."""
+        by_service: defaultdict[str, list[list[Sample]]] = defaultdict(list)
+        for (service, _), samples in self.series.items():
+            by_service[service].append([each for each in samples if each.at_s >= samples[0].at_s + warm_up_s])
+        return [row_of(service, [each for each in all_series if len(each) >= 6]) for service, all_series in by_service.items()]
+
+
+def row_of(service: str, all_series: Sequence[Sequence[Sample]]) -> Row:
+    """The growth of a service whose processes left these samples after their warm-up."""
+    if not all_series:
+        return Row(service, 0, 0.0, None, 0, 0, 0)
+    gained = [max(gain(each, name) for each in all_series) for name in ("threads", "handles", "mapped")]
+    mb_per_s = slope([([each.at_s for each in series], [each.memory_mb for each in series]) for series in all_series])
+    return Row(service, len(all_series), round(all_series[-1][-1].memory_mb, 1), round(3600 * mb_per_s, 2), *gained)
+
+
+def gain(series: Sequence[Sample], name: str) -> int:
+    """By how much a number's median of the last third is above that of the first."""
+    values, third = [getattr(each, name) for each in series], len(series) // 3
+    return round(float(np.median(values[-third:]) - np.median(values[:third])))
+
+
+def slope(all_series: Sequence[tuple[Sequence[float], Sequence[float]]]) -> float:
+    """The median slope between any two points of the same series (Theil 1950, Sen 1968, doi:10.1080/01621459.1968.10480934): a
+    step or an outlier does not make it."""
+    slopes: list[float] = []
+    for x, y in all_series:
+        i, j = np.triu_indices(len(x), 1)
+        slopes += ((np.asarray(y)[j] - np.asarray(y)[i]) / (np.asarray(x)[j] - np.asarray(x)[i])).tolist()
+    return float(np.median(slopes))
+
+
+@contextmanager
+def chain(cell: str, seed: int) -> Iterator[tuple[Running, injected.Router]]:
+    """`penumbra up --connect` to a router that can be killed."""
+    router = injected.Router(os.environ)
+    try:
+        through = ("--connect", f"tcp/127.0.0.1:{router.port}")
+        with penumbra_up(cell, seed, *through, port=router.port) as running:
+            yield running, router
+    finally:
+        router.kill()
+
+
+def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
+    """Lives through it; the numbers."""
+    with chain(cell, seed) as (running, router):
+        wait_for(running.is_tracking, 180, "a tracked pose", 0.5)
+        life, gauge = Life(running, router, cells.load(cell), seed), Gauge(psutil.Process(running.launcher.pid), router)
+        began_s = time.monotonic()
+        periods_s = {name: DAY_S / speed / per_day for name, (per_day, _) in EVENTS.items()}
+        due_s = {name: began_s + period_s / 2 for name, period_s in periods_s.items()} | {"look": began_s}
+        happened: Counter[str] = Counter()
+        try:
+            with Progress(console=Console(stderr=True)) as progress:
+                bar = progress.add_task("soak", total=60 * minutes)
+                while (now_s := time.monotonic()) < began_s + 60 * minutes:
+                    progress.update(bar, completed=now_s - began_s)
+                    name = min(due_s, key=lambda each: due_s[each])
+                    life.turn()
+                    if due_s[name] > now_s:
+                        time.sleep(min(0.2, due_s[name] - now_s))
+                    elif name == "look":
+                        gauge.look()
+                        due_s[name] = now_s + SAMPLE_S
+                    else:
+                        EVENTS[name][1](life)
+                        happened[name] += 1
+                        due_s[name] += periods_s[name]
+        finally:
+            life.end()
+        running.control({"command": "skin", "value": "all none"})
+        running.control({"command": "occlude", "value": 0})
+        is_back = wait_for(running.is_tracking, 60, "a tracked pose at the end", 0.5)
+        gauge.look()
+    return {
+        "seed": seed,
+        "minutes": minutes,
+        "speed": speed,
+        "events": dict(happened),
+        "tracking_at_end": is_back,
+        "shm_files": {"first": gauge.files[0], "last": gauge.files[-1], "left": gauge.left()},
+        "rows": [asdict(row) for row in gauge.rows(min(WARM_UP_S, 12 * minutes))],
+    }
+
+
+def show(result: dict, console: Console) -> None:
+    events = ", ".join(f"{n} x {name}" for name, n in result["events"].items())
+    table = Table(
+        *("service", "processes", "MB", "growth MB/h\n0", "threads\n+0", "handles\n+0", "/dev/shm mapped\n+0"),
+        title=f"{result['minutes']:g} minutes at {result['speed']:g} times the events of a day: {events}",
+    )
+    for row in result["rows"]:
+        grown = "lived too short" if row["mb_per_hour"] is None else f"{row['mb_per_hour']:+.1f}"
+        gains = [f"{row[name]:+d}" for name in ("threads", "handles", "mapped")]
+        table.add_row(row["service"], str(row["processes"]), f"{row['memory_mb']:.0f}", grown, *gains)
+    console.print(table)
+    files = result["shm_files"]
+    console.print(
+        f"files in /dev/shm: {files['first']} at first, {files['last']} at last, {files['left']} left when all had ended"
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="penumbra bench soak", description=__doc__)
+    parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
+    parser.add_argument("--seed", type=int, default=1, help="draws motion and what happens")
+    parser.add_argument("--minutes", type=float, default=30.0, help="how long (default: %(default)g, a day at --speed 48)")
+    parser.add_argument("--speed", type=float, default=48.0, help="events, times as often as on a day (default: %(default)g)")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file")
+    options = parser.parse_args(argv)
+    result = soak(options.cell, options.seed, options.minutes, options.speed)
+    show(result, Console())
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
