@@ -11,7 +11,7 @@ import heapq
 import importlib
 import itertools
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,8 +119,16 @@ class ReplayNode:
     def publish(self, topic: Topic, message: Message, **names: str) -> None:
         self._replay.send(topic, names, message, self._replay.now_ns)
 
-    def subscribe(self, topic: Topic, handler: Callable[[Any, dict[str, str]], None], **names: str) -> None:
-        self._replay.listen(topic, names, handler)
+    def subscribe(
+        self,
+        topic: Topic,
+        handler: Callable[[Any, dict[str, str]], None],
+        streams: Sequence[str] = (),
+        from_others: bool = False,
+        **names: str,
+    ) -> None:
+        if not from_others:  # a replay has one node of each service, which owns every stream
+            self._replay.listen(topic, names, handler)
 
     def every(self, period_s: float, function: Callable[[], None]) -> None:
         self._replay.every(round(period_s * 1e9), function)
