@@ -139,6 +139,9 @@ class ReplayNode:
     def owns(self, stream: str) -> bool:
         return True
 
+    def rank(self, stream: str) -> float:
+        return 0.0
+
 
 def digest(heard: list[Heard], period_s: float = 1.0) -> dict[str, list[Any]]:
     """What each service said, thinned to one message a period: mask areas, positions and axes of poses, and states."""
