@@ -31,8 +31,8 @@ from pathlib import Path
 from typing import TextIO
 
 ANSWER_S = 2.0
-"""A fork takes some milliseconds, on a machine that is far too busy a second; a fork server that takes longer than this is ended, and
-the service is started plainly."""
+"""A fork takes some milliseconds, on a machine that is far too busy a second. A fork server that takes longer is ended, and the
+service is started plainly."""
 AGAIN_S = 10.0
 """After which a fork server that ended is started again."""
 MOST_BYTES = 1 << 17
