@@ -30,8 +30,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-ANSWER_S = 1.0
-"""A fork takes some milliseconds; a fork server that takes longer than this is ended, and the service is started plainly."""
+ANSWER_S = 2.0
+"""A fork takes some milliseconds, on a machine that is far too busy a second. A fork server that takes longer is ended, and the
+service is started plainly."""
 AGAIN_S = 10.0
 """After which a fork server that ended is started again."""
 MOST_BYTES = 1 << 17

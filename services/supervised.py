@@ -62,6 +62,7 @@ class Supervised:
         self.popen: subprocess.Popen[str] | Forked | None = None
         self.cpu, self.memory_mb = 0.0, 0.0
         self._environment, self._forkserver = environment or {}, forkserver
+        self._orphans: set[int] = set()  # groups of processes that have ended, of which the launcher may have adopted children
         self.pidfd: int | None = None  # readable when it has ended
         self._delay_s = BACKOFF_S[0]
         self._crashes = 0
@@ -124,6 +125,7 @@ class Supervised:
     def watch(self) -> None:
         """Looks whether it still runs, and starts it again when it is due."""
         now = time.monotonic()
+        self._bury()
         if self.state == "stopping":
             self._stopping(now)
             return
@@ -163,14 +165,20 @@ class Supervised:
         if self._listener is not None:
             self._listener.join(0.2)
         if self.popen is not None:
-            with contextlib.suppress(ChildProcessError):  # its children, where the launcher has adopted them
-                while os.waitpid(-self.popen.pid, os.WNOHANG)[0]:
-                    pass
+            self._orphans.add(self.popen.pid)
         if self.pidfd is not None:
             os.close(self.pidfd)
         self.popen = self.pidfd = None
         self.cpu = self.memory_mb = 0.0
         self.is_ready = False
+
+    def _bury(self) -> None:
+        """Leaves no zombie of what a process that has ended had started."""
+        for group in tuple(self._orphans):
+            try:
+                os.waitpid(-group, os.WNOHANG)
+            except ChildProcessError:
+                self._orphans.discard(group)
 
     def end(self) -> None:
         """Asks it to end, for good; `watch` sees to it that it does within TERMINATE_S."""

@@ -132,7 +132,7 @@ def configuration(connection: Connection) -> zenoh.Config:
         # one attempt is short, because Ctrl-C is not heard inside it; `open_session` repeats it, and later Zenoh itself does
         "connect/timeout_ms": ATTEMPT_MS,
         "connect/exit_on_failure": False,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 200, "period_increase_factor": 1},
         # processes meet at the router and nowhere else: what is not configured is not found by chance
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,

@@ -7,6 +7,8 @@ from types import TracebackType
 
 HANG_S = 1.0
 """A handler hangs that takes so much longer than usual."""
+FIRST_S = 2.0
+"""What is taken for usual before anything is known: the first calls compile, and fill caches."""
 SHARE = 0.05
 """Of one call in what is usual: twenty calls are remembered."""
 
@@ -21,7 +23,7 @@ class Turn:
         self.what = what
         self._patience_s = patience_s
         self._began_s: float | None = None
-        self._usual_s = 0.0
+        self._usual_s = FIRST_S
 
     def __enter__(self) -> None:
         self._began_s = time.monotonic()

@@ -140,8 +140,8 @@ class ReplayNode:
     def owns(self, stream: str) -> bool:
         return True
 
-    def rank(self, stream: str) -> int:
-        return 0
+    def rank(self, stream: str) -> float:
+        return 0.0
 
 
 def digest(heard: list[Heard], period_s: float = 1.0) -> dict[str, list[Any]]:

@@ -129,7 +129,7 @@ def test_what_a_forked_service_started_itself_ends_with_it_and_leaves_no_zombie(
     said(process)
     (child,) = psutil.Process(process.pid).children()
     kill(process)
-    wait_for(lambda: not child.is_running(), 5, "the end of its child")
+    wait_for(lambda: process.watch() or not child.is_running(), 5, "the end of its child")
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
