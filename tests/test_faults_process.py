@@ -61,7 +61,7 @@ class Struck:
 @pytest.fixture(scope="module")
 def struck():
     with ExitStack() as stack:
-        broken = stack.enter_context(injected.breakable("table", 5))
+        broken = stack.enter_context(injected.breakable("table", 5, "--replicas", "fusion=1"))
         outside = stack.enter_context(observed.Outside(broken.running.session, "table", "forearm", "p0"))
         hold_in_reach(broken.running)
         yield Struck(broken, outside)
