@@ -105,7 +105,8 @@ def large_frame(session: zenoh.Session, cell: str, camera: str) -> None:
     """A picture as large as a message may be: its reader needs new memory for it (malloc has nothing of 32 MB or more at hand),
     though it will not use a picture of this size."""
     frame = messages.Frame(stamp_ns=time.time_ns(), image=np.zeros((4600, 4600, 3), np.uint8))
-    session.put(topics.FRAME.at(cell=cell, camera=camera), messages.encode(frame))
+    key = topics.FRAME.at(cell=cell, camera=camera)
+    session.put(key, messages.encode(frame), congestion_control=zenoh.CongestionControl.BLOCK)  # else a busy link drops it
 
 
 @contextmanager
