@@ -18,8 +18,8 @@ and do not resemble each other mean that the sense is noisier than it says: less
 Measurements come late and out of order: the filter goes back to the stamp, applies, and replays what came after. The result
 depends on the measurements and their stamps alone, never on the order of arrival (within the horizon): the whole state of the
 filter, what it refused included, is a function of the state before and the measurement. A history is a ring of measurements in
-the order of stamp and source, each with the state after it. Its first entry is the newest one that is older than the horizon:
-nothing is inserted before it. `ring` (2,) holds the slot of the first entry and the number of entries.
+the order of stamp, source and position, each with the state after it. Its first entry is the newest one that is older than the
+horizon: nothing is inserted before it. `ring` (2,) holds the slot of the first entry and the number of entries.
 
 Everything works in place on the records of `records.py`; `measure_all` and `estimate_all` are called from outside,
 for as many targets as there are. It is one file because numba keeps what it compiled until the file of the function called from
@@ -461,8 +461,7 @@ def insert(model, states, measurements, ring, m):  # type: ignore[no-untyped-def
     newest_ns = measurements[(ring[0] + ring[1] - 1) % size].stamp_ns
     if at == 0 or m.stamp_ns < newest_ns - horizon_ns:
         return LATE
-    last = measurements[(ring[0] + at - 1) % size]
-    if last.stamp_ns == m.stamp_ns and last.source == m.source:
+    if not _is_after(m, measurements[(ring[0] + at - 1) % size]):
         return DUPLICATE
     if ring[1] == size:
         if at == 1:
@@ -498,7 +497,15 @@ def find(states, ring, stamp_ns):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _is_after(a, b):  # type: ignore[no-untyped-def]
-    return a.stamp_ns > b.stamp_ns or (a.stamp_ns == b.stamp_ns and a.source > b.source)
+    """Whether a measurement comes after another: by stamp, source, and position, as of two cameras that expose together."""
+    if a.stamp_ns != b.stamp_ns:
+        return a.stamp_ns > b.stamp_ns
+    if a.source != b.source:
+        return a.source > b.source
+    for i in range(3):
+        if a.p[i] != b.p[i]:
+            return a.p[i] > b.p[i]
+    return False
 
 
 @njit(cache=True)

@@ -96,7 +96,7 @@ def breakable(cell: str, seed: int, replicas: int) -> Iterator[Chain]:
 
 
 def _replicas(number: int) -> list[str]:
-    return [word for name in REPLICATED for word in ("--replicas", f"{name}={number}")] if number > 1 else []
+    return [word for name in REPLICATED for word in ("--replicas", f"{name}={number}")]
 
 
 # ---- faults

@@ -57,10 +57,10 @@ def row(size: int, replicas: int, seed: int, seconds: float, rate_hz: float | No
 
 
 def ready(running: Running) -> dict[str, int]:
-    """Instances by service that have joined in, but the launcher."""
+    """Instances by service that have joined in, but the launcher and its router."""
     found: dict[str, int] = defaultdict(int)
     for report in reports(running):
-        found[report["service"]] += bool(report["ready"]) and report["service"] != "launcher"
+        found[report["service"]] += bool(report["ready"]) and report["service"] not in ("launcher", "router")
     return {service: number for service, number in found.items() if number}
 
 
