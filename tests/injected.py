@@ -66,14 +66,20 @@ def slowed(process: psutil.Process, stopped_s: float = 0.4, running_s: float = 0
                 process.send_signal(signal.SIGCONT)
                 done.wait(running_s)
 
-    thread = threading.Thread(target=alternate)
-    with _signalled(process, signal.SIGCONT):
-        thread.start()
-        try:
-            yield
-        finally:
-            done.set()
-            thread.join()
+    with _signalled(process, signal.SIGCONT), _meanwhile(alternate, done):
+        yield
+
+
+@contextmanager
+def _meanwhile(function: Callable[[], None], done: threading.Event) -> Iterator[None]:
+    """Calls a function in a thread of its own, which ends when `done` is set, as it is in the end."""
+    thread = threading.Thread(target=function)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 @contextmanager
@@ -119,13 +125,8 @@ def crash_loop(processes: Callable[[], Iterable[psutil.Process]], period_s: floa
             for process in processes():
                 kill(process)
 
-    thread = threading.Thread(target=reap)
-    thread.start()
-    try:
+    with _meanwhile(reap, done):
         yield
-    finally:
-        done.set()
-        thread.join()
 
 
 # ---- the disk
