@@ -24,8 +24,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from hashlib import blake2b
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, cast
@@ -36,6 +35,7 @@ import zenoh
 from shared import bus, cell, health, logs, topics
 from shared.guard import Guard
 from shared.messages import VERSION, BadMessage, Message, encode
+from shared.replicas import Clock, Replicas, Share
 from shared.topics import QoS, Topic
 from shared.turn import HANG_S, Turn
 
@@ -45,29 +45,9 @@ QUERY_DEPTH = 32
 NEWS_S = 0.2
 """Within this a session has heard which replicas there are."""
 LOOK_S = 0.2
-"""How often it is looked whether a handler hangs."""
+"""How often it is looked whether this replica is fit for its part."""
 WARM_UP_S = 2.0
 """How long a replica that joins others may listen before it takes its share."""
-
-
-@dataclass
-class Share:
-    """A subscription that is there only while one of `streams` is this replica's. traffic: of its keys; read: opens it."""
-
-    streams: tuple[str, ...]
-    traffic: list[bus.Traffic]
-    read: Callable[[], bus.Reader]
-    reader: bus.Reader | None = None
-
-    def follow(self, is_own: bool) -> None:
-        """Opens or closes the subscription where that has changed."""
-        for traffic in self.traffic:
-            traffic.is_read = is_own
-        if is_own and self.reader is None:
-            self.reader = self.read()
-        elif not is_own and self.reader is not None:
-            self.reader.close()
-            self.reader = None
 
 
 Answer = Callable[[dict[str, str], bytes], "bytes | tuple[bytes, str]"]
@@ -98,15 +78,11 @@ class Node:
         self._lately = health.Lately()
         self.report: dict[str, Callable[[], Any]] = {}
         self.worries: Callable[[], Sequence[str]] = list  # what the service itself suffers from, in words
-        self._counting = threading.Lock()
-        self._token: zenoh.LivelinessToken | None = None
         self._turns: list[Turn] = []
         self._hang = ""  # the handler that hangs, in words
+        self._clock = Clock()
         self.is_warm: Callable[[], bool] = lambda: True  # whether it could go on with what another replica does
-        self._others: frozenset[str] = frozenset()
-        self._replicas = frozenset({self.instance})
-        self._ranks: dict[str, float] = {}
-        self._shares: list[Share] = []
+        self.replicas = Replicas(topics.alive(self.cell.name, service, self.instance))
         self._process = psutil.Process()
         self._cpu = 0.0
         self._started = time.monotonic()
@@ -120,8 +96,9 @@ class Node:
         self.session = bus.open_session(self.connection, self.stopping, self._tell_waiting, patience_s)
         self._reachable = True
         if not self.is_warm():
-            self._replicas, self._ranks = frozenset(), {}  # it owns nothing before it knows whether others do
-        self._watch_replicas()
+            self.replicas.wait()
+        session = self.session
+        self._spawn(lambda: self.replicas.watch(session), "replicas")
         self.answer(topics.health(self.cell.name, self.service, self.instance), self._answer_health)
         for declare in self._pending:
             declare()
@@ -129,7 +106,7 @@ class Node:
         self._come_alive()
         self._process.cpu_percent()
         self.every(1.0, self._keep_house)
-        self._spawn(self._watch_turns, "watch turns")
+        self._spawn(self._watch_fitness, "watch fitness")
         self.log.info("on the bus", at=", ".join(self.connection.listen) or self.connection.where)
         return self
 
@@ -138,24 +115,17 @@ class Node:
         first, for at most WARM_UP_S; alone, a cold one is better than none."""
         session = cast(zenoh.Session, self.session)
 
-        def declare() -> None:
-            with self._counting:
-                if self._token is None:
-                    key = topics.alive(self.cell.name, self.service, self.instance)
-                    self._token = session.liveliness().declare_token(key)
-            self._count_replicas()
-
         def warm_up() -> None:
             began = time.monotonic()
-            while not self.is_warm() and time.monotonic() - began < (WARM_UP_S if self._others else NEWS_S):
+            while not self.is_warm() and time.monotonic() - began < (WARM_UP_S if self.replicas.others else NEWS_S):
                 if self.stopping.wait(0.02):
                     return
-            declare()
+            self.replicas.join(session)
 
         if not self.is_warm():
             self._spawn(warm_up, "warm up")
         else:
-            declare()
+            self.replicas.join(session)
 
     def run(self) -> None:
         """Opens, and serves until SIGINT or SIGTERM; a second signal ends the process at once. Raises bus.BusError."""
@@ -187,8 +157,7 @@ class Node:
         deadline = time.monotonic() + CLOSE_S
         closing = threading.Thread(target=session.close, name="close", daemon=True)
         closing.start()
-        readers = [reader.thread for share in self._shares if (reader := share.reader) is not None]
-        for thread in (closing, *self._threads, *readers):
+        for thread in (closing, *self._threads, *(reader.thread for reader in self.replicas.readers)):
             if thread is not threading.current_thread():
                 thread.join(max(0.0, deadline - time.monotonic()))
 
@@ -292,23 +261,13 @@ class Node:
 
         if streams:
             share = Share(tuple(streams), [traffic for _, traffic, _ in table.values()], read)
-            self._declare(lambda: self._join(share))
+            self._declare(lambda: self.replicas.share(share))
         else:
             self._declare(lambda: self._threads.append(read().thread))
 
     def _turn(self, what: str, patience_s: float = HANG_S) -> Turn:
         self._turns.append(turn := Turn(what, patience_s))
         return turn
-
-    def _join(self, share: Share) -> None:
-        with self._counting:
-            self._shares.append(share)
-            self._take_shares()
-
-    def _take_shares(self) -> None:
-        """Begins to read the streams that have become this replica's, and leaves those that have gone."""
-        for share in self._shares:
-            share.follow(any(map(self.owns, share.streams)))
 
     def _rate_hz(self, topic: Topic, names: dict[str, str]) -> float:
         """How often a key's publisher sends: as the table says, but for what follows the cameras' own rates."""
@@ -341,7 +300,7 @@ class Node:
 
     def answer(self, key: str, function: Answer) -> None:
         """Answers queries on `key` with `function(parameters, payload)`: bytes, or bytes and their encoding. A ValueError becomes
-        an error reply with its text. While it warms up or hangs beside others, it leaves the answers to them."""
+        an error reply with its text. While it warms up, or is unfit, beside others, it leaves the answers to them."""
 
         def serve(queryable: Any) -> None:
             while True:
@@ -361,8 +320,8 @@ class Node:
     def _reply(self, key: str, query: zenoh.Query, function: Answer) -> None:
         parameters = dict(cast(Any, query.parameters))
         try:
-            if self._token is None and self._others and function != self._answer_health:
-                raise ValueError(f"{self.service} {self.instance} {'hangs' if self._hang else 'warms up'}: ask the others")
+            if not self.replicas.has_joined and self.replicas.others and function != self._answer_health:
+                raise ValueError(f"{self.service} {self.instance} has no part now: ask the others")
             result = function(parameters, query.payload.to_bytes() if query.payload is not None else b"")
         except ValueError as error:
             query.reply_err(str(error).encode())
@@ -397,24 +356,26 @@ class Node:
 
         self._declare(lambda: self._spawn(loop, f"every {period_s} s"))
 
-    def _watch_turns(self) -> None:
-        """While a handler hangs, this replica has no part: its streams go to others, and come back when the handler returns."""
-        looked_s = time.monotonic()
+    def _watch_fitness(self) -> None:
+        """While a handler hangs, or the clock is off, this replica has no part where others live: its streams are theirs until it
+        is fit again."""
+        looked_s, has_withdrawn = time.monotonic(), False
         while not self.stopping.wait(LOOK_S):
             now_s = time.monotonic()
             late_s, looked_s = now_s - looked_s - LOOK_S, now_s
             if late_s > LOOK_S:  # the whole process stood still
                 continue
             longest_s, what = max(((turn.hangs_s(now_s), turn.what) for turn in self._turns), default=(0.0, ""))
-            was, self._hang = self._hang, f"{what} hangs for {longest_s:.0f} s" if longest_s else ""
+            self._hang = f"{what} hangs for {longest_s:.0f} s" if longest_s else ""
+            unfit = self._hang or self._clock.judge(self._received.values(), now_s)
             try:
-                if self._hang and self._token is not None:
-                    self.log.error("a handler hangs: the other replicas take over", handler=what)
-                    token, self._token = self._token, None
-                    token.undeclare()
-                    self._count_replicas()
-                elif was and not self._hang:
-                    self.log.info("the handler that hung has returned")
+                if unfit and self.replicas.has_joined and self.replicas.others:
+                    self.log.warning("unfit: the other replicas take over", why=unfit)
+                    has_withdrawn = True
+                    self.replicas.withdraw()
+                elif has_withdrawn and not unfit:
+                    self.log.info("fit again")
+                    has_withdrawn = False
                     self._come_alive()
             except zenoh.ZError:  # the session was closed
                 return
@@ -422,48 +383,11 @@ class Node:
     def owns(self, stream: str) -> bool:
         """Whether this replica is the one of the living replicas of its service that handles `stream`. While the news of a
         replica's coming or going is under way two may own a stream, or none."""
-        return self.rank(stream) == 0
+        return self.replicas.owns(stream)
 
     def rank(self, stream: str) -> float:
-        """How many living replicas of this service are before this one to handle `stream`: 0 for its owner, 1 for the one that
-        will own it when the owner goes away; infinity where this one has no part yet. Rendezvous hashing (Thaler and
-        Ravishankar 1998, doi:10.1109/90.663936): a replica that comes or goes moves only its own streams."""
-        rank = self._ranks.get(stream)
-        if rank is None:
-            ranks, replicas = self._ranks, self._replicas
-            weight = lambda replica: blake2b(f"{replica} {stream}".encode()).digest()  # noqa: E731
-            own = weight(self.instance)
-            rank = sum(weight(each) > own for each in replicas) if self.instance in replicas else math.inf
-            ranks[stream] = rank
-        return rank
-
-    def _watch_replicas(self) -> None:
-        session = cast(zenoh.Session, self.session)
-        expression = topics.alive(self.cell.name, self.service, "*")
-        tokens = session.liveliness().declare_subscriber(expression, zenoh.handlers.FifoChannel(256), history=True)
-
-        def watch() -> None:
-            living: set[str] = set()
-            while True:
-                try:
-                    sample = tokens.recv()
-                    instance = str(sample.key_expr).rpartition("/")[2]
-                    (living.discard if sample.kind == zenoh.SampleKind.DELETE else living.add)(instance)
-                    self._others = frozenset(living - {self.instance})
-                    self._count_replicas()
-                except zenoh.ZError:  # the session was closed
-                    return
-
-        self._spawn(watch, "replicas")
-
-    def _count_replicas(self) -> None:
-        """This one counts as soon as the others know of it, or where there are none."""
-        with self._counting:
-            self._ranks = {}
-            self._replicas = self._others if self._token is None and self._others else self._others | {self.instance}
-            self._ranks = {}
-            if self.session is not None:
-                self._take_shares()
+        """How many living replicas are before this one to handle `stream`; infinity where this one has no part now."""
+        return self.replicas.rank(stream)
 
     def health(self) -> dict[str, Any]:
         """What this instance is and how it fares, as JSON: its status and the reasons for it (`shared.health`), CPU in cores,
@@ -480,12 +404,12 @@ class Node:
             "pid": os.getpid(),
             "cell": self.cell.name,
             "wire_version": VERSION,
-            "ready": self._token is not None,
+            "ready": self.replicas.has_joined,
             "hangs": self._hang,
             "uptime_s": round(time.monotonic() - self._started, 1),
             "cpu": round(self._cpu, 3),
             "memory_mb": round(self._process.memory_info().rss / 1e6, 1),
-            "replicas": len(self._replicas),
+            "replicas": len(self.replicas),
             "topics": {key: traffic.report(now) for key, traffic in sorted(self._received.items())},
             "published": {key: traffic.report(now) for key, traffic in sorted(self._published.items())},
             "stale": sorted(key for key, traffic in self._received.items() if traffic.is_stale(now)),
@@ -497,7 +421,7 @@ class Node:
         return json.dumps(self.health()).encode()
 
     def _suffers(self) -> list[str]:
-        return [*([self._hang] if self._hang else []), *self.worries()]
+        return [*filter(None, [self._hang, self._clock.fault]), *self.worries()]
 
     def _look(self) -> Counter[tuple[str, str]]:
         return self._lately.look(health.counts(self._received, self._faults), time.monotonic())

@@ -351,6 +351,23 @@ def test_a_replica_that_hangs_alone_keeps_its_streams(replica):
     let_go.set()
 
 
+def test_a_replica_whose_clock_is_off_leaves_its_streams_to_the_others_until_it_is_right(replica, router, monkeypatch):
+    off, other = nodes = [replica(), replica()]
+    ahead_ns = [0]
+    monkeypatch.setattr(off, "now_ns", lambda: time.time_ns() + ahead_ns[0])
+    before = wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    for node in nodes:
+        node.subscribe(topics.FUSED, lambda message, names: None)
+    router.every(0.01, lambda: router.publish(topics.FUSED, pose(), target="forearm"))
+    ahead_ns[0] = 3600 * 10**9
+    wait_for(lambda: owners(nodes) == [other] * len(STREAMS), 10, "all streams to be the other one's")
+    assert off.health()["status"] == "degraded"
+    assert any("check the clock" in reason for reason in off.health()["reasons"])
+    ahead_ns[0] = 0
+    wait_for(lambda: owners(nodes) == before, 10, "the streams to come back")
+    assert not any("check the clock" in reason for reason in off.health()["reasons"])
+
+
 def test_a_handler_that_always_takes_long_does_not_hang(replica):
     patient = replica()
     patient.every(0.01, patient.stopping.wait, math.inf)
