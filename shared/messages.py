@@ -46,6 +46,8 @@ ROUNDING = 1e-6
 """What shares and matrices may be off by rounding, relative."""
 LARGE = 65_536
 """Bytes of an array from which it is worth while not to copy it twice."""
+HEAD = 1024
+"""Bytes within which the large array of a message begins."""
 BIN32 = 0xC6
 """MessagePack's head of bytes with their number in 32 bits."""
 _STRUCTURE = {"max_array_len": 16, "max_map_len": 32, "max_str_len": 256, "max_ext_len": 0}
@@ -213,51 +215,47 @@ class Truth(Message):
 
 
 M = typing.TypeVar("M", bound=Message)
-Fields = tuple[tuple[str, Any, typing.Mapping[str, Any]], ...]
+Convert = Callable[[Any], Any]
 
 
-def _read_fields(kind: Any) -> Fields:
-    """Name, type and metadata of each field of a message class."""
-    hints = typing.get_type_hints(kind)
-    return tuple((f.name, hints[f.name], f.metadata) for f in dataclasses.fields(kind))
+class _Plan:
+    """How the fields of a message class go onto the wire and come from it, worked out once: a bus that carries thousands of
+    messages a second has no time to look at declarations. write, read: functions by field; read raises BadMessage."""
+
+    def __init__(self, kind: type[Message]):
+        hints = typing.get_type_hints(kind)
+        self.write: dict[str, Convert] = {}
+        self.read: dict[str, Convert] = {}
+        for declared in dataclasses.fields(kind):
+            name, hint, spec = declared.name, hints[declared.name], declared.metadata.get("array")
+            where = f"{kind.__name__}.{name}"
+            if spec is not None:
+                self.write[name], self.read[name] = _array_writer(name, spec), _array_reader(where, spec)
+            elif hint is float or hint is int:
+                within = declared.metadata.get("within", (-LARGEST, LARGEST) if hint is float else (-math.inf, math.inf))
+                self.write[name], self.read[name] = _plain, _number_reader(where, hint, within)
+            elif hint is str:
+                self.write[name], self.read[name] = _plain, _text_reader(where, declared.metadata.get("choice"))
+            else:
+                self.write[name], self.read[name] = _write_sources, _sources_reader(where)
 
 
-_fields = typing.cast(Callable[[type[Message]], Fields], functools.cache(_read_fields))
-
-
-def _read_names(kind: Any) -> frozenset[str]:
-    return frozenset(field.name for field in dataclasses.fields(kind))
-
-
-_field_names = typing.cast(Callable[[type[Message]], frozenset[str]], functools.cache(_read_names))
-
-
-@functools.cache
-def _dtype_name(dtype: np.dtype) -> str:
-    """numpy puts the name together anew each time, which takes longer than the rest of an array."""
-    return dtype.name
+_plan = typing.cast(Callable[[type[Message]], _Plan], functools.cache(_Plan))
 
 
 def encode(message: Message) -> bytes:
     """The MessagePack bytes of a message. Raises BadMessage where an array has not the declared dtype and shape."""
     out: dict[str, Any] = {"version": VERSION}
-    large = False
-    for name, _, metadata in _fields(type(message)):
-        value = getattr(message, name)
-        spec = metadata.get("array")
-        if spec is not None:
-            value = np.ascontiguousarray(value)
-            dtype = _dtype_name(value.dtype)
-            _check_array(name, spec, dtype, value.shape)
-            out[name] = [dtype, value.shape, value.data.cast("B")]  # a view: nothing is copied yet
-            large |= value.nbytes >= LARGE
-        elif isinstance(value, dict):
-            out[name] = {key: dict(vars(item)) for key, item in value.items()}
-        elif isinstance(value, np.generic):
-            out[name] = value.item()
-        else:
-            out[name] = value
-    return b"".join(_pieces(out)) if large else msgpack.packb(out)
+    large = None
+    for name, write in _plan(type(message)).write.items():
+        value = write(getattr(message, name))
+        if type(value) is list and len(value[2]) >= LARGE:
+            large = name
+        out[name] = value
+    if large is None:
+        return msgpack.packb(out)
+    out[large] = out.pop(large)  # to the end, where a reader finds it without a copy
+    return b"".join(_pieces(out))
 
 
 def _pieces(fields: dict[str, Any]) -> Iterator[bytes | memoryview]:
@@ -269,7 +267,7 @@ def _pieces(fields: dict[str, Any]) -> Iterator[bytes | memoryview]:
         if isinstance(value, list):
             dtype, shape, view = value
             yield packer.pack_array_header(3) + packer.pack(dtype) + packer.pack(shape)
-            yield struct.pack(">BI", BIN32, view.nbytes)
+            yield struct.pack(">BI", BIN32, len(view))
             yield view
         else:
             yield packer.pack(value)
@@ -296,21 +294,25 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: f
             "version",
             f"{kind.__name__}: wire version {VERSION} expected, {_short(version)} came: run one release of Penumbra everywhere",
         )
-    specs = _fields(kind)
-    if raw.keys() != _field_names(kind):
-        raise BadMessage(
-            "fields", f"{kind.__name__}: fields {[n for n, _, _ in specs]} expected, {sorted(map(_short, raw))} came"
-        )
-    message = kind(**{name: _field(kind.__name__, name, hint, metadata, raw[name]) for name, hint, metadata in specs})
+    read = _plan(kind).read
+    if raw.keys() != read.keys():
+        raise BadMessage("fields", f"{kind.__name__}: fields {list(read)} expected, {sorted(map(_short, raw))} came")
+    message = kind(**{name: convert(raw[name]) for name, convert in read.items()})
     if now_ns is not None:
         check_stamp(message, now_ns, oldest_s)
     return message
 
 
 def _unpack(payload: bytes) -> Any:
-    """The objects in a payload. A large one may be full of tiny lists, each many times its size in memory: they are counted."""
+    """The objects in a payload."""
     if len(payload) <= Message.MAX_BYTES:
         return msgpack.unpackb(payload, **_STRUCTURE)
+    found = _without_a_copy(payload)
+    return _counted(payload) if found is None else found
+
+
+def _counted(payload: bytes) -> Any:
+    """A large payload may be full of tiny lists, each many times its size in memory: they are counted."""
     count = itertools.count(1)
 
     def limited(container: Any) -> Any:
@@ -319,6 +321,22 @@ def _unpack(payload: bytes) -> Any:
         return container
 
     return msgpack.unpackb(payload, list_hook=limited, object_hook=limited, **_STRUCTURE)
+
+
+def _without_a_copy(payload: bytes) -> Any:
+    """The objects of a payload that ends with the bytes of a large array, as `encode` writes it: these bytes stay where they are.
+    None for any other payload."""
+    at = payload.find(BIN32, 0, HEAD)
+    while at >= 0 and at + 5 + int.from_bytes(payload[at + 1 : at + 5], "big") != len(payload):
+        at = payload.find(BIN32, at + 1, HEAD)
+    if at < 0:
+        return None
+    found = msgpack.unpackb(payload[:at] + b"\xc4\x00", **_STRUCTURE)  # as if there were none of them
+    array = next(reversed(found.values()), None) if isinstance(found, dict) else None
+    if not isinstance(array, list) or array[-1:] != [b""]:
+        return None
+    array[-1] = memoryview(payload)[at + 5 :]
+    return found
 
 
 def check_stamp(message: Message, now_ns: int, oldest_s: float) -> None:
@@ -340,64 +358,93 @@ def _check_array(where: str, spec: _ArraySpec, dtype: str, shape: tuple[int, ...
         raise BadMessage("array", f"{where}: {spec.dtype} of shape {wanted} expected, {dtype} of shape {tuple(shape)} came")
 
 
-def _field(kind: str, name: str, hint: Any, metadata: typing.Mapping[str, Any], value: Any) -> Any:
-    where = f"{kind}.{name}"
-    spec = metadata.get("array")
-    if spec is not None:
-        return _array_from_wire(where, spec, value)
-    if hint is float or hint is int:
-        return _number(where, hint, metadata.get("within", (-LARGEST, LARGEST) if hint is float else None), value)
-    if hint is str:
-        choice = metadata.get("choice")
-        if not isinstance(value, str) or (choice and value not in choice):
-            raise BadMessage("text", f"{where}: {' | '.join(choice) if choice else 'a text'} expected, {_short(value)} came")
-        return value
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise BadMessage("sources", f"{where}: a map of sources expected, {_short(value)} came")
-    return {key: _source(f"{where}.{key}", item) for key, item in value.items()}
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
 
 
-def _number(where: str, hint: type, within: tuple[float, float] | None, value: Any) -> Any:
+def _write_sources(value: dict[str, Source]) -> dict[str, Any]:
+    return {key: dict(vars(item)) for key, item in value.items()}
+
+
+def _array_writer(name: str, spec: _ArraySpec) -> Convert:
+    def write(value: Any) -> list[Any]:
+        value = np.ascontiguousarray(value)
+        if value.dtype != spec.numpy or value.shape != spec.shape:
+            _check_array(name, spec, value.dtype.name, value.shape)
+        return [spec.dtype, value.shape, value.data.cast("B") if value.nbytes >= LARGE else value.tobytes()]
+
+    return write
+
+
+def _array_reader(where: str, spec: _ArraySpec) -> Convert:
+    numpy, check, is_float = spec.numpy, spec.check, spec.numpy.kind == "f"
+
+    def read(value: Any) -> np.ndarray:
+        well_formed = (
+            type(value) is list
+            and len(value) == 3
+            and type(value[0]) is str
+            and type(value[1]) is list
+            and all(type(n) is int for n in value[1])
+            and isinstance(value[2], bytes | memoryview)
+        )
+        if not well_formed:
+            raise BadMessage("array", f"{where}: [dtype, shape, bytes] expected, {_short(value)} came")
+        dtype, shape, data = value
+        _check_array(where, spec, dtype, tuple(shape))
+        if len(data) != numpy.itemsize * math.prod(shape):
+            expected = numpy.itemsize * math.prod(shape)
+            raise BadMessage("array", f"{where}: {expected} bytes for {dtype} {shape} expected, {len(data)} came")
+        array = np.frombuffer(data, numpy).reshape(shape)
+        # the sum of squares is soon made, and small where all is well; else each number is looked at, also where it is NaN
+        if is_float and not np.vdot(array, array) <= LARGEST and not np.abs(array).max() <= LARGEST:
+            count = int((~(np.abs(array) <= LARGEST)).sum())
+            raise BadMessage("finite", f"{where}: finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not")
+        if check is not None and (fault := check(array)):
+            raise BadMessage("values", f"{where}: {fault}")
+        return array
+
+    return read
+
+
+def _number_reader(where: str, hint: type, within: tuple[float, float]) -> Convert:
+    low, high = within
+    kinds = (int,) if hint is int else (int, float)
     wanted = "an integer" if hint is int else "a finite number"
-    numeric = isinstance(value, int) or (hint is float and isinstance(value, float))
-    if not numeric or isinstance(value, bool) or not math.isfinite(value):
-        raise BadMessage("number", f"{where}: {wanted} expected, {_short(value)} came")
-    if within is not None and not within[0] <= value <= within[1]:
-        raise BadMessage("range", f"{where}: {wanted} from {within[0]:g} to {within[1]:g} expected, {_short(value)} came")
-    return hint(value)
+
+    def read(value: Any) -> Any:
+        if type(value) in kinds and low <= value <= high:
+            return hint(value)
+        if type(value) not in kinds or not math.isfinite(value):
+            raise BadMessage("number", f"{where}: {wanted} expected, {_short(value)} came")
+        raise BadMessage("range", f"{where}: {wanted} from {low:g} to {high:g} expected, {_short(value)} came")
+
+    return read
 
 
-def _source(where: str, value: Any) -> Source:
-    if not isinstance(value, dict) or value.keys() != {"age_s", "weight"}:
-        raise BadMessage("sources", f"{where}: age_s and weight expected, {_short(value)} came")
-    return Source(**{name: _number(f"{where}.{name}", float, (-LARGEST, LARGEST), number) for name, number in value.items()})
+def _text_reader(where: str, choice: tuple[str, ...] | None) -> Convert:
+    def read(value: Any) -> str:
+        if type(value) is str and (choice is None or value in choice):
+            return value
+        raise BadMessage("text", f"{where}: {' | '.join(choice) if choice else 'a text'} expected, {_short(value)} came")
+
+    return read
 
 
-def _array_from_wire(where: str, spec: _ArraySpec, value: Any) -> np.ndarray:
-    well_formed = (
-        isinstance(value, list)
-        and len(value) == 3
-        and isinstance(value[0], str)
-        and isinstance(value[1], list)
-        and all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in value[1])
-        and isinstance(value[2], bytes)
-    )
-    if not well_formed:
-        raise BadMessage("array", f"{where}: [dtype, shape, bytes] expected, {_short(value)} came")
-    dtype, shape, data = value
-    _check_array(where, spec, dtype, tuple(shape))
-    expected = spec.numpy.itemsize * math.prod(shape)
-    if len(data) != expected:
-        raise BadMessage("array", f"{where}: {expected} bytes for {dtype} {shape} expected, {len(data)} came")
-    array = np.frombuffer(data, spec.numpy).reshape(shape)
-    # the sum of squares is soon made, and small where all is well; else each number is looked at, also where it is NaN
-    if spec.numpy.kind == "f" and not np.vdot(array, array) <= LARGEST and not np.abs(array).max() <= LARGEST:
-        count = int((~(np.abs(array) <= LARGEST)).sum())
-        raise BadMessage("finite", f"{where}: finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not")
-    fault = spec.check(array) if spec.check else None
-    if fault:
-        raise BadMessage("values", f"{where}: {fault}")
-    return array
+def _sources_reader(where: str) -> Convert:
+    number = _number_reader(where, float, (-LARGEST, LARGEST))
+
+    def read(value: Any) -> dict[str, Source]:
+        if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+            raise BadMessage("sources", f"{where}: a map of sources expected, {_short(value)} came")
+        return {key: source(key, item) for key, item in value.items()}
+
+    def source(key: str, item: Any) -> Source:
+        if not isinstance(item, dict) or item.keys() != {"age_s", "weight"}:
+            raise BadMessage("sources", f"{where}.{key}: age_s and weight expected, {_short(item)} came")
+        return Source(number(item["age_s"]), number(item["weight"]))
+
+    return read
 
 
 def _short(value: Any) -> str:

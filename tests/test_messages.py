@@ -195,7 +195,7 @@ def test_encoding_an_array_of_the_wrong_shape_says_what_was_expected():
         encode(dataclasses.replace(pose(), position=np.zeros(2, np.float32)))
 
 
-def test_a_large_array_is_packed_without_a_copy_into_the_same_bytes(monkeypatch):
+def test_a_large_array_is_packed_last_as_plain_message_pack_and_read_where_it_lies(monkeypatch):
     rng = np.random.default_rng(0)
     sent = [
         messages.Frame(stamp_ns=5, image=rng.integers(0, 255, (300, 400, 3), np.uint8)),
@@ -203,5 +203,23 @@ def test_a_large_array_is_packed_without_a_copy_into_the_same_bytes(monkeypatch)
     ]
     large = [messages.encode(message) for message in sent]
     monkeypatch.setattr(messages, "LARGE", 1 << 40)
-    assert large == [messages.encode(message) for message in sent]
-    assert (messages.decode(messages.Mask, large[1]).labels == sent[1].labels).all()
+    for message, payload, name in zip(sent, large, ("image", "labels"), strict=True):
+        plain = messages.encode(message)
+        assert msgpack.unpackb(payload) == msgpack.unpackb(plain)
+        array, copied = (getattr(messages.decode(type(message), data), name) for data in (payload, plain))
+        assert (array == getattr(message, name)).all() and (copied == array).all()
+        assert np.shares_memory(array, np.frombuffer(payload, np.uint8))
+        assert not array.flags.writeable
+
+
+@pytest.mark.parametrize("change", ["shorter", "longer", "head", "nested"])
+def test_a_large_array_that_is_not_what_it_says_is_refused(change):
+    payload = messages.encode(messages.Frame(stamp_ns=5, image=np.zeros((300, 400, 3), np.uint8)))
+    damaged = {
+        "shorter": payload[:-1],
+        "longer": payload + b"x",
+        "head": b"\xc1" + payload[1:],
+        "nested": payload[:-360_000].replace(b"uint8", b"uint9") + payload[-360_000:],
+    }[change]
+    with pytest.raises(BadMessage):
+        messages.decode(messages.Frame, damaged)
