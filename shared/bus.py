@@ -30,6 +30,8 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 SECURE_ENDPOINT = "tls/127.0.0.1:7447"
 SECURE_PROTOCOLS = ("tls",)
 PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
+POOL_BYTES = 4 << 20
+"""Of shared memory, at least: masks, and four frames of a small camera."""
 RATE_WINDOW_S = 3.0
 ATTEMPT_MS = 500
 """How long one attempt to reach the router may block inside Zenoh, where no signal is heard."""
@@ -48,7 +50,9 @@ class Connection:
     """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
     tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise; `secure`: a
     folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part; `service`: who
-    this is, and so whose certificate it shows; `slow`: a router's links that carry little."""
+    this is, and so whose certificate it shows; `slow`: a router's links that carry little; `pool_bytes`: of shared memory, by
+    which what is large goes to processes of the same host. Readers keep the pool of a publisher that is gone for as long as they
+    live, so it is no larger than it must be."""
 
     mode: str | None = None
     connect: tuple[str, ...] = ()
@@ -57,6 +61,7 @@ class Connection:
     secure: Path | None = None
     service: str = access.VIEWER
     slow: SlowLinks | None = None
+    pool_bytes: int = POOL_BYTES
 
     @property
     def default(self) -> str:
@@ -137,6 +142,7 @@ def configuration(connection: Connection) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,  # nor waited for
+        "transport/shared_memory/transport_optimization/pool_size": connection.pool_bytes,
     }
     settings |= {key: value for key, value in defaults.items() if not is_set(key)}
     if connection.config is None:

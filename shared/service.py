@@ -41,6 +41,8 @@ from shared.turn import HANG_S, Turn
 
 CLOSE_S = 0.8
 """Closing a session on a bad network may take much longer; a process that ends does not wait for that."""
+FRAMES_UNDER_WAY = 3
+"""Of each camera, in shared memory: one that is written and two that are read."""
 QUERY_DEPTH = 32
 NEWS_S = 0.2
 """Within this a session has heard which replicas there are."""
@@ -63,7 +65,9 @@ class Node:
     """
 
     def __init__(self, service: str, cell: cell.Cell, connection: bus.Connection = bus.Connection()):  # noqa: B008 (frozen)
-        self.service, self.cell, self.connection = service, cell, replace(connection, service=service)
+        frames = sum(3 * camera.width * camera.height for camera in cell.cameras.values())
+        pool_bytes = max(bus.POOL_BYTES, FRAMES_UNDER_WAY * frames)
+        self.service, self.cell, self.connection = service, cell, replace(connection, service=service, pool_bytes=pool_bytes)
         self._needs_router = bus.mode(self.connection) == "client"  # refuses a bad configuration before anything else is done
         self.instance = f"{_safe(socket.gethostname())}-{os.getpid()}-{secrets.token_hex(2)}"
         self.log = logs.get(service, instance=self.instance)
