@@ -18,6 +18,41 @@ CAMERA_HZ = 1
 START_S = 240.0
 
 
+def test_the_bench_of_the_bus_measures_both_sides_of_every_payload():
+    rows = scale.bus_rows(rounds=1)
+    assert [row["bytes"] for row in rows] == [len(messages.encode(payload.make(0))) for payload in buses.PAYLOADS.values()]
+    for row in rows:
+        assert row["latency_ratio"] == pytest.approx(row["latency_us"]["ours"] / row["latency_us"]["raw"], rel=0.02)
+        assert row["throughput_ratio"] == pytest.approx(row["per_s"]["ours"] / row["per_s"]["raw"], rel=0.02)
+        assert min(*row["latency_us"].values(), *row["per_s"].values()) > 0
+    assert rows[0]["per_s"]["ours"] > rows[-1]["per_s"]["ours"], "larger messages take longer"
+
+
+def test_a_message_of_the_bench_that_is_lost_is_told_and_does_not_hang(monkeypatch):
+    monkeypatch.setattr(buses, "PATIENCE_S", 2.0)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)
+    with router, buses.linked(endpoint) as link:
+        link._acks.undeclare()
+        with pytest.raises(AssertionError, match="16 messages were sent, 0 read: one was lost"):
+            link.per_s(64, "raw", 5.0)
+
+
+def test_the_bench_counts_what_a_cell_does(tmp_path, capsys):
+    row = scale.row(1, 1, seed=2, seconds=4.0, rate_hz=2.0)
+    assert (row["cameras"], row["targets"], row["replicas"]) == (1, 1, 1)
+    assert 0 < row["masks_per_s"] <= row["offered_per_s"] + 1
+    assert row["cpu"] == pytest.approx(sum(row["cpu_of"].values()), abs=0.01) and row["cpu"] > 0.05
+    assert set(row["cpu_of"]) == {"launcher", "router", "emulator", *scale.SHARED}
+    assert row["message_bytes"]["frame"] == pytest.approx(640 * 480 * 3, rel=0.01)
+    published, links = row["published_bytes_per_s"], row["link_bytes_per_s"]
+    assert published["frame"] == pytest.approx(row["offered_per_s"] * row["message_bytes"]["frame"], rel=0.05)
+    assert links["emulator"] > published["frame"] and links["segmentation"] > 0
+    scale.show({"seed": 2, "sizes": [1], "cores": 2, "rows": [row], "bus": []}, Console(width=200))
+    assert "age p95" in capsys.readouterr().out
+    json.dumps(row)
+
+
 @pytest.fixture(scope="module")
 def eight(tmp_path_factory):
     path = derive("table", 8, 8, tmp_path_factory.mktemp("cells"), CAMERA_HZ)
@@ -62,38 +97,3 @@ def test_the_poses_of_eight_targets_are_at_their_work_places(eight):
     for name, target in cell.targets.items():
         answer = wait_for(lambda name=name: running.pose(name), 20, f"the pose of {name}")
         assert abs(answer["position"][0] - target.home.position[0]) < 1.0
-
-
-def test_the_bench_of_the_bus_measures_both_sides_of_every_payload():
-    rows = scale.bus_rows(rounds=1)
-    assert [row["bytes"] for row in rows] == [len(messages.encode(payload.make(0))) for payload in buses.PAYLOADS.values()]
-    for row in rows:
-        assert row["latency_ratio"] == pytest.approx(row["latency_us"]["ours"] / row["latency_us"]["raw"], rel=0.02)
-        assert row["throughput_ratio"] == pytest.approx(row["per_s"]["ours"] / row["per_s"]["raw"], rel=0.02)
-        assert 0.01 < row["throughput_ratio"] < 2.0
-    assert rows[0]["per_s"]["ours"] > rows[-1]["per_s"]["ours"], "larger messages take longer"
-
-
-def test_a_message_of_the_bench_that_is_lost_is_told_and_does_not_hang(monkeypatch):
-    monkeypatch.setattr(buses, "PATIENCE_S", 2.0)
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    router = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)
-    with router, buses.linked(endpoint) as link:
-        link._acks.undeclare()
-        with pytest.raises(AssertionError, match="16 messages were sent, 0 read: one was lost"):
-            link.per_s(64, "raw", 5.0)
-
-
-def test_the_bench_counts_what_a_cell_does(tmp_path, capsys):
-    row = scale.row(1, 1, seed=2, seconds=4.0, rate_hz=2.0)
-    assert (row["cameras"], row["targets"], row["replicas"]) == (1, 1, 1)
-    assert 0 < row["masks_per_s"] <= row["offered_per_s"] + 1
-    assert row["cpu"] == pytest.approx(sum(row["cpu_of"].values()), abs=0.01) and row["cpu"] > 0.05
-    assert set(row["cpu_of"]) == {"launcher", "router", "emulator", *scale.SHARED}
-    assert row["message_bytes"]["frame"] == pytest.approx(640 * 480 * 3, rel=0.01)
-    published, links = row["published_bytes_per_s"], row["link_bytes_per_s"]
-    assert published["frame"] == pytest.approx(row["offered_per_s"] * row["message_bytes"]["frame"], rel=0.05)
-    assert links["emulator"] > published["frame"] and links["segmentation"] > 0
-    scale.show({"seed": 2, "sizes": [1], "cores": 2, "rows": [row], "bus": []}, Console(width=200))
-    assert "age p95" in capsys.readouterr().out
-    json.dumps(row)

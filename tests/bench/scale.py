@@ -51,6 +51,7 @@ def row(size: int, replicas: int, seed: int, seconds: float, rate_hz: float | No
             wait_for(lambda: ready(running) == expected, START_S, f"{expected} of cell {cell.name}", 0.5)
             recordings = [Recording(running.session, cell.name, target) for target in cell.targets]
             wait_for(lambda: all(recording.samples["fused"] for recording in recordings), START_S, "a pose of every target", 0.5)
+            wait_for_masks(running.session, cell)
             time.sleep(SETTLE_S)
             sizes = payload_sizes(running.session, cell)
             return {"cameras": size, "targets": size, "replicas": replicas} | measure(running, recordings, sizes, seconds)
@@ -69,6 +70,14 @@ def reports(running: Running) -> list[dict[str, Any]]:
     replies = running.session.get(topics.health(running.cell), timeout=3.0, consolidation=zenoh.ConsolidationMode.NONE,
                                   target=zenoh.QueryTarget.ALL)  # fmt: skip
     return [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
+
+
+def wait_for_masks(session: zenoh.Session, cell: cells.Cell) -> None:
+    """Until segmentation has compiled what it needs for every camera."""
+    seen: set[str] = set()
+    subscriber = session.declare_subscriber(topics.MASK.at(cell=cell.name), lambda sample: seen.add(str(sample.key_expr)))
+    wait_for(lambda: len(seen) == len(cell.cameras), START_S, "a mask of every camera", 0.5)
+    subscriber.undeclare()
 
 
 def payload_sizes(session: zenoh.Session, cell: cells.Cell) -> dict[str, float]:
