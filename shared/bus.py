@@ -7,6 +7,8 @@ one slow reader hold up every other subscriber of the session.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import ctypes
 import json
 import math
 import os
@@ -32,6 +34,10 @@ SECURE_PROTOCOLS = ("tls",)
 PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 POOL_BYTES = 4 << 20
 """Of shared memory, at least: masks, and four frames of a small camera."""
+KEPT_BYTES, SPARE_BYTES = 16 << 20, 32 << 20
+"""Blocks of memory up to the first size come from what the process has, and stay there; beyond the second it gives some back."""
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Of malloc.h."""
 RATE_WINDOW_S = 3.0
 ATTEMPT_MS = 500
 """How long one attempt to reach the router may block inside Zenoh, where no signal is heard."""
@@ -215,6 +221,7 @@ def open_session(
     `stopping` was set.
     """
     config = configuration(connection)
+    _keep_memory()
     deadline = time.monotonic() + patience_s
     told = False
     while True:
@@ -405,6 +412,15 @@ class Reader:
         if len(sample.payload) > kind.MAX_BYTES:  # before it is copied
             raise BadMessage("size", f"{kind.__name__}: at most {kind.MAX_BYTES} bytes expected, {len(sample.payload)} came")
         return decode(kind, sample.payload.to_bytes(), self._now_ns(), self._topic.oldest_s)
+
+
+def _keep_memory() -> None:
+    """Has glibc keep the memory of large messages. It would map pages for each and unmap them again, and the kernel would clear
+    them: for a frame of 921 kB that takes longer than all the copying. Elsewhere than with glibc nothing changes."""
+    with contextlib.suppress(OSError, AttributeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_MMAP_THRESHOLD, KEPT_BYTES)
+        mallopt(M_TRIM_THRESHOLD, SPARE_BYTES)
 
 
 def _publisher(info: zenoh.SourceInfo | None) -> tuple[str, int | None]:

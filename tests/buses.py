@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from threading import Condition, Thread
 
@@ -25,10 +26,8 @@ from shared.topics import Topic
 
 CELL = cells.load("arm")
 NAMES = {"robot": "panda", "camera": "side"}
-DEPTH = 16
 KINDS = ("ours", "raw")
 ACK = "raw/ack"
-ACK_EVERY = DEPTH // 2
 QUIET_S = 0.15
 """What has not come after so long without anything does not come any more."""
 PATIENCE_S = 30.0
@@ -36,7 +35,8 @@ PATIENCE_S = 30.0
 
 @dataclass(frozen=True)
 class Payload:
-    """A message of `bytes` on the wire, as `topic` carries it; unlimited in rate, so that the guard lets a flood through."""
+    """A message of `bytes` on the wire, as `topic` carries it; unlimited in rate, so that the guard lets a flood through. Its
+    depth, what a reader keeps, is how many are under way at once in a flood."""
 
     topic: Topic
     make: Callable[[int], messages.Message]
@@ -50,19 +50,20 @@ class Payload:
         return f"raw/{self.topic.name}"
 
 
-def _payload(topic: Topic, name: str, make: Callable[[int], messages.Message]) -> Payload:
-    return Payload(replace(topic, name=name, key=f"{topic.key}/{name}", rate_hz=1e7, depth=DEPTH), make)
+def _payload(topic: Topic, name: str, depth: int, make: Callable[[int], messages.Message]) -> Payload:
+    return Payload(replace(topic, name=name, key=f"{topic.key}/{name}", rate_hz=1e7, depth=depth), make)
 
 
 IMAGE = np.zeros((480, 640, 3), np.uint8)
 LABELS = np.zeros((480, 480), np.uint8)
 PAYLOADS = {
-    64: _payload(topics.JOINTS, "tiny", lambda now: messages.Joints(stamp_ns=now, position=np.zeros(1))),
-    4_000: _payload(topics.JOINTS, "small", lambda now: messages.Joints(stamp_ns=now, position=np.zeros(500))),
-    230_000: _payload(topics.MASK, "mask", lambda now: messages.Mask(stamp_ns=now, labels=LABELS, x0=0, y0=0, scale=1)),
-    921_000: _payload(topics.FRAME, "image", lambda now: messages.Frame(stamp_ns=now, image=IMAGE)),
+    64: _payload(topics.JOINTS, "tiny", 16, lambda now: messages.Joints(stamp_ns=now, position=np.zeros(1))),
+    4_000: _payload(topics.JOINTS, "small", 16, lambda now: messages.Joints(stamp_ns=now, position=np.zeros(500))),
+    230_000: _payload(topics.MASK, "mask", 8, lambda now: messages.Mask(stamp_ns=now, labels=LABELS, x0=0, y0=0, scale=1)),
+    921_000: _payload(topics.FRAME, "image", 2, lambda now: messages.Frame(stamp_ns=now, image=IMAGE)),
 }
-"""By their size in bytes, roughly: 64 B, 4 kB, 230 kB and a frame."""
+"""By their size in bytes, roughly: 64 B, 4 kB, 230 kB and a frame; all that are under way fit into the shared memory of a small
+cell (`bus.POOL_BYTES`)."""
 
 
 class Sender:
@@ -111,10 +112,10 @@ class Link:
     def per_s(self, size: int, kind: str, seconds: float) -> float:
         """Messages a second that are sent and read without losing one: as many are under way as the reader keeps."""
         self._ask("begin")
-        self._read, sent, ends = 0, 0, time.monotonic() + seconds
+        self._read, sent, ends, depth = 0, 0, time.monotonic() + seconds, PAYLOADS[size].topic.depth
         while time.monotonic() < ends:
             with self._news:
-                if not self._news.wait_for(lambda: sent < self._read + DEPTH, PATIENCE_S):  # noqa: B023 (called at once)
+                if not self._news.wait_for(lambda: sent < self._read + depth, PATIENCE_S):  # noqa: B023 (called at once)
                     raise AssertionError(f"{sent} messages were sent, {self._read} read: one was lost")
             self.senders[size].send(kind)
             sent += 1
@@ -161,27 +162,27 @@ def receive(endpoint: str) -> None:
     came: list[tuple[int, int]] = []
     node = Node("receiver", CELL, bus.Connection(connect=(endpoint,)))
 
-    def take(sent_ns: int) -> None:
+    def take(payload: Payload, sent_ns: int) -> None:
         came.append((time.time_ns(), sent_ns))
-        if len(came) % ACK_EVERY == 0:
+        if len(came) % (payload.topic.depth // 2) == 0:
             acks.put(len(came).to_bytes(8, "little"))
 
-    def hear(message: messages.Message, names: dict[str, str]) -> None:
-        take(message.stamp_ns)
+    def hear(payload: Payload, message: messages.Message, names: dict[str, str]) -> None:
+        take(payload, message.stamp_ns)
 
-    def hear_raw(subscriber: zenoh.Subscriber) -> None:
+    def hear_raw(payload: Payload, subscriber: zenoh.Subscriber) -> None:
         for sample in subscriber:
             sample.payload.to_bytes()
-            take(int.from_bytes(sample.attachment.to_bytes(), "little"))
+            take(payload, int.from_bytes(sample.attachment.to_bytes(), "little"))
 
     for payload in PAYLOADS.values():
-        node.subscribe(payload.topic, hear, **payload.names)
+        node.subscribe(payload.topic, partial(hear, payload), **payload.names)
     with node:
         assert node.session is not None
         acks = node.session.declare_publisher(ACK)
         for payload in PAYLOADS.values():
-            subscriber = node.session.declare_subscriber(payload.raw_key, zenoh.handlers.RingChannel(DEPTH))
-            Thread(target=hear_raw, args=(subscriber,), daemon=True).start()
+            subscriber = node.session.declare_subscriber(payload.raw_key, zenoh.handlers.RingChannel(payload.topic.depth))
+            Thread(target=hear_raw, args=(payload, subscriber), daemon=True).start()
         for line in sys.stdin:
             if line == "begin\n":
                 came.clear()

@@ -112,6 +112,7 @@ class ReplayNode:
     def __init__(self, replay: Replay, service: str):
         self._replay, self.cell, self.log = replay, replay.cell, logs.get(service)
         self.report: dict[str, Callable[[], Any]] = {}
+        self.is_warm: Callable[[], bool] = lambda: True
 
     def now_ns(self) -> int:
         return self._replay.now_ns

@@ -1,5 +1,6 @@
 """PredNet and what surrounds it: the network's shape and state, the window that follows the target, training and weights."""
 
+import argparse
 import json
 import sys
 
@@ -7,13 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from services.segmentation import compiled, evaluate, infer, loss, prednet, train
+from services.segmentation import compiled, evaluate, infer, loss, prednet, service, train
 from services.segmentation.crop import shift_state
 from services.segmentation.prednet import PredNet, Settings
-from shared import training
+from shared import cell as cells
+from shared import topics, training
 from shared.classes import Label
-from shared.window import Window, corners_of, window_around
+from shared.window import Lookout, Window, corners_of, window_around
 from sim import sequences, shots
+from tests import nodes
+from tests.live import wait_for
+from tests.replay import Replay, ReplayNode
 
 SMALL = Settings(channels=(4, 4, 8), kernels=(3, 3, 3), decoder_channels=4)
 TINY = sequences.Variety(frames=4, size=64)
@@ -284,6 +289,27 @@ def test_sizes_made_ready_in_the_background_or_thrown_out_give_the_same_masks(mo
     for t, image in enumerate(images):
         prepared.prepare(windows[t % 2])
         np.testing.assert_array_equal(prepared(image, windows[t % 2], (t + 1) * 50_000_000), wanted[t])
+
+
+class Waiting(ReplayNode):
+    """A replica whose cameras are another one's."""
+
+    def owns(self, stream: str) -> bool:
+        return False
+
+
+def test_a_replica_that_waits_has_compiled_for_the_window_of_now():
+    cell = cells.load("table")
+    replay, segmenter = Replay(cell, services=()), infer.load_segmenter()  # which has what the service's own have
+    node = Waiting(replay, "segmentation")
+    service.start(node, argparse.Namespace(camera=None, weights=infer.WEIGHTS))
+    assert not node.is_warm(), "nobody has said where to look"
+    poses = [nodes.pose(stamp_ns, x=0.2) for stamp_ns in range(1_000_000_000, 2_000_000_000, 100_000_000)]
+    replay.run((topics.FUSED, {"target": "forearm"}, pose) for pose in poses)
+    lookout = Lookout(cell, "front")
+    lookout.hear(poses[-1])
+    wait_for(lambda: segmenter.is_prepared(lookout.look(poses[-1].stamp_ns)), 60, "the network compiled ahead")
+    assert node.is_warm()
 
 
 def test_the_card_says_on_what_the_weights_were_made():

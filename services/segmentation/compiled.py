@@ -74,6 +74,10 @@ class Compiled:
             self._asked.update(fresh)
             threading.Thread(target=self._compile_ahead, args=(fresh, fresh[0] == sizes[0]), name="compile").start()
 
+    def is_prepared(self, size: tuple[int, int]) -> bool:
+        """Whether a picture of this size (height, width) waits for nothing."""
+        return size in self._compiled
+
     def _compile_ahead(self, sizes: list[tuple[int, int]], is_first_due: bool) -> None:
         if is_first_due:  # a frame may wait for it
             self._model_of(sizes[0])

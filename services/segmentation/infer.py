@@ -74,6 +74,10 @@ class Segmenter:
             around = [(h, w) for h, w in sizes[1:] if min(h, w) >= SIZE_STEP and h * w <= MAX_PIXELS]
             self._compiled.prepare([sizes[0], *around])
 
+    def is_prepared(self, window: Window) -> bool:
+        """Whether a window of this size waits for nothing."""
+        return self._compiled is None or self._compiled.is_prepared((window.height, window.width))
+
     def _remembered(self, window: Window, stamp_ns: int) -> State:
         follows = 0 < stamp_ns - self._stamp_ns <= MAX_GAP_S * 1e9
         if self._state is None or self._window is None or self._window.scale != window.scale or not follows:

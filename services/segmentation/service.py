@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -15,6 +16,8 @@ from shared.topics import FRAME, FUSED, MASK
 from shared.window import Lookout
 
 NAME = "segmentation"
+FOLLOW_S = 0.2
+"""How often a replica looks where it would have to look in the frames that are another one's."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,14 +33,30 @@ def start(node: Node, options: argparse.Namespace) -> None:
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
 
     lookouts = {name: Lookout(cell, name) for name in cameras}
+    segmenters = {name: load_segmenter(options.weights) for name in cameras}
 
-    def on_pose(message: FusedPose, _: dict[str, str]) -> None:
+    heard: set[str] = set()
+
+    def on_pose(message: FusedPose, names: dict[str, str]) -> None:
+        heard.add(names["target"])
         for lookout in lookouts.values():
             lookout.hear(message)
 
-    def watch(name: str, camera: Camera, lookout: Lookout, segmenter: Segmenter) -> None:
-        segmenter.prepare(lookout.window)
+    def is_ready(names: Iterable[str]) -> bool:
+        """Whether frames of these cameras would wait for nothing; compiles ahead where they would, once it is known where to
+        look."""
+        if not heard:
+            return False
+        windows = {name: lookouts[name].look(node.now_ns()) for name in names}
+        for name, window in windows.items():
+            segmenters[name].prepare(window)
+        return all(segmenters[name].is_prepared(window) for name, window in windows.items())
 
+    def follow() -> None:
+        """What another replica works on may be this one's next."""
+        is_ready([name for name in lookouts if not node.owns(f"camera/{name}")])
+
+    def watch(name: str, camera: Camera, lookout: Lookout, segmenter: Segmenter) -> None:
         def on_frame(frame: Frame, _: dict[str, str]) -> None:
             if frame.image.shape[:2] != (camera.height, camera.width):
                 came = f"{frame.image.shape[1]} x {frame.image.shape[0]}"
@@ -55,4 +74,6 @@ def start(node: Node, options: argparse.Namespace) -> None:
     for target in dict.fromkeys(target for lookout in lookouts.values() for target in lookout.targets):
         node.subscribe(FUSED, on_pose, target=target)
     for name, lookout in lookouts.items():
-        watch(name, cell.cameras[name], lookout, load_segmenter(options.weights))
+        watch(name, cell.cameras[name], lookout, segmenters[name])
+    node.every(FOLLOW_S, follow)
+    node.is_warm = lambda: is_ready(lookouts)
