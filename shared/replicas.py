@@ -115,10 +115,11 @@ class Replicas:
             self._shares.append(share)
             share.follow(any(map(self.owns, share.streams)))
 
-    @property
-    def readers(self) -> list[Reader]:
-        """What reads this replica's own streams now."""
-        return [reader for share in self._shares if (reader := share.reader) is not None]
+    def leave(self) -> list[Reader]:
+        """Takes nothing over any more, whoever goes; what reads its streams now."""
+        with self._lock:
+            shares, self._shares = self._shares, []
+            return [share.reader for share in shares if share.reader is not None]
 
     def owns(self, stream: str) -> bool:
         """As `rank`: whether it is 0."""

@@ -157,11 +157,12 @@ class Node:
         self.stopping.set()
         if self.session is None:
             return
+        readers = self.replicas.leave()
         session, self.session = self.session, None
         deadline = time.monotonic() + CLOSE_S
         closing = threading.Thread(target=session.close, name="close", daemon=True)
         closing.start()
-        for thread in (closing, *self._threads, *(reader.thread for reader in self.replicas.readers)):
+        for thread in (closing, *self._threads, *(reader.thread for reader in readers)):
             if thread is not threading.current_thread():
                 thread.join(max(0.0, deadline - time.monotonic()))
 

@@ -17,6 +17,7 @@ import pytest
 
 from shared import bus, logs, topics
 from shared import cell as cells
+from shared.replicas import Replicas, Share
 from shared.service import CLOSE_S, Node
 from shared.turn import Turn
 from tests.live import free_port, wait_for
@@ -76,6 +77,18 @@ def owners(nodes):
     """The owner of each stream, once all agree on exactly one; None before."""
     found = [[node for node in nodes if node.owns(stream)] for stream in STREAMS]
     return [each[0] for each in found] if all(len(each) == 1 for each in found) else None
+
+
+def test_a_replica_that_leaves_takes_nothing_over():
+    opened = []
+    for leaves in (False, True):
+        replicas = Replicas("penumbra/table/health/x/one")
+        replicas.wait()
+        replicas.share(Share(("stream",), [], lambda leaves=leaves: opened.append(leaves)))
+        if leaves:
+            assert replicas.leave() == []
+        replicas.withdraw()  # counts who is there: nobody else
+    assert opened == [False]
 
 
 def test_every_stream_has_one_owner_and_only_the_dead_ones_streams_move(replica):

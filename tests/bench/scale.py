@@ -35,6 +35,8 @@ REPLICAS, QUICK_REPLICAS = (1, 2), (1,)
 SHARED = ("segmentation", "search", "haptics", "fusion")
 """The services that share the streams."""
 START_S, SETTLE_S = 180.0, 5.0
+SAMPLES, LISTEN_S = 10, 3.0
+"""So many messages of a topic are weighed, where so many come within the time."""
 LATENCY_GOAL, THROUGHPUT_GOAL = 1.25, 0.8
 ROUNDS, QUICK_ROUNDS = 9, 3
 MESSAGES, PAUSE_S, FLOOD_S = 60, 0.004, 0.3
@@ -88,7 +90,9 @@ def payload_sizes(session: zenoh.Session, cell: cells.Cell) -> dict[str, float]:
         subscriber = session.declare_subscriber(
             topic.at(cell=cell.name), lambda sample, seen=seen: seen.append(len(sample.payload))
         )
-        threading.Event().wait(0.5)
+        deadline = time.monotonic() + LISTEN_S
+        while len(seen) < SAMPLES and time.monotonic() < deadline:
+            time.sleep(0.01)
         subscriber.undeclare()
         sizes[topic.name] = float(np.mean(seen)) if seen else 0.0
     return sizes
