@@ -19,6 +19,10 @@ from shared.bus import Traffic
 CLOCK_S = 1.0
 """Over which messages are counted to tell whether a process has another time than all others."""
 CLOCK_MESSAGES = 10
+PACE_SHARE = 0.5
+"""Of the newest look in what is known of how late a process comes: three late ones in a row tell."""
+PACE_LOST = 0.5
+"""A process that loses so large a share of its time is slower than none."""
 
 
 class Reader(Protocol):
@@ -165,6 +169,19 @@ class Clock:
             self.fault = "everything that comes is of another time: check the clock of this host" if is_off else ""
             self._since_s, self._good, self._odd = now_s, good, odd
         return self.fault
+
+
+class Pace:
+    """Tells by how late this process comes to look that it does not get its time: it is stopped again and again, or the machine
+    is overloaded, where fewer replicas do more. One long stop tells nothing: it is over."""
+
+    def __init__(self) -> None:
+        self._lost = 0.0
+
+    def judge(self, late_s: float, period_s: float) -> str:
+        """The fault now, empty where there is none. late_s: how much later than after period_s it looks again."""
+        self._lost += PACE_SHARE * (late_s / (late_s + period_s) - self._lost)
+        return f"this process stands still for {self._lost:.0%} of the time" if self._lost > PACE_LOST else ""
 
 
 def _weight(instance: str, stream: str) -> bytes:

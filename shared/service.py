@@ -35,7 +35,7 @@ import zenoh
 from shared import bus, cell, health, logs, topics
 from shared.guard import Guard
 from shared.messages import VERSION, BadMessage, Message, encode
-from shared.replicas import Clock, Replicas, Share
+from shared.replicas import Clock, Pace, Replicas, Share
 from shared.topics import QoS, Topic
 from shared.turn import HANG_S, Turn
 
@@ -84,7 +84,8 @@ class Node:
         self.worries: Callable[[], Sequence[str]] = list  # what the service itself suffers from, in words
         self._turns: list[Turn] = []
         self._hang = ""  # the handler that hangs, in words
-        self._clock = Clock()
+        self._slowness = ""  # that this process does not get its time, in words
+        self._clock, self._pace = Clock(), Pace()
         self.is_warm: Callable[[], bool] = lambda: True  # whether it could go on with what another replica does
         self.replicas = Replicas(topics.alive(self.cell.name, service, self.instance))
         self._process = psutil.Process()
@@ -362,17 +363,17 @@ class Node:
         self._declare(lambda: self._spawn(loop, f"every {period_s} s"))
 
     def _watch_fitness(self) -> None:
-        """While a handler hangs, or the clock is off, this replica has no part where others live: its streams are theirs until it
-        is fit again."""
+        """While a handler hangs, this process stands still or its clock is off, it has no part where others live: its streams are
+        theirs until it is fit again."""
         looked_s, has_withdrawn = time.monotonic(), False
         while not self.stopping.wait(LOOK_S):
             now_s = time.monotonic()
             late_s, looked_s = now_s - looked_s - LOOK_S, now_s
-            if late_s > LOOK_S:  # the whole process stood still
-                continue
-            longest_s, what = max(((turn.hangs_s(now_s), turn.what) for turn in self._turns), default=(0.0, ""))
-            self._hang = f"{what} hangs for {longest_s:.0f} s" if longest_s else ""
-            unfit = self._hang or self._clock.judge(self._received.values(), now_s)
+            self._slowness = self._pace.judge(late_s, LOOK_S)
+            if late_s < LOOK_S:  # else the whole process stood still
+                longest_s, what = max(((turn.hangs_s(now_s), turn.what) for turn in self._turns), default=(0.0, ""))
+                self._hang = f"{what} hangs for {longest_s:.0f} s" if longest_s else ""
+            unfit = self._hang or self._slowness or self._clock.judge(self._received.values(), now_s)
             try:
                 if unfit and self.replicas.has_joined and self.replicas.others:
                     self.log.warning("unfit: the other replicas take over", why=unfit)
@@ -426,7 +427,7 @@ class Node:
         return json.dumps(self.health()).encode()
 
     def _suffers(self) -> list[str]:
-        return [*filter(None, [self._hang, self._clock.fault]), *self.worries()]
+        return [*filter(None, [self._hang, self._slowness, self._clock.fault]), *self.worries()]
 
     def _look(self) -> Counter[tuple[str, str]]:
         return self._lately.look(health.counts(self._received, self._faults), time.monotonic())

@@ -13,6 +13,7 @@ import threading
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from shared import bus, logs, topics
@@ -20,6 +21,7 @@ from shared import cell as cells
 from shared.replicas import Replicas, Share
 from shared.service import CLOSE_S, Node
 from shared.turn import Turn
+from tests import injected
 from tests.live import free_port, wait_for
 from tests.nodes import pose
 
@@ -354,6 +356,18 @@ def test_a_replica_with_a_hanging_handler_leaves_its_streams_to_the_others_until
     let_go.set()
     wait_for(lambda: owners(nodes) == before, 10, "the streams to come back")
     assert hanging.health()["hangs"] == ""
+
+
+def test_a_replica_that_is_slow_but_alive_leaves_its_streams_to_the_others(replica, process):
+    slow = psutil.Process(process().pid)
+    other = replica()
+    wait_for(lambda: len(living(other)) == 2, 10, "two replicas")
+    assert not all(map(other.owns, STREAMS))
+    with injected.slowed(slow):
+        wait_for(lambda: all(map(other.owns, STREAMS)), 20, "all streams to be the other one's")
+        time.sleep(1.0)
+        assert all(map(other.owns, STREAMS)), "they stay there while it is slow"
+    wait_for(lambda: not all(map(other.owns, STREAMS)), 20, "the streams to come back")
 
 
 def test_a_replica_that_hangs_alone_keeps_its_streams(replica):
