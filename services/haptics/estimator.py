@@ -36,8 +36,9 @@ EXPECTED_SIGMA = 0.02
 tells apart places that feel alike. A worse one rests on what was felt, and would feed it back …"""
 EXPECTED_INFLATION, EXPECTED_FLOOR = 2.0, (0.01, 0.1)
 """… with its standard deviations doubled, and these [m, rad] added: it says where to look and not what is felt."""
-MISFIT = 2.5
-"""Misfit above which the voltages are not explained, and the solve starts afresh."""
+MISFIT = 2.0
+"""Misfit of the track, smoothed over windows, above which it does not explain the voltages, and the solve starts afresh: a single
+window far away, of few electrodes, has twice the misfit by its noise, and tells apart no places that feel alike."""
 NO_LIMB = 2.2
 """Misfit, smoothed over windows, above which what is felt is no limb …"""
 MISFIT_SHARE, WORST = 0.2, 6.0
@@ -128,7 +129,7 @@ class Estimator:
     def reset(self) -> None:
         """Forget the past."""
         self._T, self._covariance, self._stamp_ns, self._tracking = self.home, self._home_covariance, 0, False
-        self._waited, self._away_s, self._misfit = -1, 0.0, 1.0
+        self._waited, self._away_s, self._misfit, self._track_misfit = -1, 0.0, 1.0, 1.0
         self._pad_misfit = np.ones(len(self.skin.pads))
         self._other: tuple[Array, Array] | None = None
         self._doubt, self._turn, self._age, self._rests = 0.0, 0, 0, 0
@@ -196,13 +197,14 @@ class Estimator:
         information, gradient = self._solver.likelihood(window, solution)
         total = _size_known(information, gradient, size, self.size, 1.0)[0] + np.linalg.inv(self._covariance)
         self._T, self._covariance = perturb(T, mean), np.linalg.inv(total) + scatter
-        self._tracking = solution.misfit <= MISFIT
+        self._track_misfit = self._smoothed(self._track_misfit, solution)
+        self._tracking = self._track_misfit <= MISFIT
         squares = np.minimum(solution.residuals**2, PAD_WORST)
         used = np.maximum(np.add.reduceat(np.isfinite(window.variance).astype(float), self.skin.first[:-1]), 1.0)
         self._pad_misfit += PAD_SHARE * (np.add.reduceat(squares, self.skin.first[:-1]) / used - self._pad_misfit)
         if gap < SIZE_GAP and self._tracking:
             self.size.learn(size, *self._solver.likelihood(window, solution, SIZE_LASTING), self._home_information)
-        self._misfit += MISFIT_SHARE * (min(solution.misfit, WORST) - self._misfit)
+        self._misfit = self._smoothed(self._misfit, solution)
         if self._misfit > NO_LIMB or self.size.strangeness > STRANGE:
             return self._estimate(T, np.zeros((6, 6)), gap, FOREIGN, solution.residuals)
         information, gradient = _size_known(*self._solver.likelihood(window, solution, LASTING), size, self.size, SIZE_LASTS)
@@ -227,7 +229,7 @@ class Estimator:
                 return self._solve(window, self._prior(self._T, self._covariance), self._T), *certain
             return self._from_scratch(window, joints)
         tracked = self._solve(window, self._prior(self._T, self._covariance), self._T, coarse=0)
-        if tracked.misfit > MISFIT:
+        if self._smoothed(self._track_misfit, tracked) > MISFIT:
             self._waited = 0
             return self._from_scratch(window, joints)
         self._rests = (self._rests + 1) % OTHER_EVERY
@@ -263,7 +265,12 @@ class Estimator:
         found = [self._solve(window, home, start) for start in [self._T, *starts]]
         found.sort(key=lambda solution: solution.cost)
         self._doubt, self._other, self._covariance = 0.0, None, self._home_covariance
+        self._track_misfit = found[0].misfit
         return found[0], *self._possible(window, found)
+
+    @staticmethod
+    def _smoothed(misfit: float, solution: Solution) -> float:
+        return misfit + MISFIT_SHARE * (min(solution.misfit, WORST) - misfit)
 
     def _possible(self, window: Window, found: list[Solution]) -> tuple[Array, Array]:
         """Mean (6,), as a pose error from the best one, and scatter (6, 6) of the solutions (best first) that are possible."""
