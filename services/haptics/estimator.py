@@ -6,10 +6,13 @@ where the solve looks, and through what changes slowly (`slow.py`):
 1. predict: from the fused pose where that is known, else the last pose drifts back to its home as an Ornstein-Uhlenbeck process,
    so its spread never exceeds home's
 2. solve from there (`solve.py`), with the limb's size as it is known by now
-3. if that does not explain the voltages, nothing is tracked, or some time has passed, solve from scratch: from home, from the
-   network's pose, turned about the limb; this replaces the track where it explains the voltages clearly better
-4. learn the size close to the pads, the electrodes' rests while nothing is near
-5. hand on the likelihood: size and roll marginalised, the model's error counted as what it is, nearly the same in several windows
+3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from home moved along the limb, and from the
+   network's pose
+4. far from the pads thick and thin parts of a limb feel alike: another place that is possible, from scratch or grown beside the
+   track, is kept as its rival and solved as well, until the windows have decided between the two
+5. learn the size close to the pads, the electrodes' rests while nothing is near
+6. hand on the likelihood: size and roll marginalised, the model's error counted as what it is, nearly the same in several
+   windows; where a rival is possible, that of the two together
 
 Voltages that no limb explains (a metal part, a block) are reported as out of range.
 """
@@ -53,15 +56,20 @@ STRANGE = 3.5
 FOREIGN = "what is felt is no limb: something else is near"
 AGAIN = 3
 """Of so many windows that nothing explains, one is solved from scratch: a search takes some milliseconds."""
-OTHER_EVERY = 2
-"""Of so many windows one also looks elsewhere."""
-GROWN = 8
-"""Such windows in which another solution grows beside the track before the two are compared."""
-CONVINCING = 8.0
-"""A solve from scratch replaces the track when doubt has summed up to this: the log of how much more probable it is, less one,
-window after window, never below zero (Page's cumulative sum, DOI 10.2307/2333009) …"""
-CLEAR = 4.0
-"""… of which one window can give no more than this, lest one burst of noise carries the track away."""
+GROWN, STEPS = 4, 2
+"""Windows in which another solution grows beside the track before the two are compared, and its steps in each of them …"""
+TRACKS_OWN = 0.06
+"""… but not from so near to the track along the limb [m]: from there it would end where the track is."""
+SAME, APART = 0.02, 4.0
+"""Two places are two when the square of their distance is above APART of its variances, with SAME [m] added: below, one of them
+with its covariance stands for both."""
+BESIDE = 2.0
+"""Log odds of the track at least, when a rival has grown beside it that explains the window as well: seven to one, for the rival
+was looked for, and of many places one explains some window …"""
+CLEAR = 2.0
+"""… of which one window can change no more than this, lest one burst of noise decides …"""
+CONVINCING = 5.0
+"""… until they are these, 150 to one, and the rival is dropped; below zero the two change places."""
 LASTING = 5.0
 """Windows in which the model's error is about the same. Whoever fuses poses takes their errors for independent, so it is
 published with so many times its variance."""
@@ -75,14 +83,26 @@ SLIDES = (0.0, -0.08, 0.08, -0.16, 0.16)
 """From scratch the solve starts from home moved so far along the limb [m]: thick and thin parts are felt alike …"""
 CLEARANCE = 0.05
 """… and with a gap of at least this [m]: from inside a pad nothing leads out."""
-UNSURE = 5.0
-"""Solutions from scratch whose costs differ by less are all possible."""
 FARTHEST = 1.0
 """The gap [m] that stands for everything beyond."""
 REACH = 4.0 / 3.0
 """In range: the smallest gap is below this share of the pad's range (20 cm of 15) …"""
 WORTH = 0.03
 """… and the best known direction is better than this [m]."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the limb may be: T_world_target (4, 4) and its covariance (6, 6)."""
+
+    T: Array
+    covariance: Array
+
+    def is_apart(self, other: Place) -> bool:
+        """Whether two places differ by more than is unknown of them."""
+        offset = self.T[:3, 3] - other.T[:3, 3]
+        spread = (self.covariance + other.covariance)[:3, :3] + SAME**2 * np.eye(3)
+        return float(offset @ np.linalg.solve(spread, offset)) > APART
 
 
 @dataclass(frozen=True)
@@ -124,15 +144,18 @@ class Estimator:
         self._response, self._solver = response, Solver(skin, response)
         self._home_covariance = np.diag(np.asarray(spread, dtype=float) ** 2)
         self._home_information = np.linalg.inv(self._home_covariance)
+        self._home = Place(home, self._home_covariance)
         self.reset()
 
     def reset(self) -> None:
         """Forget the past."""
-        self._T, self._covariance, self._stamp_ns, self._tracking = self.home, self._home_covariance, 0, False
+        self._track, self._stamp_ns, self._tracking = self._home, 0, False
         self._waited, self._away_s, self._misfit, self._track_misfit = -1, 0.0, 1.0, 1.0
         self._pad_misfit = np.ones(len(self.skin.pads))
+        self._rival: Place | None = None
+        self._odds = 0.0  # log, of the track to the rival
         self._other: tuple[Array, Array] | None = None
-        self._doubt, self._turn, self._age, self._rests = 0.0, 0, 0, 0
+        self._turn, self._age = 0, 0
         self.size.forget()
         self.tare.forget()
 
@@ -151,7 +174,7 @@ class Estimator:
     @property
     def pose(self) -> Array:
         """T_world_target that is most probable after the last window, with what earlier windows said."""
-        return self._T
+        return self._track.T
 
     def update(
         self,
@@ -185,33 +208,32 @@ class Estimator:
     def _by_network(self, window: Window, joints: ArrayLike) -> Estimate:
         assert self.network is not None
         x = self._features(window, joints)
-        self._T = self.network.posterior(x)
-        relative = Relative.of(self.skin, self.surface, window.T_world_pads, np.isfinite(window.variance), self._T)
+        self._track = Place(self.network.posterior(x), self._home_covariance)
+        relative = Relative.of(self.skin, self.surface, window.T_world_pads, np.isfinite(window.variance), self._track.T)
         T, information = self.network.likelihood(x, relative)
         return self._estimate(T, information, self._gap(window, T, self.size.mean), "", np.zeros(len(self.skin)))
 
     def _by_solve(self, window: Window, joints: ArrayLike) -> Estimate:
-        solution, mean, scatter = self._tracked(window, joints)
+        solution = self._tracked(window, joints)
         T, size = solution.T, solution.size
         gap = self._gap(window, T, size)
-        information, gradient = self._solver.likelihood(window, solution)
-        total = _size_known(information, gradient, size, self.size, 1.0)[0] + np.linalg.inv(self._covariance)
-        self._T, self._covariance = perturb(T, mean), np.linalg.inv(total) + scatter
+        mean, scatter = self._mixture()
         self._track_misfit = self._smoothed(self._track_misfit, solution)
         self._tracking = self._track_misfit <= MISFIT
         squares = np.minimum(solution.residuals**2, PAD_WORST)
         used = np.maximum(np.add.reduceat(np.isfinite(window.variance).astype(float), self.skin.first[:-1]), 1.0)
         self._pad_misfit += PAD_SHARE * (np.add.reduceat(squares, self.skin.first[:-1]) / used - self._pad_misfit)
-        if gap < SIZE_GAP and self._tracking:
+        if gap < SIZE_GAP and self._tracking and self._rival is None:
             self.size.learn(size, *self._solver.likelihood(window, solution, SIZE_LASTING), self._home_information)
         self._misfit = self._smoothed(self._misfit, solution)
         if self._misfit > NO_LIMB or self.size.strangeness > STRANGE:
             return self._estimate(T, np.zeros((6, 6)), gap, FOREIGN, solution.residuals)
         information, gradient = _size_known(*self._solver.likelihood(window, solution, LASTING), size, self.size, SIZE_LASTS)
         information, gradient = self._without_roll(T, information, gradient)
-        if scatter.any():
-            keep = np.linalg.inv(np.eye(6) + information @ scatter)
-            information, gradient = keep @ information, keep @ gradient
+        if scatter.any():  # it lasts as the model's error does
+            keep = np.linalg.inv(np.eye(6) + LASTING * information @ scatter)
+            gradient = keep @ (gradient + information @ mean)
+            information = keep @ information
         trust = 1.0 / max(1.0, solution.misfit)  # voltages that are explained badly say less than their noise promises
         best, known = peak(T, trust * information, trust * gradient)
         turn = np.eye(6)
@@ -219,83 +241,96 @@ class Estimator:
         known = turn @ known @ turn.T
         return self._estimate(best, 0.5 * (known + known.T), gap, "", solution.residuals)
 
-    def _tracked(self, window: Window, joints: ArrayLike) -> tuple[Solution, Array, Array]:
-        """The solution near the track, or one from scratch that is clearly better; where several are possible, also their mean
-        (6,) as a pose error from it, and their scatter (6, 6)."""
-        certain = np.zeros(6), np.zeros((6, 6))
+    def _tracked(self, window: Window, joints: ArrayLike) -> Solution:
+        """The solution at the track, or at the rival where that is more probable by now, or the best one from scratch. Takes both
+        places on."""
         if not self._tracking:
             self._waited += 1
-            if self._waited % AGAIN:
-                return self._solve(window, self._prior(self._T, self._covariance), self._T), *certain
-            return self._from_scratch(window, joints)
-        tracked = self._solve(window, self._prior(self._T, self._covariance), self._T, coarse=0)
-        if self._smoothed(self._track_misfit, tracked) > MISFIT:
+            if self._waited % AGAIN == 0:
+                return self._from_scratch(window, joints)
+        prior = self._prior(self._track)
+        solution = self._solve(window, prior, self._track.T, coarse=0 if self._tracking else 12)
+        if self._tracking and self._smoothed(self._track_misfit, solution) > MISFIT:
             self._waited = 0
             return self._from_scratch(window, joints)
-        self._rests = (self._rests + 1) % OTHER_EVERY
-        if self._rests:
-            return tracked, *certain
-        # Beside the track another solution grows from scratch, a step or two at a time.
-        home = self._prior(self.home, self._home_covariance)
-        if self._other is None:
-            self._turn += 1
-            start = self._start(self._turn % (len(SLIDES) + 1), window, joints)
-            self._other, self._age = (start, self.size.mean), 0
-        self._age += 1
-        grown = self._age > GROWN
-        other = self._solver.solve(window, home, *self._other, *((0, 2) if grown else (1, 0)))
-        self._other = other.T, other.size
-        if not grown:
-            return tracked, *certain
-        # The track is judged with the same freedom: from its pose, but with home's spread.
-        same = self._solver.solve(window, home, tracked.T, tracked.size, 0, 2)
-        self._doubt = max(0.0, self._doubt + min(same.cost - other.cost, CLEAR) - 1.0)
-        if self._doubt == 0.0:
-            self._other = None
-        if self._doubt < CONVINCING:
-            return tracked, *certain
-        return self._from_scratch(window, joints, [other.T])
+        self._track = self._place(window, solution, prior)
+        if self._rival is not None:
+            return self._compared(window, self._rival, solution, solution.cost - prior.cost(solution))
+        if self._tracking:
+            self._look_elsewhere(window, joints, solution)
+        return solution
 
-    def _from_scratch(
-        self, window: Window, joints: ArrayLike, starts: list[Array] | None = None
-    ) -> tuple[Solution, Array, Array]:
-        """The best solution from these starts, or from everywhere, and from the track."""
-        home = self._prior(self.home, self._home_covariance)
-        starts = starts or [self._start(which, window, joints) for which in range(len(SLIDES) + 1)]
-        found = [self._solve(window, home, start) for start in [self._T, *starts]]
-        found.sort(key=lambda solution: solution.cost)
-        self._doubt, self._other, self._covariance = 0.0, None, self._home_covariance
-        self._track_misfit = found[0].misfit
-        return found[0], *self._possible(window, found)
+    def _compared(self, window: Window, rival: Place, solution: Solution, cost: float) -> Solution:
+        """The solution at the track, whose voltages have this cost, or that at the rival where it is more probable by now. Only
+        the voltages count: what was believed before is in the odds already."""
+        prior = self._prior(rival)
+        other = self._solve(window, prior, rival.T, coarse=0)
+        rival = self._place(window, other, prior)
+        self._odds += float(np.clip(other.cost - prior.cost(other) - cost, -CLEAR, CLEAR))
+        if self._odds < 0.0:
+            self._track, rival, solution, self._odds = rival, self._track, other, -self._odds
+        self._contest(rival, self._odds)
+        return solution
+
+    def _contest(self, rival: Place, odds: float) -> None:
+        """Keeps a rival with these log odds of the track, where it is another place and possible."""
+        possible = odds < CONVINCING and rival.is_apart(self._track)
+        self._rival, self._odds = rival if possible else None, max(odds, 0.0)
+
+    def _look_elsewhere(self, window: Window, joints: ArrayLike, solution: Solution) -> None:
+        """Beside the track's solution another one grows from scratch, some steps in every window; another place becomes the
+        rival."""
+        home = self._prior(self._home)
+        if self._other is None:
+            self._other, self._age = (self._elsewhere(window, joints), self.size.mean), 0
+        self._age += 1
+        if self._age <= GROWN:
+            grown = self._solver.solve(window, home, *self._other, STEPS, 0)
+            self._other = grown.T, grown.size
+            return
+        other = self._solver.solve(window, home, *self._other, 0, STEPS)
+        self._other, rival = None, self._place(window, other, home)
+        if rival.is_apart(self._track):
+            # the track is judged with the same freedom: from its pose, but with home's spread
+            same = self._solver.solve(window, home, solution.T, solution.size, 0, STEPS)
+            self._contest(rival, BESIDE + float(np.clip(other.cost - same.cost, -CLEAR, CLEAR)))
+
+    def _elsewhere(self, window: Window, joints: ArrayLike) -> Array:
+        """The next start from scratch that is not the track's own place."""
+        along = float((self._track.T[:3, 3] - self.home[:3, 3]) @ self.home[:3, 0])
+        self._turn = (self._turn + 1) % (len(SLIDES) + 1)
+        if self._turn < len(SLIDES) and abs(SLIDES[self._turn] - along) < TRACKS_OWN:
+            self._turn += 1
+        return self._start(self._turn, window, joints)
+
+    def _from_scratch(self, window: Window, joints: ArrayLike) -> Solution:
+        """The best solution from everywhere and from the track; the next best one at another place becomes the rival."""
+        home = self._prior(self._home)
+        starts = [self._track.T, *(self._start(which, window, joints) for which in range(len(SLIDES) + 1))]
+        best, *others = sorted((self._solve(window, home, start) for start in starts), key=lambda solution: solution.cost)
+        self._track, self._track_misfit = self._place(window, best, home), best.misfit
+        self._rival, self._other = None, None
+        for other in others:
+            if self._rival is None and other.cost - best.cost < CONVINCING:
+                self._contest(self._place(window, other, home), other.cost - best.cost)
+        return best
+
+    def _place(self, window: Window, solution: Solution, prior: Prior) -> Place:
+        """Where the limb is by a window's solution from a prior."""
+        information, gradient = self._solver.likelihood(window, solution)
+        information = _size_known(information, gradient, solution.size, self.size, 1.0)[0] + prior.information
+        return Place(solution.T, np.asarray(np.linalg.inv(information), np.float64))
+
+    def _mixture(self) -> tuple[Array, Array]:
+        """Mean (6,), as a pose error from the track, and scatter (6, 6) of the track and its rival."""
+        if self._rival is None:
+            return np.zeros(6), np.zeros((6, 6))
+        offset, share = pose_error(self._rival.T, self._track.T), 1.0 / (1.0 + np.exp(self._odds))
+        return share * offset, share * (1.0 - share) * np.outer(offset, offset)
 
     @staticmethod
     def _smoothed(misfit: float, solution: Solution) -> float:
         return misfit + MISFIT_SHARE * (min(solution.misfit, WORST) - misfit)
-
-    def _possible(self, window: Window, found: list[Solution]) -> tuple[Array, Array]:
-        """Mean (6,), as a pose error from the best one, and scatter (6, 6) of the solutions (best first) that are possible."""
-        best = found[0]
-        offsets: list[Array] = []
-        covariances: list[Array] = []
-        logs: list[float] = []
-        for other in found:
-            if other.cost - best.cost > UNSURE:
-                break
-            information, gradient = self._solver.likelihood(window, other)
-            information, _ = _size_known(information, gradient, other.size, self.size, 1.0)
-            covariance = np.asarray(np.linalg.inv(information + self._home_information), np.float64)
-            offset = pose_error(other.T, best.T)
-            apart = [(offset - o) @ np.linalg.solve(P, offset - o) for o, P in zip(offsets, covariances, strict=True)]
-            if apart and min(apart) < 1.0:
-                continue  # the same one
-            offsets.append(offset)
-            covariances.append(covariance)
-            logs.append(best.cost - other.cost + 0.5 * float(np.linalg.slogdet(covariance)[1]))
-        share = np.exp(np.array(logs) - max(logs))
-        share /= share.sum()
-        mean = share @ np.array(offsets)
-        away = np.array(offsets) - mean
-        return mean, np.einsum("m,mi,mj->ij", share, away, away)
 
     def _start(self, which: int, window: Window, joints: ArrayLike) -> Array:
         """Where a solve from scratch begins: home with one of its slides, no nearer to the pads than CLEARANCE, or the network's
@@ -316,8 +351,8 @@ class Estimator:
     def _solve(self, window: Window, prior: Prior, start: Array, coarse: int = 12) -> Solution:
         return self._solver.solve(window, prior, start, self.size.mean, coarse=coarse)
 
-    def _prior(self, T: Array, covariance: Array) -> Prior:
-        return Prior(T, np.asarray(np.linalg.inv(covariance), np.float64), self.size.mean, self.size.information)
+    def _prior(self, place: Place) -> Prior:
+        return Prior(place.T, np.asarray(np.linalg.inv(place.covariance), np.float64), self.size.mean, self.size.information)
 
     def _features(self, window: Window, joints: ArrayLike) -> NDArray:
         assert self.network is not None
@@ -325,28 +360,33 @@ class Estimator:
         return features(self.skin, self.network.home, window.signal, variance, window.T_world_pads, joints)
 
     def _predict(self, stamp_ns: int) -> float:
-        """Takes the track to a window's stamp; returns the seconds since the last one."""
+        """Takes the track and its rival to a window's stamp; returns the seconds since the last one."""
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
         if not 0.0 <= elapsed_s < MEMORY_S:
             self.reset()
             elapsed_s = 0.0
         self._stamp_ns = stamp_ns
         self.size.predict(elapsed_s)
-        keep = np.exp(-elapsed_s / MEMORY_S)
-        self._T = perturb(self.home, keep * pose_error(self._T, self.home))
-        self._covariance = keep**2 * self._covariance + (1.0 - keep**2) * self._home_covariance
-        forgotten = 1.0 - np.exp(-elapsed_s / ROLL_MEMORY_S)
-        self._T = _turned(self._T, -forgotten * self._roll(self._T))
-        axis = _roll_axis(self._T)
-        spread = float(axis @ self._home_covariance @ axis) - float(axis @ self._covariance @ axis)
-        self._covariance += max(0.0, (1.0 - (1.0 - forgotten) ** 2) * spread) * np.outer(axis, axis)
+        self._track = self._drifted(self._track, elapsed_s)
+        self._rival = None if self._rival is None else self._drifted(self._rival, elapsed_s)
         return elapsed_s
 
+    def _drifted(self, place: Place, elapsed_s: float) -> Place:
+        """A place after so many seconds in which nothing was felt."""
+        keep = np.exp(-elapsed_s / MEMORY_S)
+        T = perturb(self.home, keep * pose_error(place.T, self.home))
+        covariance = keep**2 * place.covariance + (1.0 - keep**2) * self._home_covariance
+        forgotten = 1.0 - np.exp(-elapsed_s / ROLL_MEMORY_S)
+        T = _turned(T, -forgotten * self._roll(T))
+        axis = _roll_axis(T)
+        spread = float(axis @ self._home_covariance @ axis) - float(axis @ covariance @ axis)
+        return Place(T, covariance + max(0.0, (1.0 - (1.0 - forgotten) ** 2) * spread) * np.outer(axis, axis))
+
     def _expect(self, T: Array, covariance: Array) -> None:
-        """Looks around a pose (4, 4) with its covariance (6, 6), where it is known well enough."""
+        """Looks around a pose (4, 4) with its covariance (6, 6), where it is known well enough: then there is no rival."""
         if float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < EXPECTED_SIGMA**2:
-            self._T = T
-            self._covariance = EXPECTED_INFLATION**2 * covariance + np.diag(np.repeat(np.square(EXPECTED_FLOOR), 3))
+            wider = EXPECTED_INFLATION**2 * covariance + np.diag(np.repeat(np.square(EXPECTED_FLOOR), 3))
+            self._track, self._rival = Place(T, wider), None
 
     def _roll(self, T: Array) -> float:
         """The turn about the limb's axis [rad] from home: the twist of the rotation between them."""

@@ -17,7 +17,7 @@ from shared.body import target_mesh
 from shared.cell import Cell
 from shared.geometry import position_orientation
 from shared.messages import FusedPose, HapticPose, Joints, Voltages
-from shared.prediction import predict
+from shared.prediction import LONGEST_S, predict
 from shared.response import Response
 from shared.robot import robot_models
 from shared.service import Node
@@ -78,7 +78,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
             if found is None:
                 estimate = which.nothing(faults["joints"])
             else:
-                T, covariance = predict(fused.get(target), window.stamp_ns)
+                T, covariance = predict(_seen(fused.get(target), window.stamp_ns), window.stamp_ns)
                 expected = None if T is None or covariance is None else (T, covariance)
                 (T_world_pads, joints), own = found, near[target]
                 amplitude, samples = window.amplitude[own.electrodes], window.samples[own.electrodes]
@@ -166,6 +166,14 @@ class Faults:
                 else:
                     del self._told[name]
                     self._node.log.info("back in use", what=name)
+
+
+def _seen(fused: FusedPose | None, stamp_ns: int) -> FusedPose | None:
+    """The fused pose, where a camera had a part in it a moment before a stamp: one that rests on the skin alone, fed back, would
+    confirm itself."""
+    if fused is None or (camera := fused.sources.get("vision")) is None:
+        return None
+    return fused if camera.age_s + (stamp_ns - fused.stamp_ns) * 1e-9 < LONGEST_S else None
 
 
 def _message(estimate: Estimate, window: Window, target: str, frame: str) -> HapticPose:

@@ -65,6 +65,11 @@ class Prior:
     size: Array
     size_information: Array
 
+    def cost(self, solution: Solution) -> float:
+        """Its share of a solution's cost: the rest is the voltages'."""
+        toward, toward_size = pose_error(self.T, solution.T), self.size - solution.size
+        return 0.5 * float(toward @ self.information @ toward) + 0.5 * float(toward_size @ self.size_information @ toward_size)
+
 
 @dataclass(frozen=True)
 class Window:
