@@ -239,6 +239,28 @@ def test_the_service_answers_every_window_within_milliseconds_and_goes_on_withou
         assert set(misfits) == {f"misfit/{pad}" for pad in table.pads} and max(misfits.values()) < 4.0
 
 
+def test_a_fused_pose_is_looked_at_only_where_a_camera_had_a_part_in_it_lately() -> None:
+    """One that rests on the skin alone would confirm the skin."""
+
+    def fused(**sources: messages.Source) -> messages.FusedPose:
+        return messages.FusedPose(
+            stamp_ns=1_000 * MS,
+            target="forearm",
+            frame="world",
+            position=np.zeros(3),
+            orientation=np.array([0.0, 0.0, 0.0, 1.0]),
+            velocity=np.zeros(6),
+            covariance=np.eye(6),
+            state="tracking",
+            sources=sources,
+        )
+
+    skin_only, camera = fused(haptic=messages.Source(0.0, 1.0)), fused(vision=messages.Source(0.2, 0.1))
+    assert service.seen(None, 1_000 * MS) is None and service.seen(skin_only, 1_000 * MS) is None
+    assert service.seen(camera, 1_200 * MS) is camera
+    assert service.seen(camera, 1_400 * MS) is None
+
+
 def test_a_turned_pad_stands_out_by_its_misfit_in_the_health(table: cells.Cell, skin: Skin) -> None:
     """Its electrodes read what the ones opposite should; its estimate goes on without it."""
     node = Node("haptics", table, bus.Connection(connect=("tcp/127.0.0.1:1",)))

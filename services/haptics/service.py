@@ -78,7 +78,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
             if found is None:
                 estimate = which.nothing(faults["joints"])
             else:
-                T, covariance = predict(_seen(fused.get(target), window.stamp_ns), window.stamp_ns)
+                T, covariance = predict(seen(fused.get(target), window.stamp_ns), window.stamp_ns)
                 expected = None if T is None or covariance is None else (T, covariance)
                 (T_world_pads, joints), own = found, near[target]
                 amplitude, samples = window.amplitude[own.electrodes], window.samples[own.electrodes]
@@ -168,7 +168,7 @@ class Faults:
                     self._node.log.info("back in use", what=name)
 
 
-def _seen(fused: FusedPose | None, stamp_ns: int) -> FusedPose | None:
+def seen(fused: FusedPose | None, stamp_ns: int) -> FusedPose | None:
     """The fused pose, where a camera had a part in it a moment before a stamp: one that rests on the skin alone, fed back, would
     confirm itself."""
     if fused is None or (camera := fused.sources.get("vision")) is None:
