@@ -36,7 +36,7 @@ MEMORY_S = 10.0
 """Time in which a pose is forgotten: with a home known to 12 cm, 5 mm a window, twice what a limb moves."""
 EXPECTED_SIGMA = 0.02
 """A fused pose is looked at where its position is known so well along its worst direction [m]: what the camera saw a moment ago
-tells apart places that feel alike. A worse one rests on what was felt, and would feed it back …"""
+tells apart places that feel alike …"""
 EXPECTED_INFLATION, EXPECTED_FLOOR = 2.0, (0.01, 0.1)
 """… with its standard deviations doubled, and these [m, rad] added: it says where to look and not what is felt."""
 MISFIT = 2.0
@@ -155,7 +155,7 @@ class Estimator:
         self._rival: Place | None = None
         self._odds = 0.0  # log, of the track to the rival
         self._other: tuple[Array, Array] | None = None
-        self._turn, self._age = 0, 0
+        self._turn, self._age, self._shown = 0, 0, False
         self.size.forget()
         self.tare.forget()
 
@@ -191,8 +191,7 @@ class Estimator:
         if not (samples > 0).any():
             return self.nothing("no electrode can be believed")
         elapsed_s = self._predict(stamp_ns)
-        if expected is not None:
-            self._expect(*expected)
+        self._shown = expected is not None and self._expect(*expected)
         own = self.skin.gain * self.skin.sensitivity * self._response.rest(joints)  # what the robot's other links change
         signal = np.where(samples > 0, self.skin.signal(amplitude) - own - self.tare.offset, 0.0)
         variance = np.where(samples > 0, self.skin.noise / np.maximum(samples, 1), np.inf)
@@ -256,7 +255,7 @@ class Estimator:
         self._track = self._place(window, solution, prior)
         if self._rival is not None:
             return self._compared(window, self._rival, solution, solution.cost - prior.cost(solution))
-        if self._tracking:
+        if self._tracking and not self._shown:
             self._look_elsewhere(window, joints, solution)
         return solution
 
@@ -382,11 +381,14 @@ class Estimator:
         spread = float(axis @ self._home_covariance @ axis) - float(axis @ covariance @ axis)
         return Place(T, covariance + max(0.0, (1.0 - (1.0 - forgotten) ** 2) * spread) * np.outer(axis, axis))
 
-    def _expect(self, T: Array, covariance: Array) -> None:
-        """Looks around a pose (4, 4) with its covariance (6, 6), where it is known well enough: then there is no rival."""
-        if float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < EXPECTED_SIGMA**2:
+    def _expect(self, T: Array, covariance: Array) -> bool:
+        """Looks around a pose (4, 4) with its covariance (6, 6), where it is known well enough; whether it is. Then there is no
+        rival, and none is looked for."""
+        known = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < EXPECTED_SIGMA**2
+        if known:
             wider = EXPECTED_INFLATION**2 * covariance + np.diag(np.repeat(np.square(EXPECTED_FLOOR), 3))
-            self._track, self._rival = Place(T, wider), None
+            self._track, self._rival, self._other = Place(T, wider), None, None
+        return known
 
     def _roll(self, T: Array) -> float:
         """The turn about the limb's axis [rad] from home: the twist of the rotation between them."""
