@@ -8,7 +8,7 @@ where the solve looks, and through what changes slowly (`slow.py`):
 2. solve from there (`solve.py`), with the limb's size as it is known by now
 3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from home moved along the limb, and from the
    network's pose
-4. far from the pads thick and thin parts of a limb feel alike: another place that is possible, from scratch or grown beside the
+4. far from the pads thick and thin parts of a limb feel alike: another place that is possible, from scratch or found beside the
    track, is kept as its rival and solved as well, until the windows have decided between the two
 5. learn the size close to the pads, the electrodes' rests while nothing is near
 6. hand on the likelihood: size and roll marginalised, the model's error counted as what it is, nearly the same in several
@@ -56,15 +56,16 @@ STRANGE = 3.5
 FOREIGN = "what is felt is no limb: something else is near"
 AGAIN = 3
 """Of so many windows that nothing explains, one is solved from scratch: a search takes some milliseconds."""
-GROWN, STEPS = 4, 2
-"""Windows in which another solution grows beside the track before the two are compared, and its steps in each of them …"""
+OTHER_EVERY = 5
+"""Of so many windows one also looks elsewhere, from one start: as limbs come near, the place where they may be splits in two
+within a few of them …"""
 TRACKS_OWN = 0.06
 """… but not from so near to the track along the limb [m]: from there it would end where the track is."""
 SAME, APART = 0.02, 4.0
 """Two places are two when the square of their distance is above APART of its variances, with SAME [m] added: below, one of them
 with its covariance stands for both."""
 BESIDE = 2.0
-"""Log odds of the track at least, when a rival has grown beside it that explains the window as well: seven to one, for the rival
+"""Log odds of the track at least, when a rival is found beside it that explains the window as well: seven to one, for the rival
 was looked for, and of many places one explains some window …"""
 CLEAR = 2.0
 """… of which one window can change no more than this, lest one burst of noise decides …"""
@@ -154,8 +155,7 @@ class Estimator:
         self._pad_misfit = np.ones(len(self.skin.pads))
         self._rival: Place | None = None
         self._odds = 0.0  # log, of the track to the rival
-        self._other: tuple[Array, Array] | None = None
-        self._turn, self._age, self._shown = 0, 0, False
+        self._turn, self._rests, self._shown = 0, 0, False
         self.size.forget()
         self.tare.forget()
 
@@ -277,21 +277,16 @@ class Estimator:
         self._rival, self._odds = rival if possible else None, max(odds, 0.0)
 
     def _look_elsewhere(self, window: Window, joints: ArrayLike, solution: Solution) -> None:
-        """Beside the track's solution another one grows from scratch, some steps in every window; another place becomes the
-        rival."""
-        home = self._prior(self._home)
-        if self._other is None:
-            self._other, self._age = (self._elsewhere(window, joints), self.size.mean), 0
-        self._age += 1
-        if self._age <= GROWN:
-            grown = self._solver.solve(window, home, *self._other, STEPS, 0)
-            self._other = grown.T, grown.size
+        """Now and then solves from another start than the track, whose solution this is; another place becomes its rival."""
+        self._rests = (self._rests + 1) % OTHER_EVERY
+        if self._rests:
             return
-        other = self._solver.solve(window, home, *self._other, 0, STEPS)
-        self._other, rival = None, self._place(window, other, home)
+        home = self._prior(self._home)
+        other = self._solve(window, home, self._elsewhere(window, joints))
+        rival = self._place(window, other, home)
         if rival.is_apart(self._track):
             # the track is judged with the same freedom: from its pose, but with home's spread
-            same = self._solver.solve(window, home, solution.T, solution.size, 0, STEPS)
+            same = self._solver.solve(window, home, solution.T, solution.size, 0, 2)
             self._contest(rival, BESIDE + float(np.clip(other.cost - same.cost, -CLEAR, CLEAR)))
 
     def _elsewhere(self, window: Window, joints: ArrayLike) -> Array:
@@ -308,7 +303,7 @@ class Estimator:
         starts = [self._track.T, *(self._start(which, window, joints) for which in range(len(SLIDES) + 1))]
         best, *others = sorted((self._solve(window, home, start) for start in starts), key=lambda solution: solution.cost)
         self._track, self._track_misfit = self._place(window, best, home), best.misfit
-        self._rival, self._other = None, None
+        self._rival = None
         for other in others:
             if self._rival is None and other.cost - best.cost < CONVINCING:
                 self._contest(self._place(window, other, home), other.cost - best.cost)
@@ -387,7 +382,7 @@ class Estimator:
         known = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < EXPECTED_SIGMA**2
         if known:
             wider = EXPECTED_INFLATION**2 * covariance + np.diag(np.repeat(np.square(EXPECTED_FLOOR), 3))
-            self._track, self._rival, self._other = Place(T, wider), None, None
+            self._track, self._rival = Place(T, wider), None
         return known
 
     def _roll(self, T: Array) -> float:
