@@ -33,7 +33,10 @@ SECURE_ENDPOINT = "tls/127.0.0.1:7447"
 SECURE_PROTOCOLS = ("tls",)
 PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 POOL_BYTES = 4 << 20
-"""Of shared memory, at least: masks, and four frames of a small camera."""
+"""Of shared memory, at least: four frames of a small camera."""
+SHARED_BYTES = 100_000
+"""Frames go by shared memory; what is smaller takes no longer through a socket, and leaves its readers nothing behind where its
+publisher dies: they keep its pool for as long as they live."""
 KEPT_BYTES, SPARE_BYTES = 16 << 20, 32 << 20
 """Blocks of memory up to the first size come from what the process has, and stay there; beyond the second it gives some back."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
@@ -149,6 +152,7 @@ def configuration(connection: Connection) -> zenoh.Config:
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,  # nor waited for
         "transport/shared_memory/transport_optimization/pool_size": connection.pool_bytes,
+        "transport/shared_memory/transport_optimization/message_size_threshold": SHARED_BYTES,
     }
     settings |= {key: value for key, value in defaults.items() if not is_set(key)}
     if connection.config is None:
