@@ -82,6 +82,12 @@ def is_tracking(recorder: Recorder, *senses: str) -> bool:
     return pose.state == "tracking" and all(pose.sources.get(sense, OLD).age_s < 0.5 for sense in senses)
 
 
+def is_steady(recorder: Recorder) -> bool:
+    """Whether fused poses have come in time for two seconds."""
+    lately = recorder.since(FUSED, time.time_ns() - 2_000_000_000)
+    return len(lately) > 20 and max(heard.age_s for heard in lately) < 0.2
+
+
 OLD = messages.Source(age_s=float("inf"), weight=0.0)
 
 
@@ -153,6 +159,7 @@ def test_poses_cross_a_slow_link_in_time_and_frames_not_at_all(slow):
     robot, compute = slow.at["robot"], slow.at["compute"]
     viewer = Recorder(slow.running.sessions["robot"], slow.running.cell, FRAME, MASK)
     wait_for(lambda: is_tracking(robot, "vision"), START_S, "the pose by the camera alone", 0.1)
+    wait_for(lambda: is_steady(compute), START_S, "what is left of the start to be over", 0.1)
     begin_ns = time.time_ns()
     time.sleep(10.0)
     end_ns = time.time_ns()
