@@ -48,6 +48,8 @@ NEWS_S = 0.2
 """Within this a session has heard which replicas there are."""
 LOOK_S = 0.2
 """How often it is looked whether this replica is fit for its part."""
+UNWATCHED_S = 5.0
+"""After so long without a look what looks hangs itself, as where it wants a thread that has no memory to begin."""
 WARM_UP_S = 2.0
 """How long a replica that joins others may listen before it takes its share."""
 
@@ -84,6 +86,7 @@ class Node:
         self.worries: Callable[[], Sequence[str]] = list  # what the service itself suffers from, in words
         self._turns: list[Turn] = []
         self._hang = ""  # the handler that hangs, in words
+        self._looked_s = math.inf  # when it was last looked whether this replica is fit
         self._slowness = ""  # that this process does not get its time, in words
         self._clock, self._pace = Clock(), Pace()
         self.is_warm: Callable[[], bool] = lambda: True  # whether it could go on with what another replica does
@@ -365,10 +368,10 @@ class Node:
     def _watch_fitness(self) -> None:
         """While a handler hangs, this process stands still or its clock is off, it has no part where others live: its streams are
         theirs until it is fit again."""
-        looked_s, has_withdrawn = time.monotonic(), False
+        self._looked_s, has_withdrawn = time.monotonic(), False
         while not self.stopping.wait(LOOK_S):
             now_s = time.monotonic()
-            late_s, looked_s = now_s - looked_s - LOOK_S, now_s
+            late_s, self._looked_s = now_s - self._looked_s - LOOK_S, now_s
             self._slowness = self._pace.judge(late_s, LOOK_S)
             if late_s < LOOK_S:  # else the whole process stood still
                 longest_s, what = max(((turn.hangs_s(now_s), turn.what) for turn in self._turns), default=(0.0, ""))
@@ -411,7 +414,7 @@ class Node:
             "cell": self.cell.name,
             "wire_version": VERSION,
             "ready": self.replicas.has_joined,
-            "hangs": self._hang,
+            "hangs": self._hangs(),
             "uptime_s": round(time.monotonic() - self._started, 1),
             "cpu": round(self._cpu, 3),
             "memory_mb": round(self._process.memory_info().rss / 1e6, 1),
@@ -427,7 +430,12 @@ class Node:
         return json.dumps(self.health()).encode()
 
     def _suffers(self) -> list[str]:
-        return [*filter(None, [self._hang, self._slowness, self._clock.fault]), *self.worries()]
+        return [*filter(None, [self._hangs(), self._slowness, self._clock.fault]), *self.worries()]
+
+    def _hangs(self) -> str:
+        """What hangs, in words; empty where nothing does."""
+        is_watched = time.monotonic() - self._looked_s < UNWATCHED_S
+        return self._hang if is_watched else f"nobody has looked after this process for {UNWATCHED_S:g} s"
 
     def _look(self) -> Counter[tuple[str, str]]:
         return self._lately.look(health.counts(self._received, self._faults), time.monotonic())

@@ -49,7 +49,7 @@ class Seen:
 
 
 class Outside:
-    """Listens to a chain from outside. Everything is decoded afterwards."""
+    """Listens to a chain from outside, but not to what its own session sends. Everything is decoded afterwards."""
 
     def __init__(self, session: zenoh.Session, cell: str, target: str, pad: str):
         self._rows: dict[str, list[tuple[float, bytes, zenoh.SourceInfo | None]]] = {}
@@ -57,7 +57,8 @@ class Outside:
         for topic in READ:
             rows = self._rows.setdefault(topic.name, [])
             key = topic.at(cell=cell, target=target, pad=pad)
-            subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1024))
+            ring, others = zenoh.handlers.RingChannel(1024), zenoh.Locality.REMOTE
+            subscriber = session.declare_subscriber(key, ring, allowed_origin=others)
             threading.Thread(target=self._read, args=(subscriber, rows, topic.name in DECODED), daemon=True).start()
             self._subscribers.append(subscriber)
 

@@ -18,7 +18,7 @@ import pytest
 
 from shared import bus, logs, topics
 from shared import cell as cells
-from shared.replicas import Replicas, Share
+from shared.replicas import Clock, Replicas, Share
 from shared.service import CLOSE_S, Node
 from shared.turn import Turn
 from tests import injected
@@ -368,6 +368,15 @@ def test_a_replica_that_is_slow_but_alive_leaves_its_streams_to_the_others(repli
         time.sleep(1.0)
         assert all(map(other.owns, STREAMS)), "they stay there while it is slow"
     wait_for(lambda: not all(map(other.owns, STREAMS)), 20, "the streams to come back")
+
+
+def test_a_process_whose_watch_itself_hangs_says_so(replica, monkeypatch):
+    node, let_go = replica(), threading.Event()
+    assert node.health()["hangs"] == ""
+    monkeypatch.setattr(Clock, "judge", lambda *_: let_go.wait() and "")
+    wait_for(lambda: "nobody has looked" in node.health()["hangs"], 20, "the health to tell")
+    let_go.set()
+    wait_for(lambda: node.health()["hangs"] == "", 20, "the health to be well again")
 
 
 def test_a_replica_that_hangs_alone_keeps_its_streams(replica):
