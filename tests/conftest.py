@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from shared import bus
-from tests.live import Running, free_port, hold_in_reach, penumbra_up
+from shared.runtime import bus
+from tests.support.live import Running, free_port, hold_in_reach, penumbra_up
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -22,10 +22,11 @@ from hypothesis import strategies as st
 from rich.progress import Progress
 
 from services.skin import decode as skin_decode
-from shared import board, messages
-from shared import cell as cells
-from tests.inputs import KINDS, SPOILERS, damaged
-from tests.nodes import pose
+from shared.cell import description as cells
+from shared.contract import messages
+from shared.skin import board
+from tests.support.inputs import KINDS, SPOILERS, damaged
+from tests.support.nodes import pose
 
 BATCH = 1000
 """Inputs of one run of hypothesis, which remembers all of a run."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from services.emulator.serial import SerialBoards
-from sim.world import World
+from services.emulator.serial_boards import SerialBoards
+from sim.world.world import World
 
 COMMANDS = {
     "occlude": "a share of the target's pixels to hide from 0 to 1, or auto",

@@ -12,12 +12,12 @@ from functools import partial
 from pathlib import Path
 
 from services.emulator.control import control
-from services.emulator.pace import Pacer, Time
-from services.emulator.serial import SerialBoards
-from shared import topics
-from shared.service import Node
-from shared.topics import VOLTAGES
-from sim.world import TICK_NS, Sensors, Stream, World
+from services.emulator.pacing import Pacer, Time
+from services.emulator.serial_boards import SerialBoards
+from shared.contract import topics
+from shared.contract.topics import VOLTAGES
+from shared.runtime.node import Node
+from sim.world.world import TICK_NS, Sensors, Stream, World
 
 NAME = "emulator"
 

@@ -11,8 +11,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from services.fusion import so3
-from shared import geometry
-from shared.messages import FusedPose, Source
+from shared.contract.messages import FusedPose, Source
+from shared.geometry import rigid
 
 Array = NDArray[np.floating[Any]]
 
@@ -43,9 +43,9 @@ class Refused(ValueError):
 @dataclass(frozen=True)
 class Estimate:
     """The target at one moment. `T` (4, 4); `velocity` (6,): linear [m/s], angular [rad/s]; `covariance` (6, 6) of the pose error
-    (`shared.geometry`); `state`: tracking, coasting or lost; `sources`: the senses heard so far."""
+    (`shared.geometry.rigid`); `state`: tracking, coasting or lost; `sources`: the senses heard so far."""
 
-    T: geometry.Array
+    T: rigid.Array
     velocity: Array
     covariance: Array
     state: str

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fusion import kernel
+from services.fusion import filter
 from services.fusion.estimate import (
     ACCEPTED,
     FUTURE,
@@ -23,10 +23,10 @@ from services.fusion.estimate import (
     refusal,
     shaped,
 )
-from services.fusion.filter import Settings, model
 from services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, STATE
-from shared import geometry
-from shared.messages import FusedPose, Source
+from services.fusion.settings import Settings, model
+from shared.contract.messages import FusedPose, Source
+from shared.geometry import rigid
 
 
 class Bank:
@@ -44,14 +44,14 @@ class Bank:
         self._states = np.zeros((n, self.settings.capacity), STATE)
         self._measurements = np.zeros((n, self.settings.capacity), MEASUREMENT)
         self._rings = np.zeros((n, 2), np.int64)
-        kernel.clear_all(self._states, self._measurements, self._rings)
+        filter.clear_all(self._states, self._measurements, self._rings)
 
     def __len__(self) -> int:
         return len(self.logs)
 
     def forget(self, targets: slice = slice(None)) -> None:
         """Begins anew with every target, or with some of them; their counts go on."""
-        kernel.clear_all(self._states[targets], self._measurements[targets], self._rings[targets])
+        filter.clear_all(self._states[targets], self._measurements[targets], self._rings[targets])
         for log in self.logs[targets]:
             log.heard_ns.clear()
 
@@ -70,7 +70,7 @@ class Bank:
         `ErrorStateObserver.measure`. What is refused is counted, and the others are taken.
         """
         fates = np.empty(len(targets), np.int64)
-        kernel.measure_all(
+        filter.measure_all(
             *(self._models, self._states, self._measurements, self._rings),
             *(targets, sources, stamps_ns, T, information, latest(now_ns), fates),
         )
@@ -86,8 +86,8 @@ class Bank:
             if (source := message.sources.get(name)) is not None:
                 believed_ns[s], weight[s] = message.stamp_ns - int(1e9 * source.age_s), source.weight
                 self.logs[target].heard(name, int(believed_ns[s]))
-        T = geometry.transform(message.position, message.orientation)
-        kernel.adopt(
+        T = rigid.transform(message.position, message.orientation)
+        filter.adopt(
             *(self._models[target], self._states, self._measurements, self._rings, target),
             *(message.stamp_ns, T, message.velocity, message.covariance, believed_ns, weight),
         )
@@ -96,7 +96,7 @@ class Bank:
         """The ESTIMATE of every target (n,) at a stamp, or of some of them; otherwise as `ErrorStateObserver.estimate`."""
         models = self._models[targets]
         out = np.empty(len(models), ESTIMATE)
-        kernel.estimate_all(models, self._states[targets], self._rings[targets], stamp_ns, out)
+        filter.estimate_all(models, self._states[targets], self._rings[targets], stamp_ns, out)
         return out
 
     def earliest_ns(self, target: int) -> int:
@@ -121,7 +121,7 @@ class ErrorStateObserver:
     home : expected pose (4, 4) before anything is known, with standard deviations `spread` (position [m], rotation [rad]).
     """
 
-    def __init__(self, home: geometry.Array, spread: tuple[float, float], settings: Settings | None = None):
+    def __init__(self, home: rigid.Array, spread: tuple[float, float], settings: Settings | None = None):
         self._join(Bank(np.asarray(home)[None], [spread], settings), 0)
 
     @classmethod

@@ -18,8 +18,8 @@ What the paper leaves open or what cannot be done as printed, and what is done h
   at 1.5 m can resolve. R_v then grows by W_v = 8 m^2 and 16 pi rad^2, so that a hundredth of the arm hidden gives the camera a
   standard deviation of 28 cm: whenever the skin is in range it decides nearly alone. That is the paper's weighting, and kept.
 - R_c = f_c(x^, theta) by Gaussian-process regression: its inverse is the information of the haptic pose, with `penumbra haptics
-  --method paper` that of the regression (`Regression` of services/haptics/network.py). Along what the skin does not observe it is
-  zero, and R_c infinite; so R^-1 is used throughout, R never, and a sense that has nothing to say has a block of zeros.
+  --method paper` that of the regression (`Regression` of services/haptics/paper_network.py). Along what the skin does not observe
+  it is zero, and R_c infinite; so R^-1 is used throughout, R never, and a sense that has nothing to say has a block of zeros.
 - Continuous time, with measurements that arrive one by one: between two of them y moves on with u, and an old one is dropped.
   The Riccati equation is integrated by backward Euler in information form, stable for any step and gain; the low-pass exactly.
 - Late measurements: a sense's older pose after a newer one is refused; y is not taken back to its stamp.
@@ -36,8 +36,8 @@ import numpy as np
 
 from services.fusion import so3
 from services.fusion.estimate import Array, Estimate, Limits, Log
-from shared import geometry
-from shared.messages import FusedPose, Source
+from shared.contract.messages import FusedPose, Source
+from shared.geometry import rigid
 
 STEP_S = 0.01
 SENSES = {"vision": slice(0, 6), "haptic": slice(6, 12)}
@@ -105,7 +105,7 @@ class _State:
 class PaperObserver:
     """The interface of `observer.ErrorStateObserver`, the paper's equations."""
 
-    def __init__(self, home: geometry.Array, spread: tuple[float, float], settings: PaperSettings | None = None):
+    def __init__(self, home: rigid.Array, spread: tuple[float, float], settings: PaperSettings | None = None):
         self.settings = settings or PaperSettings()
         self.log = Log()
         self._home = home
@@ -275,8 +275,8 @@ def _pose(T: Array) -> Array:
     return np.array([*T[:3, 3], np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
 
 
-def _transform(x: Array) -> geometry.Array:
-    return geometry.from_rpy(x[:3], x[3:])
+def _transform(x: Array) -> rigid.Array:
+    return rigid.from_rpy(x[:3], x[3:])
 
 
 def _wrapped(x: Array) -> Array:

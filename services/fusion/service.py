@@ -16,8 +16,10 @@ from services.fusion import so3
 from services.fusion.estimate import AHEAD_S, Array, Estimate, Refused, information, latest
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
-from shared import cell, geometry, messages, topics
-from shared.service import Node
+from shared.cell import description
+from shared.contract import messages, topics
+from shared.geometry import rigid
+from shared.runtime.node import Node
 
 NAME = "fusion"
 OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
@@ -62,7 +64,7 @@ def warm_up(kind: type[ErrorStateObserver | PaperObserver]) -> None:
 class Group:
     """The observers of the cell's targets, of which all can be asked at once, and their clock now_ns()."""
 
-    def __init__(self, kind: str, targets: list[cell.Target], now_ns: Callable[[], int]):
+    def __init__(self, kind: str, targets: list[description.Target], now_ns: Callable[[], int]):
         homes = [target.home.transform for target in targets]
         spreads = [(target.home_spread.position, target.home_spread.rotation) for target in targets]
         self.lock = threading.Lock()
@@ -175,7 +177,7 @@ class Fusion:
             if information is None:
                 log.heard(source, message.stamp_ns)
                 return
-            T = geometry.transform(message.position, message.orientation)
+            T = rigid.transform(message.position, message.orientation)
             try:
                 self.observer.measure(source, message.stamp_ns, T, information, hidden, now_ns)
             except Refused as error:
@@ -238,7 +240,7 @@ def as_json(message: messages.FusedPose) -> dict[str, Any]:
         "stamp_ns": message.stamp_ns,
         "position": message.position.tolist(),
         "orientation": message.orientation.tolist(),
-        "rpy": geometry.rpy(message.orientation).tolist(),
+        "rpy": rigid.rpy(message.orientation).tolist(),
         "velocity": message.velocity.tolist(),
         "covariance": message.covariance.tolist(),
         "state": message.state,

@@ -24,13 +24,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from services.haptics.network import PoseNetwork, Relative, features
-from services.haptics.slow import PERSON_S, SIZE_GAP, SIZE_LASTING, Size, Tare
+from services.haptics.paper_network import PoseNetwork, Relative, features
+from services.haptics.size_and_rest import PERSON_S, SIZE_GAP, SIZE_LASTING, Size, Tare
 from services.haptics.solve import LEVER, Prior, Solution, Solver, Window, marginal, peak
-from shared.geometry import Array, perturb, pose_error
-from shared.response import Response
-from shared.skin import Skin
-from shared.surface import Surface
+from shared.geometry.rigid import Array, perturb, pose_error
+from shared.geometry.surface import Surface
+from shared.skin.layout import Skin
+from shared.skin.response import Response
 
 MEMORY_S = 10.0
 """Time in which a pose is forgotten: with a home known to 12 cm, 5 mm a window, twice what a limb moves."""

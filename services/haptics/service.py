@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.haptics import network
+from services.haptics import paper_network
+from services.haptics.batches import Backlog, Collector, Window
 from services.haptics.estimator import FOREIGN, Estimate, Estimator
-from services.haptics.kinematics import PadPoses
-from services.haptics.window import Backlog, Collector, Window
-from shared.body import target_mesh
-from shared.cell import Cell
-from shared.geometry import position_orientation
-from shared.messages import FusedPose, HapticPose, Joints, Voltages
-from shared.prediction import LONGEST_S, predict
-from shared.response import Response
-from shared.robot import robot_models
-from shared.service import Node
-from shared.skin import Near, Skin
-from shared.surface import Surface
-from shared.topics import FUSED, HAPTIC, JOINTS, VOLTAGES
+from services.haptics.pad_poses import PadPoses
+from shared.body.anatomy import target_mesh
+from shared.body.robot import robot_models
+from shared.cell.description import Cell
+from shared.contract.messages import FusedPose, HapticPose, Joints, Voltages
+from shared.contract.topics import FUSED, HAPTIC, JOINTS, VOLTAGES
+from shared.geometry.rigid import position_orientation
+from shared.geometry.surface import Surface
+from shared.perception.prediction import LONGEST_S, predict
+from shared.runtime.node import Node
+from shared.skin.layout import Near, Skin
+from shared.skin.response import Response
 
 NAME = "haptics"
 WEIGHTS = Path(__file__).parent / "weights"
@@ -100,7 +100,7 @@ def estimator(node: Node, options: argparse.Namespace, cell: Cell, target: str) 
     path = options.weights / f"{cell.name}-{target}.npz"
     weights = None
     try:
-        weights = network.load(path, cell, target)
+        weights = paper_network.load(path, cell, target)
     except (FileNotFoundError, ValueError) as error:
         node.log.warning("no network: the solve starts from the target's home instead", target=target, why=str(error))
     mesh = target_mesh(cell.targets[target], cell)

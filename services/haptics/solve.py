@@ -22,9 +22,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from shared.geometry import perturb, pose_error
-from shared.response import Response
-from shared.skin import Skin
+from shared.geometry.rigid import perturb, pose_error
+from shared.skin.layout import Skin
+from shared.skin.response import Response
 
 Array = NDArray[np.float64]
 

@@ -25,15 +25,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from scipy.spatial.transform import Rotation
 
 from services.haptics.estimator import Estimator
-from services.haptics.network import PoseNetwork, Regression, Relative, features, fingerprint
-from services.haptics.slow import SIZE, SIZE_SPREAD
-from shared import cell as cells
-from shared.body import target_mesh
-from shared.geometry import Array, from_rpy, pose_error
-from shared.response import Response
-from shared.robot import robot_models
-from shared.skin import Skin, link_names
-from shared.surface import Surface, nearest_points
+from services.haptics.paper_network import PoseNetwork, Regression, Relative, features, fingerprint
+from services.haptics.size_and_rest import SIZE, SIZE_SPREAD
+from shared.body.anatomy import target_mesh
+from shared.body.robot import robot_models
+from shared.cell import description as cells
+from shared.geometry.rigid import Array, from_rpy, pose_error
+from shared.geometry.surface import Surface, nearest_points
+from shared.skin.layout import Skin, link_names
+from shared.skin.response import Response
 
 WEIGHTS = Path(__file__).parent / "weights"
 HIDDEN = (256, 256, 256, 256)

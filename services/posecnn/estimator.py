@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from services.posecnn import network, patch, voting
 from services.posecnn.network import REFERENCE_PX, STRIDE, Network
 from services.posecnn.uncertainty import Signs, Uncertainty
-from shared import body, geometry, raster
-from shared.body import Mesh
-from shared.cell import Camera, Cell
-from shared.classes import Label
-from shared.geometry import Array
-from shared.vision import State, VisionEstimate
-from shared.window import Window
+from shared.body import anatomy
+from shared.body.anatomy import Mesh
+from shared.cell.description import Camera, Cell
+from shared.contract.labels import Label
+from shared.geometry import raster, rigid
+from shared.geometry.rigid import Array
+from shared.perception.lookout import Window
+from shared.perception.vision import State, VisionEstimate
 
 WEIGHTS = Path(__file__).parent / "weights" / "posecnn.npz"
 SMALLEST = 24
@@ -73,7 +74,7 @@ class PoseCNN:
     ):
         self._camera: Camera = cell.cameras[cell.one("cameras", camera)]
         self._target = cell.targets[cell.one("targets", target)]
-        self._mesh: Mesh = body.target_mesh(self._target, cell)
+        self._mesh: Mesh = anatomy.target_mesh(self._target, cell)
         self._length = float(np.ptp(self._mesh.vertices[:, 0]))
         self._shape = torch.from_numpy(network.proportions(self._mesh.vertices))[None]
         if net is None or uncertainty is None:
@@ -81,7 +82,7 @@ class PoseCNN:
         self._net, self._uncertainty = net, uncertainty
         able = torch.cpu.get_capabilities()
         self._half = bool(able.get("avx512_bf16") or able.get("amx_bf16"))
-        self._T_camera_world = geometry.inverse(self._camera.T_world_camera)
+        self._T_camera_world = rigid.inverse(self._camera.T_world_camera)
         self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])
 
     def prepare(self) -> None:
@@ -90,7 +91,7 @@ class PoseCNN:
         with torch.inference_mode():
             self._look(patch.cut(image, self._intrinsics, np.array([patch.SIDE / 2.0] * 2), float(patch.SIDE)))
         voting.vote(np.array([[4.0, 4.0], [8.0, 4.0]]), np.array([[1.0, 0.0], [-1.0, 0.0]]), patch.SIDE // STRIDE)
-        ahead = geometry.apply(geometry.from_rpy((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)), self._mesh.vertices)
+        ahead = rigid.apply(rigid.from_rpy((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)), self._mesh.vertices)
         raster.silhouette(ahead, self._mesh.faces, (50.0, 50.0, 32.0, 32.0), (0, 0, 64, 64))
 
     def update(self, image: NDArray[np.uint8], window: Window, T_prior: Array | None = None) -> Estimate:
@@ -161,13 +162,13 @@ class PoseCNN:
         T[:3, 3] = depth * np.array([*(centre - square.centre) / square.focal, 1.0])
         pooled = torch.from_numpy(centre[None].astype(np.float32)), torch.tensor([length_px])
         quaternion = self._net.rotations(out.features, *pooled)[0].numpy()
-        T[:3, :3] = patch.facing(T[:3, 3]) @ geometry.transform((0.0, 0.0, 0.0), quaternion)[:3, :3]
+        T[:3, :3] = patch.facing(T[:3, 3]) @ rigid.transform((0.0, 0.0, 0.0), quaternion)[:3, :3]
         return labels, self._found(T, vote, labels, seen, square)
 
     def _found(
         self, T: Array, vote: voting.Vote, labels: NDArray[np.int64], seen: NDArray[np.bool_], square: patch.Patch
     ) -> Found | None:
-        vertices = geometry.apply(T, self._mesh.vertices)
+        vertices = rigid.apply(T, self._mesh.vertices)
         if vertices[:, 2].min() < raster.NEAR:
             return None
         whole, inside = self._silhouette(vertices, square, len(labels))
@@ -204,7 +205,7 @@ class PoseCNN:
 
     def _is_covered(self, labels: NDArray[np.int64], square: patch.Patch, T_world_target: Array) -> bool:
         """Whether most of the target's picture at a pose shows things that can stand before it."""
-        vertices = geometry.apply(self._T_camera_world @ T_world_target, self._mesh.vertices)
+        vertices = rigid.apply(self._T_camera_world @ T_world_target, self._mesh.vertices)
         if vertices[:, 2].min() < raster.NEAR:
             return False
         _, inside = self._silhouette(vertices, square, len(labels))

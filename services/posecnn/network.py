@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from shared.classes import Label
+from shared.contract.labels import Label
 
 STRIDE = 2
 """Patch pixels a side of one position of the dense outputs."""

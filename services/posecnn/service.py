@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 
 from services.posecnn.estimator import WEIGHTS, PoseCNN, load
-from shared.messages import Frame, FusedPose
-from shared.prediction import predict
-from shared.service import Node
-from shared.topics import FRAME, FUSED, VISION
-from shared.window import Lookout
+from shared.contract.messages import Frame, FusedPose
+from shared.contract.topics import FRAME, FUSED, VISION
+from shared.perception.lookout import Lookout
+from shared.perception.prediction import predict
+from shared.runtime.node import Node
 
 NAME = "posecnn"
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.posecnn.patch import facing
-from shared import geometry
-from shared.geometry import Array
+from shared.geometry import rigid
+from shared.geometry.rigid import Array
 
 KINDS = ("depth", "lateral", "turn", "tilt", "roll")
 """Depth by the distance, lateral by the target's length, the others in radians."""
@@ -77,7 +77,7 @@ def rotation_axes(T: Array) -> Array:
 
 def errors(T_true: Array, T: Array, length: float) -> dict[str, Array]:
     """The errors of a pose T_camera_target by kind, in the kind's unit: two of lateral, one of every other."""
-    error = geometry.pose_error(T_true, T)
+    error = rigid.pose_error(T_true, T)
     position = facing(T[:3, 3]).T @ error[:3]
     roll, tilt, turn = rotation_axes(T).T @ error[3:]
     return {

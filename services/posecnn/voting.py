@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from shared.geometry import Array
+from shared.geometry.rigid import Array
 
 AGREES_RAD = 0.2
 """A ray that misses the centre by less than this angle agrees with it."""

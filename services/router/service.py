@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import psutil
 
-from shared import bus, topics
-from shared.service import Node
-from shared.slow import SlowLinks
+from shared.contract import topics
+from shared.runtime import bus
+from shared.runtime.node import Node
+from shared.runtime.slow_links import SlowLinks
 
 NAME = "router"
 MODE = "router"

@@ -9,8 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from services.search.evidence import Intrinsics
-from shared import geometry, raster
-from shared.body import Mesh
+from shared.body.anatomy import Mesh
+from shared.geometry import raster, rigid
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class Model:
 
     def in_camera(self, T: Array) -> Array:
         """The vertices (n, 3) [m] in the camera's frame."""
-        return geometry.apply(T, self.vertices)
+        return rigid.apply(T, self.vertices)
 
     def silhouette(self, T: Array, k: Intrinsics, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
         """The silhouette (h, w) in a window (x0, y0, w, h) of the image with intrinsics k."""

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from services.search.contour import Model
 from services.search.evidence import TARGET, Evidence
-from shared import geometry
-from shared.classes import Label
-from shared.messages import Mask
+from shared.contract.labels import Label
+from shared.contract.messages import Mask
+from shared.geometry import rigid
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def hypotheses(model: Model, evidence: Evidence, T_home: Array) -> list[Array]:
     found = []
     for toward_hand, tilt, roll in itertools.product(_directions(evidence, rows, columns, axes[:, 1]), TILTS, ROLLS):
         x = np.array([*(np.cos(tilt) * toward_hand), np.sin(tilt)])
-        R = geometry.rotation(roll * x) @ _shortest_rotation(T_home[:3, 0], x) @ T_home[:3, :3]
+        R = rigid.rotation(roll * x) @ _shortest_rotation(T_home[:3, 0], x) @ T_home[:3, :3]
         for z, slide in itertools.product(depths, slides):
             T = np.eye(4)
             T[:3, :3] = R
@@ -109,7 +109,7 @@ def mirrored(T: Array) -> list[Array]:
     starts = []
     for R, roll in ((_shortest_rotation(x, reflected), 0.0), (np.eye(3), 0.6), (np.eye(3), -0.6)):
         start = T.copy()
-        start[:3, :3] = geometry.rotation(roll * x) @ R @ T[:3, :3]
+        start[:3, :3] = rigid.rotation(roll * x) @ R @ T[:3, :3]
         starts.append(start)
     return starts
 
@@ -131,6 +131,6 @@ def _shortest_rotation(a: Array, b: Array) -> Array:
         if a @ b > 0.0:
             return np.eye(3)
         axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
-        return geometry.rotation(np.pi * axis / np.linalg.norm(axis))
+        return rigid.rotation(np.pi * axis / np.linalg.norm(axis))
     angle = np.arctan2(np.linalg.norm(axis), a @ b)
-    return geometry.rotation(angle * axis / np.linalg.norm(axis))
+    return rigid.rotation(angle * axis / np.linalg.norm(axis))

@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from shared.cell import Camera
-from shared.classes import Label
+from shared.cell.description import Camera
+from shared.contract.labels import Label
 
 FREE, TARGET, COVERED = 0, 1, 2
 """State of a pixel. COVERED: something stands in front, or nothing is known there. The limb's other parts cover too: the

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from collections import deque
 
-from services.search.joints import JointHistory
-from services.search.search import METHODS, Search
-from shared.messages import Frame, FusedPose, Joints, Mask
-from shared.prediction import predict
-from shared.service import Node
-from shared.topics import FRAME, FUSED, JOINTS, MASK, VISION
-from shared.window import Lookout
+from services.search.tracker import METHODS, Search
+from shared.contract.messages import Frame, FusedPose, Joints, Mask
+from shared.contract.topics import FRAME, FUSED, JOINTS, MASK, VISION
+from shared.perception.joint_history import JointHistory
+from shared.perception.lookout import Lookout
+from shared.perception.prediction import predict
+from shared.runtime.node import Node
 
 NAME = "search"
 FRAMES_KEPT = 4

@@ -17,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from services.segmentation import infer
-from shared.classes import Label
-from shared.window import STEP, Window, whole_frame
+from services.segmentation import inference
+from shared.contract.labels import Label
+from shared.perception.lookout import STEP, Window, whole_frame
 
 SETTLE = 4
 PERIOD_NS = 50_000_000
@@ -48,7 +48,7 @@ def arguments() -> argparse.ArgumentParser:
     )
     parser.add_argument("files", type=Path, nargs="+", metavar="IMAGE|VIDEO")
     parser.add_argument("--out", type=Path, default=Path("masks"), help="folder to write to (default: masks)")
-    parser.add_argument("--weights", type=Path, default=infer.WEIGHTS, help="the network (default: the committed one)")
+    parser.add_argument("--weights", type=Path, default=inference.WEIGHTS, help="the network (default: the committed one)")
     parser.add_argument("--sequence", action="store_true", help="the pictures are frames of one film, in this order")
     parser.add_argument(
         "--scale",
@@ -69,20 +69,20 @@ def main(argv: list[str] | None = None) -> int:
             twice = next(name for name in names if names.count(name) > 1)
             raise FileError(f"files of different names expected, {twice} came twice: call it once for each, with an --out each")
         options.out.mkdir(parents=True, exist_ok=True)
-        segmenter = infer.load_segmenter(options.weights)
+        segmenter = inference.load_segmenter(options.weights)
         stamp_ns = 0
         for path in options.files:
             if is_picture(path):
                 image = read(path)
                 if not options.sequence:
-                    stamp_ns += 2 * round(infer.MAX_GAP_S * 1e9)  # so long that the last picture is forgotten
+                    stamp_ns += 2 * round(inference.MAX_GAP_S * 1e9)  # so long that the last picture is forgotten
                 for _ in range(1 if options.sequence else SETTLE):
                     stamp_ns += PERIOD_NS
                     mask = whole_mask(segmenter, image, options.scale, stamp_ns)
                 write(options.out / f"{path.stem}_mask.png", mask)
                 write(options.out / f"{path.stem}_overlay.png", overlay(image, mask)[..., ::-1])
             else:
-                stamp_ns += 2 * round(infer.MAX_GAP_S * 1e9)
+                stamp_ns += 2 * round(inference.MAX_GAP_S * 1e9)
                 stamp_ns = film(segmenter, path, options.out, options.scale, stamp_ns)
     except (FileError, FileNotFoundError) as error:
         print(f"penumbra segmentation infer: {error}", file=sys.stderr)
@@ -106,7 +106,7 @@ def read(path: Path) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
 
 
-def film(segmenter: infer.Segmenter, path: Path, out: Path, scale: int | None, stamp_ns: int) -> int:
+def film(segmenter: inference.Segmenter, path: Path, out: Path, scale: int | None, stamp_ns: int) -> int:
     """Masks and overlay of a film; returns the stamp of its last frame. Raises FileError."""
     source = cv2.VideoCapture(str(path))
     rate = source.get(cv2.CAP_PROP_FPS) or 1e9 / PERIOD_NS
@@ -139,7 +139,7 @@ def frames(source: cv2.VideoCapture) -> Iterator[NDArray[np.uint8]]:
         yield np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
 
 
-def whole_mask(segmenter: infer.Segmenter, image: NDArray[np.uint8], scale: int | None, stamp_ns: int) -> NDArray[np.uint8]:
+def whole_mask(segmenter: inference.Segmenter, image: NDArray[np.uint8], scale: int | None, stamp_ns: int) -> NDArray[np.uint8]:
     """Classes (h, w) of a whole image (h, w, 3), looked at as the service does where it knows of no pose; what is left over at
     the edges is background. Raises FileError where the image is too small for the network."""
     height, width = image.shape[:2]
@@ -163,7 +163,7 @@ def overlay(image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.uin
         colours[mask == label] = colour
     blended = (image // 2 + colours // 2).astype(np.uint8)
     blended[mask == Label.BACKGROUND] = image[mask == Label.BACKGROUND]
-    target = np.isin(mask, infer.TARGET_LABELS).astype(np.uint8)
+    target = np.isin(mask, inference.TARGET_LABELS).astype(np.uint8)
     contours, _ = cv2.findContours(target, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return np.asarray(cv2.drawContours(blended, contours, -1, (255, 255, 255), 1), np.uint8)
 

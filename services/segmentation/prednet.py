@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from shared.classes import Label
+from shared.contract.labels import Label
 
 State = tuple[Tensor, ...]
 """What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""

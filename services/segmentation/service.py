@@ -8,12 +8,12 @@ from pathlib import Path
 
 import torch
 
-from services.segmentation.infer import WEIGHTS, Segmenter, load_segmenter
-from shared.cell import Camera
-from shared.messages import Frame, FusedPose, Mask
-from shared.service import Node
-from shared.topics import FRAME, FUSED, MASK
-from shared.window import Lookout
+from services.segmentation.inference import WEIGHTS, Segmenter, load_segmenter
+from shared.cell.description import Camera
+from shared.contract.messages import Frame, FusedPose, Mask
+from shared.contract.topics import FRAME, FUSED, MASK
+from shared.perception.lookout import Lookout
+from shared.runtime.node import Node
 
 NAME = "segmentation"
 FOLLOW_S = 0.2

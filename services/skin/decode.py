@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from services.arguments import Parser
-from shared import board
+from services.flags import Parser
+from shared.skin import board
 
 
 def main(argv: list[str]) -> int:

@@ -9,8 +9,8 @@ A row of a pad, about 230 times a second:
 
 Bringing back, the cheapest first: a reply that came damaged shows that the board hears us: wait until the line is quiet. One that
 did not come, or in which the phase has jumped: end what the board believes to be reading, and find out by a stream of probes
-where its commands begin and at which frequency it is (`shared.board.realign_probes`). No answer: a BREAK, and the probes again.
-Still none: `BoardSilent`.
+where its commands begin and at which frequency it is (`shared.skin.board.realign_probes`). No answer: a BREAK, and the probes
+again. Still none: `BoardSilent`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared import board
-from shared.board import Command, Kind, PacketError
+from shared.skin import board
+from shared.skin.board import Command, Kind, PacketError
 
 Array = NDArray[np.float64]
 Components = NDArray[np.complex128]

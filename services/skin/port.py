@@ -12,7 +12,7 @@ from pathlib import Path
 
 import serial
 
-from shared import board
+from shared.skin import board
 
 BREAK_S = 1e-3
 """Fifty bytes long: a receiver takes a low line for a BREAK from one byte on."""

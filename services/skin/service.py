@@ -15,11 +15,11 @@ from typing import Any
 
 from services.skin.driver import Batches, Line, PadReader
 from services.skin.port import SerialPort
-from shared import board
-from shared import cell as cells
-from shared.messages import Voltages
-from shared.service import Node
-from shared.topics import VOLTAGES
+from shared.cell import description as cells
+from shared.contract.messages import Voltages
+from shared.contract.topics import VOLTAGES
+from shared.runtime.node import Node
+from shared.skin import board
 
 NAME = "skin"
 BACKOFF_S = (0.2, 5.0)

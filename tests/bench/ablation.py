@@ -20,10 +20,11 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from services.segmentation import evaluate, infer, train
+from services.segmentation import inference
 from services.segmentation.prednet import Settings
+from services.segmentation.training import evaluate, train
 from shared import training
-from sim import sequences, shots
+from sim.sets import sequences, shots
 from tests.bench import segmentation
 
 VARIANTS: dict[str, tuple[Settings, float]] = {
@@ -46,7 +47,7 @@ def easy(seed: int, index: int) -> sequences.Sequence:
     hidden = np.random.default_rng([seed, index]).uniform(0.0, 0.93)
     film = shots.clip(seed, index, 320, 240, 1.5, hidden, "easy", 8)
     labels = np.stack([shot.labels for shot in film])
-    shown = np.argwhere(np.isin(labels, infer.TARGET_LABELS))[:, 1:]
+    shown = np.argwhere(np.isin(labels, inference.TARGET_LABELS))[:, 1:]
     y, x = np.clip((shown.mean(0) - SIDE / 2).astype(int) if len(shown) else (72, 112), 0, (240 - SIDE, 320 - SIDE))
     cut = np.s_[:, y : y + SIDE, x : x + SIDE]
     images = np.stack([shot.image for shot in film if shot.image is not None])
@@ -64,8 +65,8 @@ def learn(name: str, data: train.Data, seed: int, minutes: float, steps: int | N
 def score(trainer: train.Trainer, data: train.Data, seed: int) -> dict[str, Any]:
     """The averaged weights on held-out sequences, calibrated on others."""
     offset, _ = evaluate.calibrate(trainer.average, data.calibration)
-    segmenter = infer.Segmenter(trainer.average, offset)
-    ms = infer.speed(segmenter, segmentation.VARIETY.size, segmentation.VARIETY.size)
+    segmenter = inference.Segmenter(trainer.average, offset)
+    ms = inference.speed(segmenter, segmentation.VARIETY.size, segmentation.VARIETY.size)
     found = segmentation.result(seed, segmentation.rows(segmenter, data.held_out), [], ms)
     return {"rows": found["rows"], "ms_per_frame": found["ms_per_frame"]}
 

@@ -24,11 +24,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from shared import cell as cells
-from shared import topics
-from shared.topics import Topic
-from tests import injected, observed
-from tests.live import Running, penumbra_up, wait_for
+from shared.cell import description as cells
+from shared.contract import topics
+from shared.contract.topics import Topic
+from tests.support import injected, observed
+from tests.support.live import Running, penumbra_up, wait_for
 
 SERVICES = ("emulator", "segmentation", "search", "haptics", "fusion")
 REPLICATED = SERVICES[1:]
@@ -136,7 +136,7 @@ def _memory(chain: Chain, process: psutil.Process) -> AbstractContextManager[Non
 @contextmanager
 def _crash_loop(chain: Chain, process: psutil.Process) -> Iterator[None]:
     words = process.cmdline()
-    service = words[words.index("services.cli") + 1]
+    service = words[words.index("services.command.cli") + 1]
     spared = {each.pid for each in chain.instances(service)} - {process.pid}
     with injected.crash_loop(lambda: [each for each in chain.instances(service) if each.pid not in spared]):
         yield

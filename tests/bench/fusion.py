@@ -1,7 +1,7 @@
 """`penumbra bench fusion`: is the observer as good as it says, is it better than its rivals, and what does it cost.
 
-Monte Carlo runs of simulated limbs and senses (`tests.fusion_runs`: minimum-jerk reaches, errors that last, pictures that are
-late; nothing is drawn from the filter's own model) in six situations, and in a seventh with a hand as fast as hands are.
+Monte Carlo runs of simulated limbs and senses (`tests.bench.lib.fusion_runs`: minimum-jerk reaches, errors that last, pictures
+that are late; nothing is drawn from the filter's own model) in six situations, and in a seventh with a hand as fast as hands are.
 
 NEES: the squared error of the pose that is published, in units of its covariance, at the moment of publication; 6 degrees of
 freedom, 5 where the roll about the limb is not observed. NIS: the same of the innovations of accepted measurements. Values of
@@ -41,12 +41,13 @@ from scipy.stats import chi2
 from services.fusion.estimate import SOURCES, Estimate
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
-from shared import geometry, messages
-from shared.geometry import Array
-from tests import fusion_runs as runs
-from tests.fusion_baselines import FixedLagSmoother, Newest
+from shared.contract import messages
+from shared.geometry import rigid
+from shared.geometry.rigid import Array
+from tests.bench.lib import fusion_runs as runs
+from tests.bench.lib.fusion_baselines import FixedLagSmoother, Newest
 
-HOME, SPREAD = geometry.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0]), (0.12, 0.4)
+HOME, SPREAD = rigid.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0]), (0.12, 0.4)
 """Of the cell `table`."""
 INSTANTS_S = 0.11
 """Between moments that are scored: it walks through all phases of both senses' periods."""
@@ -79,7 +80,7 @@ class Scores:
 def normalised(truth: Array, T: Array, covariance: Array, rolls: bool) -> float:
     """The squared pose error of T (4, 4) in units of its covariance (6, 6); without `rolls` along the five directions other than
     the rotation about the limb."""
-    error = geometry.pose_error(truth, T)
+    error = rigid.pose_error(truth, T)
     if not rolls:
         axes = np.eye(6)
         axes[3:, 3:] = T[:3, :3]

@@ -1,9 +1,9 @@
 """`penumbra bench haptics`: how near the skin's pose comes to what its voltages can tell at all.
 
-Voltages come from the full boundary-element model (`sim.field`), never from the response that the estimator uses: random limb
-poses at a given gap, sizes from the 5th percentile woman to the 95th man that the estimator does not know, ten samples averaged,
-noise and converter as the cell says. Beside every error stands the Cramér-Rao bound with that size unknown, once with the broad
-prior that the first look at a limb has, once with a tracking prior.
+Voltages come from the full boundary-element model (`sim.skin.field`), never from the response that the estimator uses: random
+limb poses at a given gap, sizes from the 5th percentile woman to the 95th man that the estimator does not know, ten samples
+averaged, noise and converter as the cell says. Beside every error stands the Cramér-Rao bound with that size unknown, once with
+the broad prior that the first look at a limb has, once with a tracking prior.
 
 Then limbs that rest for ten seconds (what is published, and what the default observer makes of it, against their covariances),
 limbs that move through all gaps, and things that are no limb.
@@ -29,21 +29,21 @@ from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
 from services.fusion.observer import ErrorStateObserver
-from services.haptics import network
+from services.haptics import paper_network
+from services.haptics.batches import Collector
 from services.haptics.estimator import Estimator
 from services.haptics.service import WEIGHTS
-from services.haptics.slow import SIZE_SPREAD
-from services.haptics.window import Collector
-from services.skin.train import links, mountings
-from shared import cell as cells
-from shared import geometry
-from shared.body import target_mesh
-from shared.geometry import Array
-from shared.response import Response, fingerprint
-from shared.robot import robot_models
-from shared.skin import Skin, link_names
-from shared.surface import Surface
-from sim import field
+from services.haptics.size_and_rest import SIZE_SPREAD
+from services.skin.model import links, mountings
+from shared.body.anatomy import target_mesh
+from shared.body.robot import robot_models
+from shared.cell import description as cells
+from shared.geometry import rigid
+from shared.geometry.rigid import Array
+from shared.geometry.surface import Surface
+from shared.skin.layout import Skin, link_names
+from shared.skin.response import Response, fingerprint
+from sim.skin import field
 
 ARRAYS = {"bare": "table", "hull": "arm"}
 """Cells: pads in a table top, and pads on a robot's hull."""
@@ -110,9 +110,9 @@ class Rig:
         self._rest = np.zeros(len(self.skin))  # what the robot's other links add
         if len(self.joints):
             self._rest = np.concatenate([links(self.cell, known[own], self.joints[None])[0] for own in prints])
-        self.weights: network.PoseNetwork | None = None
+        self.weights: paper_network.PoseNetwork | None = None
         try:
-            self.weights = network.load(WEIGHTS / f"{self.cell.name}-{self.target}.npz", self.cell, self.target)
+            self.weights = paper_network.load(WEIGHTS / f"{self.cell.name}-{self.target}.npz", self.cell, self.target)
         except (FileNotFoundError, ValueError) as error:
             print(f"{name}: without a network: {error}", file=sys.stderr)
         away = np.linalg.norm(self.pads[:, :3, 3] - self.pads[:, :3, 3].mean(axis=0), axis=1)
@@ -132,7 +132,7 @@ class Rig:
         out = np.zeros(len(self.skin))
         for k in self.chosen[count]:
             own = self.skin.of(k)
-            out[own] = self.fields[k].change(body, geometry.inverse(self.pads[k]) @ T)
+            out[own] = self.fields[k].change(body, rigid.inverse(self.pads[k]) @ T)
         return out * self.skin.gain * self.skin.sensitivity
 
     def voltages(self, signal: Array, rng: np.random.Generator) -> Array:
@@ -167,7 +167,7 @@ class Rig:
         T[:3, 3] = self.pads[self.chosen[count], :3, 3].mean(axis=0)
         T[:3, 3] += np.array([rng.uniform(-0.05, 0.05), rng.uniform(-0.03, 0.03), 0.25]) @ axes
         turn = np.array([0.3 * rng.standard_normal(), rng.uniform(-0.12, 0.12), rng.uniform(-0.26, 0.26)]) @ axes
-        T[:3, :3] = geometry.perturb(T, np.concatenate([np.zeros(3), turn]))[:3, :3]
+        T[:3, :3] = rigid.perturb(T, np.concatenate([np.zeros(3), turn]))[:3, :3]
         for _ in range(12):
             T[:3, 3] += (gap - self.gap(T, size, count)) * axes[2]
         return T, size
@@ -176,7 +176,7 @@ class Rig:
         """Fisher information (8, 8) of a window with these true signals (n,) about pose and size, by the response's
         derivatives."""
         R = self.pads[:, :3, :3]
-        _, jacobian = self.response.logs(np.stack([geometry.inverse(pad) @ T for pad in self.pads]), size)
+        _, jacobian = self.response.logs(np.stack([rigid.inverse(pad) @ T for pad in self.pads]), size)
         turned = jacobian.copy()
         for part in (slice(0, 3), slice(3, 6)):
             turned[:, part] = np.einsum("nij,nj->ni", R[self.skin.pad_of], jacobian[:, part])
@@ -204,7 +204,7 @@ def _scene(rig: Rig, seed: int, count: int, gap: float, k: int) -> Scene:
     step = 0.5 * (WINDOW_NS - PERIOD_NS) * 1e-9 * direction / np.linalg.norm(direction)
     signals = {0.0: rig.signal(body, T, count)}
     for speed in SPEEDS[1:]:  # the mean over the window's way, by Simpson's rule
-        ends = [rig.signal(body, geometry.perturb(T, np.append(s * speed * step, np.zeros(3))), count) for s in (-1, 1)]
+        ends = [rig.signal(body, rigid.perturb(T, np.append(s * speed * step, np.zeros(3))), count) for s in (-1, 1)]
         signals[speed] = (4.0 * signals[0.0] + ends[0] + ends[1]) / 6.0
     return T, size, signals, rng
 
@@ -234,11 +234,11 @@ def single_windows(
                     spread = TRACKING if prior else BROAD
                     row.bounds.append(_bound(information, axes, spread))
                     for _ in range(plan.draws):
-                        home = geometry.perturb(T, (spread * rng.standard_normal(6)) @ axes)
+                        home = rigid.perturb(T, (spread * rng.standard_normal(6)) @ axes)
                         estimator = rig.estimator(home, np.sqrt(np.diag(axes.T @ np.diag(spread**2) @ axes)), method)
                         amplitude = rig.voltages(np.tile(signals[speed], (SAMPLES, 1)), rng).mean(axis=0)
                         estimator.update(1, amplitude, rig.samples(count), rig.pads, rig.joints)
-                        row.errors.append(axes @ geometry.pose_error(T, estimator.pose))
+                        row.errors.append(axes @ rigid.pose_error(T, estimator.pose))
             for (prior, speed), row in table.items():
                 yield _row(rig, gap, count, prior, speed, row)
 
@@ -288,7 +288,7 @@ def resting(rig: Rig, seed: int, gap: float, k: int) -> Consistency:
 def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: Array) -> Consistency:
     """What estimator and observer make of windows with these true poses and signals (windows, n)."""
     axes = rig.axes(poses[0], 8)
-    home = geometry.perturb(poses[0], (BROAD * rng.standard_normal(6)) @ axes)
+    home = rigid.perturb(poses[0], (BROAD * rng.standard_normal(6)) @ axes)
     estimator = rig.estimator(home, np.sqrt(np.diag(axes.T @ np.diag(BROAD**2) @ axes)))
     spread = rig.cell.targets[rig.target].home_spread
     observer = ErrorStateObserver(home, (spread.position, spread.rotation))
@@ -308,18 +308,18 @@ def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: A
             observer.measure("haptic", window.stamp_ns, estimate.T, estimate.information)
         if stamp_ns < SETTLED_S * 1e9:
             continue
-        errors.append(rig.axes(T, 8) @ geometry.pose_error(T, estimator.pose))
+        errors.append(rig.axes(T, 8) @ rigid.pose_error(T, estimator.pose))
         if not estimate.in_range:
             continue
         seen += 1
         values = np.linalg.eigvalsh(estimate.information)
         rank = int((values > 1e-6 * values[-1]).sum())
-        error = geometry.pose_error(T, estimate.T)
+        error = rigid.pose_error(T, estimate.T)
         published.append(float(error @ estimate.information @ error) / rank)
         if i % 10 == 0:
             told = observer.estimate(window.stamp_ns)
             known = np.delete(rig.axes(told.T, 8), NAMES.index("roll"), axis=0)
-            error = known @ geometry.pose_error(T, told.T)
+            error = known @ rigid.pose_error(T, told.T)
             fused.append(float(error @ np.linalg.solve(known @ told.covariance @ known.T, error)) / len(known))
     means = [float(np.mean(values)) if values else float("nan") for values in (published, fused)]
     return Consistency(*means, seen / max(len(errors), 1), ms, errors)
@@ -345,7 +345,7 @@ def moving(rig: Rig, seed: int, k: int, seconds: float) -> tuple[list[float], Co
 
     def at(t: Array) -> list[Array]:
         way = reach * (np.sin(np.outer(t, rate) + phase) - np.sin(phase)) @ axes[:3, :3]
-        return [geometry.perturb(T, np.append(step, np.zeros(3))) for step in way]
+        return [rigid.perturb(T, np.append(step, np.zeros(3))) for step in way]
 
     knots = np.arange(0.0, seconds + 0.05, 0.04)
     logs = np.log(np.maximum([rig.signal(body, pose, 8) for pose in at(knots)], 1e-9))
@@ -362,7 +362,7 @@ def things(rig: Rig) -> dict[str, field.Body]:
     for _ in range(3):
         block = block.subdivide()
     bar = bar.subdivide_to_size(0.03)
-    bar.apply_transform(geometry.from_rpy((0.0, 0.0, 0.0), (0.0, np.pi / 2.0, 0.0)))
+    bar.apply_transform(rigid.from_rpy((0.0, 0.0, 0.0), (0.0, np.pi / 2.0, 0.0)))
     bodies = {"metal bar, grounded": (bar, np.inf, None), "metal bar": (bar, 0.0, None), "plastic block": (block, 0.0, 3.0)}
     return {
         name: field.Body(field.Panels.of_mesh(mesh.vertices, mesh.faces), ground, permittivity)

@@ -22,9 +22,9 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from shared import cell as cells
-from shared import messages, topics
-from tests.live import penumbra_up, wait_for
+from shared.cell import description as cells
+from shared.contract import messages, topics
+from tests.support.live import penumbra_up, wait_for
 
 VISIBLE = 0.33
 """At most this share of the target hidden: visible (the paper's light occlusion)."""

@@ -21,9 +21,10 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from services.search.evidence import Intrinsics
-from services.search.objects import RigidObject, refine
-from shared import geometry, raster
-from shared.body import Mesh
+from services.search.objects.pose import RigidObject, refine
+from shared.body.anatomy import Mesh
+from shared.geometry import raster
+from shared.geometry import rigid as geometry
 
 Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -15,9 +15,9 @@ from typing import Any
 
 from rich.console import Console
 
-from sim import trial
-from tests import campaign, curves, page, pictures, trials
+from sim.sets import trial
 from tests.bench import table1
+from tests.bench.lib import campaign, curves, page, pictures, trials
 
 
 def passed(seed: int) -> trials.Played:
@@ -30,8 +30,8 @@ def jobs(seed: int, quick: bool) -> list[campaign.Job]:
     here = "tests.bench.paper"
     return [
         campaign.Job(f"{seed}-passage", f"{here}:passed", (seed,)),
-        campaign.Job(f"{seed}-haptic{'-quick' * quick}", "tests.curves:haptic_by_gap", (seed, quick)),
-        campaign.Job("response", "tests.curves:response_by_gap", ()),
+        campaign.Job(f"{seed}-haptic{'-quick' * quick}", "tests.bench.lib.curves:haptic_by_gap", (seed, quick)),
+        campaign.Job("response", "tests.bench.lib.curves:response_by_gap", ()),
     ]
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from shared import cell as cells
-from shared import topics
-from sim.world import record
+from shared.cell import description as cells
+from shared.contract import topics
+from sim.world.world import record
 from tests.bench.live import SENSES, accuracy, reach_of, show_errors
-from tests.replay import SERVICES, Replay
+from tests.support.replay import SERVICES, Replay
 
 
 def main(argv: list[str] | None = None) -> int:

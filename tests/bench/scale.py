@@ -23,12 +23,13 @@ import zenoh
 from rich.console import Console
 from rich.table import Table
 
-from shared import bus, messages, topics
-from shared import cell as cells
-from tests import buses
+from shared.cell import description as cells
+from shared.contract import messages, topics
+from shared.runtime import bus
+from tests.bench.lib import buses
 from tests.bench.live import Recording, cpu_times, fused_ages_s, percentiles
-from tests.cells import derive
-from tests.live import Running, free_port, penumbra_up, wait_for
+from tests.support.cells import derive
+from tests.support.live import Running, free_port, penumbra_up, wait_for
 
 SIZES, QUICK_SIZES = (1, 2, 4, 8), (1, 2)
 REPLICAS, QUICK_REPLICAS = (1, 2), (1,)

@@ -1,9 +1,10 @@
 """`penumbra bench search`: how near the search comes to the truth, and to what a mask can tell at all.
 
-Random scenes that hide a given share of the target (`sim.shots`), starts perturbed by 2 cm and 4 degrees. Exact masks come from
-the renderer, network masks from the trained segmentation, which saw the frames before in the window that the service would cut.
-Beside each row stand the paper's search and the Cramér-Rao bound of an exact mask (`tests.bound`): the median of the position
-errors that an efficient estimator would make on the same pictures, the prior left out, as the published pose leaves it out.
+Random scenes that hide a given share of the target (`sim.sets.shots`), starts perturbed by 2 cm and 4 degrees. Exact masks come
+from the renderer, network masks from the trained segmentation, which saw the frames before in the window that the service would
+cut. Beside each row stand the paper's search and the Cramér-Rao bound of an exact mask (`tests.bench.lib.bound`): the median of
+the position errors that an efficient estimator would make on the same pictures, the prior left out, as the published pose leaves
+it out.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, rankdata
 
-from services.search.fit import Noise
-from services.search.search import Search, Searched
-from services.segmentation.infer import Segmenter, load_segmenter
-from shared import geometry
-from shared.classes import Label
-from shared.geometry import Array
-from shared.messages import Mask
-from shared.window import Window, corners_of, whole_frame, window_around
-from sim import shots
-from sim.shots import Shot
-from tests import bound
+from services.search.mask_fit import Noise
+from services.search.tracker import Search, Searched
+from services.segmentation.inference import Segmenter, load_segmenter
+from shared.contract.labels import Label
+from shared.contract.messages import Mask
+from shared.geometry import rigid
+from shared.geometry.rigid import Array
+from shared.perception.lookout import Window, corners_of, whole_frame, window_around
+from sim.sets import shots
+from sim.sets.shots import Shot
+from tests.bench.lib import bound
 
 HIDDEN = (0.0, 0.3, 0.6, 0.85)
 VIEWS = ((320, 240, 1.5), (640, 480, 1.5), (1280, 960, 4.5), (1280, 960, 8.0))
@@ -83,7 +84,7 @@ class Result:
 
     @property
     def error(self) -> Array:
-        return geometry.pose_error(self.shot.T_world_target, self.estimate.T)
+        return rigid.pose_error(self.shot.T_world_target, self.estimate.T)
 
     @property
     def position(self) -> float:
@@ -105,7 +106,7 @@ class Result:
 
     @property
     def axis(self) -> float:
-        return geometry.axis_angle_error(self.shot.T_world_target, self.estimate.T)
+        return rigid.axis_angle_error(self.shot.T_world_target, self.estimate.T)
 
     @property
     def roll(self) -> float:
@@ -142,7 +143,7 @@ def window_of(shot: Shot, T: Array, previous: Window | None = None) -> Window:
 
 def around(error: Array) -> Callable[[Shot, Window | None], Window]:
     """The window around the true pose moved by an error (6,), for a frame and the window before."""
-    return lambda shot, previous: window_of(shot, geometry.perturb(shot.T_world_target, error), previous)
+    return lambda shot, previous: window_of(shot, rigid.perturb(shot.T_world_target, error), previous)
 
 
 def exact_mask(shot: Shot, window: Window) -> Mask:
@@ -169,7 +170,7 @@ def exact_results(
     pictures = []
     for index in range(count):
         shot = shots.shot(seed, index, *view, hidden, images=False)
-        T_prior = geometry.perturb(shot.T_world_target, perturbed(np.random.default_rng([seed, index, 1])))
+        T_prior = rigid.perturb(shot.T_world_target, perturbed(np.random.default_rng([seed, index, 1])))
         mask = exact_mask(shot, window_of(shot, T_prior))
         for method in out:
             search = search_of(shot, "default" if method == "contour" else method, True)
@@ -198,7 +199,7 @@ def network_results(
         film = shots.clip(seed, index, *view, hidden, domain, WARM_FRAMES)
         error = perturbed(np.random.default_rng([seed, index, 1]))
         *_, mask = network_masks(segmenter, film, around(error))
-        T_prior = geometry.perturb(film[-1].T_world_target, error)
+        T_prior = rigid.perturb(film[-1].T_world_target, error)
         for method in out:
             search = search_of(film[-1], "default" if method == "contour" else method, False)
             out[method].append(searched(film[-1], search, mask, T_prior))
@@ -340,7 +341,7 @@ def lost_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domai
         film = shots.clip(seed, index, *NEES_VIEW, HIDDEN[index % len(HIDDEN)], domain, 3)
         last = film[-1]
         near, far = perturbed(rng), np.concatenate([_length(rng, 0.08, 0.4), _length(rng, 0.3, 1.5)])
-        T_near, T_far = (geometry.perturb(last.T_world_target, error) for error in (near, far))
+        T_near, T_far = (rigid.perturb(last.T_world_target, error) for error in (near, far))
         *_, mask = network_masks(segmenter, film, around(near))
         yield judgement("good start", last, mask, T_near)
         yield judgement("wrong mask", last, spoiled(mask, rng), T_near)
@@ -349,7 +350,7 @@ def lost_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domai
         *_, mask = network_masks(segmenter, film, lambda shot, previous: whole_frame(shot.camera))
         yield judgement("no prior", last, mask, None)
         empty = shots.clip(seed, index, *NEES_VIEW, 0.0, domain, 3, present=False)
-        T_prior = geometry.perturb(empty[-1].T_world_target, near) if index % 2 else None
+        T_prior = rigid.perturb(empty[-1].T_world_target, near) if index % 2 else None
         *_, mask = network_masks(segmenter, empty, around(near))
         yield judgement("absent", empty[-1], mask, T_prior)
 
@@ -396,7 +397,7 @@ def gone_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domai
         error = perturbed(np.random.default_rng([seed, index, 3]))
         search = search_of(film[-1], "default", False)
         for shot, mask in zip(film, network_masks(segmenter, film, around(error)), strict=True):
-            found = searched(shot, search, mask, geometry.perturb(shot.T_world_target, error))
+            found = searched(shot, search, mask, rigid.perturb(shot.T_world_target, error))
             if shot.hidden > GONE:
                 yield shot.hidden, found.estimate.state
 

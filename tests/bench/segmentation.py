@@ -20,10 +20,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from services.segmentation import evaluate, infer
-from services.segmentation.evaluate import WARM_UP, FrameScore
-from shared.window import Window, corners_of, whole_frame, window_around
-from sim import sequences, shots
+from services.segmentation import inference
+from services.segmentation.training import evaluate
+from services.segmentation.training.evaluate import WARM_UP, FrameScore
+from shared.perception.lookout import Window, corners_of, whole_frame, window_around
+from sim.sets import sequences, shots
 
 SEED_BASE = 50_000_000
 """Added to the seed: far from every seed of training, calibration and cards."""
@@ -38,7 +39,7 @@ BACK = 0.9
 GOALS = {"iou": (0.93, 0.88, 0.78), "area_bias": 0.01, "contour_mean_px": 0.1, "contour_rms_px": 0.6, "recovery": 5, "ms": 15.0}
 
 
-def rows(segmenter: infer.Segmenter, data: Iterable[evaluate.Labelled]) -> list[FrameScore]:
+def rows(segmenter: inference.Segmenter, data: Iterable[evaluate.Labelled]) -> list[FrameScore]:
     """Scores of the frames of sequences after their first ones."""
     scores: list[FrameScore] = []
     for index, sequence in enumerate(data, 1):
@@ -49,7 +50,7 @@ def rows(segmenter: infer.Segmenter, data: Iterable[evaluate.Labelled]) -> list[
     return scores
 
 
-def film_scores(segmenter: infer.Segmenter, film: list[shots.Shot]) -> tuple[list[float], list[float]]:
+def film_scores(segmenter: inference.Segmenter, film: list[shots.Shot]) -> tuple[list[float], list[float]]:
     """Hidden share and IoU (NaN where too little is visible) of each frame, the window around the true pose."""
     corners, window = corners_of(film[0].mesh.vertices), whole_frame(film[0].camera)
     hidden, iou = [], []
@@ -125,12 +126,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1, help="draws the scenes (default: 1)")
     parser.add_argument("--frames", type=int, default=1650, help="frames of the rows (default: 1650)")
     parser.add_argument("--films", type=int, default=6, help="films of 10 s with full occlusions (default: 6)")
-    parser.add_argument("--weights", type=Path, default=infer.WEIGHTS, help="the network (default: the committed one)")
+    parser.add_argument("--weights", type=Path, default=inference.WEIGHTS, help="the network (default: the committed one)")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
-    segmenter = infer.load_segmenter(options.weights)
-    ms = infer.speed(segmenter, VARIETY.size, VARIETY.size, 200)
+    segmenter = inference.load_segmenter(options.weights)
+    ms = inference.speed(segmenter, VARIETY.size, VARIETY.size, 200)
     count = -(-options.frames // (VARIETY.frames - WARM_UP))
     held_out = (sequences.render(SEED_BASE + options.seed, index, VARIETY) for index in range(count))
     scores = rows(segmenter, track(held_out, "sequences", total=count, transient=True))

@@ -20,14 +20,14 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import brentq, least_squares
 
-from services.skin import train
-from shared import cell as cells
-from shared import geometry
-from shared.body import Mesh, target_mesh
-from shared.classes import Label
-from shared.response import Response, networks
-from shared.surface import Surface
-from sim.field import Body, PadField, limb, shell
+from services.skin import model
+from shared.body.anatomy import Mesh, target_mesh
+from shared.cell import description as cells
+from shared.contract.labels import Label
+from shared.geometry import rigid
+from shared.geometry.surface import Surface
+from shared.skin.response import Response, networks
+from sim.skin.field import Body, PadField, limb, shell
 
 Array = np.ndarray
 
@@ -60,13 +60,13 @@ def part(mesh: Mesh, label: Label) -> Mesh:
 
 def across(mesh: Mesh, gap: float, aside: float = 0.0) -> Array:
     """T_pad_mesh (4, 4): its axis along the pad's y, `aside` [m] along x, its skin at this gap [m] above the middle of itself."""
-    T = geometry.from_rpy((aside, 0.0, 0.0), (0.0, 0.0, np.pi / 2))
+    T = rigid.from_rpy((aside, 0.0, 0.0), (0.0, 0.0, np.pi / 2))
     T[1, 3] = -0.5 * (mesh.vertices[:, 0].min() + mesh.vertices[:, 0].max())
     surface, under = Surface(mesh.vertices, mesh.faces), np.array([[aside, 0.0, 0.0]])
 
     def excess(height: float) -> float:
         T[2, 3] = height
-        return float(surface.nearest(geometry.apply(geometry.inverse(T), under))[0][0]) - gap
+        return float(surface.nearest(rigid.apply(rigid.inverse(T), under))[0][0]) - gap
 
     T[2, 3] = brentq(excess, gap, gap + 0.2)
     return T
@@ -102,8 +102,8 @@ def figures(cell: cells.Cell) -> dict[str, Any]:
         right, left = (pad.change(body, across(mesh, gap / 100, side * OFF_CENTRE_M)) for side in (1, -1))
         contrast[gap] = 0.5 * float((right[1] - right[2]) / (right[1] + right[2]) + (left[2] - left[1]) / (left[1] + left[2]))
     cylinder = trimesh.creation.cylinder(LINK_RADIUS_M, LINK_LENGTH_M, sections=32)
-    x_axis = geometry.from_rpy((0.0, 0.0, -LINK_RADIUS_M - LINK_BEHIND_M), (0.0, np.pi / 2, 0.0))
-    backed = PadField(kind, shell(geometry.apply(x_axis, np.asarray(cylinder.vertices))))
+    x_axis = rigid.from_rpy((0.0, 0.0, -LINK_RADIUS_M - LINK_BEHIND_M), (0.0, np.pi / 2, 0.0))
+    backed = PadField(kind, shell(rigid.apply(x_axis, np.asarray(cylinder.vertices))))
     factor = {gap: float(backed.change(body, across(mesh, gap / 100))[0]) / centre(gap / 100) for gap in LINK_FACTOR}
     return {
         "plate_pF": pad.plate_pF,
@@ -120,7 +120,7 @@ def bodies(cell: cells.Cell, pad: PadField) -> dict[str, dict[int, list[float]]]
     """What different bodies change [fF] at all electrodes, by name and gap [cm]."""
     whole = target_mesh(next(iter(cell.targets.values())), cell)
     arm, hand = part(whole, Label.FOREARM), part(whole, Label.HAND)
-    cylinder = trimesh.creation.cylinder(0.02, 0.3, sections=24, transform=geometry.from_rpy((0, 0, 0), (0, np.pi / 2, 0)))
+    cylinder = trimesh.creation.cylinder(0.02, 0.3, sections=24, transform=rigid.from_rpy((0, 0, 0), (0, np.pi / 2, 0)))
     bar = Mesh(np.asarray(cylinder.vertices), np.asarray(cylinder.faces, np.int32), np.zeros(len(cylinder.faces), np.uint8))
     panels = limb(bar).panels
     shown = {
@@ -141,15 +141,15 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
     target, aim = next(iter(cell.targets.items()))
     mesh, known, response = target_mesh(aim, cell), networks(cell), Response(cell, target)
     errors: dict[float, list[Array]] = {gap: [] for gap in GAPS_CM}
-    mountings, limbs = train.mountings(cell, target), {}
+    mountings, limbs = model.mountings(cell, target), {}
     for mounting in mountings:
         count = len(GAPS_CM) * max(1, poses // len(mountings))
-        data = train.solve(mounting, mesh, count, seed, gaps=[gap / 100 for gap in GAPS_CM], limbs=limbs)
-        relative = np.abs(train.predict(known[mounting.fingerprint], data) / data.change - 1.0)
+        data = model.solve(mounting, mesh, count, seed, gaps=[gap / 100 for gap in GAPS_CM], limbs=limbs)
+        relative = np.abs(model.predict(known[mounting.fingerprint], data) / data.change - 1.0)
         for k, gap in enumerate(GAPS_CM):
             errors[gap].append(relative[k :: len(GAPS_CM)].ravel())
     pooled = {gap: np.concatenate(parts) for gap, parts in errors.items()}
-    T = np.tile(geometry.from_rpy((0.0, 0.0, 0.12), (0.1, 0.2, 0.3)), (len(cell.pads), 1, 1))
+    T = np.tile(rigid.from_rpy((0.0, 0.0, 0.12), (0.1, 0.2, 0.3)), (len(cell.pads), 1, 1))
     response.change(T)
     blocks = []
     for _ in range(9):

@@ -29,10 +29,10 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from shared import cell as cells
-from shared import topics
-from tests import injected
-from tests.live import Running, connect, penumbra_up, wait_for
+from shared.cell import description as cells
+from shared.contract import topics
+from tests.support import injected
+from tests.support.live import Running, connect, penumbra_up, wait_for
 
 DAY_S = 86_400.0
 SAMPLE_S = 5.0
@@ -123,7 +123,16 @@ class Life:
         """`penumbra restart`: all that can be, one after another."""
         if self._restart is None or self._restart.poll() is not None:
             endpoint = f"tcp/127.0.0.1:{self.router.port}"
-            command = [sys.executable, "-m", "services.cli", "restart", "--cell", self.running.cell, "--connect", endpoint]
+            command = [
+                sys.executable,
+                "-m",
+                "services.command.cli",
+                "restart",
+                "--cell",
+                self.running.cell,
+                "--connect",
+                endpoint,
+            ]
             self._restart = subprocess.Popen(command, stdout=subprocess.DEVNULL)
 
     def router_loss(self) -> None:
@@ -205,8 +214,8 @@ class Gauge:
             for child in self._launcher.children():
                 with suppress(psutil.NoSuchProcess):
                     words = child.cmdline()
-                    if "services.cli" in words:
-                        yield words[words.index("services.cli") + 1], child
+                    if "services.command.cli" in words:
+                        yield words[words.index("services.command.cli") + 1], child
 
     def rows(self, warm_up_s: float) -> list[Row]:
         """By service, what grew after the warm-up of each process."""

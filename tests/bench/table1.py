@@ -1,8 +1,8 @@
 """`penumbra bench table1`: the paper's result table, on runs that nothing was fitted to, beside the paper's own numbers.
 
 A cell of the table is what the skin reaches (all of the run, or nothing of it), how far away the camera stands, and the share of
-the limb that is hidden. `sim.trial` draws its runs, `tests.trials` plays them through the services: ProcNet (our vision) and what
-fusion makes of it with the skin, PoseCNN likewise, and the paper's own search, network and observer throughout.
+the limb that is hidden. `sim.sets.trial` draws its runs, `tests.bench.lib.trials` plays them through the services: ProcNet (our
+vision) and what fusion makes of it with the skin, PoseCNN likewise, and the paper's own search, network and observer throughout.
 
 Errors are those of the object's centre, averages over all scored frames as in the paper, with the 95 % confidence interval of a
 bootstrap over the runs. A sense that has no pose in a frame cannot be scored there: the share of such frames stands beside.
@@ -25,10 +25,10 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from sim import trial
-from sim.trial import SETTINGS, Setting
-from tests import campaign, trials
-from tests.trials import CHAINS
+from sim.sets import trial
+from sim.sets.trial import SETTINGS, Setting
+from tests.bench.lib import campaign, trials
+from tests.bench.lib.trials import CHAINS
 
 REFERENCE = Path(__file__).parents[1] / "references" / "paper_table1.json"
 COLUMNS = {

@@ -1,8 +1,8 @@
 """`penumbra bench tracking`: an occluder passes before the moving arm, and the camera alone has to hold it.
 
-Films of 10 s (`sim.shots.passing`) are played through the services in one process (`tests.replay`): segmentation, search and
-fusion without the skin, so that the window follows the pose predicted while nothing is seen. Scored are the camera's own poses
-(errors, false reports of tracking, frames until recovered), and the fused one while everything is hidden.
+Films of 10 s (`sim.sets.shots.passing`) are played through the services in one process (`tests.support.replay`): segmentation,
+search and fusion without the skin, so that the window follows the pose predicted while nothing is seen. Scored are the camera's
+own poses (errors, false reports of tracking, frames until recovered), and the fused one while everything is hidden.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from shared import geometry, topics
-from shared.geometry import Array
-from shared.messages import Frame, FusedPose, Message, VisionPose
-from shared.topics import Topic
-from sim import shots
-from sim.shots import Domain, Shot
+from shared.contract import topics
+from shared.contract.messages import Frame, FusedPose, Message, VisionPose
+from shared.contract.topics import Topic
+from shared.geometry import rigid
+from shared.geometry.rigid import Array
+from sim.sets import shots
+from sim.sets.shots import Domain, Shot
 from tests.bench.search import GONE, LOST
-from tests.replay import Replay
+from tests.support.replay import Replay
 
 BACKGROUNDS: dict[str, Domain] = {"plain": "easy", "cluttered": "wide"}
 SERVICES = ("segmentation", "search", "fusion")
@@ -68,8 +69,8 @@ class Film:
 
     def errors(self, pose: VisionPose | FusedPose, truth: Truth) -> tuple[float, float]:
         """Position error [m] and the axis's [rad]."""
-        T = geometry.transform(pose.position, pose.orientation)
-        return float(np.linalg.norm(T[:3, 3] - truth.T[:3, 3])), geometry.axis_angle_error(truth.T, T)
+        T = rigid.transform(pose.position, pose.orientation)
+        return float(np.linalg.norm(T[:3, 3] - truth.T[:3, 3])), rigid.axis_angle_error(truth.T, T)
 
     def is_right(self, truth: Truth) -> bool:
         """Whether the camera's pose is tracked and not wrong."""

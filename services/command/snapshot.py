@@ -1,0 +1,175 @@
+"""`penumbra snapshot OUT.png`: what the camera sees, what the network makes of it, and where the observer says the arm is.
+
+Drawn over the camera's picture: the mask's classes as a tint, the silhouette of the fused pose as a line (green: tracking, amber:
+coasting, red: lost), each pad as its outline, filled the brighter the more it feels.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from services import flags
+from services.command import look
+from shared.body import anatomy
+from shared.body.robot import robot_models
+from shared.cell import description as cells
+from shared.contract import messages, topics
+from shared.contract.labels import Label
+from shared.geometry import raster, rigid
+from shared.runtime import bus
+from shared.skin.layout import Skin, link_names
+
+PATIENCE_S = 5.0
+"""How long to wait until every topic has been heard."""
+
+TINTS = {
+    Label.ROBOT: (90, 140, 255),
+    Label.TORSO: (170, 120, 200),
+    Label.UPPER_ARM: (240, 150, 60),
+    Label.FOREARM: (40, 220, 120),
+    Label.HAND: (40, 220, 220),
+    Label.OCCLUDER: (230, 60, 60),
+}
+LINES = {"tracking": (30, 230, 60), "coasting": (255, 190, 30), "lost": (240, 40, 40)}
+PAD_HALF = (0.0305, 0.03)
+FULL_SIGNAL = 0.6
+"""Volts of the strongest electrode at which a pad is drawn full: an arm at 1 cm."""
+
+
+def main(argv: list[str]) -> int:
+    parser = flags.parser("snapshot", "Writes a picture of the cell: camera, mask, fused silhouette, pads lit by signal.")
+    parser.add_argument("out", type=Path, help="the picture to write (.png or .jpg)")
+    parser.add_argument("--camera", help="a camera of the cell (default: its first)")
+    parser.add_argument("--target", help="a target of the cell (default: its first)")
+    options = parser.parse_args(argv)
+    cell = cells.load(options.cell)
+    camera, target = cell.one("cameras", options.camera), cell.one("targets", options.target)
+    if options.out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        parser.error(f"out: a .png or .jpg expected, {str(options.out)!r} came")
+    with look.open_session(bus.connection(options)) as session:
+        heard = listen(session, cell, camera, target)
+    picture = draw(cell, camera, target, **heard)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(options.out), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+        raise bus.BusError(f"{options.out} cannot be written: check the folder's permissions")
+    print(f"{options.out}: {picture.shape[1]} x {picture.shape[0]}")
+    return 0
+
+
+def listen(session: zenoh.Session, cell: cells.Cell, camera: str, target: str) -> dict[str, Any]:
+    """One moment of the cell: a mask and the frame that it belongs to, the fused pose nearest to it, joints and voltages."""
+    keep = {topics.FRAME: 30, topics.MASK: 30, topics.FUSED: 400, topics.JOINTS: 1, topics.VOLTAGES: len(cell.pads)}
+    names = {"cell": cell.name, "camera": camera, "target": target}
+    readers = {topic: session.declare_subscriber(topic.at(**names), zenoh.handlers.RingChannel(n)) for topic, n in keep.items()}
+    frames: dict[int, messages.Frame] = {}
+    fused: dict[int, messages.FusedPose] = {}
+    joints: dict[str, messages.Joints] = {}
+    voltages: dict[str, messages.Voltages] = {}
+    deadline = time.monotonic() + PATIENCE_S
+    missing = "frame"
+    while time.monotonic() < deadline:
+        mask = None
+        for topic, reader in readers.items():
+            while (sample := reader.try_recv()) is not None:
+                message = messages.decode(topic.message, sample.payload.to_bytes())
+                part = str(sample.key_expr).split("/")[3]
+                match message:
+                    case messages.Frame():
+                        frames[message.stamp_ns] = message
+                    case messages.Mask():
+                        mask = message
+                    case messages.FusedPose():
+                        fused[message.stamp_ns] = message
+                    case messages.Joints():
+                        joints[part] = message
+                    case messages.Voltages():
+                        voltages[part] = message
+        complete = set(voltages) >= set(cell.pads) and set(joints) >= set(cell.robots) and fused
+        missing = "frame" if not frames else "fused pose" if not fused else "voltages or joints" if not complete else "mask"
+        if mask and complete and mask.stamp_ns in frames:
+            nearest = min(fused, key=lambda stamp: abs(stamp - mask.stamp_ns))
+            return {
+                "frame": frames[mask.stamp_ns],
+                "mask": mask,
+                "pose": fused[nearest],
+                "joints": {name: message.position for name, message in joints.items()},
+                "volts": {name: message.volts.mean(axis=0) for name, message in voltages.items()},
+            }
+        time.sleep(0.01)
+    raise bus.BusError(
+        f"no {missing} came within {PATIENCE_S:.0f} s on cell {cell.name}: is `penumbra up` running? See `penumbra topics --hz`"
+    )
+
+
+def draw(
+    cell: cells.Cell,
+    camera_name: str,
+    target_name: str,
+    frame: messages.Frame,
+    mask: messages.Mask,
+    pose: messages.FusedPose,
+    joints: dict[str, NDArray],
+    volts: dict[str, NDArray],
+) -> NDArray[np.uint8]:
+    """The picture (h, w, 3) uint8 RGB. joints: by robot; volts: mean electrode amplitudes by pad."""
+    camera = cell.cameras[camera_name]
+    picture = frame.image.copy()
+    _tint(picture, mask)
+    _pads(picture, cell, camera, joints, volts)
+    mesh = anatomy.target_mesh(cell.targets[target_name], cell)
+    T = rigid.inverse(camera.T_world_camera) @ rigid.transform(pose.position, pose.orientation)
+    k = (camera.fx, camera.fy, camera.cx, camera.cy)
+    silhouette = raster.silhouette(rigid.apply(T, mesh.vertices), mesh.faces, k, (0, 0, camera.width, camera.height))
+    outline, _ = cv2.findContours(silhouette.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, outline, -1, LINES[pose.state], 2, cv2.LINE_AA)
+    senses = ", ".join(f"{name} {100 * source.weight:.0f} %" for name, source in sorted(pose.sources.items()))
+    deviation_cm = 100 * np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3]).max())
+    text = f"{cell.name}: {pose.state}, +-{deviation_cm:.1f} cm  ({senses or 'no sense heard'})"
+    picture[:30] = (0.35 * picture[:30]).astype(np.uint8)
+    cv2.putText(picture, text, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
+
+
+def _tint(picture: NDArray[np.uint8], mask: messages.Mask) -> None:
+    """Blends the classes of the mask's window into the picture, in place."""
+    colours = np.zeros((256, 3), np.float32)
+    for label, colour in TINTS.items():
+        colours[label] = colour
+    labels = np.kron(mask.labels, np.ones((mask.scale, mask.scale), np.uint8))
+    top, left = max(mask.y0, 0), max(mask.x0, 0)
+    bottom = min(mask.y0 + labels.shape[0], picture.shape[0])
+    right = min(mask.x0 + labels.shape[1], picture.shape[1])
+    if bottom <= top or right <= left:
+        return
+    labels = labels[top - mask.y0 : bottom - mask.y0, left - mask.x0 : right - mask.x0]
+    region = picture[top:bottom, left:right]
+    shown = labels != Label.BACKGROUND
+    region[shown] = (0.55 * region[shown] + 0.45 * colours[labels[shown]]).astype(np.uint8)
+
+
+def _pads(picture: NDArray[np.uint8], cell: cells.Cell, camera: cells.Camera, joints: dict, volts: dict) -> None:
+    """Draws the pads that face the camera, filled by their strongest signal, in place."""
+    skin = Skin(cell)
+    links = link_names({name: model.link_transforms(joints[name]) for name, model in robot_models(cell).items()})
+    T_camera_world = rigid.inverse(camera.T_world_camera)
+    corners = np.array([(x * PAD_HALF[0], y * PAD_HALF[1], 0.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+    for name, T_world_pad in zip(cell.pads, skin.T_world_pads(links), strict=True):
+        T = T_camera_world @ T_world_pad
+        points = rigid.apply(T, corners)
+        if points[:, 2].min() < raster.NEAR or T[:3, 2] @ T[:3, 3] > 0:
+            continue
+        outline = (points @ camera.K.T / points[:, 2:])[:, :2].round().astype(np.int32)
+        own = skin.of(skin.pads.index(name))
+        signal = float(np.max(skin.polarity[own] * (volts[name] - skin.a3[own])))
+        level = np.clip(np.log1p(max(signal, 0.0) / 0.003) / np.log1p(FULL_SIGNAL / 0.003), 0.0, 1.0)
+        lit = picture.copy()
+        cv2.fillPoly(lit, [outline], (int(60 + 195 * level), int(60 + 150 * level), int(90 * (1 - level))), cv2.LINE_AA)
+        cv2.addWeighted(lit, 0.35 + 0.5 * level, picture, 0.65 - 0.5 * level, 0, picture)
+        cv2.polylines(picture, [outline], True, (255, 255, 255), 1, cv2.LINE_AA)

@@ -1,0 +1,233 @@
+"""The processes of a launcher by service, and what changes while they run: restarts one after another, and numbers of replicas.
+
+A change is a generator that the launcher's main thread takes a step of now and then, because what it starts ends with the thread
+that started it. It is asked for on the bus, and asked about until it is done.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from services.launcher.forkserver import ForkServer
+from services.launcher.supervised import Supervised, stop, wait
+
+READY_S = 120.0
+"""How long a change waits for a process that it started: a first start compiles."""
+MOST = 64
+"""Replicas of a service on one machine."""
+REMEMBERED = 16
+"""Changes that can still be asked about."""
+
+
+class ChangeFailed(RuntimeError):
+    """A change stops where it is; the text says why."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How a service's processes are started. beside: whether two may run at once, so that a new one can take over from an old."""
+
+    command: list[str]
+    restart: str = "always"
+    environment: dict[str, str] = field(default_factory=dict)
+    beside: bool = True
+
+    def check(self, service: str, number: int) -> None:
+        """Raises ValueError for a number of replicas that cannot be."""
+        most = MOST if self.beside else 1
+        if not 0 <= number <= most:
+            why = "" if self.beside else ", because it stands for what there is but once"
+            raise ValueError(f"{service}={number}: 0 to {most} of {service} expected{why}")
+
+
+@dataclass
+class Change:
+    """One change: what it is, what it does now, and how it ended."""
+
+    what: str
+    steps: Iterator[str]
+    doing: str = "begins"
+    error: str = ""
+    is_done: bool = False
+
+    def report(self) -> dict[str, Any]:
+        return {"what": self.what, "doing": self.doing, "error": self.error, "done": self.is_done}
+
+
+class Fleet:
+    """kinds: every service that may run; counts: how many of each, none where it is not named; forkserver: where a service that
+    died comes from, while there is one."""
+
+    def __init__(self, kinds: Mapping[str, Kind], counts: Mapping[str, int], forkserver: ForkServer | None = None):
+        self._kinds, self._forkserver = kinds, forkserver
+        self._groups = {name: [self._make(name) for _ in range(counts.get(name, 0))] for name in kinds}
+        self._lock = threading.Lock()
+        self._changes: OrderedDict[str, Change] = OrderedDict()
+        self._name()
+
+    @property
+    def processes(self) -> list[Supervised]:
+        """All of them, in the order of the kinds."""
+        return [process for group in self._groups.values() for process in tuple(group)]
+
+    def start(self, *services: str) -> list[Supervised]:
+        """Starts the processes of these services, or without names all that are not started yet; returns them."""
+        chosen = [process for name in services or self._groups for process in self._groups[name] if process.state == "stopped"]
+        for process in chosen:
+            process.start()
+        return chosen
+
+    def watch(self) -> None:
+        """Looks after every process, and takes a step of the change under way. To be called from the thread that started them."""
+        for process in self.processes:
+            process.watch()
+        if self._forkserver is not None:
+            self._forkserver.watch(all(process.is_ready or process.popen is None for process in self.processes))
+        change = self._under_way()
+        if change is None:
+            return
+        try:
+            change.doing = next(change.steps)
+        except StopIteration:
+            change.is_done = True
+        except (ChangeFailed, OSError) as error:
+            change.error, change.is_done = str(error), True
+
+    def wait(self, seconds: float) -> None:
+        """Returns when there is something to look after, or after `seconds`."""
+        wait(self.processes, seconds)
+
+    def stop(self) -> None:
+        if self._forkserver is not None:
+            self._forkserver.stop()
+        stop(self.processes)
+
+    # ---- what is asked for on the bus
+
+    def answer(self, parameters: dict[str, str], payload: bytes) -> bytes:
+        """Answers the launcher's queryable with a change's report: `{command: restart, services, id}` (a list, `all`, or null for
+        all that can be replaced without a gap), `{command: scale, service, number, id}` or `{command: state, id}`. Raises
+        ValueError that says what was expected."""
+        try:
+            asked = json.loads(payload)
+            command, name = asked["command"], str(asked["id"])[:64]
+        except (ValueError, TypeError, KeyError):
+            raise ValueError(f"JSON with command and id expected, {payload[:60]!r} came") from None
+        with self._lock:
+            if command == "state":
+                if name not in self._changes:
+                    raise ValueError(f"no change {name} was asked for here")
+            elif command == "restart":
+                self._begin(name, self._restart(asked.get("services")))
+            elif command == "scale":
+                self._begin(name, self._scale(asked.get("service"), asked.get("number")))
+            else:
+                raise ValueError(f"restart, scale or state expected, {command!r:.60} came")
+            return json.dumps(self._changes[name].report()).encode()
+
+    def _under_way(self) -> Change | None:
+        return next((change for change in tuple(self._changes.values()) if not change.is_done), None)
+
+    def _begin(self, name: str, change: Change) -> None:
+        if (other := self._under_way()) is not None:
+            raise ValueError(f"busy: {other.what}, {other.doing}; ask again when that is done")
+        self._changes[name] = change
+        while len(self._changes) > REMEMBERED:
+            self._changes.popitem(last=False)
+
+    def _restart(self, services: Any) -> Change:
+        running = [name for name, group in self._groups.items() if group]
+        if services is None:
+            services = [name for name in running if self._kinds[name].beside]
+        elif services == "all":
+            services = running
+        strangers = [name for name in services if name not in running] if isinstance(services, list) else [services]
+        if strangers:
+            raise ValueError(
+                f"restart {strangers[0]!s:.60}: one of {', '.join(running) or 'no service'} expected: these run here"
+            )
+        chosen = [name for name in running if name in services]
+        return Change(f"restart of {', '.join(chosen) or 'nothing'}", self._one_after_another(chosen))
+
+    def _scale(self, service: Any, number: Any) -> Change:
+        if service not in self._kinds or not isinstance(number, int) or isinstance(number, bool):
+            raise ValueError(f"scale {service!s:.60}={number!s:.60}: NAME=NUMBER, NAME one of {', '.join(self._kinds)} expected")
+        self._kinds[service].check(service, number)
+        return Change(f"scale {service} to {number}", self._to_number(service, number))
+
+    # ---- changes, a step at a time
+
+    def _one_after_another(self, services: list[str]) -> Iterator[str]:
+        for service in services:
+            for old in tuple(self._groups[service]):
+                yield from self._replace(service, old)
+        if self._forkserver is not None:
+            self._forkserver.renew()  # what was restarted may have been installed anew
+
+    def _replace(self, service: str, old: Supervised) -> Iterator[str]:
+        if self._kinds[service].beside:  # the old one serves until the new one does
+            new = yield from self._add(service)
+            yield from self._remove(service, old)
+        else:
+            yield from self._end(old)
+            new = self._make(service)
+            group = self._groups[service]
+            group[group.index(old)] = new
+            self._name()
+            new.start()
+            yield from self._until_ready(new)
+        new.restarts += old.restarts
+
+    def _to_number(self, service: str, number: int) -> Iterator[str]:
+        group = self._groups[service]
+        while len(group) < number:
+            yield from self._add(service)
+        while len(group) > number:
+            yield from self._remove(service, group[-1])
+
+    def _add(self, service: str) -> Generator[str, None, Supervised]:
+        new = self._make(service)
+        self._groups[service].append(new)
+        self._name()
+        new.start()
+        try:
+            yield from self._until_ready(new)
+        except ChangeFailed:
+            yield from self._remove(service, new)
+            raise
+        return new
+
+    def _remove(self, service: str, old: Supervised) -> Iterator[str]:
+        yield from self._end(old)
+        self._groups[service].remove(old)
+        self._name()
+
+    def _end(self, old: Supervised) -> Iterator[str]:
+        old.end()
+        while old.state != "stopped":
+            yield f"waiting for {old.name} ({old.pid}) to end"
+
+    def _until_ready(self, new: Supervised) -> Iterator[str]:
+        deadline = time.monotonic() + READY_S
+        while not new.is_ready:
+            if new.restarts or new.state in ("waiting", "failed"):
+                raise ChangeFailed(f"{new.name} does not start: {new.note}")
+            if time.monotonic() > deadline:
+                raise ChangeFailed(f"{new.name} did not answer within {READY_S:.0f} s")
+            yield f"waiting for {new.name} ({new.pid}) to serve"
+
+    def _make(self, service: str) -> Supervised:
+        kind = self._kinds[service]
+        return Supervised(service, kind.command, kind.restart, kind.environment, self._forkserver)
+
+    def _name(self) -> None:
+        """One is called as its service, several are numbered."""
+        for service, group in self._groups.items():
+            for number, process in enumerate(tuple(group), 1):
+                process.name = service if len(group) == 1 else f"{service} {number}"

@@ -1,0 +1,254 @@
+"""One process that the launcher starts, watches, starts again and ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+import psutil
+
+from services.launcher import display
+from services.launcher.forkserver import Forked, ForkServer
+from shared.runtime import logs
+
+BACKOFF_S = (0.2, 10.0)
+"""Between the deaths of a process that does not become healthy: the first, doubled each time, and the longest."""
+STABLE_S = 10.0
+"""A process that ran this long is healthy: when it dies it is started again at once."""
+CRASH_LOOP = 3
+SILENT_S = 10.0
+"""A process that was well before and hangs for this long, or does not answer, is killed and started again."""
+TERMINATE_S = 1.5
+ASKED_FOR_NOTHING = 2
+"""Exit code of a process whose flags, cell or installation cannot work: starting it again changes nothing."""
+
+# Every process is one worker: pools of threads that spin would take the two cores from the others.
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "passive",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
+
+
+class Supervised:
+    """One process that is started, watched and started again.
+
+    state: starting, running, waiting (for its next start), failed (it will not be started again), stopping or stopped. is_ready:
+    it does its part for the others. forkserver: where it comes from when it has died, if that is possible.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: list[str],
+        restart: str = "always",
+        environment: dict[str, str] | None = None,
+        forkserver: ForkServer | None = None,
+    ):
+        self.name, self.command, self.restart = name, command, restart
+        self.state, self.note, self.restarts = "stopped", "", 0
+        self.is_ready = False
+        self.popen: subprocess.Popen[str] | Forked | None = None
+        self.cpu, self.memory_mb = 0.0, 0.0
+        self._environment, self._forkserver = environment or {}, forkserver
+        self._orphans: set[int] = set()  # groups of processes that have ended, of which the launcher may have adopted children
+        self.pidfd: int | None = None  # readable when it has ended
+        self._delay_s = BACKOFF_S[0]
+        self._crashes = 0
+        self._started = self._due = self._heard = 0.0
+        self._hangs = self._hung = ""
+        self._last_words: deque[str] = deque(maxlen=20)
+        self._usage: psutil.Process | None = None
+        self._listener: threading.Thread | None = None
+
+    @property
+    def pid(self) -> int | None:
+        return self.popen.pid if self.popen else None
+
+    @property
+    def is_looping(self) -> bool:
+        """Whether it died again and again, and has not run for STABLE_S since."""
+        return self._crashes >= CRASH_LOOP
+
+    def start(self) -> None:
+        """Starts it, from the launcher's main thread: the kernel ends it when that thread ends."""
+        popen = subprocess.Popen(
+            self.command,
+            env=environment(self._environment),
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            start_new_session=True,  # Ctrl-C reaches the launcher alone, which then stops the others in order
+        )
+        self._attend(popen)
+
+    def _start_again(self) -> None:
+        self.restarts += 1
+        forked = self._forkserver.fork(self.command, environment(self._environment)) if self._forkserver else None
+        if forked is None:
+            self.start()
+        else:
+            self._attend(forked)
+
+    def _attend(self, popen: subprocess.Popen[str] | Forked) -> None:
+        """Begins to look after a process that has just begun."""
+        self.popen = popen
+        with contextlib.suppress(OSError, AttributeError):  # only Linux has them; without, its end is noticed a little later
+            self.pidfd = os.pidfd_open(popen.pid)
+        self._last_words.clear()
+        self._started, self._heard = time.monotonic(), 0.0
+        self._hangs = self._hung = ""
+        self.state, self.is_ready = "starting", False
+        self._usage = psutil.Process(popen.pid)
+        self._listener = threading.Thread(target=self._listen, args=(popen,), daemon=True)
+        self._listener.start()
+
+    def _listen(self, popen: subprocess.Popen[str] | Forked) -> None:
+        assert popen.stderr is not None
+        for line in popen.stderr:
+            self._last_words.append(line.rstrip())
+            sys.stderr.write(line)  # rich moves it above the live table
+        popen.stderr.close()
+
+    def watch(self) -> None:
+        """Looks whether it still runs, and starts it again when it is due."""
+        now = time.monotonic()
+        self._bury()
+        if self.state == "stopping":
+            self._stopping(now)
+            return
+        if self.popen is not None:
+            self._look(self.popen, now)
+        if self.state == "waiting" and now >= self._due:
+            self._start_again()
+
+    def _look(self, popen: subprocess.Popen[str] | Forked, now: float) -> None:
+        if now - self._started > STABLE_S:
+            self._delay_s, self._crashes, self.note = 0.0, 0, ""
+        code = popen.poll()
+        if code is None:
+            if self._heard and now - self._heard > SILENT_S:
+                self._hung = f"{self._hangs or f'no answer for {SILENT_S:.0f} s'}, "
+                self.signal(signal.SIGKILL)
+            return
+        self._ended(code, now)
+
+    def _ended(self, code: int, now: float) -> None:
+        self.clear()
+        words = next((logs.sentence(line.strip()) for line in reversed(self._last_words) if line.strip()), "")
+        why = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        self.note = f"{self._hung}{why}: {words}".removesuffix(": ")
+        if code == ASKED_FOR_NOTHING or self.restart == "never":
+            self.state = "failed"
+            return
+        self._crashes += 1
+        if self.is_looping:
+            self.note = f"crash loop: {self.note}"
+        self.state, self._due = "waiting", now + self._delay_s
+        self._delay_s = min(max(2 * self._delay_s, BACKOFF_S[0]), BACKOFF_S[1])
+
+    def clear(self) -> None:
+        """After its end: nothing of it is left."""
+        self.signal(signal.SIGKILL)  # whatever it started itself
+        if self._listener is not None:
+            self._listener.join(0.2)
+        if self.popen is not None:
+            self._orphans.add(self.popen.pid)
+        if self.pidfd is not None:
+            os.close(self.pidfd)
+        self.popen = self.pidfd = None
+        self.cpu = self.memory_mb = 0.0
+        self.is_ready = False
+
+    def _bury(self) -> None:
+        """Leaves no zombie of what a process that has ended had started."""
+        for group in tuple(self._orphans):
+            try:
+                os.waitpid(-group, os.WNOHANG)
+            except ChildProcessError:
+                self._orphans.discard(group)
+
+    def end(self) -> None:
+        """Asks it to end, for good; `watch` sees to it that it does within TERMINATE_S."""
+        if self.popen is None:
+            self.state = "stopped"
+            return
+        self.signal(signal.SIGTERM)
+        self.state, self._due = "stopping", time.monotonic() + TERMINATE_S
+
+    def _stopping(self, now: float) -> None:
+        assert self.popen is not None
+        if self.popen.poll() is not None:
+            self.clear()
+            self.state, self.note = "stopped", ""
+        elif now > self._due:
+            self.signal(signal.SIGKILL)
+
+    def heard(self, is_ready: bool = True, hangs: str = "") -> None:
+        """Its health query was answered, and said whether it does its part, and what in it hangs."""
+        if not hangs or not self._heard:
+            self._heard = time.monotonic()
+        self.is_ready, self._hangs = is_ready, hangs
+        if self.state == "starting":
+            self.state = "running"
+
+    def measure(self) -> None:
+        """Takes CPU (cores since the last call) and memory."""
+        if self._usage is not None and self.popen is not None:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                self.cpu = self._usage.cpu_percent() / 100
+                self.memory_mb = self._usage.memory_info().rss / 1e6
+
+    def signal(self, number: signal.Signals) -> None:
+        """To its whole process group, which it leads."""
+        if self.popen is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.popen.pid, number)
+
+    def row(self, health: dict[str, Any] | None = None) -> display.ProcessRow:
+        """For the table; health: its own report, where it gave one."""
+        state, note = self.state, self.note
+        if state == "running" and health is not None and health["status"] != "ok":
+            state, note = health["status"], "; ".join([*([note] if note else []), *health["reasons"]])
+        return display.ProcessRow(self.name, state, self.pid, self.cpu, self.memory_mb, self.restarts, note)
+
+
+def environment(own: dict[str, str]) -> dict[str, str]:
+    """The environment of the launcher's processes; own: what one of them has besides."""
+    return {**ONE_THREAD, **os.environ, **own, "PENUMBRA_PARENT": str(os.getpid())}
+
+
+def wait(processes: Iterable[Supervised], seconds: float) -> None:
+    """Returns when one of them ends, or after `seconds`."""
+    ends = select.poll()
+    for process in processes:
+        if process.pidfd is not None:
+            ends.register(process.pidfd, select.POLLIN)
+    ends.poll(1e3 * seconds)
+
+
+def stop(processes: list[Supervised]) -> None:
+    """SIGTERM to all, and SIGKILL to what is still there after TERMINATE_S."""
+    for process in processes:
+        process.signal(signal.SIGTERM)
+    deadline = time.monotonic() + TERMINATE_S
+    for process in processes:
+        if process.popen is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.popen.wait(max(0.0, deadline - time.monotonic()))
+            process.signal(signal.SIGKILL)
+            process.popen.wait()
+        process.clear()
+        process.state = "failed" if process.state == "failed" else "stopped"

@@ -1,0 +1,1 @@
+"""Makes PoseCNN's weights again, and measures them."""

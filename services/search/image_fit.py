@@ -1,0 +1,414 @@
+"""The pose once more, on the image itself: a mask is as sharp as a network draws it, the picture is sharper.
+
+One pass, from a pose near the right one (contracting curve density: Hanek, Beetz 2004, doi:10.1023/B:VISI.0000036836.66311.97):
+  1. project the mesh's contour (`contour.trace`) and read the picture's colours along a short line across it at each point;
+  2. learn the colours on both sides: mean and covariance of what lies beyond the edge's blur, pooled along the contour;
+  3. for every offset of the edge on the line, compare the colours with those of a blurred step between the two sides, and add
+     what the mask says; this is the likelihood of the contour's offset, taken for a Gaussian;
+  4. solve for the pose error as `fit` does.
+What covers the target ends the lines, as it guards the mask's boundary.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from services.search.contour import MEASURED, Model, match, normal_equations
+from services.search.evidence import Evidence, Intrinsics, compare
+from services.search.mask_fit import Fit, Limits, marginal, with_prior
+from shared.geometry import rigid
+
+Array = NDArray[np.float64]
+
+LINE = 5
+"""Reach of the line on both sides of the contour [px], read at every pixel's distance."""
+OFFSETS = 8
+"""Offsets of the edge on the line: so many half pixels on both sides."""
+BLUR = 0.7
+"""Width of the edge [px]: a step through this camera is 0.5 - 0.5 tanh(x / BLUR)."""
+NEAREST = 1
+"""The pixel on the contour shows both sides; from this distance on [px] they teach, for a limb darkens towards its contour."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a picture's colours are believed. `passes`: at most; `spacing` of contour points [px]; `pooling`: standard deviation of
+    the pooling along the contour [px]; `floor`: least standard deviation of a colour [of 255]; `clipped`: squared Mahalanobis
+    distance that a pixel counts at most; `temperature`: pixels of a line that say the same; `mask`: standard deviation of the
+    mask's boundary on a line [px]; `huber` [px]; `edge`: standard deviation that an offset has at least [px]; `correlation`:
+    length of contour over which offsets err together [px]; `dilation`: of the whole contour [px]; `wave`: of errors that change
+    slowly along each side of the limb, as its shading does [px]: with one side hidden they look like another distance."""
+
+    passes: int = 5
+    spacing: float = 3.0
+    pooling: float = 4.0
+    floor: float = 3.0
+    clipped: float = 25.0
+    temperature: float = 2.0
+    mask: float = 1.6
+    huber: float = 0.5
+    edge: float = 0.2
+    correlation: float = 9.0
+    dilation: float = 0.12
+    wave: float = 0.1
+
+
+def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uint8], Evidence]:
+    """The part of an image (h, w, 3) that the evidence's window shows, and the evidence in the image's own pixels."""
+    (h, w), scale = evidence.state.shape, evidence.scale
+    x0, y0, width, height = evidence.x0, evidence.y0, w * scale, h * scale
+    inside = image[max(y0, 0) : max(y0 + height, 0), max(x0, 0) : max(x0 + width, 0)]
+    left, top = min(max(-x0, 0), width), min(max(-y0, 0), height)
+    right, bottom = width - left - inside.shape[1], height - top - inside.shape[0]
+    if left or top or right or bottom:  # what lies beyond the image is COVERED, so its colours do not matter
+        inside = np.pad(inside, ((top, bottom), (left, right), (0, 0)))
+    if scale == 1:
+        return inside, evidence
+
+    def enlarged(array: NDArray, how: int) -> NDArray:
+        return np.asarray(cv2.resize(array, (width, height), interpolation=how), array.dtype)
+
+    k, centre = evidence.intrinsics, (scale - 1) / 2.0
+    return inside, replace(
+        evidence,
+        state=enlarged(evidence.state, cv2.INTER_NEAREST),
+        field=enlarged(evidence.field, cv2.INTER_LINEAR),
+        known=None if evidence.known is None else enlarged(evidence.known, cv2.INTER_LINEAR),
+        guarded=enlarged(evidence.guarded, cv2.INTER_NEAREST),
+        hand=enlarged(evidence.hand, cv2.INTER_NEAREST),
+        seen_px=evidence.seen_px * scale**2,
+        boundary_px=evidence.boundary_px * scale,
+        intrinsics=Intrinsics(k.fx * scale, k.fy * scale, k.cx * scale + centre, k.cy * scale + centre),
+        scale=1,
+    )
+
+
+def refine(
+    model: Model,
+    first: Fit,
+    image: NDArray[np.uint8],
+    evidence: Evidence,
+    T_prior: Array,
+    prior: Array,
+    settings: Settings | None = None,
+    limits: Limits | None = None,
+) -> Fit:
+    """The pose near `first` whose contour lies on an edge of colours in the image (h, w, 3) uint8 RGB that the mask is of.
+
+    `prior` (6, 6): information about T_prior (4 x 4) along the camera's axes, taken out of the result again as by `fit`.
+    """
+    settings, limits = settings or Settings(), limits or Limits()
+    regular = np.zeros((7, 7))
+    regular[:6, :6] = prior + limits.information
+    regular[6, 6] = settings.dilation**-2
+    pictures = _pyramid(_Picture(model, *native(image, evidence), settings, T_prior, regular), evidence.scale)
+    T = with_prior(first.T, first.covariance, T_prior, prior)
+    best = _through(pictures[-1:], T)
+    for enough, start, way in _further(pictures, T, T_prior if prior.any() else None):
+        if best.rms >= enough:
+            best = min(best, _through(way, start), key=lambda one: one.rms)
+    trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
+    T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits, trust * best.waves)
+    k = evidence.intrinsics
+    both, free = compare(evidence.state, model.silhouette(best.T, k, (0, 0, *evidence.state.shape[::-1])))
+    return replace(
+        first,
+        T=T,
+        covariance=covariance,
+        T_searched=best.T,
+        length=best.length / evidence.scale,
+        rms=best.rms,
+        both=both,
+        either=evidence.seen_px + free,
+        free=free,
+        sharp=best.rms < SHARP,
+    )
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
+    square of the offsets left [px], the share of the roll that is believed, and the right sides (7, k) of `Settings.wave`."""
+
+    T: Array
+    moved: Array
+    H: Array
+    g: Array
+    length: float
+    rms: float
+    rolls: float
+    waves: Array
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """An image (h, w, 3) uint8 with the evidence of its pixels, in which the pose is looked for."""
+
+    model: Model
+    image: NDArray[np.uint8]
+    evidence: Evidence
+    settings: Settings
+    T_prior: Array
+    regular: Array
+
+    def halved(self) -> _Picture:
+        """The same at half the resolution: twice the reach."""
+        h, w = self.evidence.state.shape[0] // 2, self.evidence.state.shape[1] // 2
+        k, evidence = self.evidence.intrinsics, self.evidence
+
+        def half(array: NDArray) -> NDArray:
+            return np.asarray(cv2.resize(array[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA))
+
+        smaller = replace(
+            evidence,
+            state=np.ascontiguousarray(evidence.state[: 2 * h : 2, : 2 * w : 2]),
+            field=half(evidence.field).astype(np.float32, copy=False),
+            known=None if evidence.known is None else half(evidence.known).astype(np.float32, copy=False),
+            guarded=(half(evidence.guarded * np.uint8(4)) > 0).astype(np.uint8),
+            intrinsics=Intrinsics(k.fx / 2.0, k.fy / 2.0, (k.cx - 0.5) / 2.0, (k.cy - 0.5) / 2.0),
+        )
+        return replace(self, image=half(self.image).astype(np.uint8, copy=False), evidence=smaller)
+
+    def descend(self, T: Array, passes: int) -> _Pass:
+        """The pose reached from T by Gauss-Newton's steps."""
+        moved = np.zeros(7)
+        moved[:6] = rigid.pose_error(T, self.T_prior)
+        for _ in range(passes):
+            here = self._at(T, moved)
+            step = np.linalg.solve(here.H + self.regular, here.g - self.regular @ moved)
+            step /= max(1.0, float(np.max(np.abs(step[:6]) / MAX_STEP)))
+            T, moved = rigid.perturb(T, step[:6]), moved + step
+            if np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED:
+                break
+        # the derivatives are those before the last step, which hardly moved them
+        return replace(here, T=T, moved=moved, g=here.g - here.H @ step)
+
+    def _at(self, T: Array, moved: Array) -> _Pass:
+        evidence, settings, k = self.evidence, self.settings, self.evidence.intrinsics
+        V = self.model.in_camera(T)
+        points = self.model.outline(V, k, evidence.state.shape, settings.spacing)
+        own = evidence.field_of(self.model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1])))
+        by_mask, mask_kind = match(points, evidence.field, evidence.guarded, own, LINE)
+        believed = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
+        r, sigma, kind = offsets(points, self.image, evidence.guarded, by_mask, mask_kind, *believed)
+        weight = points[:, 7] / (settings.correlation * (sigma**2 + settings.edge**2))
+        fixed = (kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False)
+        H, g, length, square, _, _, rolls = normal_equations(points, r - moved[6], *fixed)
+        waves = [normal_equations(points, settings.wave * wave, *fixed)[1] for wave in _waves(points, T)]
+        rms = math.sqrt(square / length) if length > 0 else math.inf
+        return _Pass(T, moved, H, g, length, rms, rolls, np.stack(waves, axis=1))
+
+
+def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:
+    """The picture at the mask's own resolution, which is `scale` times coarser, at twice that, and so on up to its own: a mask is
+    as wrong in its own pixels, however many of the image's they are."""
+    pictures = [replace(picture, settings=replace(picture.settings, mask=scale * picture.settings.mask))]
+    while scale > 1:
+        scale //= 2
+        smaller = pictures[0].halved()
+        pictures.insert(0, replace(smaller, settings=replace(smaller.settings, mask=scale * picture.settings.mask)))
+    return pictures
+
+
+def _further(pictures: list[_Picture], T: Array, T_prior: Array | None) -> Iterator[tuple[float, Array, list[_Picture]]]:
+    """Starts and ways where the mask's pose T may have led astray, in the order in which they are tried, each unless the offsets
+    left are small enough already: from the prediction, if there is one; where the right pose was out of the lines' reach, from
+    coarse to fine; both, with twice the reach at first."""
+    if T_prior is not None:
+        yield TYPICAL, T_prior, pictures[-1:]
+    if len(pictures) > 1:
+        yield SHARP, T, pictures
+    if T_prior is not None:
+        yield SHARP, T_prior, [pictures[0].halved(), *pictures]
+
+
+def _through(pictures: list[_Picture], T: Array) -> _Pass:
+    """The pose reached from T in one picture after the other, as the last one sees it."""
+    for picture in pictures:
+        found = picture.descend(T, picture.settings.passes)
+        T = found.T
+    return found
+
+
+def _waves(points: Array, T: Array) -> list[Array]:
+    """Shapes (n,) that an error of the contour may have: on either side of the limb, straight and bent along it."""
+    axis = T[:3, 0]
+    along = (points[:, :3] - T[:3, 3]) @ axis
+    s = 2.0 * (along - along.min(initial=0.0)) / max(float(np.ptp(along)) if len(along) else 0.0, 1e-6) - 1.0
+    across = points[:, 5] * axis[1] - points[:, 6] * axis[0] > 0.0
+    return [np.where(across == side, shape, 0.0) for side in (False, True) for shape in (s, 1.5 * s**2 - 0.5)]
+
+
+TYPICAL = 0.2
+"""Offsets left [px] up to which the covariance is that of the settings; of larger ones it grows with their fourth power."""
+SHARP = 0.3
+"""Offsets of the image's edges left [px], each counted up to `Settings.huber`, with which a pose is believed."""
+MAX_STEP = np.array([0.02, 0.02, 0.05, 0.1, 0.1, 0.1])
+"""Largest step of a pass [m, rad]."""
+CONVERGED = 2e-4
+"""A pass that moves less than this [m], and four times it [rad], is the last."""
+_SAMPLES = 2 * LINE + 1
+_GRID = 2 * OFFSETS + 1
+_MIXED = 3
+"""Half pixels from the edge up to which a pixel shows a mixture of both sides."""
+
+
+@njit(cache=True, nogil=True)
+def offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped, temperature, mask_sigma):
+    """Offset [px] of the edge along the outward normal of each contour point, its standard deviation and whether it was measured
+    (DROPPED, MEASURED). The arguments after `mask_kind` are those of `Settings`."""
+    n = len(points)
+    colours = np.empty((n, _SAMPLES, 3), np.float32)
+    first, last = np.empty(n, np.int64), np.empty(n, np.int64)  # of the samples that nothing covers
+    own = np.zeros((n, 2, 10))  # of the samples inside and outside: number, sums, sums of products
+    for i in range(n):
+        first[i], last[i] = _read(points[i], image, guarded, colours[i])
+        for s in range(first[i], last[i] + 1):
+            t = s - LINE
+            if abs(t) >= NEAREST:
+                _count(own[i, 0 if t < 0 else 1], colours[i, s])
+    r, sigma, kind = np.zeros(n), np.ones(n), np.zeros(n, np.uint8)
+    side = np.empty((2, 10))
+    mean, spread = np.empty((2, 3)), np.empty((2, 6))
+    mixture = np.empty((2 * _MIXED + 1, 10))  # mean, precision and log determinant of each
+    pure = np.empty((2, _SAMPLES))
+    score = np.empty(_GRID)
+    reach2 = (2.5 * pooling) ** 2
+    for i in range(n):
+        if first[i] > LINE - NEAREST or last[i] < LINE + NEAREST:
+            continue
+        side[:] = 0.0
+        for j in range(n):
+            du, dv = points[j, 3] - points[i, 3], points[j, 4] - points[i, 4]
+            d2 = du * du + dv * dv
+            if d2 < reach2 and points[j, 5] * points[i, 5] + points[j, 6] * points[i, 6] > 0.5:
+                w = math.exp(-0.5 * d2 / (pooling * pooling))
+                for a in range(2):
+                    for b in range(10):
+                        side[a, b] += w * own[j, a, b]
+        if side[0, 0] < 2.0 or side[1, 0] < 2.0:
+            continue
+        for a in range(2):
+            _moments(side[a], floor, mean[a], spread[a])
+        for m in range(2 * _MIXED + 1):
+            share = 0.5 - 0.5 * math.tanh(0.5 * (m - _MIXED) / BLUR)
+            if m == 0:
+                share = 1.0
+            elif m == 2 * _MIXED:
+                share = 0.0
+            _mix(share, mean, spread, mixture[m])
+        for s in range(first[i], last[i] + 1):
+            pure[0, s] = _misfit(colours[i, s], mixture[0], clipped)
+            pure[1, s] = _misfit(colours[i, s], mixture[2 * _MIXED], clipped)
+        best = -1e30
+        for o in range(_GRID):
+            edge = 0.5 * (o - OFFSETS)
+            total = 0.0
+            for s in range(first[i], last[i] + 1):
+                m = int(2.0 * (s - LINE - edge)) + _MIXED
+                if m <= 0:
+                    total += pure[0, s]
+                elif m >= 2 * _MIXED:
+                    total += pure[1, s]
+                else:
+                    total += _misfit(colours[i, s], mixture[m], clipped)
+            score[o] = -0.5 * total / temperature
+            if mask_kind[i] == MEASURED:
+                score[o] -= 0.5 * ((edge - by_mask[i]) / mask_sigma) ** 2
+            best = max(best, score[o])
+        total, first_moment, second = 0.0, 0.0, 0.0
+        for o in range(_GRID):
+            edge = 0.5 * (o - OFFSETS)
+            p = math.exp(score[o] - best)
+            total += p
+            first_moment += p * edge
+            second += p * edge * edge
+        r[i] = first_moment / total
+        sigma[i] = math.sqrt(max(second / total - r[i] * r[i], 0.0))
+        kind[i] = MEASURED
+    return r, sigma, kind
+
+
+@njit(cache=True, nogil=True)
+def _read(point, image, guarded, colours):
+    """Fills the colours along a point's line; returns the first and last sample before something covers it or it ends."""
+    h, w = guarded.shape
+    first, last = LINE + 1, LINE - 1
+    for way in (1, -1):
+        for t in range(0 if way == 1 else 1, LINE + 1):
+            u, v = point[3] + way * t * point[5], point[4] + way * t * point[6]
+            x, y = int(math.floor(u)), int(math.floor(v))
+            if x < 0 or y < 0 or x >= w - 1 or y >= h - 1 or guarded[int(v + 0.5), int(u + 0.5)] != 0:
+                break
+            s = LINE + way * t
+            a, b = u - x, v - y
+            for c in range(3):
+                top = image[y, x, c] * (1.0 - a) + image[y, x + 1, c] * a
+                bottom = image[y + 1, x, c] * (1.0 - a) + image[y + 1, x + 1, c] * a
+                colours[s, c] = top * (1.0 - b) + bottom * b
+            first, last = min(first, s), max(last, s)
+        if last < LINE:  # the contour's point itself is covered
+            break
+    return first, last
+
+
+@njit(cache=True, nogil=True)
+def _count(sums, colour):
+    r, g, b = colour[0], colour[1], colour[2]
+    sums[0] += 1.0
+    sums[1] += r
+    sums[2] += g
+    sums[3] += b
+    sums[4] += r * r
+    sums[5] += r * g
+    sums[6] += r * b
+    sums[7] += g * g
+    sums[8] += g * b
+    sums[9] += b * b
+
+
+@njit(cache=True, nogil=True)
+def _moments(sums, floor, mean, spread):
+    """Mean (3,) and covariance (6,) (rr, rg, rb, gg, gb, bb) of colours summed by `_count`."""
+    n = sums[0]
+    for c in range(3):
+        mean[c] = sums[1 + c] / n
+    k = 0
+    for c in range(3):
+        for d in range(c, 3):
+            spread[k] = sums[4 + k] / n - mean[c] * mean[d] + (floor * floor if c == d else 0.0)
+            k += 1
+
+
+@njit(cache=True, nogil=True)
+def _mix(share, mean, spread, out):
+    """Mean (3,), precision (6,) and log determinant of the covariance of the colours where a pixel shows `share` of the inside.
+
+    Light mixes, and a display's value is the root of the light (gamma 2, near enough): without this an edge seems to lie in the
+    darker side, by up to a quarter of a pixel.
+    """
+    for c in range(3):
+        out[c] = math.sqrt(share * mean[0, c] ** 2 + (1.0 - share) * mean[1, c] ** 2)
+    mixed = share * spread[0] + (1.0 - share) * spread[1]
+    a, b, c, d, e, f = mixed[0], mixed[1], mixed[2], mixed[3], mixed[4], mixed[5]
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    det = a * A + b * B + c * C
+    out[3], out[4], out[5] = A / det, B / det, C / det
+    out[6], out[7], out[8] = (a * f - c * c) / det, (b * c - a * e) / det, (a * d - b * b) / det
+    out[9] = math.log(det)
+
+
+@njit(cache=True, nogil=True)
+def _misfit(colour, mixture, clipped):
+    """Squared Mahalanobis distance of a colour from a mixture, clipped, and the mixture's log determinant."""
+    r, g, b = colour[0] - mixture[0], colour[1] - mixture[1], colour[2] - mixture[2]
+    d = mixture[3] * r * r + mixture[6] * g * g + mixture[8] * b * b
+    d += 2.0 * (mixture[4] * r * g + mixture[5] * r * b + mixture[7] * g * b)
+    return min(d, clipped) + mixture[9]

@@ -1,0 +1,259 @@
+"""The default search: least squares between the mesh's occluding contour and the boundary of the mask.
+
+One pass, from a pose T_camera_target:
+  1. project the mesh; its occluding contour are the edges between a face seen from the front and one seen from behind (`trace`);
+  2. keep the points on the outside of the silhouette and outside everything that covers the target;
+  3. from each, walk along the contour's normal to the mask's boundary: the offset r [px] (`match`);
+  4. solve the damped normal equations for the pose error and for the mask's dilation b, r = J e + b + noise.
+The passes are Levenberg-Marquardt with Huber's weights; where they end badly, they start again after coarse passes with a longer
+walk. What is hidden is dropped and not scored.
+
+The covariance is that of the measurement alone. Neighbouring points of a mask's boundary err together, so the contour counts as
+one independent point per correlation length; the dilation b is a nuisance with a prior of its own and is marginalised, because
+half a pixel around the limb looks like centimetres of depth.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.search.contour import Model, match, normal_equations
+from services.search.evidence import Evidence, compare
+from shared.geometry import rigid
+
+Array = NDArray[np.float64]
+
+SPACING_PX = 3.0
+"""Distance of the sampled contour points: closer ones bring no new information."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How a mask's boundary errs, in pixels of the mask.
+
+    `edge`: standard deviation along the normal; `correlation`: length along the contour over which errors are one error;
+    `dilation`: standard deviation of the whole mask's being too large or small. Defaults: a trained network's masks.
+    """
+
+    edge: float = 0.5
+    correlation: float = 14.0
+    dilation: float = 0.3
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Standard deviations of position [m] and rotation [rad] of a direction that the contour does not show: the weak prior
+    that keeps the solve regular, and the largest deviations published."""
+
+    position: float = 1.0
+    rotation: float = 1.5
+
+    @property
+    def covariance(self) -> Array:
+        return np.diag([self.position**2] * 3 + [self.rotation**2] * 3)
+
+    @property
+    def information(self) -> Array:
+        return np.diag([self.position**-2.0] * 3 + [self.rotation**-2.0] * 3)
+
+
+COARSE, FINE = (24.0, 5.0, 4), (8.0, 2.0, 8)
+"""Reach of the walk [px], Huber's threshold [px], passes at most."""
+CONVERGED = 1e-3
+"""Of a pass of which nothing finer follows [m]."""
+ROUGH = 4e-3
+"""Of a pass after which the image is asked [m]: a pixel or two."""
+MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
+"""Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
+DAMPING = (1e-3, 10.0, 1e2)
+"""Marquardt's factor at the start, its change after a pass that gained or lost, and where the search gives up."""
+KEPT = 0.05
+"""Share of the prior's information that stays in the measurement: without any, what the contour hardly shows would be
+extrapolated far beyond where the problem is linear."""
+GOOD, MISFIT = 2.0, 3.0
+"""A smaller `Fit.misfit` has nearly every fit that is right; a larger one has one of a hundred, and most that are wrong."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
+    `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
+    `cost`: chi^2 of contour, dilation and prior together; `misfit`: the same per measurement, 1 to 3 where the pose
+    is right; `both`, `either`, `free`: see `compare`; `sharp`: whether the image has edges along the contour (`refine`)."""
+
+    T: Array
+    covariance: Array
+    T_searched: Array
+    length: float
+    rms: float
+    dilation: float
+    cost: float
+    misfit: float
+    both: int
+    either: int
+    free: int
+    sharp: bool = False
+
+    @property
+    def overlap(self) -> float:
+        """Of the pixels that are scored: those of both the mask's target and the silhouette, as a share of those of either."""
+        return self.both / self.either if self.either else 0.0
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """The contour at one pose, which is `moved` (7,) from the prior: pose error and dilation."""
+
+    T: Array
+    moved: Array
+    points: Array
+    r: Array
+    kind: NDArray[np.uint8]
+    H: Array
+    g: Array
+    cost: float
+    counts: tuple[int, int, int]
+
+
+class _Problem:
+    def __init__(self, model: Model, evidence: Evidence, noise: Noise, regular: Array, converged: float):
+        self.model, self.evidence, self.noise, self.regular, self.converged = model, evidence, noise, regular, converged
+
+    def at(self, T: Array, moved: Array, reach: float, huber: float) -> _Pass:
+        evidence, k = self.evidence, self.evidence.intrinsics
+        V = self.model.in_camera(T)
+        silhouette = self.model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1]))
+        points = self.model.outline(V, k, evidence.state.shape, SPACING_PX)
+        offsets, kind = match(points, evidence.field, evidence.guarded, evidence.field_of(silhouette), reach)
+        r = offsets - moved[6]
+        H, g, _, _, counted, cost, _ = self.normal_equations(T, points, r, kind, huber, True)
+        both, free = compare(evidence.state, silhouette)
+        # parts of the mask that no contour is near pull at nothing, but must not look cheap; nor may points pay by dropping out
+        unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
+        cost = cost * evidence.boundary_px / max(counted, 1.0) + unexplained + float(np.dot(moved, self.regular @ moved))
+        return _Pass(T, moved, points, r, kind, H, g, cost, (both, evidence.seen_px + free, free))
+
+    def normal_equations(
+        self, T: Array, points: Array, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
+    ) -> tuple[Array, Array, float, float, float, float, float]:
+        noise, k = self.noise, self.evidence.intrinsics
+        weights = points[:, 7] / (noise.correlation * noise.edge**2)
+        return normal_equations(points, r, kind, weights, T[:3, 3], T[:3, 0], k.fx, k.fy, huber, bounded)
+
+    def coarse(self, T: Array, moved: Array) -> tuple[Array, Array]:
+        """The pose and what it is moved by after steps that are all taken, as the contour points matched change with each."""
+        reach, huber, passes = COARSE
+        for _ in range(passes):
+            step = self.step(self.at(T, moved, reach, huber), 0.0)
+            T, moved = rigid.perturb(T, step[:6]), moved + step
+            if _small(step, self.converged):
+                break
+        return T, moved
+
+    def fine(self, here: _Pass) -> _Pass:
+        """The best pose near by, by Levenberg and Marquardt."""
+        (reach, huber, passes), damping = FINE, DAMPING[0]
+        for _ in range(passes):
+            step = self.step(here, damping)
+            there = self.at(rigid.perturb(here.T, step[:6]), here.moved + step, reach, huber)
+            if there.cost < here.cost:
+                here, damping = there, damping / DAMPING[1]
+            else:
+                damping *= DAMPING[1]
+            if _small(step, self.converged) or damping > DAMPING[2]:
+                break
+        return here
+
+    def step(self, here: _Pass, damping: float) -> Array:
+        information = here.H + self.regular
+        information[_DIAGONAL] *= 1.0 + damping
+        step = np.linalg.solve(information, here.g - self.regular @ here.moved)
+        return np.asarray(step / max(1.0, float(np.max(np.abs(step[:6]) / MAX_STEP))), np.float64)
+
+
+_DIAGONAL = np.diag_indices(7)
+
+
+def fit(
+    model: Model,
+    T_start: Array,
+    evidence: Evidence,
+    T_prior: Array | None = None,
+    prior: Array | None = None,
+    noise: Noise | None = None,
+    limits: Limits | None = None,
+    converged: float = CONVERGED,
+) -> Fit:
+    """The pose T_camera_target whose contour lies on the mask's boundary, searched from T_start (4 x 4).
+
+    `prior` (6, 6) is the information about T_prior (T_start where None) along the camera's axes. It keeps the solve near where
+    the contour says little, and is taken out of the result again: `Fit.T` and `Fit.covariance` are the measurement's alone.
+    `converged`: a pass that moves less than this [m], and four times it [rad], is the last of its stage.
+    """
+    noise, limits = noise or Noise(), limits or Limits()
+    weak = limits.information
+    regular = np.zeros((7, 7))
+    regular[:6, :6] = weak if prior is None else prior + weak
+    regular[6, 6] = noise.dilation**-2
+    problem = _Problem(model, evidence, noise, regular, converged)
+
+    start = np.zeros(7)
+    if T_prior is not None:
+        start[:6] = rigid.pose_error(T_start, T_prior)
+    independent = evidence.measurements(noise.correlation)
+    here = problem.at(T_start, start, *FINE[:2])
+    if here.cost <= GOOD * independent:
+        here = problem.fine(here)
+    else:  # the start may be too far away for the short walk
+        there = problem.fine(problem.at(*problem.coarse(T_start, start), *FINE[:2]))
+        here = there if there.cost <= GOOD * independent else min(there, problem.fine(here), key=lambda one: one.cost)
+
+    # the pose is final: only what was measured informs
+    moved = here.moved
+    H, g, length, square, _, _, rolls = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False)
+    rms = math.sqrt(square / length) if length > 0 else math.inf
+    misfit = here.cost / independent
+    # a mask or a fit worse than expected: believe the residuals
+    trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
+    H, g = H * trust, g * trust
+    T, covariance = marginal(here.T, moved, H, g, regular, rolls, limits)
+    return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
+
+
+def marginal(
+    T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float, limits: Limits, waves: Array | None = None
+) -> tuple[Array, Array]:
+    """The pose and covariance (6, 6) that the measurement alone says, from the normal equations of pose error and dilation at T,
+    which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out but for KEPT, the dilation marginalised (Schur
+    complement).
+
+    `rolls`: share of the information about the roll that is believed, see `normal_equations`; `waves` (7, k): right sides of
+    errors that all of the contour shares, of one standard deviation each.
+    """
+    gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
+    weak = (1.0 - KEPT) * limits.information + KEPT * regular[:6, :6]
+    covariance = np.linalg.inv(H[:6, :6] - np.outer(gain, H[6, :6]) + weak)
+    offset = covariance @ (g[:6] - gain * (g[6] - regular[6, 6] * moved[6]) - weak @ moved[:6])
+    if waves is not None:
+        bent = covariance @ (waves[:6] - np.outer(gain, waves[6]))
+        covariance = covariance + bent @ bent.T
+    # the roll that a nearly round section shows is doubted, and with it all that leans on it
+    c = covariance[:, 3:] @ T[:3, 0]
+    roll = float(T[:3, 0] @ c[3:])
+    doubt = min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll)
+    covariance = (covariance + covariance.T) / 2.0 + doubt * np.outer(c, c) / roll
+    return rigid.perturb(T, offset), covariance
+
+
+def with_prior(T: Array, covariance: Array, T_prior: Array, prior: Array) -> Array:
+    """The most probable pose of a measurement T with its covariance (6, 6) and of a prior with its information (6, 6)."""
+    information = np.linalg.inv(covariance)
+    return rigid.perturb(T_prior, np.linalg.solve(information + prior, information @ rigid.pose_error(T, T_prior)))
+
+
+def _small(step: Array, converged: float) -> bool:
+    return bool(np.abs(step[:3]).max() < converged and np.abs(step[3:6]).max() < 4.0 * converged)

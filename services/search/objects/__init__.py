@@ -1,0 +1,1 @@
+"""`penumbra search refine` and `track`: the pose of any rigid mesh on files."""

@@ -1,0 +1,318 @@
+"""The way from a far start to the pose that a mask shows, for masks that are wrong in places.
+
+  1. Turn the start about the object's middle to all sides (`starts`), and shift each so that silhouette and mask have the same
+     middle and the same area (`align`).
+  2. A few steps of least squares of contour against boundary each, on a small picture; the best go on (`descend`).
+  3. More steps on the full picture, with ever less said by points that are far off.
+  4. The hypotheses are compared by how many pixels silhouette and mask differ in, and how far those are from the mask's boundary.
+
+The start itself counts as a weak measurement: of poses that explain the mask alike, the nearest to the start is right.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from services.search import evidence
+from services.search.contour import DROPPED, NEAR, Model, match
+from services.search.evidence import COVERED, FREE, TARGET, Evidence, Intrinsics
+from services.search.mask_fit import Noise
+from shared.geometry import rigid
+
+Array = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+COARSE_PX, FINE_PX = 45.0, 200.0
+"""Square root of the mask's area [px] that a picture is made smaller for."""
+TURNS = (14.0, 28.0)
+"""The starts are turned by these angles [deg] ..."""
+AXES = 16
+"""... about so many axes."""
+SURVIVORS = (14, 5)
+"""Hypotheses that go on after the alignment, and to the full picture."""
+SAME = (0.01, 0.06)
+"""Hypotheses nearer than this [m, rad] are one."""
+NOISE = Noise(edge=2.0, correlation=40.0, dilation=0.7)
+"""How a network's mask of any object errs [px of the image]."""
+FARTHEST_PX = 8.0
+"""A pixel further from the mask's boundary than this [px of the image] counts no more: a missing part is one mistake."""
+PIECE = 0.2
+"""Least share of the mask that a piece of it has, to be taken for the whole object."""
+AROUND = 0.5
+"""Diagonals of the mask around it that are looked at."""
+DAMPING = 0.02
+STILL = (3e-4, 1.5e-3)
+"""A step smaller than this [m, rad] is the last."""
+MAX_STEP = np.array([0.08, 0.08, 0.15, 0.3, 0.3, 0.3])
+"""Largest step of a pass [m, rad] for an object a metre away."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """An object about its own middle: with few triangles for the small picture, and with all."""
+
+    coarse: Model
+    fine: Model
+
+
+@dataclass(frozen=True)
+class Level:
+    """A mask in a picture whose pixels are `scale` image pixels wide; `distance` (h, w) float32: of each pixel's centre from the
+    mask's boundary [px of this picture]."""
+
+    evidence: Evidence
+    distance: NDArray[np.float32]
+    scale: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.evidence.state.shape[0], self.evidence.state.shape[1]
+
+
+def level(state: NDArray[np.uint8], k: Intrinsics, x0: int, y0: int, scale: int) -> Level:
+    """The state (h, w) of the pixels from (x0, y0) on of an image with intrinsics k, made smaller."""
+    if scale > 1:
+        h, w = state.shape[0] // scale, state.shape[1] // scale
+        cut = state[: h * scale, : w * scale]
+
+        def share(kind: int) -> Array:
+            return cv2.resize((cut == kind).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA).astype(np.float64)
+
+        target, covered = share(TARGET), share(COVERED)
+        state = np.where(covered >= 0.5, COVERED, np.where(target > 0.5 * (1.0 - covered), TARGET, FREE)).astype(np.uint8)
+    half = (scale - 1) / 2.0
+    k = Intrinsics(k.fx / scale, k.fy / scale, (k.cx - x0 - half) / scale, (k.cy - y0 - half) / scale)
+    target = (state == TARGET).astype(np.uint8)
+    distance = np.where(
+        target != 0, cv2.distanceTransform(target, cv2.DIST_L2, 5), cv2.distanceTransform(1 - target, cv2.DIST_L2, 5)
+    )
+    return Level(evidence.gather(state, np.zeros_like(state), k, x0, y0, scale), (distance - 0.5).astype(np.float32), scale)
+
+
+@njit(cache=True, nogil=True)
+def _difference(state, distance, silhouette, farthest):
+    """The sum of distances [px] of the pixels in which a silhouette (h, w) and the mask differ, the mask's pixels that the
+    silhouette covers, and its pixels that are free, and those that are covered."""
+    total, both, free, covered = 0.0, 0, 0, 0
+    for y in range(state.shape[0]):
+        for x in range(state.shape[1]):
+            if silhouette[y, x]:
+                if state[y, x] == TARGET:
+                    both += 1
+                elif state[y, x] == FREE:
+                    free += 1
+                    total += min(distance[y, x], farthest)
+                else:
+                    covered += 1
+            elif state[y, x] == TARGET:
+                total += min(distance[y, x], farthest)
+    return total, both, free, covered
+
+
+@dataclass(frozen=True)
+class Score:
+    """How a pose explains a mask; `cost`: chi^2 of the pixels that differ and of the way from the start."""
+
+    cost: float
+    both: int
+    either: int
+    covered: int
+
+    @property
+    def overlap(self) -> float:
+        return self.both / max(self.either, 1)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known beforehand: T_camera_object and the information (6, 6) about it along the camera's axes."""
+
+    T: Array
+    information: Array
+
+    def cost(self, T: Array) -> float:
+        error = rigid.pose_error(self.T, T)
+        return float(error @ self.information @ error)
+
+
+def score(model: Model, at: Level, T: Array, prior: Prior, noise: Noise = NOISE) -> Score:
+    """How well a pose explains the mask."""
+    h, w = at.shape
+    silhouette = model.silhouette(T, at.evidence.intrinsics, (0, 0, w, h))
+    total, both, free, covered = _difference(at.evidence.state, at.distance, silhouette, FARTHEST_PX / at.scale)
+    # a contour that is off by r along a length l makes pixels differ whose distances sum up to l r^2 / 2
+    cost = 2.0 * total * at.scale**3 / (noise.edge**2 * noise.correlation)
+    return Score(cost + prior.cost(T), both, at.evidence.seen_px + free, covered)
+
+
+def starts(T: Array) -> list[Array]:
+    """The pose T (4 x 4) turned about its origin to all sides."""
+    i = np.arange(AXES) + 0.5
+    z = 1.0 - 2.0 * i / AXES  # a Fibonacci lattice on the sphere
+    angle = np.pi * (1.0 + 5.0**0.5) * i
+    axes = np.stack([np.sqrt(1.0 - z * z) * np.cos(angle), np.sqrt(1.0 - z * z) * np.sin(angle), z], axis=1)
+    turns = [np.concatenate([np.zeros(3), np.radians(degrees) * axis]) for degrees in TURNS for axis in axes]
+    return [T, *(rigid.perturb(T, turn) for turn in turns)]
+
+
+Moments = tuple[float, float, float]
+"""Area [px] and middle (u, v) of a region."""
+
+
+def regions(at: Level) -> list[Moments]:
+    """The mask, and where it is of several pieces each of the large ones: the others may be another object's."""
+    target = at.evidence.state == TARGET
+    count, _, sizes, middles = cv2.connectedComponentsWithStats(target.astype(np.uint8))
+    areas = sizes[1:, cv2.CC_STAT_AREA]
+    large = [i for i in range(count - 1) if areas[i] > PIECE * areas.sum()]
+    pieces = [(float(areas[i]), float(middles[1 + i][0]), float(middles[1 + i][1])) for i in large] if count > 2 else []
+    return [_moments(target), *pieces]
+
+
+def align(model: Model, at: Level, T: Array, wanted: Moments) -> Array:
+    """The pose shifted so that the silhouette's area and middle are those of a region; what is covered does not count."""
+    state, k = at.evidence.state, at.evidence.intrinsics
+    h, w = at.shape
+    for _ in range(2):  # the second time in the right place and of nearly the right size
+        found = _moments(model.silhouette(T, k, (0, 0, w, h)) & (state != COVERED))
+        T = T.copy()
+        if found[0] < 4.0:  # outside the picture: its origin goes to the mask's middle
+            T[:2, 3] = ((wanted[1] - k.cx) / k.fx * T[2, 3], (wanted[2] - k.cy) / k.fy * T[2, 3])
+            continue
+        T[:3, 3] *= min(max(math.sqrt(found[0] / wanted[0]), 0.6), 1.7)
+        # along the line of sight the middle stays where it is in the image
+        T[0, 3] += (wanted[1] - found[1]) / k.fx * T[2, 3]
+        T[1, 3] += (wanted[2] - found[2]) / k.fy * T[2, 3]
+    return T
+
+
+def _moments(mask: Bool) -> Moments:
+    columns, rows = mask.sum(axis=0), mask.sum(axis=1)
+    area = float(columns.sum())
+    if area == 0.0:
+        return 0.0, 0.0, 0.0
+    return area, float(columns @ np.arange(len(columns))) / area, float(rows @ np.arange(len(rows))) / area
+
+
+@dataclass(frozen=True)
+class Contour:
+    """The contour at a pose: points (n, 8) as `trace` gives them, offsets r (n,) to the boundary and their kinds (n,)."""
+
+    points: Array
+    r: Array
+    kind: NDArray[np.uint8]
+
+    def jacobian(self, T: Array, k: Intrinsics) -> Array:
+        """How the contour moves along its normal (n, 7) [px] by a pose error at T [m, rad] and by the mask's dilation [px]."""
+        X, Y, Z, nx, ny = self.points[:, 0], self.points[:, 1], self.points[:, 2], self.points[:, 5], self.points[:, 6]
+        J = np.empty((len(X), 7))
+        J[:, 0], J[:, 1] = nx * k.fx / Z, ny * k.fy / Z
+        J[:, 2] = -(J[:, 0] * X + J[:, 1] * Y) / Z
+        J[:, 3:6] = np.cross(self.points[:, :3] - T[:3, 3], J[:, :3])  # a rotation vector w moves the point by w x (X - origin)
+        J[:, 6] = 1.0
+        return J
+
+
+def contour(model: Model, at: Level, T: Array, reach: float, spacing: float = 2.0) -> Contour:
+    """The contour at a pose, compared with the mask within `reach` [px of the level]."""
+    k = at.evidence.intrinsics
+    V = model.in_camera(T)
+    points = model.outline(V, k, at.shape, spacing)
+    own = at.evidence.field_of(model.silhouette_of(V, k, (0, 0, *at.shape[::-1])))
+    r, kind = match(points, at.evidence.field, at.evidence.guarded, own, reach)
+    return Contour(points, r, kind)
+
+
+def robust(r: Array, width: float) -> Array:
+    """Weights (n,) of offsets: those of Cauchy's distribution, for which one far away says nearly nothing."""
+    return 1.0 / (1.0 + np.square(r / width))
+
+
+def information(found: Contour, at: Level, T: Array, width: float, noise: Noise) -> tuple[Array, Array]:
+    """Of the pose error at T: the information (6, 6) and its right side (6,), of points that count less and less beyond `width`
+    [px of the image]. The mask's dilation is marginalised (Schur complement)."""
+    weights = found.points[:, 7] * robust(found.r, width / at.scale) * (found.kind != DROPPED)
+    weights *= at.scale**3 / (noise.edge**2 * noise.correlation)
+    J = found.jacobian(T, at.evidence.intrinsics)
+    weighted = J * weights[:, None]
+    H, g = weighted.T @ J, weighted.T @ found.r
+    gain = H[:6, 6] / (H[6, 6] + (noise.dilation / at.scale) ** -2)
+    return H[:6, :6] - np.outer(gain, H[6, :6]), g[:6] - gain * g[6]
+
+
+def descend(model: Model, at: Level, T: Array, prior: Prior, widths: tuple[float, ...], noise: Noise = NOISE) -> Array:
+    """Steps of least squares, one for each of `widths` [px of the image], beyond which points count less and less."""
+    for width in widths:
+        found = contour(model, at, T, max(3.0 * width / at.scale, 4.0))
+        H, g = information(found, at, T, width, noise)
+        H += prior.information
+        H[_DIAGONAL] *= 1.0 + DAMPING
+        step = np.linalg.solve(H, g + prior.information @ rigid.pose_error(prior.T, T))
+        step /= max(1.0, float(np.max(np.abs(step) / MAX_STEP)))
+        T = rigid.perturb(T, step)
+        T[2, 3] = max(T[2, 3], 2.0 * NEAR)
+        if width == widths[-1] and np.abs(step[:3]).max() < STILL[0] and np.abs(step[3:]).max() < STILL[1]:
+            break
+    return T
+
+
+_DIAGONAL = np.diag_indices(6)
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """A mask on a small and on the full picture."""
+
+    coarse: Level
+    fine: Level
+
+
+def pyramid(state: NDArray[np.uint8], k: Intrinsics) -> Pyramid:
+    """`state` (h, w): FREE, TARGET or COVERED for every pixel of an image with intrinsics k. Far from the mask it is left out."""
+    target = state == TARGET
+    rows, columns = np.flatnonzero(target.any(axis=1)), np.flatnonzero(target.any(axis=0))
+    size = math.sqrt(np.count_nonzero(target))
+    fine = max(1, int(size / FINE_PX))
+    coarse = max(fine, round(size / COARSE_PX))
+    margin = int(AROUND * math.hypot(rows[-1] - rows[0] + 1, columns[-1] - columns[0] + 1)) + 8 * coarse
+    x0, y0 = max(int(columns[0]) - margin, 0), max(int(rows[0]) - margin, 0)
+    window = state[y0 : rows[-1] + margin + 1, x0 : columns[-1] + margin + 1]
+    return Pyramid(level(window, k, x0, y0, coarse), level(window, k, x0, y0, fine))
+
+
+COARSE_WIDTHS = (16.0, 12.0, 10.0, 8.0, 8.0)
+MORE_WIDTHS = (8.0, 6.0, 6.0, 5.0, 5.0)
+FINE_WIDTHS = (5.0, 4.0, 4.0, 3.0, 3.0, 3.0)
+
+
+def search(shape: Shape, masks: Pyramid, prior: Prior, noise: Noise = NOISE) -> list[tuple[Score, Array]]:
+    """The poses T_camera_object near the prior that explain the mask best, best first."""
+    model, at = shape.coarse, masks.coarse
+    aligned = [align(model, at, T, region) for region in regions(at) for T in starts(prior.T)]
+    found = ranked(model, at, aligned, prior, noise)[: SURVIVORS[0]]
+    for widths in (COARSE_WIDTHS, MORE_WIDTHS):
+        found = distinct(ranked(model, at, [descend(model, at, T, prior, widths, noise) for _, T in found], prior, noise))
+    model, at = shape.fine, masks.fine
+    poses = [descend(model, at, T, prior, FINE_WIDTHS, noise) for _, T in found[: SURVIVORS[1]]]
+    return distinct(ranked(model, at, poses, prior, noise))
+
+
+def ranked(model: Model, at: Level, poses: list[Array], prior: Prior, noise: Noise) -> list[tuple[Score, Array]]:
+    """The poses with their scores, best first."""
+    return sorted(((score(model, at, T, prior, noise), T) for T in poses), key=lambda one: one[0].cost)
+
+
+def distinct(ranked: list[tuple[Score, Array]]) -> list[tuple[Score, Array]]:
+    """Those of which none better is near by."""
+    kept: list[tuple[Score, Array]] = []
+    for one in ranked:
+        errors = [rigid.pose_error(one[1], T) for _, T in kept]
+        if all(np.linalg.norm(e[:3]) > SAME[0] or np.linalg.norm(e[3:]) > SAME[1] for e in errors):
+            kept.append(one)
+    return kept

@@ -1,0 +1,369 @@
+"""The search of one target in the masks of one camera: evidence, fit, judgement, and the way back after a loss."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.search import contour, detect, evidence, paper_search
+from services.search.evidence import TARGET, Evidence, Intrinsics
+from services.search.image_fit import refine
+from services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
+from services.search.robot_depth import RobotDepth
+from shared.body import anatomy
+from shared.cell.description import Cell
+from shared.contract.messages import Mask
+from shared.geometry import rigid
+from shared.perception.vision import State, VisionEstimate
+
+Array = NDArray[np.float64]
+
+METHODS = ("default", "paper")
+HIDDEN = 0.95
+"""A larger hidden share leaves too little to measure a pose."""
+SHORTEST_PX = 30.0
+"""Least contour measured [px] for a pose: about four independent points."""
+FITS, FITS_WELL = 0.8, 0.9
+"""Overlap below which the target is not where the fit says, and from which no other explanation is tried. Network masks reach
+0.93 to 0.97 at the right pose."""
+FITS_EXPECTED = 0.6
+"""The same of a pose that the image confirms where a sure prediction expects it: a mask that takes an occluder for the wall is
+no reason to give up."""
+WRONG = 6.0
+"""`Fit.misfit` from which a pose is wrong whatever its overlap."""
+GATE = 27.9
+"""Squared Mahalanobis distance, six degrees of freedom, that one in 10^4 right poses exceeds."""
+RECOGNISED = 0.5
+"""Up to this hidden share a shape is the target's; a smaller piece may be anything, and is believed only where a sure prediction
+expects it."""
+RECOGNISED_PX = 80.0
+"""Least contour of a shape [px] that nothing sure expects."""
+SURE = 0.05
+"""Standard deviation of the position [m] along its worst direction up to which a prediction is sure."""
+EXPECTED = 10.6
+"""Squared Mahalanobis distance, six degrees of freedom, from such a prediction that one in 10 right poses exceeds."""
+PRIOR_INFLATION = 2.0
+PRIOR_FLOOR = (0.02, 0.09)
+"""The prediction's standard deviations are doubled, and these [m, rad] added, before the solve leans on it: it shall only keep
+the fit from wandering off."""
+JOINT_MARGIN = 0.02
+"""Along the limb [m]: how far beyond its predicted near end the mask is still believed, for the prediction may be off."""
+DETECT_REACH = 1.2
+"""Lengths of the target around a region of the mask that belong to it: the region may be either end."""
+HOME_GATE = 16.8
+"""Squared Mahalanobis distance from where the target is expected, six degrees of freedom, that one in 100 right poses exceeds:
+a shape further away is not believed to be the target."""
+DETECT_EVERY_NS = {"lost": 250_000_000, "doubtful": 1_000_000_000}
+"""Least time between two detections, for each takes as long as twenty frames that are tracked."""
+EXPLAINED = 0.5
+"""Overlap with all of a region, a bare upper arm included, from which no other region is tried."""
+DETECT_FITS = 4
+"""Hypotheses that are fitted, of those that overlap best."""
+HOME_WEIGHT = 0.005
+"""Overlap that one standard deviation from home costs a detection: decides between mirror images, which overlap equally."""
+PAPER_SIGMA = (0.02, 0.09)
+"""The paper gives its search no covariance, but an average error of less than 2 cm [m]; the rotation [rad] is ours."""
+
+
+@dataclass(frozen=True)
+class Searched(VisionEstimate):
+    """`T_searched`: the most probable pose together with the prediction."""
+
+    T_searched: Array
+
+
+class Search:
+    """One target seen by one camera. Raises CellError for a name that the cell does not have."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        camera: str | None = None,
+        target: str | None = None,
+        method: str = "default",
+        noise: Noise | None = None,
+    ):
+        if method not in METHODS:
+            raise ValueError(f"method: one of {', '.join(METHODS)} expected, got {method!r}")
+        self.method = method
+        self._camera = cell.cameras[cell.one("cameras", camera)]
+        self._target = cell.targets[cell.one("targets", target)]
+        self._model = contour.Model(anatomy.target_mesh(self._target, cell))
+        self._reach = DETECT_REACH * float(np.ptp(self._model.vertices, axis=0).max())
+        self._noise, self._limits = noise or Noise(), Limits()
+        self._T_camera_world = rigid.inverse(self._camera.T_world_camera)
+        self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])  # covariances: camera axes to world axes
+        self._robots = RobotDepth(cell, self._T_camera_world)
+        self._detected_ns: int | None = None
+
+    def prepare(self) -> None:
+        """Compiles what `update` needs, so that the first frame does not wait for it."""
+        joints = {name: np.zeros(len(robot.joints)) for name, robot in self._robots.robots.items()}
+        T_home, size = self._target.home.transform, (self._camera.width, self._camera.height)
+        k = Intrinsics.of_window(self._camera, 0, 0, 1)
+        shown = self._model.silhouette(self._T_camera_world @ T_home, k, (0, 0, *size))
+        mask = Mask(stamp_ns=0, labels=shown * np.uint8(self._target.label_values[0]), x0=0, y0=0, scale=1)
+        image = np.repeat(mask.labels[..., None] * np.uint8(20), 3, axis=2)
+        self.update(mask, T_home, 1e-4 * np.eye(6), joints, image)
+        self._detected_ns = None
+
+    def update(
+        self,
+        mask: Mask,
+        T_prior: Array | None = None,
+        prior_covariance: Array | None = None,
+        joints: Mapping[str, Array] | None = None,
+        image: NDArray[np.uint8] | None = None,
+    ) -> Searched:
+        """What a mask, and the image it is of, say about the target's pose.
+
+        T_prior (4 x 4): the predicted T_world_target, None where nothing is known; `prior_covariance` (6, 6) along the world's
+        axes; `joints` (n,) [rad] by robot, to know exactly what the robots hide; `image` (h, w, 3) uint8 RGB: without it the mask
+        alone is used.
+
+        Raises ValueError for a mask or an image that cannot be this camera's.
+        """
+        h, w = mask.labels.shape
+        if mask.scale < 1 or h * mask.scale > 2 * self._camera.height or w * mask.scale > 2 * self._camera.width:
+            raise ValueError(
+                f"mask: a window of an image of {self._camera.width} x {self._camera.height} at a scale of at least 1 expected, "
+                f"{w} x {h} at scale {mask.scale} came: check the segmentation's camera"
+            )
+        if image is not None and image.shape[:2] != (self._camera.height, self._camera.width):
+            expected_size, came = f"{self._camera.width} x {self._camera.height}", f"{image.shape[1]} x {image.shape[0]}"
+            raise ValueError(f"image: {expected_size} expected, as the mask's camera has, {came} came")
+        T_start = self._T_camera_world @ (self._target.home.transform if T_prior is None else T_prior)
+        if self.method == "paper":
+            return self._paper(self._gather(mask, T_start, joints), T_start)
+        tracked: tuple[Evidence, Fit] | None = None
+        if T_prior is not None:
+            seen, best, certain = self._track(mask, T_start, prior_covariance, joints, image)
+            tracked = seen, best
+            if certain:
+                return self._judge(*tracked, image is not None, T_start, prior_covariance)
+        usable = tracked is not None and tracked[1].overlap >= FITS and tracked[1].misfit < WRONG
+        due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost")
+        other = self._detect(mask, T_start, joints) if due else None
+        if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
+            tracked = other[0], self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
+        if tracked is None:
+            return self._lost(T_start)
+        return self._judge(*tracked, image is not None, T_start if T_prior is not None else None, prior_covariance)
+
+    def _track(
+        self,
+        mask: Mask,
+        T_start: Array,
+        prior_covariance: Array | None,
+        joints: Mapping[str, Array] | None,
+        image: NDArray[np.uint8] | None,
+    ) -> tuple[Evidence, Fit, bool]:
+        """The pose near the prediction, and whether no other need be looked for. The fit to the mask is rough where an image
+        comes after it; what the image does not confirm is tried again from mirror images, and behind an unknown occluder."""
+        seen = self._gather(mask, T_start, joints, limb=T_start)
+        prior = self._leaning(prior_covariance)
+        first = self._fit(seen, T_start, T_start, prior, CONVERGED if image is None else ROUGH)
+        best = self._closer(seen, first, T_start, prior, image)
+        if not best.sharp:
+            first = self._settled(seen, self._with_mirror(seen, first, T_start, prior), T_start, prior)
+            best = self._closer(seen, first, T_start, prior, image)
+        if image is not None and not best.sharp and seen.seen_px >= detect.SMALLEST_PX:
+            seen, best = self._behind_unknown(seen, mask.labels, T_start, prior, image) or (seen, best)
+        fits = best.sharp or (first.overlap >= FITS_WELL and first.misfit < WRONG)
+        return seen, best, fits or seen.seen_px < detect.SMALLEST_PX
+
+    def _behind_unknown(
+        self, seen: Evidence, labels: NDArray[np.uint8], T_start: Array, prior: Array, image: NDArray[np.uint8]
+    ) -> tuple[Evidence, Fit] | None:
+        """The pose if what hides the target is no occluder to the mask, where the image confirms it."""
+        state = seen.state.copy()
+        predicted = self._model.silhouette(T_start, seen.intrinsics, (0, 0, *state.shape[::-1]))
+        evidence.cover_unexplained(state, predicted)
+        less = evidence.gather(state, labels, seen.intrinsics, seen.x0, seen.y0, seen.scale)
+        closer = self._closer(less, self._fit(less, T_start, T_start, prior), T_start, prior, image)
+        return (less, closer) if closer.sharp else None
+
+    def _closer(self, seen: Evidence, found: Fit, T_prior: Array, prior: Array, image: NDArray[np.uint8] | None) -> Fit:
+        """A fit, or where the image shows edges at a pose near it, that pose."""
+        if image is None or seen.seen_px < detect.SMALLEST_PX:
+            return found
+        closer = refine(self._model, found, image, seen, T_prior, prior)
+        away = rigid.pose_error(closer.T, T_prior)
+        expected = prior.any() and away @ prior @ away < EXPECTED
+        return closer if closer.sharp and closer.overlap >= (FITS_EXPECTED if expected else FITS) else found
+
+    def _gather(self, mask: Mask, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None) -> Evidence:
+        """`limb`: T_camera_target of the limb, where it is known; beyond its near end nothing is believed."""
+        k = Intrinsics.of_window(self._camera, mask.x0, mask.y0, mask.scale)
+        depth = self._robots.render(joints, k, mask.labels.shape) if joints else None
+        z = self._model.in_camera(T)[:, 2]
+        state = evidence.classify(mask.labels, self._target.label_values, depth, (float(z.min()), float(z.max())))
+        evidence.cover_outside(state, mask.x0, mask.y0, mask.scale, self._camera)
+        if limb is not None:
+            evidence.cover_beyond(state, limb, float(self._model.vertices[:, 0].min()) - JOINT_MARGIN, k)
+        return evidence.gather(state, mask.labels, k, mask.x0, mask.y0, mask.scale)
+
+    @property
+    def _home_information(self) -> Array:
+        spread = self._target.home_spread
+        return np.diag(np.repeat([spread.position**-2.0, spread.rotation**-2.0], 3))
+
+    def _predicted(self, prior_covariance: Array | None) -> tuple[Array, Array]:
+        """The prediction's covariance along the camera's axes, and the floor that is added to it."""
+        floor = np.diag(np.repeat(np.square(PRIOR_FLOOR), 3))
+        covariance = np.zeros((6, 6)) if prior_covariance is None else self._axes.T @ prior_covariance @ self._axes
+        return covariance, floor
+
+    def _leaning(self, prior_covariance: Array | None) -> Array:
+        """The information (6, 6) about the prediction that the solve leans on."""
+        covariance, floor = self._predicted(prior_covariance)
+        return np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64)
+
+    def _settled(self, seen: Evidence, first: Fit, T_prior: Array, prior: Array) -> Fit:
+        """A fit, or where it is bad a better one beside it: what went wrong is mostly the roll, or the tilt's sign."""
+        if seen.seen_px < detect.SMALLEST_PX or first.misfit <= MISFIT:
+            return first
+        beside = [self._fit(seen, T, T_prior, prior) for T in detect.mirrored(first.T_searched)]
+        return min((first, *beside), key=lambda found: found.cost)
+
+    def _is_better(self, other: Fit, first: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
+        """Whether another pose explains the mask better, and the prediction allows it or itself fails."""
+        if other.overlap <= max(first.overlap, FITS):
+            return False
+        covariance, floor = self._predicted(prior_covariance)
+        error = rigid.pose_error(other.T, T_start)
+        return bool(first.overlap < FITS or error @ np.linalg.solve(covariance + floor + other.covariance, error) < GATE)
+
+    def _is_expected(self, found: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
+        """Whether the prediction is sure, and the pose found is where it says."""
+        covariance, floor = self._predicted(prior_covariance)
+        if np.linalg.eigvalsh(covariance[:3, :3])[-1] > SURE**2:
+            return False
+        error = rigid.pose_error(found.T, T_start)
+        uncertain = covariance + found.covariance + (floor if prior_covariance is None else 0.0)
+        return bool(error @ np.linalg.solve(uncertain, error) < EXPECTED)
+
+    def _with_mirror(self, seen: Evidence, first: Fit, T_start: Array, prior: Array) -> Fit:
+        """The first fit, from the prediction, and that from its mirror image where both may be right: an axis nearly parallel
+        to the image looks the same tilted either way. Merged by their likelihoods, so that the covariance covers both."""
+        T_mirror = detect.mirrored(first.T_searched)[0]
+        away = rigid.pose_error(T_mirror, T_start)
+        if first.overlap < FITS or (first.misfit < GOOD and away @ prior @ away > GATE):
+            return first
+        other = self._fit(seen, T_mirror, T_start, prior)
+        if other.cost < first.cost:
+            first, other = other, first
+        share = 1.0 / (1.0 + np.exp(0.5 * min(other.cost - first.cost, 100.0)))
+        if share < 0.01:
+            return first
+        apart = rigid.pose_error(other.T, first.T)
+        covariance = (1.0 - share) * first.covariance + share * other.covariance + share * (1.0 - share) * np.outer(apart, apart)
+        return replace(first, T=rigid.perturb(first.T, share * apart), covariance=covariance)
+
+    def _is_detection_due(self, stamp_ns: int, case: str) -> bool:
+        if self._detected_ns is not None and 0 < stamp_ns - self._detected_ns < DETECT_EVERY_NS[case]:
+            return False
+        self._detected_ns = stamp_ns
+        return True
+
+    def _detect(self, mask: Mask, T_home: Array, joints: Mapping[str, Array] | None) -> tuple[Evidence, Fit] | None:
+        """The target anywhere in the mask, not too far from home: the pose that explains most of the first region it fits."""
+        information, best, most = self._home_information, None, (False, 0.0)
+        reach_px = self._reach * self._camera.fx / mask.scale / max(T_home[2, 3], contour.NEAR)
+        for window, pieces in detect.regions(mask, self._target.label_values, reach_px):
+            whole = self._gather(window, T_home, joints)
+            for piece in pieces:
+                T = self._best_start(self._gather(piece, T_home, joints), T_home)
+                if T is None:
+                    continue
+                seen = self._gather(window, T, joints, limb=T)
+                found = self._settled(seen, self._fit(seen, T, T_home, information), T_home, information)
+                away = rigid.pose_error(found.T_searched, T_home)
+                fits = found.overlap >= FITS and found.misfit < WRONG, self._overlap(whole, found.T_searched)
+                if away @ information @ away < HOME_GATE and fits > most:
+                    best, most = (seen, found), fits
+                if most > (True, FITS):
+                    return best
+            if most > (True, EXPLAINED):
+                break
+        return best
+
+    def _best_start(self, seen: Evidence, T_home: Array) -> Array | None:
+        """The pose that best explains the largest region of a mask."""
+        spread, information = self._target.home_spread, self._home_information
+
+        def score(share: float, T: Array) -> float:
+            angle = np.arccos(np.clip((np.sum(T[:3, :3] * T_home[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+            distance = np.linalg.norm(T[:3, 3] - T_home[:3, 3])
+            return share - HOME_WEIGHT * float(np.hypot(distance / spread.position, angle / spread.rotation))
+
+        def fitted(T: Array) -> tuple[float, Fit]:
+            found = self._fit(seen, T, T_home, information)
+            return score(found.overlap, found.T_searched), found
+
+        starts = detect.hypotheses(self._model, seen, T_home)
+        if not starts:
+            return None
+        ranked = sorted(starts, key=lambda T: -score(self._overlap(seen, T), T))
+        best = max((fitted(T) for T in ranked[:DETECT_FITS]), key=lambda pair: pair[0])
+        for T in detect.mirrored(best[1].T_searched):
+            best = max(best, fitted(T), key=lambda pair: pair[0])
+        return best[1].T_searched
+
+    def _fit(self, seen: Evidence, T_start: Array, T_prior: Array, prior: Array, converged: float = CONVERGED) -> Fit:
+        return fit(self._model, T_start, seen, T_prior, prior, self._noise, self._limits, converged)
+
+    def _overlap(self, seen: Evidence, T: Array) -> float:
+        h, w = seen.state.shape
+        both, free = evidence.compare(seen.state, self._model.silhouette(T, seen.intrinsics, (0, 0, w, h)))
+        return both / max(seen.seen_px + free, 1)
+
+    def _judge(
+        self, seen: Evidence, best: Fit, with_image: bool, T_prior: Array | None, prior_covariance: Array | None
+    ) -> Searched:
+        """The estimate of a fit; `with_image`: an image was there to confirm it; T_prior: T_camera_target as predicted, None
+        where nothing is known."""
+        fits = best.sharp if with_image else best.misfit < WRONG
+        expected, T_probable = False, best.T_searched
+        if T_prior is not None:
+            expected = self._is_expected(best, T_prior, prior_covariance)
+            if prior_covariance is not None:
+                information = np.asarray(np.linalg.inv(self._predicted(prior_covariance)[0]), np.float64)
+                T_probable = with_prior(best.T, best.covariance, T_prior, information)
+        amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
+        hidden = float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0))
+        explained = 1.0 - (best.both + best.free) / amodal  # covered, or outside the window
+        if hidden > (HIDDEN if expected else RECOGNISED) or best.length < (SHORTEST_PX if expected else RECOGNISED_PX):
+            state: State = "occluded" if explained > 0.5 else "lost"
+        else:
+            state = "tracking" if best.overlap >= (FITS_EXPECTED if expected and best.sharp else FITS) and fits else "lost"
+        if state == "tracking":
+            return self._estimate(best.T, best.covariance, best.overlap, hidden, state, T_probable)
+        return self._estimate(best.T_searched, self._limits.covariance, best.overlap, hidden, state, best.T_searched)
+
+    def _amodal_px(self, T: Array, k: Intrinsics) -> int:
+        """Pixels of the whole silhouette, whatever covers it and wherever the window ends."""
+        V = self._model.in_camera(T)
+        if V[:, 2].min() < contour.NEAR:
+            return 0
+        u, v = k.fx * V[:, 0] / V[:, 2] + k.cx, k.fy * V[:, 1] / V[:, 2] + k.cy
+        x0, y0 = int(np.floor(u.min())), int(np.floor(v.min()))
+        window = (x0, y0, min(int(np.ceil(u.max())) - x0 + 1, 4096), min(int(np.ceil(v.max())) - y0 + 1, 4096))
+        return int(np.count_nonzero(self._model.silhouette(T, k, window)))
+
+    def _paper(self, seen: Evidence, T_start: Array) -> Searched:
+        T, value = paper_search.ascend(self._model, T_start, seen.state == TARGET, seen.intrinsics)
+        hidden = float(np.clip(1.0 - seen.seen_px / max(self._amodal_px(T, seen.intrinsics), 1), 0.0, 1.0))
+        covariance = np.diag(np.repeat(np.square(PAPER_SIGMA), 3))
+        return self._estimate(T, covariance, (value + 1.0) / 2.0, hidden, "occluded" if hidden > HIDDEN else "tracking", T)
+
+    def _lost(self, T: Array) -> Searched:
+        return self._estimate(T, self._limits.covariance, 0.0, 1.0, "lost", T)
+
+    def _estimate(self, T: Array, covariance: Array, share: float, hidden: float, state: State, T_searched: Array) -> Searched:
+        T_world_camera = self._camera.T_world_camera
+        covariance = self._axes @ covariance @ self._axes.T
+        return Searched(T_world_camera @ T, (covariance + covariance.T) / 2.0, share, hidden, state, T_world_camera @ T_searched)

@@ -1,0 +1,30 @@
+"""The recurrent state that moves along with the window."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from services.segmentation.prednet import State
+from shared.perception.lookout import Window
+
+
+def shift_state(state: State, strides: Sequence[int], old: Window, new: Window) -> State:
+    """The recurrent state of `old` as that of `new` (same scale): what both see is kept, the rest has seen nothing (zero).
+
+    Raises ValueError where the windows are not a whole number of the coarsest layer's positions apart.
+    """
+    unit = max(strides) * old.scale
+    if old.scale != new.scale or (new.x0 - old.x0) % unit or (new.y0 - old.y0) % unit:
+        raise ValueError(f"windows of one scale, multiples of {unit} pixels apart, expected, {old} and {new} came")
+    out = []
+    for tensor, stride in zip(state, strides, strict=True):
+        dx, dy = ((new.x0 - old.x0) // (old.scale * stride), (new.y0 - old.y0) // (old.scale * stride))
+        height, width = new.height // stride, new.width // stride
+        moved = torch.zeros(*tensor.shape[:2], height, width, dtype=tensor.dtype).to(memory_format=torch.channels_last)
+        rows = slice(max(0, dy), max(max(0, dy), min(tensor.shape[2], height + dy)))
+        columns = slice(max(0, dx), max(max(0, dx), min(tensor.shape[3], width + dx)))
+        moved[:, :, rows.start - dy : rows.stop - dy, columns.start - dx : columns.stop - dx] = tensor[:, :, rows, columns]
+        out.append(moved)
+    return tuple(out)

@@ -1,0 +1,1 @@
+"""Makes the segmentation's weights again, and measures them."""

@@ -1,0 +1,162 @@
+"""How good masks are on labelled sequences, and the calibration of their size. Cards and `penumbra bench segmentation` alike."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from services.segmentation.inference import TARGET_LABELS, classes
+from services.segmentation.prednet import PredNet
+from shared.contract.labels import Label
+
+WARM_UP = 3
+"""Frames at the start of a sequence that do not count: the state knows nothing yet."""
+HIDDEN = (0.0, 0.33, 0.66, 0.95)
+"""Borders of the classes of hidden share in the score."""
+GOOD = 0.8
+"""Frames of this IoU and more calibrate the size: in others wholes are wrong, not contours."""
+FEWEST = 50
+"""Pixels of the target that a frame must show to count."""
+NEAR_PX = 6.0
+"""A boundary farther away than this belongs to something else: it is wrong, but not a contour's error."""
+OWN = (Label.BACKGROUND, Label.TORSO)
+"""Where one of these is the neighbour, the boundary is the target's own; anything else may be in front of it."""
+
+
+class Labelled(Protocol):
+    """A sequence: images (frames, h, w, 3) uint8, labels (frames, h, w) uint8, hidden: share of the target covered (frames,), NaN
+    where nobody knows."""
+
+    @property
+    def images(self) -> NDArray[np.uint8]: ...
+    @property
+    def labels(self) -> NDArray[np.uint8]: ...
+    @property
+    def hidden(self) -> NDArray[np.float64]: ...
+
+
+@dataclass(frozen=True)
+class FrameScore:
+    """A frame's mask of the target beside the truth, visible pixels: hidden share, IoU, masked over true area, and the boundary's
+    offsets [px] at the points of the true one, positive where the mask is too large."""
+
+    hidden: float
+    iou: float
+    area: float
+    offsets: NDArray[np.float64]
+
+
+def run(net: PredNet, images: NDArray[np.uint8]) -> Iterator[torch.Tensor]:
+    """Logits (classes, h, w) float32 of each frame of a sequence (frames, h, w, 3) uint8, from an empty state."""
+    state = net.initial_state(1, *images.shape[1:3])
+    dtype = net.head.weight.dtype
+    for image in images:
+        with torch.inference_mode():
+            picture = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(dtype) / 255.0
+            logits, _, state = net(picture, state)
+        yield logits[0].float()
+
+
+def calibrate(net: PredNet, data: Iterable[Labelled]) -> tuple[float, dict[str, Any]]:
+    """The offset of the target classes' logits that makes the median ratio of masked to true area 1, and the bias without it."""
+    offsets = np.linspace(-3.0, 3.0, 241)
+    target, other = list(TARGET_LABELS), [i for i in Label if i not in TARGET_LABELS]
+    ratios = []
+    for sequence in data:
+        for logits, labels in itertools.islice(zip(run(net, sequence.images), sequence.labels, strict=True), WARM_UP, None):
+            m = (logits[target].amax(0) - logits[other].amax(0)).numpy()
+            t = np.isin(labels, TARGET_LABELS)
+            if t.any() and ((m > 0) & t).sum() >= GOOD * ((m > 0) | t).sum():
+                ratios.append((m.size - np.searchsorted(np.sort(m.ravel()), -offsets, side="right")) / t.sum())
+    if not ratios:
+        return 0.0, {"area_bias_before": None, "frames": 0}
+    median = np.median(ratios, axis=0)
+    best = int(np.argmin(np.abs(median - 1.0)))
+    return round(float(offsets[best]), 3), {"area_bias_before": round(float(median[120] - 1.0), 4), "frames": len(ratios)}
+
+
+def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str, Any]:
+    """The card's score: `summary` by hidden share, and the IoU of every class."""
+    bias = torch.zeros(len(Label), 1, 1)
+    bias[list(TARGET_LABELS)] = offset
+    scores: list[FrameScore] = []
+    both, either = np.zeros(len(Label)), np.zeros(len(Label))
+    for sequence in data:
+        found = np.stack([classes(logits + bias) for logits in run(net, sequence.images)])[WARM_UP:]
+        labels = sequence.labels[WARM_UP:]
+        for label in Label:
+            both[label] += np.sum((found == label) & (labels == label))
+            either[label] += np.sum((found == label) | (labels == label))
+        scores += frame_scores(found, labels, sequence.hidden[WARM_UP:])
+    score: dict[str, Any] = {}
+    for (low, high), part in by_hidden(scores).items():
+        if part:
+            score[f"hidden {low:.0%} to {high:.0%}"] = summary(part)
+    if unknown := [s for s in scores if np.isnan(s.hidden)]:
+        score["hidden share unknown"] = summary(unknown)
+    score["iou_by_class"] = {i.name.lower(): round(float(both[i] / either[i]), 3) for i in Label if either[i]}
+    return score
+
+
+def frame_scores(found: NDArray[np.uint8], labels: NDArray[np.uint8], hidden: NDArray[np.float64]) -> Iterator[FrameScore]:
+    """Scores of frames of which at least FEWEST pixels of the target are visible: classes found and true (frames, h, w)."""
+    for mask, truth, share in zip(found, labels, hidden, strict=True):
+        f, t = np.isin(mask, TARGET_LABELS), np.isin(truth, TARGET_LABELS)
+        if t.sum() > FEWEST:
+            iou, area = (f & t).sum() / (f | t).sum(), f.sum() / t.sum()
+            yield FrameScore(float(share), float(iou), float(area), contour_offsets(f, truth))
+
+
+def contour_offsets(found: NDArray[np.bool_], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """How far [px] the boundary of a mask (h, w) lies outside the target's own boundary in the true classes (h, w), at every
+    edge between a pixel of the target and one that it hides.
+
+    What is measured is the published mask: the signed distance of the boundary between its pixels. A mask that is right has
+    offsets of zero; the truth too is made of whole pixels, so a boundary t off is one pixel off at a share t of the points.
+    Points with no boundary within NEAR_PX are left out.
+    """
+    target, own = np.isin(truth, TARGET_LABELS), np.isin(truth, OWN)
+    rows, columns = np.flatnonzero(target.any(1)), np.flatnonzero(target.any(0))
+    if not len(rows):
+        return np.empty(0)
+    room = int(NEAR_PX) + 2
+    box = (slice(max(rows[0] - room, 0), rows[-1] + room + 1), slice(max(columns[0] - room, 0), columns[-1] + room + 1))
+    found, target, own = found[box], target[box], own[box]
+    if found.all() or not found.any():
+        return np.empty(0)
+    inside, outside = distance_transform_edt(found), distance_transform_edt(~found)
+    depth = np.where(found, inside - 0.5, 0.5 - outside)  # of the pixels' middles below the mask's boundary
+    offsets = []
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        edges = (target[a] & own[b]) | (own[a] & target[b])
+        offsets.append(((depth[a] + depth[b]) / 2.0)[edges])
+    every = np.concatenate(offsets)
+    return every[np.abs(every) <= NEAR_PX]
+
+
+def by_hidden(scores: Iterable[FrameScore]) -> dict[tuple[float, float], list[FrameScore]]:
+    """Frames' scores by the class of hidden share, (from, to)."""
+    every = list(scores)
+    return {(low, high): [s for s in every if low <= s.hidden < high] for low, high in itertools.pairwise(HIDDEN)}
+
+
+def summary(scores: Sequence[FrameScore]) -> dict[str, Any]:
+    """What cards say of at least one frame's scores: IoU, area bias (relative), contour error [px]."""
+    iou, area = np.array([s.iou for s in scores]), np.array([s.area for s in scores])
+    offsets = np.concatenate([s.offsets for s in scores])
+    known = len(offsets) > 0
+    return {
+        "iou_median": round(float(np.median(iou)), 3),
+        "iou_mean": round(float(iou.mean()), 3),
+        "area_bias_median": round(float(np.median(area) - 1.0), 4),
+        "contour_mean_px": round(float(offsets.mean()), 3) if known else None,
+        "contour_rms_px": round(float(np.sqrt((offsets**2).mean())), 3) if known else None,
+        "frames": len(scores),
+    }

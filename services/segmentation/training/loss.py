@@ -1,0 +1,51 @@
+"""The training loss: sum of the layers' prediction errors + Dice + focal (section "PredNet Model"), and once more
+Dice of the target's classes as one, which is what the search looks at."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from services.segmentation.inference import TARGET_LABELS
+
+ERROR_WEIGHTS = (1.0, 0.1)
+"""Of the first layer's prediction error and of every other's, as in Lotter et al. 2017 (L_all): an upper layer can also lower its
+error by sending nothing, so it must not weigh as much as the picture's."""
+
+
+def dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
+    """1 - the mean over the classes present of 2 |P and T| / (|P| + |T|) (Milletari et al. 2016, doi:10.1109/3DV.2016.79).
+
+    logits (batch, classes, h, w), labels (batch, h, w) int64; counted over the whole batch. `smooth` [pixels] keeps a class of a
+    few pixels from weighing as much as a large one.
+    """
+    probability = logits.softmax(1)
+    truth = F.one_hot(labels, logits.shape[1]).movedim(-1, 1).to(probability.dtype)
+    both, sum_p, sum_t = ((probability * truth).sum((0, 2, 3)), probability.sum((0, 2, 3)), truth.sum((0, 2, 3)))
+    score = (2.0 * both + smooth) / (sum_p + sum_t + smooth)
+    present = sum_t > 0
+    return 1.0 - score[present].mean()
+
+
+def target_dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
+    """1 - the mean over the pictures that show the target of 2 |P and T| / (|P| + |T|), its classes taken as one: a picture of
+    which little is visible weighs as much as another. Shapes as for `dice`."""
+    target = list(TARGET_LABELS)
+    probability = logits.softmax(1)[:, target].sum(1)
+    truth = torch.isin(labels, torch.tensor(target)).to(probability.dtype)
+    both, sum_p, sum_t = ((probability * truth).sum((1, 2)), probability.sum((1, 2)), truth.sum((1, 2)))
+    score = (2.0 * both + smooth) / (sum_p + sum_t + smooth)
+    shown = sum_t > 0
+    return 1.0 - (score[shown].mean() if shown.any() else score.mean())
+
+
+def focal(logits: Tensor, labels: Tensor, gamma: float = 2.0) -> Tensor:
+    """Mean of -(1 - p)^gamma log p of the true class (Lin et al. 2017, doi:10.1109/ICCV.2017.324). Shapes as for `dice`."""
+    log_p = -F.cross_entropy(logits, labels, reduction="none")
+    return (-((1.0 - log_p.exp()) ** gamma) * log_p).mean()
+
+
+def prediction_error(missed: list[Tensor]) -> Tensor:
+    """The weighted sum of the layers' mean absolute prediction errors."""
+    return ERROR_WEIGHTS[0] * missed[0] + ERROR_WEIGHTS[1] * torch.stack(missed[1:]).sum()

@@ -1,0 +1,323 @@
+"""A user's own frames and masks to train on. The folder has one of these forms:
+
+  images/ and masks/   images/[SEQUENCE/]NAME.png and masks/[SEQUENCE/]NAME.png
+  pairs                [SEQUENCE/]NAME.png and [SEQUENCE/]NAME_mask.png
+  COCO                 one .json file with "images", "annotations" and "categories"; its file names are relative
+                       to the folder or to images/ in it; polygons or run lengths, later annotations over earlier ones
+
+Pictures may be JPEG or BMP as well. A mask is a PNG with one channel that holds a class for every pixel: 0 background, 1 robot,
+2 torso, 3 upper arm, 4 forearm, 5 hand, 6 occluder (`shared.contract.labels.Label`); in COCO, categories have these names. What
+is not labelled counts as background. The files of a subfolder are the frames of one sequence in the order of their names (as
+text: write 0001.png); pictures that lie in no subfolder are single ones, each a sequence that stands still. A tenth of the
+sequences, or of their pieces of 40 frames, is kept for the calibration, another for the score.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.contract.labels import Label
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
+PIECE = 40
+"""Frames of a longer sequence that are held out, or learned from, together."""
+SHORTEST = 8
+"""Frames of a sequence; a shorter one is played forth and back."""
+UNIT = 8
+"""Pictures are cut to multiples of this many pixels a side: what the network can take."""
+SMALLEST = 32
+"""Pixels a side that a picture has at least."""
+CLASSES = ", ".join(f"{label.value} {label.name.lower()}" for label in Label)
+
+
+class DataError(ValueError):
+    """A folder that cannot be learned from. The text says what was expected, what came and where."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A class and its outline in one picture: COCO's `segmentation`, polygons or run lengths."""
+
+    label: Label
+    outline: Any
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture's file and its truth: a mask's file or shapes."""
+
+    picture: Path
+    truth: Path | tuple[Shape, ...]
+
+    def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """RGB image (h, w, 3) and classes (h, w). Raises DataError where a file cannot be read or the two do not fit."""
+        image = cv2.imread(str(self.picture), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is None:
+            raise DataError(f"{self.picture}: a picture expected, this file cannot be read as one")
+        height, width = image.shape[:2]
+        if isinstance(self.truth, Path):
+            labels = read_mask(self.truth)
+        else:
+            try:
+                labels = paint(self.truth, height, width)
+            except (ValueError, TypeError) as error:
+                raise DataError(f"annotations of {self.picture}: polygons or run lengths expected: {error}") from None
+        if labels.shape != (height, width):
+            came = f"{labels.shape[1]} x {labels.shape[0]}"
+            raise DataError(f"{self.truth}: a mask of {width} x {height} as {self.picture.name} expected, {came} came")
+        return image[..., ::-1].astype(np.uint8), labels
+
+
+class Recorded:
+    """A sequence on disk that reads like an array (frames, h, w, 4) of red, green, blue and class, and is `evaluate.Labelled`."""
+
+    def __init__(self, frames: Sequence[Frame], size: tuple[int, int]):
+        self._frames = frames
+        self._height, self._width = (n // UNIT * UNIT for n in size)
+        there = len(frames)
+        forth_and_back = [*range(there), *range(there - 2, 0, -1)]
+        self._order = list(itertools.islice(itertools.cycle(forth_and_back), max(there, SHORTEST)))
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def __getitem__(self, chosen: slice) -> NDArray[np.uint8]:
+        read = {i: np.dstack(self._frames[i].read()) for i in set(self._order[chosen])}
+        return np.stack([read[i][: self._height, : self._width] for i in self._order[chosen]])
+
+    @property
+    def side(self) -> int:
+        """The largest patch that fits in."""
+        return min(self._height, self._width)
+
+    @property
+    def images(self) -> NDArray[np.uint8]:
+        return self[:][..., :3]
+
+    @property
+    def labels(self) -> NDArray[np.uint8]:
+        return self[:][..., 3]
+
+    @property
+    def hidden(self) -> NDArray[np.float64]:
+        return np.full(len(self), np.nan)
+
+
+class Recordings:
+    """All sequences of a folder, checked: to learn from (indexed), for the calibration and for the score (a tenth each).
+
+    Raises DataError or FileNotFoundError where there is nothing to learn from or something does not fit.
+    """
+
+    jitter = 0.4
+    """The authors' amount for photographs."""
+
+    def __init__(self, folder: Path, seed: int):
+        pieces = []
+        for sequence in find(folder):
+            size = check(sequence)
+            cuts = range(0, len(sequence), PIECE)
+            pieces += [Recorded(sequence[i : i + PIECE], size) for i in cuts]
+        if len(pieces) < 3:
+            raise DataError(
+                f"{folder}: at least 3 sequences, or pieces of {PIECE} frames of them, expected (to learn from, to calibrate and"
+                f" to score with), {len(pieces)} came"
+            )
+        order = np.random.default_rng([seed, 4]).permutation(len(pieces))
+        tenth = max(len(pieces) // 10, 1)
+        self.calibration = [pieces[i] for i in order[:tenth]]
+        self.held_out = [pieces[i] for i in order[tenth : 2 * tenth]]
+        self._train = [pieces[i] for i in order[2 * tenth :]]
+        self.side = min(piece.side for piece in pieces)
+        self.sources = ({"folder": folder.name, "sequences": tenth}, {"folder": folder.name, "sequences": len(self.held_out)})
+
+    def ensure(self, count: int) -> int:
+        """How many sequences may be used: all of them, at once."""
+        return len(self._train)
+
+    def __getitem__(self, index: int) -> Recorded:
+        return self._train[index]
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def find(folder: Path) -> list[list[Frame]]:
+    """The sequences of a folder by the forms that the module's text names, in the order of their names."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {folder}: one with frames and masks expected (see `penumbra segmentation train -h`)")
+    described = sorted(folder.glob("*.json"))
+    if len(described) > 1:
+        raise DataError(f"{folder}: one .json file in COCO's form expected, {', '.join(path.name for path in described)} came")
+    if described:
+        return in_sequences(folder, coco(described[0]))
+    if (folder / "images").is_dir() and (folder / "masks").is_dir():
+        pictures = {path.relative_to(folder / "images").with_suffix(""): path for path in _pictures(folder / "images")}
+        masks = {path.relative_to(folder / "masks").with_suffix(""): path for path in sorted((folder / "masks").rglob("*.png"))}
+        return in_sequences(folder / "images", _pairs(folder, pictures, masks))
+    every = _pictures(folder)
+    stem = lambda path: path.relative_to(folder).with_suffix("")  # noqa: E731
+    masks = {stem(path).with_name(path.stem.removesuffix("_mask")): path for path in every if path.stem.endswith("_mask")}
+    pictures = {stem(path): path for path in every if not path.stem.endswith("_mask")}
+    return in_sequences(folder, _pairs(folder, pictures, masks))
+
+
+def in_sequences(root: Path, frames: Iterable[Frame]) -> list[list[Frame]]:
+    """Frames of one subfolder of `root` together, those that lie in none alone."""
+    groups: dict[Path, list[Frame]] = {}
+    for frame in sorted(frames, key=lambda frame: frame.picture):
+        place = frame.picture.parent
+        alone = place == root or place == root / "images"
+        groups.setdefault(frame.picture if alone else place, []).append(frame)
+    return list(groups.values())
+
+
+def check(sequence: Sequence[Frame]) -> tuple[int, int]:
+    """Read every frame of a sequence; its height and width. Raises DataError."""
+    sizes: dict[tuple[int, ...], Path] = {}
+    for frame in sequence:
+        sizes.setdefault(frame.read()[1].shape, frame.picture)
+    if len(sizes) > 1:
+        (a, first), (b, other) = list(sizes.items())[:2]
+        raise DataError(
+            f"{other.parent}: frames of one size expected in a sequence, {first.name} has {a[1]} x {a[0]}, {other.name}"
+            f" {b[1]} x {b[0]}; put them into folders of their own"
+        )
+    height, width = next(iter(sizes))
+    if min(height, width) < SMALLEST:
+        raise DataError(f"{sequence[0].picture}: at least {SMALLEST} x {SMALLEST} pixels expected, {width} x {height} came")
+    return height, width
+
+
+def read_mask(path: Path) -> NDArray[np.uint8]:
+    """Classes (h, w) of a mask's file. Raises DataError where it is none, or a value is no class."""
+    mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if mask is None:
+        raise DataError(f"{path}: a mask expected, this file cannot be read as a picture")
+    if mask.ndim == 3:
+        if not (mask[..., :1] == mask[..., 1:3]).all():
+            raise DataError(f"{path}: one channel of class indices expected ({CLASSES}), colours or a palette came")
+        mask = mask[..., 0]
+    wrong = np.argwhere(mask > max(Label))
+    if len(wrong):
+        r, c = wrong[0]
+        raise DataError(f"{path}: classes {CLASSES} expected, {mask[r, c]} came at row {r}, column {c}")
+    return mask.astype(np.uint8)
+
+
+def coco(path: Path) -> list[Frame]:
+    """The frames of a file in COCO's form (https://cocodataset.org/#format-data). Raises DataError."""
+    try:
+        content = json.loads(path.read_text())
+        categories = {one["id"]: str(one["name"]) for one in content["categories"]}
+        files = {one["id"]: str(one["file_name"]) for one in content["images"]}
+        outlines = [(one["image_id"], one["category_id"], one["segmentation"]) for one in content["annotations"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f'{path}: COCO\'s form expected, an object with "images" (id, file_name), "annotations" (image_id, category_id,'
+            f' segmentation) and "categories" (id, name); {error!r} came'
+        ) from None
+    labels = {}
+    for key, name in categories.items():
+        label = Label.__members__.get(name.strip().upper().replace(" ", "_").replace("-", "_"))
+        if label is None:
+            known = ", ".join(label.name.lower() for label in Label)
+            raise DataError(f"{path}: categories named {known} expected, {name!r} came: rename or remove it")
+        labels[key] = label
+    shapes: dict[Any, list[Shape]] = {key: [] for key in files}
+    for image, category, outline in outlines:
+        if image not in files or category not in labels:
+            raise DataError(f"{path}: an annotation of image {image!r}, category {category!r}: one of the two is not in the file")
+        shapes[image].append(Shape(labels[category], outline))
+    frames = []
+    for key, name in files.items():
+        places = [path.parent / name, path.parent / "images" / name]
+        picture = next((place for place in places if place.is_file()), None)
+        if picture is None:
+            raise FileNotFoundError(f"{path}: image {name!r} expected at {places[0]} or {places[1]}, it is at neither")
+        frames.append(Frame(picture, tuple(shapes[key])))
+    return frames
+
+
+def paint(shapes: Sequence[Shape], height: int, width: int) -> NDArray[np.uint8]:
+    """Classes (h, w) of shapes, later ones over earlier ones."""
+    labels = np.full((height, width), Label.BACKGROUND, np.uint8)
+    for shape in shapes:
+        outline = shape.outline
+        if isinstance(outline, list):
+            for polygon in outline:
+                labels[fill(np.reshape(polygon, (-1, 2)).astype(float), height, width)] = shape.label
+        else:
+            labels[run_lengths(outline, height, width)] = shape.label
+    return labels
+
+
+def fill(polygon: NDArray[np.float64], height: int, width: int) -> NDArray[np.bool_]:
+    """The pixels (h, w) whose middle lies in a polygon (n, 2) of x, y in COCO's coordinates: pixel i reaches from i to i + 1."""
+    mask = np.zeros((height, width), bool)
+    x, y = polygon.T
+    x_next, y_next = np.roll(x, -1), np.roll(y, -1)
+    for row in range(max(int(y.min()), 0), min(int(np.ceil(y.max())), height)):
+        middle = row + 0.5
+        crosses = (y <= middle) != (y_next <= middle)
+        at = np.sort((x + (middle - y) * (x_next - x) / np.where(crosses, y_next - y, 1.0))[crosses])
+        for begin, end in at.reshape(-1, 2):
+            mask[row, max(int(np.ceil(begin - 0.5)), 0) : max(int(np.ceil(end - 0.5)), 0)] = True
+    return mask
+
+
+def run_lengths(outline: Any, height: int, width: int) -> NDArray[np.bool_]:
+    """The pixels (h, w) of COCO's run lengths, column by column: {"size": [h, w], "counts": a list, or packed in a string}."""
+    if not isinstance(outline, dict) or not {"size", "counts"} <= outline.keys():
+        raise DataError(f'{{"size": [h, w], "counts": …}} expected, {outline!r} came')
+    counts = outline["counts"]
+    counts = _unpack(counts) if isinstance(counts, str) else counts
+    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+    if tuple(outline["size"]) != (height, width) or len(flat) != height * width:
+        raise DataError(f"size {[height, width]} expected, {outline['size']} with {len(flat)} pixels came")
+    return flat.reshape(width, height).T
+
+
+def _unpack(text: str) -> list[int]:
+    """COCO's packed counts: five bits a character, lowest first; from the third on, the change to the one before the last."""
+    counts: list[int] = []
+    value = shift = 0
+    for character in text.encode():
+        bits = character - 48
+        value |= (bits & 31) << shift
+        shift += 5
+        if bits & 32:  # more follow
+            continue
+        if bits & 16:
+            value -= 1 << shift
+        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
+        value = shift = 0
+    return counts
+
+
+def _pictures(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURES)
+
+
+def _pairs(folder: Path, pictures: dict[Path, Path], masks: dict[Path, Path]) -> list[Frame]:
+    names = sorted(pictures.keys() & masks.keys())
+    if not names:
+        raise DataError(
+            f"{folder}: pairs NAME.png and NAME_mask.png, or images/NAME.png and masks/NAME.png, or a COCO .json expected;"
+            f" {len(pictures)} pictures and {len(masks)} masks came, no two of one name"
+        )
+    alone = sorted(pictures.keys() ^ masks.keys())
+    if alone:
+        kind = "mask" if alone[0] in pictures else "picture"
+        more = f" and {len(alone) - 1} more" if len(alone) > 1 else ""
+        raise DataError(f"{folder}: a {kind} for {alone[0]}{more} expected, there is none: add it or remove the other")
+    return [Frame(pictures[name], masks[name]) for name in names]

@@ -1,0 +1,339 @@
+"""Makes weights/ again: `penumbra segmentation train`; with --data, weights for a user's own frames and masks.
+
+Simulated sequences are rendered by a second process into a growing data set on disk while the network learns from those there.
+Step n takes its sequences, patches and colours from a generator seeded by (seed, n), and all schedules are functions of the
+progress, so that a run of --steps interrupted and resumed ends with the same weights as one that was not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from services.segmentation import inference, prednet
+from services.segmentation.prednet import PredNet, Settings
+from services.segmentation.training import loss, recordings
+from services.segmentation.training.evaluate import Labelled, calibrate, held_out
+from shared import training
+from sim.sets import sequences
+
+VALIDATION_SEED = 1_000_000
+"""Added to the seed for held-out data: nothing there was ever trained on."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How training goes. `peak_rate`: of Adam's one cycle; `frames`: that a step plays; `patches`: (from which progress on,
+    pixels a side, sequences a batch); `reuse`: how often a sequence is visited on average while the data set grows up to `most`
+    sequences; `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`:
+    of the weights that are exported; `seen`: (frames that the state has seen before those that are learned from, how often)."""
+
+    peak_rate: float = 3e-3
+    frames: int = 5
+    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.1, 128, 4), (0.4, 160, 3))
+    reuse: int = 4
+    most: int = 6000
+    error_weight: float = 0.3
+    focal_weight: float = 5.0
+    target_weight: float = 1.0
+    clip: float = 1.0
+    averaging: float = 0.995
+    seen: tuple[tuple[int, float], ...] = ((0, 0.4), (4, 0.3), (12, 0.2), (36, 0.1))
+
+    def rate(self, progress: float) -> float:
+        """The learning rate at a progress in [0, 1]."""
+        return self.peak_rate * training.one_cycle(progress, 0.15)
+
+    def before(self, rng: np.random.Generator) -> int:
+        """Frames that the state shall have seen, drawn from `seen`."""
+        counts, shares = zip(*self.seen, strict=True)
+        return int(rng.choice(counts, p=shares))
+
+    def patch(self, progress: float) -> tuple[int, int]:
+        """Pixels a side and sequences a batch at a progress."""
+        return next((size, batch) for start, size, batch in reversed(self.patches) if progress >= start)
+
+
+class Data(Protocol):
+    """Sequences to learn from, red, green, blue and class (frames, h, w, 4), and others for the calibration and the score.
+    jitter: how much their colours are changed; side: the largest patch [px] that fits in all; sources: what a card says of the
+    calibration's and the score's."""
+
+    jitter: float
+    side: int
+
+    @property
+    def sources(self) -> tuple[dict[str, Any], dict[str, Any]]: ...
+    @property
+    def calibration(self) -> Iterable[Labelled]: ...
+    @property
+    def held_out(self) -> Iterable[Labelled]: ...
+    def ensure(self, count: int) -> int:
+        """Wait until `count` sequences are there, or all; returns how many may be used."""
+
+    def __getitem__(self, index: int, /) -> Any: ...
+    def close(self) -> None:
+        """Make no more."""
+
+
+Render = Callable[[int, int], sequences.Sequence]
+
+
+class Simulated:
+    """Sequences rendered in order by a process of low priority, kept on disk. `each`: for the calibration, and for the score;
+    `render`: sequence of a seed and an index, a function that another process can import."""
+
+    jitter = 0.2
+    """Less than the authors' of photographs: our renderer varies the light itself."""
+    side = sequences.Variety.size
+
+    def __init__(self, folder: Path, seed: int, most: int, each: int = 60, render: Render = sequences.render):
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder, self._seed, self._most, self._each, self._render = folder, seed, most, each, render
+        self._asked = 0
+        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=os.nice, initargs=(10,))
+        self._pending: list[Future[None]] = []
+        self._arrays: list[NDArray[np.uint8]] = []
+
+    def ensure(self, count: int, ahead: int = 64) -> int:
+        """Wait until `count` sequences (at most `most`) are there, ask for some more; returns how many may be used."""
+        count = min(count, self._most)
+        for index in range(self._asked, min(count + ahead, self._most)):
+            self._pending.append(self._pool.submit(_render_to, self._path(index), self._render, self._seed, index))
+            self._asked = index + 1
+        while len(self._arrays) < count:
+            self._pending[len(self._arrays)].result()
+            self._arrays.append(np.load(self._path(len(self._arrays)), mmap_mode="r"))
+        return count
+
+    def __getitem__(self, index: int) -> NDArray[np.uint8]:
+        """Red, green, blue and class (frames, h, w, 4) of a sequence that is there."""
+        return self._arrays[index]
+
+    @property
+    def sources(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Seeds that nothing else is made of."""
+        return {"seed": VALIDATION_SEED + self._seed}, {"seed": VALIDATION_SEED + self._seed + 1}
+
+    @property
+    def calibration(self) -> Iterator[sequences.Sequence]:
+        """Sequences for the calibration, rendered as they are asked for."""
+        return (self._render(VALIDATION_SEED + self._seed, index) for index in range(self._each))
+
+    @property
+    def held_out(self) -> Iterator[sequences.Sequence]:
+        """Sequences for the score."""
+        return (self._render(VALIDATION_SEED + self._seed + 1, index) for index in range(self._each))
+
+    def close(self) -> None:
+        """Render no more."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _path(self, index: int) -> Path:
+        return self._folder / f"{self._seed}-{index:06d}.npy"
+
+
+def _render_to(path: Path, render: Render, seed: int, index: int) -> None:
+    if path.is_file():
+        return
+    sequence = render(seed, index)
+    part = path.with_suffix(".part.npy")
+    np.save(part, np.concatenate([sequence.images, sequence.labels[..., None]], axis=-1))
+    part.replace(path)  # a file is there wholly or not at all
+
+
+class Trainer(training.Trainer[PredNet, Data]):
+    """PredNet being trained."""
+
+    SETTINGS = Settings
+    schedule: Schedule
+
+    def __init__(self, settings: Settings, schedule: Schedule, seed: int):
+        torch.manual_seed(seed)
+        net = PredNet(settings)
+        super().__init__(settings, schedule, seed, net, torch.optim.Adam(net.parameters(), betas=(0.9, 0.98)))
+        self._half = inference.fastest_dtype() is torch.bfloat16
+
+    def train_step(self, data: Data, progress: float) -> dict[str, float]:
+        """One step of gradient descent; returns the parts of the loss."""
+        size, batch = self.schedule.patch(progress)
+        size = min(size, data.side)
+        rng = np.random.default_rng([self.seed, 1, self.step])
+        count = data.ensure(8 * batch + self.step * batch // self.schedule.reuse)
+        images, labels = draw_batch(
+            [data[i] for i in rng.integers(count, size=batch)], self.schedule.frames, size, rng, data.jitter
+        )
+        with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
+            parts = self._losses(images, labels, self.schedule.before(rng))
+        schedule = self.schedule
+        weights = {"focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
+        total = parts["dice"] + sum(weight * parts[name] for name, weight in weights.items())
+        self.descend(total, schedule.rate(progress), schedule.clip, schedule.averaging)
+        return {name: float(value.detach()) for name, value in parts.items()} | {"total": float(total.detach())}
+
+    def _losses(self, images: torch.Tensor, labels: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
+        """images (batch, frames, 3, h, w) in [0, 1], labels (batch, frames, h, w). `before`: frames played without learning,
+        forth and back through the sequence, so that the network is also trained with a state that has seen much. Without it
+        masks decay within seconds of use."""
+        frames = images.shape[1]
+        state = self.net.initial_state(images.shape[0], *images.shape[-2:])
+        with torch.no_grad():
+            for n in range(before, 0, -1):  # the last one played is the second frame, from which the first is one step
+                turn, t = divmod(n, frames - 1)
+                _, _, state = self.net(images[:, t if turn % 2 == 0 else frames - 1 - t], state)
+        logits, errors = [], []
+        for t in range(frames):
+            out, missed, state = self.net(images[:, t], state)
+            logits.append(out.float())
+            if t > 0 or before:  # nothing can be predicted from nothing
+                errors.append(loss.prediction_error([m.float() for m in missed]))
+        all_logits, all_labels = torch.cat(logits), labels.transpose(0, 1).flatten(0, 1)
+        return {
+            "dice": loss.dice(all_logits, all_labels),
+            "focal": loss.focal(all_logits, all_labels),
+            "target": loss.target_dice(all_logits, all_labels),
+            "error": torch.stack(errors).mean(),
+        }
+
+    @classmethod
+    def begin(cls, path: Path, schedule: Schedule, seed: int) -> Trainer:
+        """A trainer that starts from weights with a card; the card it writes tells of them."""
+        net, card = prednet.load(path)
+        trainer = cls(net.settings, schedule, seed)
+        trainer.net.load_state_dict(net.state_dict())
+        trainer.average.load_state_dict(net.state_dict())
+        trainer.started_from = {key: card[key] for key in ("seed", "date", "started_from") if key in card}
+        trainer.started_from |= {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
+        return trainer
+
+
+def draw_batch(
+    chosen: Iterable[Any], frames: int, size: int, rng: np.random.Generator, amount: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Patches of so many frames of sequences (n, h, w, 4): images (batch, frames, 3, size, size) in [0, 1] and labels
+    (batch, frames, size, size). Three of five lie around a pixel of the target; mirrored, played backwards and coloured anew at
+    random, by `amount`.
+    """
+    images, labels = [], []
+    for sequence in chosen:
+        start = rng.integers(0, len(sequence) - frames + 1)
+        sequence = sequence[start : start + frames]
+        height, width = sequence.shape[1:3]
+        middle = rng.integers(0, [height, width])
+        if rng.random() < 0.6:
+            target = np.argwhere(np.isin(sequence[rng.integers(len(sequence)), ..., 3], inference.TARGET_LABELS))
+            if len(target):
+                middle = target[rng.integers(len(target))] + rng.integers(-size // 3, size // 3 + 1, size=2)
+        y, x = np.clip(middle - size // 2, 0, [height - size, width - size])
+        patch = sequence[:, y : y + size, x : x + size]
+        if rng.random() < 0.5:
+            patch = patch[:, :, ::-1]
+        if rng.random() < 0.5:
+            patch = patch[::-1]
+        picture = jitter(patch[..., :3].astype(np.float32) / 255.0, rng, amount)
+        images.append(torch.from_numpy(picture).movedim(-1, 1))
+        labels.append(torch.from_numpy(patch[..., 3].astype(np.int64)))
+    return torch.stack(images), torch.stack(labels)
+
+
+def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float) -> NDArray[np.float32]:
+    """Brightness, contrast, saturation and tint of a picture (..., 3) in [0, 1], changed at random by up to `amount`."""
+    brightness, contrast, saturation = 1.0 + amount * rng.uniform(-1.0, 1.0, 3)
+    tint = 1.0 + 0.25 * amount * rng.uniform(-1.0, 1.0, 3)
+    grey = picture.mean(axis=-1, keepdims=True)
+    picture = grey + saturation * (picture - grey)
+    mean = picture.mean()
+    return np.clip((mean + contrast * (picture - mean)) * brightness * tint, 0.0, 1.0, dtype=np.float32)
+
+
+def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
+    """Calibrate and score the averaged weights on held-out sequences, write them with their card; returns the card."""
+    offset, calibrated = calibrate(trainer.average, data.calibration)
+    card = {
+        "seed": trainer.seed,
+        "date": datetime.date.today().isoformat(),
+        "settings": {
+            "schedule": asdict(trainer.schedule),
+            "steps": trainer.step,
+            "minutes": round(trainer.minutes, 1),
+        },
+        **({"started_from": trainer.started_from} if trainer.started_from else {}),
+        "parameters": sum(p.numel() for p in trainer.net.parameters()),
+        "calibration": {**data.sources[0], "target_logit_offset": offset, **calibrated},
+        "held_out": {**data.sources[1], **held_out(trainer.average, offset, data.held_out)},
+    }
+    out.parent.mkdir(parents=True, exist_ok=True)
+    prednet.save(out, trainer.average, card)
+    return card
+
+
+def arguments() -> argparse.ArgumentParser:
+    """The flags of `penumbra segmentation train`."""
+    parser = argparse.ArgumentParser(
+        prog="penumbra segmentation train",
+        description="Train the segmentation network on simulated sequences, or on your own frames and masks.",
+        epilog=recordings.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    training.add_arguments(parser, "segmentation", 60.0)
+    parser.add_argument("--size", type=int, nargs="+", help="channels of each layer (default: 16 16 32 64)")
+    parser.add_argument("--delay", action=argparse.BooleanOptionalAction, default=False, help="axonal delays between the layers")
+    parser.add_argument("--cell", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations")
+    parser.add_argument("--error-weight", type=float, help="of the prediction errors in the loss (default: 0.3; 0: without)")
+    parser.add_argument(
+        "--start",
+        type=Path,
+        nargs="?",
+        const=inference.WEIGHTS,
+        help="start from these weights (without a value: the committed ones), of their size, instead of random ones",
+    )
+    parser.add_argument("--data", type=Path, help="your own frames and masks, in the forms below, instead of simulated sequences")
+    parser.add_argument("--cache", type=Path, default=Path("segmentation-data"), help="folder of rendered sequences (some GB)")
+    parser.add_argument(
+        "--out", type=Path, help="the weights, their card beside them (default: the committed ones; with --data segmentation.npz)"
+    )
+    parser.add_argument("--held-out", type=int, default=60, help="simulated sequences for calibration, and as many for the score")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Train, then write weights and card."""
+    options = arguments().parse_args(argv)
+    schedule = Schedule()
+    if options.error_weight is not None:
+        schedule = replace(schedule, error_weight=options.error_weight)
+    if options.resume and options.checkpoint.is_file():
+        trainer = Trainer.restore(options.checkpoint, schedule)
+    elif options.start:
+        trainer = Trainer.begin(options.start, schedule, options.seed)
+    else:
+        channels = tuple(options.size or Settings.channels)
+        kernels = (*(3 for _ in channels[:-2]), 5, 5)
+        trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.cell), schedule, options.seed)
+    try:
+        data: Data = (
+            recordings.Recordings(options.data, trainer.seed)
+            if options.data
+            else Simulated(options.cache, trainer.seed, schedule.most, options.held_out)
+        )
+    except recordings.DataError as error:
+        print(f"penumbra segmentation train: {error}", file=sys.stderr)
+        return 2
+    out = options.out or (Path("segmentation.npz") if options.data else inference.WEIGHTS)
+    if not training.complete(trainer, data, options):
+        return 130
+    card = export(trainer, out, data)
+    print(f"{out}: {card['held_out']}")
+    return 0

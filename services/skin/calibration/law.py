@@ -1,0 +1,258 @@
+"""The paper's response law fitted to what one electrode read at known gaps: v = a3 + polarity * a1 / (1 + a2 d^2).
+
+Close in the law itself and the placing of the limb are what is wrong, far out the noise is. A fit in volts sees only the first
+and hides errors of 30 % at 15 cm; a fit of logarithms sees noise as signal there. So every gap weighs by all three: the standard
+error of its mean [V], a share of the signal that the law cannot say (LAW_ERROR), and the slope times the placing's error. The
+loss is robust (soft L1, Triggs et al. 2000, doi:10.1007/3-540-44480-7_21): one gap that was held wrongly counts little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from shared.cell import description as cells
+
+Array = NDArray[np.float64]
+
+LAW_ERROR = 0.04
+"""What the law is wrong by, as a share of the signal: that of the field model's responses around it, 1 to 20 cm."""
+PLACING = 5e-4
+"""Standard deviation [m] of a gap that a robot or a rig holds; by hand it is more."""
+SHAPE_SPREAD = 0.2
+"""How far log a2 may lie from the designed one: it belongs to the board's and the limb's shapes. Where the nearest gap leaves a1
+and a2 open (beyond 2 cm only their ratio is seen), this decides."""
+SNR_DB = 1.0
+"""The paper's end of the range (section "Sensor Model")."""
+FEWEST = 4
+"""Gaps, an empty scene among them: three parameters and one to check them by."""
+SAME_GAP = 1e-4
+CLIPPED = 0.1
+"""Share of the samples at an end of the converter above which a gap is left out."""
+SURE = 6.0
+"""Standard errors of a difference that is believed."""
+MIXED = 0.25
+"""Share of the way there that the signal may go back with the gap before its polarity is unclear."""
+
+
+class InputError(ValueError):
+    """Readings that no law can be fitted to; the text says what was expected, what came and what to do."""
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What an electrode read at k gaps, rising: gap (k,) [m], infinite where nothing was near; mean (k,) [V] and its standard
+    error (k,); noise [V^2], the variance of one sample, or None where too few samples say; notes: what was left out."""
+
+    gap: Array
+    mean: Array
+    error: Array
+    noise: float | None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted law. deviation (3,): standard deviations of log a1, log a2 and a3 [V]; covariance (3, 3): of the same; residual
+    (k,): what was read less the law, in standard deviations of all three errors; gain: the signal as a share of the designed
+    law's, over the gaps that were read (a1 alone trades with a2 and says less)."""
+
+    law: cells.Law
+    covariance: Array
+    residual: Array
+    gain: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def deviation(self) -> Array:
+        return np.sqrt(np.diag(self.covariance))
+
+
+def signal(law: cells.Law | cells.Nominal, gap: ArrayLike) -> Array:
+    """What something at gaps [m] adds to the amplitude [V], without its sign; nothing at an infinite gap."""
+    return law.a1 / (1.0 + law.a2 * np.asarray(gap, np.float64) ** 2)
+
+
+def snr_db(law: cells.Law, gap: ArrayLike) -> Array:
+    """Signal-to-noise ratio [dB] of one sample at gaps [m] (paper, section "Sensor Model"): 10 log10(v^2 / (2 sigma^2))."""
+    return 10.0 * np.log10(signal(law, gap) ** 2 / (2.0 * law.noise))
+
+
+def reach(law: cells.Law, snr: float = SNR_DB) -> float:
+    """The gap [m] at which the ratio sinks to `snr` [dB]; zero where it never reaches that."""
+    least = np.sqrt(2.0 * law.noise * 10.0 ** (snr / 10.0))
+    return float(np.sqrt(max(law.a1 / least - 1.0, 0.0) / law.a2))
+
+
+def white_noise(volts: Array) -> float:
+    """Variance [V^2] of one sample from differences of successive ones (von Neumann 1941, doi:10.1214/aoms/1177731677): a limb
+    that sways or an offset that drifts does not count. Single spikes are left out. volts (s,), s >= 3."""
+    steps = np.diff(volts)
+    typical = 1.4826 * np.median(np.abs(steps))
+    kept = steps[np.abs(steps) <= 5.0 * typical] if typical > 0.0 else steps
+    return float(np.mean(kept**2) / 2.0)
+
+
+def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str) -> Readings:
+    """The samples of an electrode, brought together by gap.
+
+    gaps (s,) [m], infinite for an empty scene; volts (s,) in the order of time, NaN where a sample is missing; full_scale, lsb
+    [V]: the converter's. Raises InputError where too little is left.
+    """
+    notes = []
+    missing = ~np.isfinite(volts)
+    if missing.any():
+        notes.append(f"{missing.sum()} of {len(volts)} samples are missing or not a number: left out")
+    if 2 * missing.sum() > len(volts):
+        raise InputError(f"electrode {name}: {missing.sum()} of {len(volts)} samples are not numbers: record them again")
+    gaps, volts = gaps[~missing], volts[~missing]
+    rows: list[tuple[float, float, float]] = []
+    variances = []
+    clipped = []
+    for gap in _distinct(gaps):
+        own = volts[(gaps == gap) | (np.abs(gaps - gap) <= SAME_GAP)] if np.isfinite(gap) else volts[np.isinf(gaps)]
+        if np.mean((own >= full_scale - lsb / 2.0) | (own <= lsb / 2.0)) > CLIPPED:
+            clipped.append(gap)
+            continue
+        if len(own) >= 10:
+            variances.append((white_noise(own), len(own)))
+        rows.append((gap, *_mean(own, lsb)))
+    if clipped:
+        where = ", ".join(map(_gap, clipped))
+        notes.append(f"saturated at {where} (an amplitude of 0 or from {full_scale:.3g} V on): left out")
+    if len(rows) < FEWEST:
+        why = f"; {notes[-1]}" if clipped else ""
+        raise InputError(
+            f"electrode {name}: at least {FEWEST} gaps expected (the empty scene may be one), {len(rows)} came{why}: record "
+            "more, from 1 to 20 cm" + (", and turn the amplifier down" if clipped else "")
+        )
+    gap_, mean, error = (np.array(column) for column in zip(*rows, strict=True))
+    noise = _pooled(np.array(variances)) if variances else None
+    return Readings(gap_, mean, error, noise, tuple(notes))
+
+
+def fit(read: Readings, nominal: cells.Law, name: str, placing: float = PLACING) -> Fit:
+    """The law that an electrode follows.
+
+    nominal: its law as designed (the start, and for a2 a weak prior); placing [m]: standard deviation of the gaps.
+    Raises InputError where the readings have no contrast, mixed polarity or too short a range.
+    """
+    notes = list(read.notes)
+    near = np.isfinite(read.gap)
+    if near.sum() < FEWEST - 1 or read.gap[near].max() < 2.0 * max(read.gap[near].min(), SAME_GAP):
+        raise InputError(
+            f"electrode {name}: gaps expected of which the farthest is at least twice the nearest, "
+            f"{', '.join(map(_gap, read.gap[near])) or 'none'} came: record from 1 to 20 cm"
+        )
+    polarity = _polarity(read, name)
+    if read.noise is None:
+        notes.append("fewer than 10 samples at every gap: the noise stays as designed")
+    noise = nominal.noise if read.noise is None else read.noise
+    if noise == 0.0:
+        raise InputError(f"electrode {name}: no noise at all in its samples: record raw samples, not means or a simulation's")
+    prior = np.log(nominal.a2)
+    x = _start(read, polarity, prior)
+
+    def parts(x: Array) -> tuple[Array, Array]:
+        """Signal, and its derivative by the gap over it."""
+        d = np.where(near, read.gap, 0.0)
+        fall = 1.0 + np.exp(x[1]) * d**2
+        return np.where(near, np.exp(x[0]) / fall, 0.0), 2.0 * np.exp(x[1]) * d / fall
+
+    def standard(x: Array, deviation: Array) -> Array:
+        s = parts(x)[0]
+        return np.append((read.mean - x[2] - polarity * s) / deviation, (x[1] - prior) / SHAPE_SPREAD)
+
+    for _ in range(20):  # the errors are shares of the signal, so they follow it
+        s, slope = parts(x)
+        deviation = np.sqrt(read.error**2 + s**2 * (LAW_ERROR**2 + (slope * placing) ** 2))
+        found = least_squares(standard, x, args=(deviation,), loss="soft_l1", x_scale=(1.0, 1.0, 0.01))
+        moved, x = np.abs(found.x - x).max(), found.x
+        if moved < 1e-7:
+            break
+    residual = standard(x, deviation)[:-1]
+    excess = max(1.0, float(2.0 * found.cost) / max(len(residual) - 3, 1))
+    if x[2] < 0.0:
+        raise InputError(f"electrode {name}: the fit's offset a3 is {x[2]:.3g} V, an amplitude is never below 0: check the gaps")
+    law = cells.Law(a1=float(np.exp(x[0])), a2=float(np.exp(x[1])), a3=float(x[2]), polarity=polarity, noise=noise)
+    gain = float(np.exp(np.mean(np.log(signal(law, read.gap[near]) / signal(nominal, read.gap[near])))))
+    for gap, r in zip(read.gap, residual, strict=True):
+        if abs(r) > 4.0:
+            notes.append(f"{_gap(gap)} lies {abs(r):.0f} standard deviations {'above' if r > 0 else 'below'} the law")
+    return Fit(law, np.linalg.inv(found.jac.T @ found.jac) * excess, residual, gain, tuple(notes))
+
+
+def _distinct(gaps: Array) -> list[float]:
+    """Gaps that differ by more than SAME_GAP, rising."""
+    out: list[float] = []
+    for gap in np.unique(gaps):
+        if not out or gap - out[-1] > SAME_GAP:
+            out.append(float(gap))
+    return out
+
+
+def _mean(volts: Array, lsb: float) -> tuple[float, float]:
+    """Mean without spikes, and its standard error: that of white noise, or of the means of ten stretches where the noise is not
+    white, and at least what rounding may leave of a signal without noise."""
+    middle = np.median(volts)
+    spread = max(1.4826 * float(np.median(np.abs(volts - middle))), lsb)
+    kept = volts[np.abs(volts - middle) <= 6.0 * spread]
+    error = spread / np.sqrt(len(kept))
+    if len(kept) >= 40:
+        stretches = [stretch.mean() for stretch in np.array_split(kept, 10)]
+        error = max(error, float(np.std(stretches, ddof=1)) / np.sqrt(10.0))
+    return float(kept.mean()), float(np.hypot(error, 0.05 * lsb))
+
+
+def _pooled(variances: Array) -> float:
+    """One variance from those of k gaps, (k, 2) with their numbers of samples; gaps with twice the usual one are left out."""
+    kept = variances[variances[:, 0] <= 2.0 * np.median(variances[:, 0])]
+    return float(np.average(kept[:, 0], weights=kept[:, 1]))
+
+
+def _polarity(read: Readings, name: str) -> Literal[-1, 1]:
+    """1 where the amplitude rises as something comes near, -1 where it falls."""
+    low, high = int(np.argmin(read.mean)), int(np.argmax(read.mean))
+    span = read.mean[high] - read.mean[low]
+    if span < SURE * np.hypot(read.error[low], read.error[high]):
+        raise InputError(
+            f"electrode {name}: no contrast: it reads {read.mean.mean():.4f} V at every gap, within {1e3 * span:.2g} mV: "
+            "is it connected, and was the limb above this pad?"
+        )
+    steps = np.diff(read.mean)
+    sure = np.abs(steps) > SURE * np.hypot(read.error[1:], read.error[:-1])
+    falls, rises = -steps[sure & (steps < 0)].sum(), steps[sure & (steps > 0)].sum()
+    if min(falls, rises) > MIXED * max(falls, rises):
+        way = steps < 0 if falls < rises else steps > 0
+        odd = int(np.argmax(np.where(sure & way, np.abs(steps), 0.0)))
+        raise InputError(
+            f"electrode {name}: mixed polarity: with the gap its amplitude rises by {1e3 * rises:.3g} mV and falls by "
+            f"{1e3 * falls:.3g} mV, the other way from {_gap(read.gap[odd])} to {_gap(read.gap[odd + 1])}: "
+            "were gaps mixed up, or was something else near?"
+        )
+    return 1 if falls > rises or (falls == rises and low > high) else -1
+
+
+def _start(read: Readings, polarity: int, prior: float) -> Array:
+    """The best of many a2, with a1 and a3 by linear least squares: (log a1, log a2, a3)."""
+    best: tuple[float, Array] | None = None
+    near = np.isfinite(read.gap)
+    for log_a2 in prior + np.linspace(-3.0, 3.0, 25):
+        shape = np.where(near, 1.0 / (1.0 + np.exp(log_a2) * np.where(near, read.gap, 0.0) ** 2), 0.0)
+        weight = 1.0 / np.hypot(read.error, LAW_ERROR * shape * np.ptp(read.mean) / np.ptp(shape))
+        design = np.stack([polarity * shape, np.ones_like(shape)], axis=1) * weight[:, None]
+        (a1, a3), *_ = np.linalg.lstsq(design, read.mean * weight, rcond=None)
+        cost = float(np.sum((design @ (a1, a3) - read.mean * weight) ** 2))
+        if a1 > 0.0 and (best is None or cost < best[0]):
+            best = (cost, np.array([np.log(a1), log_a2, a3]))
+    if best is None:  # steps against the polarity outweigh: the robust fit starts from the design
+        return np.array([np.log(np.ptp(read.mean)), prior, read.mean[-1]])
+    return best[1]
+
+
+def _gap(gap: float) -> str:
+    return f"{100 * gap:.3g} cm" if np.isfinite(gap) else "the empty scene"

@@ -1,0 +1,390 @@
+"""`penumbra skin model`: fits the networks of `shared.skin.response` to the boundary-element field of a cell's pads.
+
+For every mounting of a cell (a pad type, and for a backed pad its robot link) the field is solved for limbs of random size at
+random poses, from contact to where nothing is felt, and a network learns the logarithms. Mountings that already have a network
+are left alone. The network of a bare pad is learned from nothing; for a pad before a link only what is missing to the bare one,
+which needs fewer poses.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+
+import numpy as np
+import torch
+from rich.progress import Progress
+from scipy.linalg import block_diag
+from scipy.spatial import ConvexHull
+
+from services import flags
+from shared.body.anatomy import Mesh, target_mesh
+from shared.body.robot import robot_models
+from shared.cell import description as cells
+from shared.geometry import rigid
+from shared.geometry.surface import Surface
+from shared.skin.response import FEATURES, FOLDER, Network, Rest, features, fingerprint, networks, save
+from sim.skin.field import Body, PadField, Panels, limb, shell
+
+Array = np.ndarray
+
+POSES, POSES_BACKED = 45_000, 3_000
+"""Fields solved for a bare pad, and for one more mounting."""
+POSTURES = 80
+"""Of the robot, for what its other links change at a pad …"""
+LINK_PANELS = (8, 8)
+"""… each in so many rows and columns of panels …"""
+JOINED = 0.005
+"""… without what lies in the pad's own link or nearer to it than this [m]."""
+LIMBS = 32
+"""Sizes of limbs: each must be prepared, so poses share them."""
+LENGTH, GIRTH = (-0.12, 0.10), (-0.31, 0.15)
+"""Bounds of the log factors: from the 5th percentile of women to the 95th of men (ANSUR II), and a little beyond."""
+GAPS = (0.004, 0.04, 0.12, 0.5)
+"""A third of the limbs is within the first two gaps [m] of the pad, a third within the first and the third, and so on."""
+CLEAR = 0.003
+"""No limb comes nearer [m] to the board or the link."""
+BEHIND = -0.15
+"""A limb may be as far behind the pad's plane as this cosine of its direction."""
+TILT = 0.6
+"""Largest angle [rad] between the limb's axis and the plane across the direction in which it is."""
+OVERHANG = 0.05
+"""How far [m] beside the limb's ends a pad may be."""
+PIECES = (40, 18)
+"""Rows and columns of the limb's pieces."""
+HIDDEN, HIDDEN_BACKED = 128, 32
+STEPS, STEPS_BACKED, BATCH = 250_000, 10_000, 512
+NEAR_GAP = 0.05
+"""Nearer [m] the networks err more."""
+FAINTEST = 1e-5
+"""Changes below this [fF] are numerical errors: a limb behind the link."""
+HELD_OUT_SEED = 1_000_003
+BANDS = (0.005, 0.015, 0.03, 0.06, 0.12, 0.17, 0.25, 0.5)
+"""Gaps [m] between which errors are reported apart."""
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """What a network is fitted for: a pad that has it, name of its file, its fingerprint and that of the same pad without
+    a link, the pad type and the link behind it."""
+
+    pad: str
+    name: str
+    fingerprint: str
+    bare: str
+    kind: cells.PadType
+    backing: Panels | None
+
+
+def mountings(cell: cells.Cell, target: str) -> list[Mounting]:
+    """The different mountings of a cell's pads, those without a link first."""
+    out: dict[str, Mounting] = {}
+    models = robot_models(cell) if any(pad.backed for pad in cell.pads.values()) else {}
+    for name, pad in sorted(cell.pads.items(), key=lambda item: item[1].backed):
+        own = fingerprint(cell, name, target)
+        if own in out:
+            continue
+        backing, label = None, f"{pad.type}-{target}"
+        if pad.backed:
+            robot, _, link = pad.link.partition("/")
+            mesh = models[robot].meshes[link]
+            backing, label = (
+                shell(rigid.apply(rigid.inverse(pad.T_link_pad), mesh.vertices)),
+                f"{cell.name}-{name}-{target}",
+            )
+        out[own] = Mounting(name, label, own, fingerprint(cell, name, target, bare=True), cell.pad_types[pad.type], backing)
+    return list(out.values())
+
+
+class Poses:
+    """Random limbs before a pad: where they are, how they lie, how large they are; none that touches the board or the link."""
+
+    def __init__(self, mesh: Mesh, backing: Panels | None, seed: int):
+        self.rng = np.random.default_rng([seed, 41])
+        self.surface = Surface(mesh.vertices, mesh.faces)
+        self.ends = float(mesh.vertices[:, 0].min()), float(mesh.vertices[:, 0].max())
+        xs, ys = np.meshgrid(np.linspace(-0.0305, 0.0305, 7), np.linspace(-0.03, 0.03, 7))
+        board = np.column_stack([xs.ravel(), ys.ravel(), np.zeros(xs.size)])
+        self.solid = board if backing is None else np.concatenate([board, backing.centroids])
+        sizes = np.random.default_rng([seed, 42]).permuted(np.tile((np.arange(LIMBS) + 0.5) / LIMBS, (2, 1)), axis=1).T
+        self.sizes = np.array([LENGTH[0], GIRTH[0]]) + sizes * (LENGTH[1] - LENGTH[0], GIRTH[1] - GIRTH[0])
+
+    def draw(self, gap: float | None = None) -> tuple[Array, int, float]:
+        """T_pad_limb (4, 4), the number of the limb, and its gap [m]: this one within 2 %, or any."""
+        rng = self.rng
+        while True:
+            which = int(rng.integers(LIMBS))
+            factors = np.exp(self.sizes[which][[0, 1, 1]])
+            up = BEHIND + (1.0 - BEHIND) * rng.uniform() ** 0.6
+            turn = rng.uniform(0, 2 * np.pi)
+            toward = np.array([*(np.sqrt(1 - up * up) * np.array([np.cos(turn), np.sin(turn)])), up])
+            x = np.cross(toward, rng.standard_normal(3))
+            x = x / np.linalg.norm(x) + np.tan(rng.uniform(-TILT, TILT)) * toward
+            x /= np.linalg.norm(x)
+            y = np.cross(rng.standard_normal(3), x)
+            y /= np.linalg.norm(y)
+            R = np.column_stack([x, y, np.cross(x, y)])
+            along = rng.uniform(self.ends[0] - OVERHANG, self.ends[1] + OVERHANG) * factors[0]
+            # slide it away along `toward` until the pad's middle has the wanted gap
+            wanted = gap or float(np.exp(rng.uniform(np.log(GAPS[0]), np.log(GAPS[rng.integers(1, 4)]))))
+            far = wanted + 0.05
+            for _ in range(12):
+                t = toward * far - along * x
+                short = wanted - self._gap(np.zeros((1, 3)), R, t, factors)
+                if abs(short) < 0.02 * wanted:
+                    break
+                far += short
+            if far > 0.0 and abs(short) < 0.02 * wanted and self._gap(self.solid, R, t, factors) > CLEAR:
+                T = np.eye(4)
+                T[:3, :3], T[:3, 3] = R, t
+                return T, which, wanted - short
+
+    def _gap(self, points: Array, R: Array, t: Array, factors: Array) -> float:
+        """About the distance [m] of points (n, 3) to the limb: exact in the mesh's own size."""
+        local = (points - t) @ R
+        distance, nearest, _ = self.surface.nearest(local / factors)
+        return float((np.sign(distance) * np.linalg.norm(nearest * factors - local, axis=1)).min())
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Fields: poses (n, 4, 4) of the limb in the pad's frame, its sizes (n, 2) and gaps (n,) [m], changes (n, e) [fF]."""
+
+    T: Array
+    size: Array
+    gap: Array
+    change: Array
+
+
+def solve(
+    mounting: Mounting,
+    mesh: Mesh,
+    count: int,
+    seed: int,
+    progress: Progress | None = None,
+    gaps: Sequence[float] = (),
+    limbs: dict[tuple[float, ...], Body] | None = None,
+) -> Solved:
+    """So many random fields, at these gaps [m] in turn or at all. limbs: those prepared so far, by size: preparing takes time."""
+    field, poses = PadField(mounting.kind, mounting.backing), Poses(mesh, mounting.backing, seed)
+    limbs = {} if limbs is None else limbs
+    T, size, gap = np.empty((count, 4, 4)), np.empty((count, 2)), np.empty(count)
+    change = np.empty((count, len(mounting.kind.electrodes)))
+    task = progress.add_task(f"{mounting.name}: fields", total=count) if progress else None
+    for k in range(count):
+        T[k], which, gap[k] = poses.draw(gaps[k % len(gaps)] if gaps else None)
+        size[k] = poses.sizes[which]
+        key = tuple(size[k].tolist())
+        if key not in limbs:
+            limbs[key] = limb(mesh, *np.exp(size[k]))
+        change[k] = field.change(limbs[key], T[k])
+        if progress and task is not None and k % 50 == 0:
+            progress.update(task, completed=k)
+    if progress and task is not None:
+        progress.remove_task(task)
+    return Solved(T, size, gap, change)
+
+
+def pieces(mesh: Mesh) -> Array:
+    """The limb's skin in pieces (7, k): see `shared.skin.response.Network`."""
+    panels = limb(mesh, stations=PIECES[0], around=PIECES[1]).panels
+    return np.ascontiguousarray(np.column_stack([panels.centroids, panels.normals, panels.areas]).T, dtype=np.float32)
+
+
+def links(cell: cells.Cell, mounting: Mounting, joints: Array) -> Array:
+    """What all links but the pad's own change (k, e) [fF] at joint angles (k, j) of the cell's robots."""
+    models, own = robot_models(cell), cell.pads[mounting.pad]
+    field = PadField(mounting.kind, mounting.backing)
+    robot, _, carrier = own.link.partition("/")
+    others = {
+        (name, link): shell(mesh.vertices, *LINK_PANELS).corners
+        for name, model in models.items()
+        for link, mesh in model.meshes.items()
+        if (name, link) != (robot, carrier)
+    }
+    behind = ConvexHull(rigid.apply(rigid.inverse(own.T_link_pad), models[robot].meshes[carrier].vertices))
+    change = np.empty((len(joints), len(mounting.kind.electrodes)))
+    for k, q in enumerate(joints):
+        poses, first = {}, 0
+        for name, model in models.items():
+            poses[name] = model.link_transforms(q[first : first + len(model.joints)])
+            first += len(model.joints)
+        T_pad_world = rigid.inverse(poses[robot][carrier] @ own.T_link_pad)
+        corners = np.concatenate([rigid.apply(T_pad_world @ poses[name][link], c) for (name, link), c in others.items()])
+        away = (corners.mean(axis=1) @ behind.equations[:, :3].T + behind.equations[:, 3]).max(axis=1) > JOINED
+        change[k] = field.change_of_links(Panels(corners[away]))
+    return change
+
+
+def joint_range(cell: cells.Cell) -> tuple[Array, Array]:
+    """Bounds (j,) [rad] of all joints: the cell's own for the emulator, or those of the robots."""
+    if cell.sim is not None and cell.sim.joints_low:
+        return np.array(cell.sim.joints_low), np.array(cell.sim.joints_high)
+    models = robot_models(cell).values()
+    return np.concatenate([m.lower for m in models]), np.concatenate([m.upper for m in models])
+
+
+def fit_rest(cell: cells.Cell, mounting: Mounting, seed: int) -> tuple[Rest, float]:
+    """The polynomial for the other links of a pad's robot, and the 95th percentile of its relative error on others."""
+    low, high = joint_range(cell)
+    postures = np.random.default_rng([seed, 44]).uniform(low, high, (POSTURES, len(low)))
+    others = np.random.default_rng([HELD_OUT_SEED, 44]).uniform(low, high, (POSTURES // 5, len(low)))
+    empty = Rest(np.zeros((len(mounting.kind.electrodes), 1)), 0.5 * (low + high), 0.5 * np.maximum(high - low, 1e-6))
+    change, held_out = links(cell, mounting, postures), links(cell, mounting, others)
+    rest = replace(empty, coefficients=np.linalg.lstsq(empty.terms(postures), np.log(change), rcond=None)[0].T)
+    return rest, float(np.percentile(np.abs(rest.change(others) / held_out - 1.0), 95))
+
+
+class _Fit(torch.nn.Module):
+    def __init__(self, outputs: int, hidden: int):
+        super().__init__()
+        self.first, self.second = torch.nn.Linear(FEATURES, hidden), torch.nn.Linear(hidden, hidden)
+        self.last, self.skip = torch.nn.Linear(hidden, outputs), torch.nn.Linear(FEATURES, outputs, bias=False)
+
+    @property
+    def layers(self) -> tuple[torch.nn.Linear, ...]:
+        """Those with biases, from input to output."""
+        return self.first, self.second, self.last
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        hidden = torch.tanh(self.second(torch.tanh(self.first(x))))
+        return torch.as_tensor(self.last(hidden) + self.skip(x))
+
+
+def fit(
+    points: Array, data: Solved, seed: int, steps: int, start: Network | None = None, progress: Progress | None = None
+) -> Network:
+    """The network that has the logarithms of the changes, robust against the few poses that it cannot follow. With a start, only
+    what is missing to it is learned, by a small network beside it."""
+    torch.manual_seed(seed)
+    rng = np.random.default_rng([seed, 43])
+    usable = (data.change > FAINTEST).all(axis=1)
+    data = Solved(data.T[usable], data.size[usable], data.gap[usable], data.change[usable])
+    inputs, wanted = features(points, data.T, data.size), np.log(data.change)
+    if start is not None:
+        wanted -= np.log(predict(start, data))
+    mean, scale = (start.mean, start.scale) if start else (inputs.mean(axis=0), inputs.std(axis=0) + 1e-9)
+    x = torch.from_numpy(((inputs - mean) / scale).astype(np.float32))
+    y = torch.from_numpy(wanted.astype(np.float32))
+    model = _Fit(y.shape[1], HIDDEN if start is None else HIDDEN_BACKED)
+    with torch.no_grad():
+        model.last.bias.copy_(y.mean(dim=0))
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3, weight_decay=0.0 if start is None else 0.1)
+    task = progress.add_task("network", total=steps) if progress else None
+    for step in range(steps):
+        for group in optimizer.param_groups:
+            group["lr"] = 2e-3 * min(1.0, (step + 1) / 300) * (0.5 * (1.0 + np.cos(np.pi * step / steps)) + 5e-4)
+        rows = torch.from_numpy(rng.integers(0, len(x), BATCH))
+        error = model(x[rows]) - y[rows]
+        loss = (torch.sqrt(error * error + 0.02**2) - 0.02).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if progress and task is not None and step % 100 == 0:
+            progress.update(task, completed=step, description=f"network, error {error.abs().median().item():.4f}")
+    if progress and task is not None:
+        progress.remove_task(task)
+    with torch.no_grad():
+        weights = tuple(layer.weight.numpy().astype(float) for layer in model.layers)
+        biases = tuple(layer.bias.numpy().astype(float) for layer in model.layers)
+        network = Network(points, mean, scale, weights, biases, model.skip.weight.numpy().astype(float))  # type: ignore[arg-type]
+    return network if start is None else beside(start, network)
+
+
+def beside(one: Network, other: Network) -> Network:
+    """One network that gives the sum of the outputs of two with the same input."""
+    (a0, a1, a2), (b0, b1, b2) = one.weights, other.weights
+    (a3, a4, a5), (b3, b4, b5) = one.biases, other.biases
+    weights = np.concatenate([a0, b0]), block_diag(a1, b1), np.concatenate([a2, b2], axis=1)
+    biases = np.concatenate([a3, b3]), np.concatenate([a4, b4]), a5 + b5
+    return replace(one, weights=weights, biases=biases, skip=one.skip + other.skip)
+
+
+def predict(network: Network, data: Solved) -> Array:
+    """Changes (n, e) [fF] of a network."""
+    x = (features(network.points, data.T, data.size) - network.mean) / network.scale
+    first = np.tanh(x @ network.weights[0].T + network.biases[0])
+    second = np.tanh(first @ network.weights[1].T + network.biases[1])
+    return np.exp(second @ network.weights[2].T + network.biases[2] + x @ network.skip.T)
+
+
+def error(network: Network, data: Solved) -> float:
+    """Standard deviation of the relative error beyond NEAR_GAP, as the median has it: its tails are the estimator's outliers."""
+    far = data.gap > NEAR_GAP
+    return float(1.4826 * np.median(np.abs(np.log(predict(network, data)[far] / np.maximum(data.change[far], FAINTEST)))))
+
+
+def score(network: Network, data: Solved) -> dict[str, dict[str, float]]:
+    """Median and 95th percentile of the relative error of all electrodes [%] per band of the gap [cm]."""
+    error = 100.0 * np.abs(predict(network, data) / data.change - 1.0)
+    out = {}
+    for low, high in itertools.pairwise(BANDS):
+        own = error[(data.gap >= low) & (data.gap < high)]
+        if len(own):
+            out[f"{100 * low:g}-{100 * high:g} cm"] = {
+                "poses": len(own),
+                "median_percent": round(float(np.median(own)), 3),
+                "p95_percent": round(float(np.percentile(own, 95)), 3),
+            }
+    return out
+
+
+def main(argv: list[str]) -> int:
+    """`penumbra skin model`"""
+    parser = flags.Parser(
+        prog="penumbra skin model", description="Fits the field model of a cell's pads to its boundary elements."
+    )
+    flags.add_cell(parser)
+    parser.add_argument("--target", help="the limb (default: the cell's first target)")
+    parser.add_argument("--seed", type=int, default=1, help="draws poses and the network's start (default: %(default)s)")
+    parser.add_argument(
+        "--poses", type=int, help=f"fields to solve for each mounting (default: {POSES}, with a link {POSES_BACKED})"
+    )
+    parser.add_argument("--steps", type=int, help=f"of the network's training (default: {STEPS}, with a link {STEPS_BACKED})")
+    parser.add_argument("--again", action="store_true", help="also fit mountings that have a network already")
+    options = parser.parse_args(argv)
+    cell = cells.load(options.cell)
+    if not cell.pads:
+        raise cells.CellError(f"cell {cell.name} has no pads: nothing to fit")
+    torch.set_num_threads(1)
+    target = cell.one("targets", options.target)
+    mesh = target_mesh(cell.targets[target].model_copy(update={"size": None}), cell)  # the networks know of sizes
+    points = pieces(mesh)
+    with Progress() as progress:
+        for mounting in mountings(cell, target):
+            known = networks(cell)
+            if mounting.fingerprint in known and not options.again:
+                progress.console.print(f"{mounting.name}: has a network already, kept (--again fits it anew)")
+                continue
+            began = time.monotonic()
+            start = known.get(mounting.bare) if mounting.backing is not None else None
+            poses = options.poses or (POSES if start is None else POSES_BACKED)
+            steps = options.steps or (STEPS if start is None else STEPS_BACKED)
+            data = solve(mounting, mesh, poses, options.seed, progress)
+            network = fit(points, data, options.seed, steps, start, progress)
+            unseen = solve(mounting, mesh, max(poses // 12, 50), HELD_OUT_SEED, progress)
+            held_out = score(network, unseen)
+            rest, rest_error = fit_rest(cell, mounting, options.seed) if mounting.backing is not None else (None, None)
+            network = replace(network, rest=rest, error=error(network, unseen))
+            path = cell.folder / FOLDER / f"{mounting.name}.npz"
+            save(path, network, mounting.fingerprint)
+            card = {
+                "made_by": f"penumbra skin model --cell {options.cell} --target {target} --seed {options.seed}",
+                "date": date.today().isoformat(),
+                "fingerprint": mounting.fingerprint,
+                "poses": poses,
+                "steps": steps,
+                "minutes": round((time.monotonic() - began) / 60.0, 1),
+                "held_out_seed": HELD_OUT_SEED,
+                "held_out": held_out,
+                **({"other_links_p95_percent": round(100.0 * rest_error, 2)} if rest_error is not None else {}),
+            }
+            path.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n")
+            progress.console.print(f"{mounting.name}: {path}")
+            for band, row in held_out.items():
+                progress.console.print(f"  {band:>9}: median {row['median_percent']} %, 95 % below {row['p95_percent']} %")
+    return 0

@@ -1,0 +1,87 @@
+"""Who may say what on a secured bus: the router's rules, from the one table of topics.
+
+A certificate's common name is the name of its holder. Sensors and methods publish what the table says, speak for nobody's health
+but their own, and read everything; a viewer only reads and asks; an operator also steers the emulator and the launcher. What no
+rule allows, the router drops, without an answer to the sender.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from shared.contract import topics
+from shared.contract.topics import TOPICS, Topic
+
+SERVICES = ("emulator", "skin", "segmentation", "search", "posecnn", "haptics", "fusion", "launcher")
+"""Processes with a health of their own …"""
+ROUTER, OPERATOR, VIEWER = "router", "operator", "viewer"
+"""… the meeting point, which passes on what other routers have let through, and people's commands."""
+HOLDERS = (*SERVICES, ROUTER, OPERATOR, VIEWER)
+
+ANSWERS = {"fusion": topics.current_pose("*", "*"), "emulator": topics.control("*"), "launcher": topics.launcher("*")}
+"""Queryables beside the health, by who answers them."""
+EVERYTHING = ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
+              "liveliness_token", "liveliness_query", "declare_liveliness_subscriber")  # fmt: skip
+
+
+def holder(service: str, is_router: bool) -> str:
+    """Whose certificate a process shows: what is no service only looks."""
+    if is_router:
+        return ROUTER
+    return service if service in (*SERVICES, OPERATOR) else VIEWER
+
+
+def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES) -> dict[str, Any]:
+    """Zenoh's `access_control` of a router, as JSON: allowed is what a rule names, on keys that lie within the rule's.
+
+    table: the topics. services: the holders that publish, answer and tell of their health.
+    """
+    table, services = tuple(table), tuple(services)
+    keys = [topic.at() for topic in table]
+    rules = [
+        # a router's own clients are filtered where they come in, so that all may be handed out
+        _rule("hear", EVERYTHING, ["penumbra/**"], "egress"),
+        _rule("pass on", EVERYTHING, ["penumbra/**"]),
+        _rule("read", ["declare_subscriber"], keys),
+        _rule("see who lives", ["liveliness_query", "declare_liveliness_subscriber"], [topics.alive("*")]),
+        _rule("ask", ["query"], [topics.current_pose("*", "*"), topics.health("*")]),
+        _rule("steer", ["query"], [topics.control("*"), topics.launcher("*")]),
+    ]
+    reader = ["hear", "read", "see who lives", "ask"]
+    policies = {ROUTER: ["hear", "pass on"], OPERATOR: [*reader, "steer"], VIEWER: reader}
+    for service in services:
+        own = [
+            _rule(f"{service} lives", ["liveliness_token"], [topics.alive("*", service)]),
+            _rule(f"{service} answers", ["declare_queryable", "reply"],
+                  [topics.health("*", service), *([ANSWERS[service]] if service in ANSWERS else [])]),
+        ]  # fmt: skip
+        if says := [topic.at() for topic in table if service in topic.publishers]:
+            own.append(_rule(f"{service} publishes", ["put"], says))
+        rules += own
+        policies[service] = [*reader, *(rule["id"] for rule in own)]
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [{"id": name, "cert_common_names": [name]} for name in policies],
+        "policies": [{"rules": allowed, "subjects": [name]} for name, allowed in policies.items()],
+    }
+
+
+def limits(table: Iterable[Topic] = TOPICS) -> list[dict[str, Any]]:
+    """Zenoh's `low_pass_filter` of a router, as JSON: what is larger than a topic's messages can be does not come in."""
+    return [
+        {
+            "id": topic.name,
+            "flows": ["ingress"],
+            "messages": ["put"],
+            "key_exprs": [topic.at()],
+            "size_limit": topic.message.MAX_BYTES,
+        }
+        for topic in table
+    ]
+
+
+def _rule(name: str, messages: Iterable[str], keys: Iterable[str], flow: str = "ingress") -> dict[str, Any]:
+    return {"id": name, "permission": "allow", "flows": [flow], "messages": list(messages), "key_exprs": list(keys)}

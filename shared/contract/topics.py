@@ -1,0 +1,102 @@
+"""The one table of topics. The bus, `penumbra topics`, the health check and the recorder all read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from shared.contract import messages
+
+
+class QoS(Enum):
+    """Why a topic is sent as it is."""
+
+    LATEST_WINS = "a new sample makes the old one worthless: never wait for a slow reader"
+    NEVER_DROP = "every message counts: wait for the reader"
+
+
+class Priority(Enum):
+    """What goes first where several messages wait for a link: Zenoh's priority of that name, which has a queue of its own."""
+
+    POSE = "INTERACTIVE_HIGH"
+    SIGNAL = "DATA_HIGH"
+    IMAGE = "DATA_LOW"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """`key` with its {names} to fill in; nominal `rate_hz`; `depth`: samples that a reader keeps while busy;
+    `stale_s`: the age after which a reader calls the topic stale; `publisher`: the service that may publish it, or
+    either of two; `slow_hz`: how often a slow link carries a key's messages, 0 for never (`penumbra router --slow`)."""
+
+    name: str
+    key: str
+    message: type[messages.Message]
+    rate_hz: float
+    depth: int
+    stale_s: float
+    publisher: str
+    about: str
+    priority: Priority
+    slow_hz: float
+    qos: QoS = QoS.LATEST_WINS
+
+    @property
+    def publishers(self) -> tuple[str, ...]:
+        """The services that may publish it."""
+        return tuple(self.publisher.split(" or "))
+
+    @property
+    def oldest_s(self) -> float:
+        """The age after which a message is refused: it is of a backlog, or replayed. Clocks may differ by MAX_FUTURE_S."""
+        return 5.0 * self.stale_s + messages.MAX_FUTURE_S
+
+    def at(self, **names: str) -> str:
+        """The key expression; a name that is not given becomes the wildcard `*`."""
+        wanted = {"cell", "camera", "robot", "pad", "target"}
+        return self.key.format(**{name: names.get(name, "*") for name in wanted})
+
+
+FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, "emulator", "one RGB image",
+              Priority.IMAGE, 0)  # fmt: skip
+JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, "emulator", "joint angles [rad]",
+               Priority.SIGNAL, 20)  # fmt: skip
+VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1, "emulator or skin",
+                 "electrode amplitudes [V], 1 kHz in batches", Priority.SIGNAL, 0)  # fmt: skip
+TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 50, 16, 0.2, "emulator",
+              "what the emulator knows", Priority.SIGNAL, 5)  # fmt: skip
+MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, "segmentation",
+             "class indices of a window of a frame", Priority.IMAGE, 0)  # fmt: skip
+VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, "search or posecnn",
+               "the camera's pose and covariance", Priority.POSE, 20)  # fmt: skip
+HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 50, 16, 0.1, "haptics",
+               "the skin's pose and information", Priority.POSE, 20)  # fmt: skip
+FUSED = Topic("fused", "penumbra/{cell}/target/{target}/pose/fused", messages.FusedPose, 200, 4, 0.1, "fusion", "the one pose",
+              Priority.POSE, 20)  # fmt: skip
+
+TOPICS = (FRAME, JOINTS, VOLTAGES, TRUTH, MASK, VISION, HAPTIC, FUSED)
+
+
+def current_pose(cell: str, target: str) -> str:
+    """Queryable: the current fused pose, MessagePack of FusedPose, or JSON with `?format=json`."""
+    return f"penumbra/{cell}/target/{target}/pose"
+
+
+def control(cell: str) -> str:
+    """Queryable of the emulator: what `penumbra sim` asks, JSON in and out."""
+    return f"penumbra/{cell}/sim/control"
+
+
+def launcher(cell: str) -> str:
+    """Queryable of `penumbra up`: what `penumbra restart` and `penumbra scale` ask, JSON in and out."""
+    return f"penumbra/{cell}/launcher/control"
+
+
+def alive(cell: str, service: str = "*", instance: str = "*") -> str:
+    """Liveliness token of one running instance."""
+    return f"penumbra/{cell}/alive/{service}/{instance}"
+
+
+def health(cell: str, service: str = "*", instance: str = "*") -> str:
+    """Queryable: the health and metrics of one running instance, JSON."""
+    return f"penumbra/{cell}/{service}/{instance}/health"

@@ -1,0 +1,1 @@
+"""Rigid-body geometry, triangle meshes as pictures, and distances to them."""

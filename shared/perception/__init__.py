@@ -1,0 +1,1 @@
+"""What the senses share: where to look, what vision reports, and where things were at a stamp."""

@@ -1,0 +1,173 @@
+"""Where to look: the window of the image around the predicted targets, around their homes when they are lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from shared.body import anatomy
+from shared.cell.description import Camera, Cell
+from shared.contract.messages import FusedPose
+from shared.geometry import rigid
+from shared.geometry.rigid import Array
+from shared.perception.prediction import predict
+
+STEP = 8
+"""Windows lie and measure in multiples of this many of their own pixels: the stride of the network's coarsest layer."""
+SIZE_STEP = 32
+"""Sizes are rounded up to this, so that the size seldom changes while the target turns."""
+MAX_PIXELS = 224 * 224
+"""Of a window around targets: what a step has time for. A larger target is looked at with a coarser scale."""
+MAX_PIXELS_WIDE = 320 * 240
+"""Of the whole frame, or of all around the targets' homes, when nobody knows where one of them is."""
+HOME_SIGMAS = 2.0
+"""A lost target is looked for so many standard deviations around its home: further away it would not be believed to be it."""
+MARGIN_M = 0.04
+"""Room around the target [m]: the prediction's error, and the surroundings that tell the contour."""
+NEAR_M = 0.1
+"""A target with a part nearer to the camera than this is not projected."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A window of a frame: pixel (r, c) of `height` x `width` covers `scale` x `scale` image pixels from
+    (y0 + r * scale, x0 + c * scale) on, as in `messages.Mask`."""
+
+    x0: int
+    y0: int
+    width: int
+    height: int
+    scale: int = 1
+
+    @property
+    def right(self) -> int:
+        """The first image column beyond the window."""
+        return self.x0 + self.width * self.scale
+
+    @property
+    def bottom(self) -> int:
+        """The first image row beyond the window."""
+        return self.y0 + self.height * self.scale
+
+
+def corners_of(vertices: Array) -> Array:
+    """The corners (8, 3) of the box around vertices (n, 3), in their frame."""
+    low, high = np.min(vertices, axis=0), np.max(vertices, axis=0)
+    x, y, z = np.meshgrid(*zip(low, high, strict=True), indexing="ij")
+    return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+
+
+class Sized(Protocol):
+    """Something so many pixels wide and high: a camera, a window."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+
+
+def whole_frame(camera: Sized) -> Window:
+    """The window of (nearly) the whole frame: what is left over at the right and lower edge is less than STEP pixels."""
+    scale = 1
+    while camera.width * camera.height > MAX_PIXELS_WIDE * scale * scale:
+        scale *= 2
+    unit = STEP * scale
+    return Window(0, 0, max(camera.width // unit, 1) * STEP, max(camera.height // unit, 1) * STEP, scale)
+
+
+class Lookout:
+    """Where to look in the frames of one camera: around the targets of its cell as fusion predicts them, and around the homes of
+    those that are lost. targets: those that it can see, by what its picture shows of the region around their homes."""
+
+    def __init__(self, cell: Cell, camera: str):
+        self._camera = cell.cameras[camera]
+        self._poses: dict[str, FusedPose] = {}
+        self._boxes: dict[str, Array] = {}
+        self._homes: dict[str, tuple[Array, Array]] = {}
+        for name, target in cell.targets.items():
+            corners = corners_of(anatomy.target_mesh(target, cell).vertices)
+            home, spread = rigid.apply(target.home.transform, corners), target.home_spread
+            room = HOME_SIGMAS * np.hypot(spread.position, spread.rotation * np.abs(corners).max())
+            region = corners_of(np.vstack([home - room, home + room]))
+            if _is_in_picture(self._camera, region):
+                self._boxes[name], self._homes[name] = corners, (np.eye(4), region)
+        self.targets = tuple(self._boxes)
+        self._window = self._wide()
+
+    def hear(self, pose: FusedPose) -> None:
+        """Takes the newest fused pose of a target; of one that it cannot see nothing is kept."""
+        if pose.target in self._boxes:
+            self._poses[pose.target] = pose
+
+    @property
+    def window(self) -> Window:
+        """The window last looked at, at first that around all homes."""
+        return self._window
+
+    def look(self, stamp_ns: int) -> Window:
+        """The window for a frame exposed at a stamp: kept where it was while it does (`window_around`)."""
+        known = {name: predict(self._poses.get(name), stamp_ns)[0] for name in self._boxes}
+        sure = [(T, self._boxes[name]) for name, T in known.items() if T is not None]
+        found = window_around(self._camera, sure, self._window) if len(sure) == len(known) else None
+        self._window = found or self._wide([name for name, T in known.items() if T is None], sure)
+        return self._window
+
+    def _wide(self, lost: Iterable[str] = (), sure: Iterable[tuple[Array, Array]] = ()) -> Window:
+        homes = [self._homes[name] for name in lost or self._homes]
+        return window_around(self._camera, [*homes, *sure], None, MAX_PIXELS_WIDE) or whole_frame(self._camera)
+
+
+def _is_in_picture(camera: Camera, region: Array) -> bool:
+    """Whether a camera may see something of a box, given as its corners (8, 3) in the world: unless all of them lie beyond one
+    side of what it sees."""
+    x, y, z = rigid.apply(rigid.inverse(camera.T_world_camera), region).T
+    u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
+    sides = (z - NEAR_M, u, camera.width * z - u, v, camera.height * z - v)
+    return all((side >= 0.0).any() for side in sides)
+
+
+def window_around(
+    camera: Camera, targets: Iterable[tuple[Array, Array]], previous: Window | None = None, most: int = MAX_PIXELS
+) -> Window | None:
+    """The window of at most `most` pixels that holds targets, given as (T_world_target (4, 4), corners (8, 3) of their box), with
+    MARGIN_M of room.
+
+    The previous window is kept while it holds them and is not much too large: the less it moves, the more the recurrent state
+    is worth. None where no target is in the picture, or one is too near to the camera to say.
+    """
+    low, high = np.array([np.inf, np.inf]), np.array([-np.inf, -np.inf])
+    for T_world_target, corners in targets:
+        points = rigid.apply(rigid.inverse(camera.T_world_camera) @ T_world_target, corners)
+        if points[:, 2].min() < NEAR_M:
+            return None
+        focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+        pixels = points[:, :2] / points[:, 2:] * focal + centre
+        margin = MARGIN_M * focal / points[:, 2].mean()
+        low, high = np.minimum(low, pixels.min(axis=0) - margin), np.maximum(high, pixels.max(axis=0) + margin)
+    size = np.array([camera.width, camera.height])
+    low, high = np.maximum(low, 0.0), np.minimum(high, size - 1.0)
+    if np.any(high - low < 2.0):
+        return None
+    scale = 1
+    while np.prod(np.maximum((high - low) / scale, 2 * STEP)) > most:
+        scale *= 2
+    if previous is not None and previous.scale == scale and _fits(previous, low, high):
+        return previous
+    unit = STEP * scale
+    limit = np.maximum(size // unit * STEP, STEP)
+    extent = np.minimum(np.ceil((high - low) / (scale * SIZE_STEP)).astype(int) * SIZE_STEP, limit)
+    if previous is not None and previous.scale == scale:
+        old = np.array([previous.width, previous.height])
+        extent = np.where((old >= extent) & (old <= extent + SIZE_STEP), old, extent)
+    middle = (low + high) / 2.0
+    x0, y0 = np.clip(np.round((middle - extent * scale / 2.0) / unit).astype(int), 0, (limit - extent) // STEP) * unit
+    return Window(int(x0), int(y0), int(extent[0]), int(extent[1]), scale)
+
+
+def _fits(window: Window, low: Array, high: Array) -> bool:
+    holds = window.x0 <= low[0] and window.y0 <= low[1] and high[0] < window.right and high[1] < window.bottom
+    spare = np.array([window.width, window.height]) - (high - low) / window.scale
+    return bool(holds and spare.max() < 3 * SIZE_STEP)

@@ -1,0 +1,42 @@
+"""What every vision process finds of a target in a frame, and how it is told to fusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.contract.messages import VisionPose
+from shared.geometry import rigid
+
+State = Literal["tracking", "occluded", "lost"]
+
+
+@dataclass(frozen=True)
+class VisionEstimate:
+    """T_world_target, covariance (6, 6) along the world's axes, overlap and hidden share in [0, 1], state. The pose is the
+    measurement's alone."""
+
+    T: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    overlap: float
+    hidden: float
+    state: State
+
+    def message(self, stamp_ns: int, target: str, camera: str, frame: str) -> VisionPose:
+        """The estimate of a frame exposed at a stamp."""
+        position, orientation = rigid.position_orientation(self.T)
+        return VisionPose(
+            stamp_ns=stamp_ns,
+            target=target,
+            camera=camera,
+            frame=frame,
+            position=position,
+            orientation=orientation,
+            covariance=self.covariance,
+            overlap=self.overlap,
+            hidden=self.hidden,
+            state=self.state,
+        )

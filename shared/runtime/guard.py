@@ -1,0 +1,118 @@
+"""What a reader takes from a publisher: every message once, and no more of them than belong to its topic.
+
+A replayed message carries a number that was here before, or a stamp too old for its topic (`Topic.oldest_s`). A publisher is
+forgotten only when whatever it has sent is too old by its stamp. What another publisher says again, as where two replicas both
+take themselves for the owner, carries a stamp that was here before.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from shared.contract.messages import MAX_FUTURE_S, MAX_PAST_S, BadMessage
+
+RATE_TIMES = 5.0
+"""A publisher may send so many times its topic's rate, and a second's worth of that at once."""
+PUBLISHERS = 16
+"""Publishers of one key that are known at a time."""
+FORGET_S = MAX_PAST_S + MAX_FUTURE_S
+WINDOW = 64
+"""Numbers that may arrive out of order."""
+MEASUREMENTS = 64
+"""Measurements of a key that are remembered: of the slowest stream more than its oldest that is taken."""
+NUMBERS = 1 << 32
+"""Publishers count modulo this: at 200 Hz it comes around after eight months."""
+
+
+class Window:
+    """Which of a publisher's numbers were here: the sliding window of RFC 4303, section 3.4.3 (doi:10.17487/RFC4303)."""
+
+    def __init__(self, number: int):
+        self._highest = number
+        self._seen = (1 << WINDOW) - 1  # what was before the first is not waited for
+
+    def take(self, number: int) -> int:
+        """How many more numbers are missing than before: those that were left out, or -1 for one that comes late. Raises
+        BadMessage for one that was here, or may have been."""
+        ahead = (number - self._highest) % NUMBERS
+        if ahead == 0 or ahead >= NUMBERS // 2:
+            behind = -ahead % NUMBERS
+            if behind >= WINDOW or self._seen >> behind & 1:
+                raise BadMessage("replayed", f"a number after {self._highest} expected, {number} came: it was here before")
+            self._seen |= 1 << behind
+            return -1
+        self._seen = (self._seen << ahead | 1) & ((1 << WINDOW) - 1) if ahead < WINDOW else 1
+        self._highest = number
+        return ahead - 1
+
+
+class Bucket:
+    """Lets `rate_hz` events a second through, and a second's worth at once (a token bucket). Seconds may start anywhere."""
+
+    def __init__(self, rate_hz: float, now_s: float):
+        self._rate_hz = rate_hz
+        self._tokens = max(1.0, rate_hz)
+        self._last_s = now_s
+
+    def take(self, now_s: float) -> bool:
+        """Whether one more fits."""
+        self._tokens = min(max(1.0, self._rate_hz), self._tokens + (now_s - self._last_s) * self._rate_hz)
+        self._last_s = now_s
+        if self._tokens < 1.0:
+            return False
+        self._tokens -= 1.0
+        return True
+
+
+@dataclass
+class _Publisher:
+    bucket: Bucket
+    heard_s: float
+    window: Window | None = None
+    stamp_ns: int | None = None
+
+
+class Guard:
+    """The publishers of one key. rate_hz: how often one of them is expected to send."""
+
+    def __init__(self, rate_hz: float):
+        self._limit_hz = RATE_TIMES * rate_hz
+        self._publishers: dict[str, _Publisher] = {}
+        self._measurements: deque[tuple[int, str]] = deque(maxlen=MEASUREMENTS)
+
+    def admit(self, publisher: str, number: int | None, now_s: float) -> int | None:
+        """How many more numbers of this publisher are missing than before; None where it does not count. `now_s` must not run
+        backwards. Raises BadMessage: replayed, rate, or publishers where there are too many."""
+        found = self._publishers.get(publisher)
+        if found is None or now_s - found.heard_s > FORGET_S:
+            found = self._newcomer(publisher, now_s)
+        missing = None
+        if number is not None:
+            if found.window is None:
+                found.window, missing = Window(number), 0
+            else:
+                missing = found.window.take(number)
+        if not found.bucket.take(now_s):
+            raise BadMessage("rate", f"at most {self._limit_hz:g} messages a second of a publisher expected, more came")
+        return missing
+
+    def believe(self, publisher: str, stamp_ns: int, now_s: float, camera: str = "") -> None:
+        """Takes a good message that was admitted; camera: of whose picture it tells, where it tells of one. Raises BadMessage for
+        a measurement that somebody has told already, and where a publisher that does not number its messages sends one that is
+        not newer; one that does may, as where a pose of one camera is older than the last of another."""
+        found = self._publishers[publisher]
+        if found.window is None:
+            if found.stamp_ns is not None and stamp_ns <= found.stamp_ns:
+                raise BadMessage("replayed", f"without numbers, a stamp after {found.stamp_ns} expected, {stamp_ns} came")
+            found.stamp_ns = stamp_ns
+        if (stamp_ns, camera) in self._measurements:
+            raise BadMessage("repeated", f"every measurement once expected, that of stamp {stamp_ns} came again")
+        self._measurements.append((stamp_ns, camera))
+        found.heard_s = now_s
+
+    def _newcomer(self, publisher: str, now_s: float) -> _Publisher:
+        self._publishers = {name: known for name, known in self._publishers.items() if now_s - known.heard_s <= FORGET_S}
+        if len(self._publishers) >= PUBLISHERS:
+            raise BadMessage("publishers", f"at most {PUBLISHERS} publishers of a key expected, another one came")
+        return self._publishers.setdefault(publisher, _Publisher(Bucket(self._limit_hz, now_s), now_s))

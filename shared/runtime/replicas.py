@@ -1,0 +1,188 @@
+"""The replicas of a service: which of them live, which stream is whose, and who is not fit to have any.
+
+Each replica that can do its part holds a liveliness token; whoever sees the same tokens finds the same owner for a stream.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import Protocol
+
+import zenoh
+
+from shared.runtime.bus import Traffic
+
+CLOCK_S = 1.0
+"""Over which messages are counted to tell whether a process has another time than all others."""
+CLOCK_MESSAGES = 10
+PACE_SHARE = 0.5
+"""Of the newest look in what is known of how late a process comes: three late ones in a row tell."""
+PACE_LOST = 0.5
+"""A process that loses so large a share of its time is slower than none."""
+
+
+class Reader(Protocol):
+    """What reads a subscription."""
+
+    thread: threading.Thread
+
+    def close(self) -> None: ...
+
+
+@dataclass
+class Share:
+    """A subscription that is there only while one of `streams` is this replica's. traffic: of its keys; read: opens it."""
+
+    streams: tuple[str, ...]
+    traffic: list[Traffic]
+    read: Callable[[], Reader]
+    reader: Reader | None = None
+
+    def follow(self, is_own: bool) -> None:
+        """Opens or closes the subscription where that has changed."""
+        for traffic in self.traffic:
+            traffic.is_read = is_own
+        if is_own and self.reader is None:
+            self.reader = self.read()
+        elif not is_own and self.reader is not None:
+            self.reader.close()
+            self.reader = None
+
+
+class Replicas:
+    """This replica among the living ones. key: of its liveliness token, whose last chunk is the instance.
+
+    Before it is open it is alone and owns everything. `others`: the instances that hold a token beside this one.
+    """
+
+    def __init__(self, key: str):
+        self._key = key
+        self._instance = key.rpartition("/")[2]
+        self._lock = threading.RLock()
+        self._token: zenoh.LivelinessToken | None = None
+        self._shares: list[Share] = []
+        self._ranks: dict[str, float] = {}
+        self._living = frozenset({self._instance})
+        self.others: frozenset[str] = frozenset()
+
+    @property
+    def has_joined(self) -> bool:
+        """Whether the others know of this replica."""
+        return self._token is not None
+
+    def __len__(self) -> int:
+        return len(self._living)
+
+    def wait(self) -> None:
+        """It owns nothing before it knows whether others do."""
+        with self._lock:
+            self._living, self._ranks = frozenset(), {}
+
+    def watch(self, session: zenoh.Session) -> None:
+        """Follows who comes and goes, until the session is closed."""
+        expression = f"{self._key.rpartition('/')[0]}/*"
+        tokens = session.liveliness().declare_subscriber(expression, zenoh.handlers.FifoChannel(256), history=True)
+        living: set[str] = set()
+        while True:
+            try:
+                sample = tokens.recv()
+                instance = str(sample.key_expr).rpartition("/")[2]
+                (living.discard if sample.kind == zenoh.SampleKind.DELETE else living.add)(instance)
+                with self._lock:
+                    self.others = frozenset(living - {self._instance})
+                    self._count()
+            except zenoh.ZError:
+                return
+
+    def join(self, session: zenoh.Session) -> None:
+        """The last step of coming alive: from now on it has its part."""
+        with self._lock:
+            if self._token is None:
+                self._token = session.liveliness().declare_token(self._key)
+            self._count()
+
+    def withdraw(self) -> None:
+        """Leaves its streams to the others."""
+        with self._lock:
+            if self._token is not None:
+                token, self._token = self._token, None
+                token.undeclare()
+            self._count()
+
+    def share(self, share: Share) -> None:
+        """Follows the ownership of a share's streams from now on."""
+        with self._lock:
+            self._shares.append(share)
+            share.follow(any(map(self.owns, share.streams)))
+
+    def leave(self) -> list[Reader]:
+        """Takes nothing over any more, whoever goes; what reads its streams now."""
+        with self._lock:
+            shares, self._shares = self._shares, []
+            return [share.reader for share in shares if share.reader is not None]
+
+    def owns(self, stream: str) -> bool:
+        """As `rank`: whether it is 0."""
+        return self.rank(stream) == 0
+
+    def rank(self, stream: str) -> float:
+        """How many living replicas of this service are before this one to handle `stream`: 0 for its owner, 1 for the one that
+        will own it when the owner goes away; infinity where this one has no part yet. Rendezvous hashing (Thaler and
+        Ravishankar 1998, doi:10.1109/90.663936): a replica that comes or goes moves only its own streams."""
+        rank = self._ranks.get(stream)
+        if rank is None:
+            ranks, living = self._ranks, self._living
+            own = _weight(self._instance, stream)
+            rank = sum(_weight(each, stream) > own for each in living) if self._instance in living else math.inf
+            ranks[stream] = rank
+        return rank
+
+    def _count(self) -> None:
+        """This one counts as soon as the others know of it, or where there are none."""
+        self._ranks = {}
+        self._living = self.others if self._token is None and self.others else self.others | {self._instance}
+        self._ranks = {}  # again: another thread may have put a rank among the old ones into the first
+        for share in self._shares:
+            share.follow(any(map(self.owns, share.streams)))
+
+
+class Clock:
+    """Tells by what is refused whether this process has another time than those that it hears. fault: what is wrong, empty where
+    nothing is."""
+
+    def __init__(self) -> None:
+        self._since_s = -math.inf
+        self._good = self._odd = 0
+        self.fault = ""
+
+    def judge(self, traffic: Iterable[Traffic], now_s: float) -> str:
+        """The fault now. traffic: of all that is read; now_s: of a clock that nobody sets."""
+        if now_s - self._since_s >= CLOCK_S:
+            traffic = list(traffic)
+            good = sum(each.count for each in traffic)
+            odd = sum(each.bad.get("past", 0) + each.bad.get("future", 0) for each in traffic)
+            is_off = odd - self._odd >= CLOCK_MESSAGES and good == self._good
+            self.fault = "everything that comes is of another time: check the clock of this host" if is_off else ""
+            self._since_s, self._good, self._odd = now_s, good, odd
+        return self.fault
+
+
+class Pace:
+    """Tells by how late this process comes to look that it does not get its time: it is stopped again and again, or the machine
+    is overloaded, where fewer replicas do more. One long stop tells nothing: it is over."""
+
+    def __init__(self) -> None:
+        self._lost = 0.0
+
+    def judge(self, late_s: float, period_s: float) -> str:
+        """The fault now, empty where there is none. late_s: how much later than after period_s it looks again."""
+        self._lost += PACE_SHARE * (late_s / (late_s + period_s) - self._lost)
+        return f"this process stands still for {self._lost:.0%} of the time" if self._lost > PACE_LOST else ""
+
+
+def _weight(instance: str, stream: str) -> bytes:
+    return blake2b(f"{instance} {stream}".encode()).digest()

@@ -1,0 +1,242 @@
+"""The sensing board's protocol on its serial line: commands of 16 bytes, replies of sums, and what the sums say.
+
+A board excites its pad's ring with a sine of `electrode_hz`, takes `samples_per_cycle` samples of each of its six channels in
+every cycle, and adds up each of these samples over many cycles. The amplitude of a channel is the first Fourier component of
+the mean cycle. There is no header, no checksum and no sequence number: a reply's size and what is possible in it are all there
+is to tell whether it is whole. Only bytes and arrays here: `services/skin` has the serial port, `sim.skin.board` the emulated
+board.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shared.cell import description as cells
+
+Array = NDArray[np.float64]
+
+BAUD = 500_000
+BYTE_S = 10 / BAUD
+"""A byte on the line: eight bits, a start and a stop."""
+CLOCK_HZ = 120e6
+"""Every period is a whole number of ticks of this clock."""
+SAMPLE_HZ = 400e3
+"""Samples a second of a channel after power-on …"""
+ELECTRODE_HZ = 100e3
+"""… and the excitation's frequency."""
+CHANNELS = 6
+COMMAND_BYTES = 16
+HEAD_BYTES = 16
+"""Of a reply, before its sums."""
+SAMPLES_PER_CYCLE = range(2, 10)
+"""What a board can do: beyond it the firmware stops."""
+BLOCK = 128
+"""Samples that a board takes in one go: the number of cycles grows in steps of about BLOCK / samples_per_cycle."""
+MOST_MEASURES = 65_504
+FULL_SCALE = 4095
+"""The largest value of one sample, 12 bits."""
+UNUSED = 0xFFFF_FFFF
+"""`measures` of a command that has none …"""
+KEEP = struct.unpack("<f", b"\xff\xff\xff\xfe")[0]
+"""… and a frequency that is not to be changed: any negative one. With these no 16 bytes across two commands look like another
+command, so a board that lost a byte stays silent and does nothing that was not asked for."""
+OVERRUN = b"Error\r\n"
+"""What the firmware prints, on the same line and at any place, when its converter was not read in time."""
+
+_COMMAND = struct.Struct("<iIff")
+_HEAD = struct.Struct("<Bx6H2x")
+
+
+class PacketError(ValueError):
+    """Bytes that are no command or reply of a board; the text says what was expected and what came."""
+
+
+class Kind(IntEnum):
+    """What a command asks for."""
+
+    SEND_MEASURES = 0
+    SET_FREQ = 1
+    SET_FREQ_2 = 2
+
+
+@dataclass(frozen=True)
+class Command:
+    """kind: a `Kind`, or any other 32-bit integer, which no board answers. measures: cycles to measure. electrode_hz: of the
+    excitation. sample_hz: of the converter, and for SET_FREQ_2 the samples per cycle."""
+
+    kind: int
+    measures: int = UNUSED
+    electrode_hz: float = KEEP
+    sample_hz: float = KEEP
+
+    def pack(self) -> bytes:
+        """The 16 bytes. Raises PacketError for numbers that do not fit into them."""
+        try:
+            return _COMMAND.pack(self.kind, self.measures, self.electrode_hz, self.sample_hz)
+        except (struct.error, OverflowError):
+            raise PacketError(f"a 32-bit kind, measures from 0 to 2^32 - 1 and frequencies expected, {self} came") from None
+
+    @staticmethod
+    def unpack(data: bytes) -> Command:
+        """Raises PacketError for another size than 16 bytes."""
+        if len(data) != COMMAND_BYTES:
+            raise PacketError(f"a command or its echo of {COMMAND_BYTES} bytes expected, {len(data)} came")
+        return Command(*_COMMAND.unpack(data))
+
+    def is_answered(self, samples_per_cycle: int) -> bool:
+        """Whether a board answers it, rather than keeping silent."""
+        if self.kind == Kind.SEND_MEASURES:
+            return 0 < self.measures <= MOST_MEASURES and samples_per_cycle in SAMPLES_PER_CYCLE
+        return self.kind in (Kind.SET_FREQ, Kind.SET_FREQ_2)
+
+
+def send_measures(measures: int) -> bytes:
+    """Asks for the sums over so many cycles, as `cycles` rounds them. Raises PacketError for a number never answered."""
+    if not 0 < measures <= MOST_MEASURES:
+        raise PacketError(f"measures: 1 to {MOST_MEASURES} cycles expected, {measures} came: a board never answers that")
+    return Command(Kind.SEND_MEASURES, measures).pack()
+
+
+def set_frequency(electrode_hz: float, samples_per_cycle: int) -> bytes:
+    """SET_FREQ_2. Raises PacketError for what would stop the firmware."""
+    if samples_per_cycle not in SAMPLES_PER_CYCLE:
+        raise PacketError(f"samples_per_cycle: 2 to 9 expected, {samples_per_cycle} came: above 9 the firmware stops")
+    if not 0.0 < electrode_hz * samples_per_cycle < CLOCK_HZ:
+        raise PacketError(f"electrode_hz: above 0 and below {CLOCK_HZ / samples_per_cycle:g} Hz expected, {electrode_hz:g} came")
+    return Command(Kind.SET_FREQ_2, UNUSED, electrode_hz, float(samples_per_cycle)).pack()
+
+
+def period(hz: float, multiple: int = 1) -> int:
+    """Ticks of the clock [1 / 120 MHz] in the period that a board takes for a frequency: a multiple of so many, at least one."""
+    return max(1, round(CLOCK_HZ / hz / multiple)) * multiple
+
+
+def actual_hz(hz: float, multiple: int = 1) -> float:
+    """The frequency that a board takes for one that is asked for; multiple: samples per cycle, where the two are set together."""
+    return CLOCK_HZ / period(hz, multiple)
+
+
+def step(samples_per_cycle: int) -> int:
+    """The cycles of one block: `measures` are reached in steps of it."""
+    return round(BLOCK / samples_per_cycle)
+
+
+def cycles(measures: int, samples_per_cycle: int) -> int:
+    """The cycles that a board measures when asked for `measures`: 100 at 4 samples a cycle gives 128."""
+    size = step(samples_per_cycle)
+    return -(-measures // size) * size
+
+
+def reply_bytes(samples_per_cycle: int) -> int:
+    """Size of a reply to SEND_MEASURES."""
+    return HEAD_BYTES + 4 * CHANNELS * samples_per_cycle
+
+
+def reply_s(count: int, electrode_hz: float, samples_per_cycle: int) -> float:
+    """The least time [s] from a command's first byte to its reply's last: two packets on the line and the cycles."""
+    return (COMMAND_BYTES + reply_bytes(samples_per_cycle)) * BYTE_S + count / electrode_hz
+
+
+@dataclass(frozen=True)
+class Reply:
+    """counts (6,): cycles of each channel; sums (6, samples_per_cycle): of the raw samples over these cycles."""
+
+    counts: NDArray[np.int64]
+    sums: NDArray[np.int64]
+
+    @property
+    def samples_per_cycle(self) -> int:
+        return int(self.sums.shape[1])
+
+    def fourier(self) -> tuple[Array, NDArray[np.complex128]]:
+        """Mean level (6,) and first Fourier component (6,) of the mean cycle, in steps of the converter: |X| is the amplitude,
+        arg X the phase of a cosine. At two samples a cycle only the component along the samples can be seen.
+
+        Raises PacketError where a channel has no cycles.
+        """
+        if not self.counts.all():
+            empty = ", ".join(map(str, np.flatnonzero(self.counts == 0)))
+            raise PacketError(f"at least one cycle in every channel expected, none came in channel {empty}: ask again")
+        mean = self.sums / self.counts[:, None]
+        return mean.mean(axis=1), mean @ _waves(self.samples_per_cycle)
+
+    def is_possible(self, count: int) -> bool:
+        """Whether a board that was asked for `count` cycles can have sent it: every channel has so many, and no sum is more than
+        full scale in each."""
+        return bool((self.counts == count).all() and self.sums.max() <= FULL_SCALE * count)
+
+
+@cache
+def _waves(samples_per_cycle: int) -> NDArray[np.complex128]:
+    """(samples_per_cycle,): 2 / n exp(-2 pi i k / n); at two samples the wave is its own conjugate and counts once."""
+    n = samples_per_cycle
+    waves = (1.0 if n == 2 else 2.0) / n * np.exp(-2j * np.pi * np.arange(n) / n)
+    return waves.real.round(15) + 1j * waves.imag.round(15)
+
+
+def encode(counts: ArrayLike, sums: ArrayLike) -> bytes:
+    """The reply of counts (6,) and sums (6, samples_per_cycle). Raises PacketError for what does not fit into one."""
+    n, s = np.asarray(counts), np.asarray(sums)
+    if n.shape != (CHANNELS,) or s.ndim != 2 or len(s) != CHANNELS or s.shape[1] not in SAMPLES_PER_CYCLE:
+        raise PacketError(f"counts (6,) and sums (6, 2 to 9) expected, {n.shape} and {s.shape} came")
+    if n.min() < 0 or n.max() > 0xFFFF or s.min() < 0 or s.max() > 0xFFFF_FFFF:
+        raise PacketError(f"counts of 16 bits and sums of 32 bits expected, up to {n.max()} and {s.max()} came")
+    return _HEAD.pack(s.shape[1], *map(int, n)) + s.astype("<u4").tobytes()
+
+
+def decode(data: bytes) -> Reply:
+    """Counts and sums of a whole reply. Raises PacketError with the sizes that fit where it is not one."""
+    spc = data[0] if data else 0
+    if spc in SAMPLES_PER_CYCLE and len(data) == reply_bytes(spc):
+        counts = np.array(_HEAD.unpack_from(data)[1:], dtype=np.int64)
+        return Reply(counts, np.frombuffer(data, "<u4", offset=HEAD_BYTES).reshape(CHANNELS, spc).astype(np.int64))
+    sizes = {reply_bytes(n): n for n in SAMPLES_PER_CYCLE}
+    came = "1 byte" if len(data) == 1 else f"{len(data)} bytes"
+    if len(data) in sizes:
+        fit = f"{reply_bytes(spc)} bytes fit" if spc in SAMPLES_PER_CYCLE else "a board takes 2 to 9"
+        raise PacketError(f"{came} hold {sizes[len(data)]} samples a cycle, but the first byte says {spc}: {fit}")
+    fit = f", and by its first byte this one has {reply_bytes(spc)}" if spc in SAMPLES_PER_CYCLE else ""
+    listed = f"{', '.join(map(str, list(sizes)[:-1]))} or {max(sizes)}"
+    raise PacketError(f"a reply of {listed} bytes (16 + 24 for each of 2 to 9 samples a cycle) expected{fit}, {came} came")
+
+
+def readers(pad: cells.Pad, pad_type: cells.PadType) -> tuple[cells.Reader, ...]:
+    """The boards of a pad as the cell file has them, or where it has none: two electrodes a board in the order of the pad type,
+    the first on channels 0 to 2, the second on 3 to 5. Five electrodes c, r, l, t, b take three boards."""
+    if pad.boards:
+        return pad.boards
+    names = list(pad_type.electrodes)
+    pairs = [names[k : k + 2] for k in range(0, len(names), 2)]
+    return tuple(cells.Reader(channels={name: (3 * k, 3 * k + 1, 3 * k + 2) for k, name in enumerate(pair)}) for pair in pairs)
+
+
+FILLER = b"\xff"
+"""A byte that is the start of no command. 16 of them end whatever command a board believes to be reading."""
+
+
+def realign_probes(attempt: int = 0) -> list[bytes]:
+    """16 pieces of a stream in which a board finds exactly one command, wherever in a command it believes to be: each is one byte
+    longer than a command. Each asks to keep the frequencies, and carries its number and that of the attempt (modulo 8) in
+    `measures`, which the board's answer repeats. All else in the stream is unknown to a board. Between the pieces a board needs
+    time to answer."""
+    return [_probe(attempt, number).pack() + FILLER for number in range(COMMAND_BYTES)]
+
+
+def realign_answer(data: bytes, attempt: int = 0) -> tuple[int, Command] | None:
+    """The first answer to `realign_probes` of this attempt in what came: the number of the piece that the board has understood,
+    and the answer; None without. When `sent` pieces were sent, (number - sent) % 16 fillers set the board right."""
+    answers = {_probe(attempt, number).pack()[:8]: number for number in range(COMMAND_BYTES)}
+    for at in range(len(data) - COMMAND_BYTES + 1):
+        if (number := answers.get(data[at : at + 8])) is not None:
+            return number, Command.unpack(data[at : at + COMMAND_BYTES])
+    return None
+
+
+def _probe(attempt: int, number: int) -> Command:
+    return Command(Kind.SET_FREQ, 0xFFFF_FF80 | attempt % 8 << 4 | number)

@@ -1,0 +1,287 @@
+"""Whether a pad's electrodes can be believed, told from their voltages; and what a pad whose voltages do not fit is likely to be.
+
+`Watch` sees one pad alone. What it cannot see there (a pad turned on its mount, a calibration from another pad) `likely` finds by
+comparing what the pad reads with what the field model says for a pose that the other pads and cameras know.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.skin.layout import Skin
+
+Array = NDArray[np.float64]
+Kind = Literal["saturated", "dead", "noisy", "hum", "drift"]
+
+BLOCK = 20
+"""Samples in which a limb's motion is a cubic: what is left of them is noise."""
+LOOK_S = 1.0
+"""Samples of one look: 50 and 60 Hz are apart in it, and a mean is known to 0.08 mV."""
+LEAST_SAMPLES = 100
+MAINS_HZ = (50.0, 60.0)
+BESIDE_HZ = (-6.0, -3.5, 3.5, 6.0)
+"""Where nothing may be beside a line of the mains: a moving limb leaves something at all of them."""
+QUIET = 0.25
+"""Share of the calibrated noise below which an electrode is dead: 6 standard deviations of an estimate from 800 degrees of
+freedom lie at 0.7, the rest is for a calibration that was noisy."""
+NOISY = 4.0
+RIPPLE = 0.01
+"""Noise as a share of the signal that is no fault: a hand is never quite still."""
+LINE = 25.0
+"""Power of a line over what white noise gives on average: false once in exp(25) looks."""
+STANDS_OUT = 4.0
+"""A line's amplitude over those beside it."""
+HUM_V = 5e-4
+"""Mains below this [V] harms nothing."""
+BELOW_V = 1.5e-3
+"""A signal so far below zero [V] is no limb: a body takes field lines away, it adds none."""
+ALONE_V = 3e-3
+ALONE = (4.0, 10.0)
+"""An electrode this many times above all others of its pad, and by ALONE_V more, feels nothing that they do not: the first for
+signals up to FAR_V, as from 5 cm away, where a limb gives all nearly the same; the second above it."""
+FAR_V = 0.03
+LASTS = 3
+"""Looks in a row that see a drift before it is told."""
+
+MENDS: dict[Kind, str] = {
+    "saturated": "turn the amplifier's potentiometer down, or take away what touches the pad",
+    "dead": "check the electrode's wire and connector, and which channel the cell file gives it",
+    "noisy": "check connectors and shield, or calibrate again",
+    "hum": "shield the wires, move them away from mains cables, and connect the board's ground",
+    "drift": "let the boards warm up and take the offsets again with nothing near: penumbra skin calibrate",
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why an electrode is not to be believed; `text` says what was expected and what came."""
+
+    kind: Kind
+    text: str
+
+
+@dataclass(frozen=True)
+class Look:
+    """What one look saw of e electrodes. level (e,) [V]: mean; signal (e,) [V]: of it what the skin adds, without its sign; noise
+    (e,) [V^2]: variance of a sample, motion apart; hum (e,) [V], hum_hz (e,): amplitude of the mains and its frequency."""
+
+    level: Array
+    signal: Array
+    noise: Array
+    hum: Array
+    hum_hz: Array
+
+
+class Watch:
+    """Finds faults of one pad's electrodes as its samples come; `pad` is its place in `skin`. False alarms with white noise: see
+    the thresholds. Saturation and death are told within BLOCK samples, the others after a look, a drift after LASTS of them."""
+
+    def __init__(self, skin: Skin, pad: int):
+        own = skin.of(pad)
+        self.names = tuple(name.partition("/")[2] for name in skin.names[own])
+        self._a3, self._polarity, self._noise = skin.a3[own], skin.polarity[own], skin.noise[own]
+        self._lsb, self._end = skin.lsb[own], skin.full_scale[own]
+        reach = skin.peak[own] / skin.a2[own]
+        self._even = reach.mean() / reach
+        self.look: Look | None = None
+        self._rows: list[Array] = []
+        self._count = self._due_ns = 0
+        self._tail = np.empty((0, len(self.names)))
+        self._slow: dict[int, Fault] = {}
+        self._quick: dict[int, Fault] = {}
+        self._odd = np.zeros(len(self.names), np.int64)
+
+    def add(self, stamp_ns: int, period_ns: int, volts: Array) -> dict[str, Fault]:
+        """Take a batch (s, e) [V] whose last row has stamp_ns; the faults in force by electrode."""
+        if self._rows and abs(stamp_ns - (len(volts) - 1) * period_ns - self._due_ns) > 3 * period_ns + 5_000_000:
+            self._forget()
+        self._due_ns = stamp_ns + period_ns
+        self._rows.append(volts)
+        self._count += len(volts)
+        self._tail = np.concatenate([self._tail, volts])[-BLOCK:]
+        if len(self._tail) == BLOCK:
+            self._see_ends()
+        if self._count >= max(LEAST_SAMPLES, LOOK_S * 1e9 / period_ns):
+            self.look = self._see(np.concatenate(self._rows).astype(np.float64), period_ns * 1e-9)
+            self._slow = self._judge(self.look, self._count)
+            self._rows.clear()
+            self._count = 0
+        return self.faults
+
+    @property
+    def faults(self) -> dict[str, Fault]:
+        """The faults in force by electrode, the gravest of each."""
+        found = {**self._slow, **self._quick}
+        return {self.names[k]: found[k] for k in sorted(found)}
+
+    def _forget(self) -> None:
+        self._rows.clear()
+        self._count = 0
+        self._tail = self._tail[:0]
+
+    def _see_ends(self) -> None:
+        """Electrodes at an end of the converter, or without any noise, in the last BLOCK samples."""
+        high, low = self._tail.max(axis=0), self._tail.min(axis=0)
+        ended = high >= self._end - 0.5 * self._lsb
+        still = (high - low <= 1.01 * self._lsb) & (self._noise > self._lsb**2)
+        self._quick = {}
+        if not (ended.any() or still.any()):
+            return
+        for k in np.flatnonzero(ended | still):
+            if ended[k]:
+                text = f"saturated: it reads {high[k]:.3f} V, amplitudes end at {self._end[k]:.3f} V"
+                self._quick[int(k)] = Fault("saturated", text)
+            else:
+                self._quick[int(k)] = Fault("dead", f"dead: {BLOCK} samples stand at {high[k]:.3f} V without any noise")
+
+    def _see(self, volts: Array, period_s: float) -> Look:
+        level = volts.mean(axis=0)
+        centred = volts - level
+        blocks = centred[: len(centred) // BLOCK * BLOCK].reshape(-1, BLOCK, centred.shape[1])
+        basis = _cubics()
+        left = np.sum(blocks**2, axis=(0, 1)) - np.sum(np.einsum("si,bse->bie", basis, blocks) ** 2, axis=(0, 1))
+        noise = np.maximum(left, 0.0) / (len(blocks) * (BLOCK - basis.shape[1]))
+        amplitude = np.abs(_lines(len(volts), period_s) @ centred).reshape(len(MAINS_HZ), 1 + len(BESIDE_HZ), -1)
+        clear = amplitude[:, 0] * (amplitude[:, 0] > STANDS_OUT * amplitude[:, 1:].mean(axis=1))
+        which = np.argmax(clear, axis=0)
+        hum = np.take_along_axis(clear, which[None], axis=0)[0]
+        return Look(level, self._polarity * (level - self._a3), noise, hum, np.array(MAINS_HZ)[which])
+
+    def _judge(self, look: Look, samples: int) -> dict[int, Fault]:
+        """Faults by electrode, the gravest of each."""
+        quiet = look.noise < QUIET * self._noise
+        noisy = look.noise > NOISY * self._noise + (RIPPLE * look.signal) ** 2
+        hums = (look.hum > HUM_V) & (look.hum**2 > LINE * 6.0 * self._noise / samples)
+        drifts = self._drifts(look.signal)
+        self._odd = np.where(drifts, self._odd + 1, 0)
+        out: dict[int, Fault] = {}
+        for k in range(len(self.names)):
+            mv, design = 1e3 * np.sqrt(look.noise[k]), 1e3 * np.sqrt(self._noise[k])
+            if quiet[k]:
+                out[k] = Fault("dead", f"dead: noise of {mv:.2g} mV, {design:.2g} mV expected")
+            elif hums[k]:
+                out[k] = Fault("hum", f"hum: {1e3 * look.hum[k]:.2g} mV at {look.hum_hz[k]:g} Hz")
+            elif noisy[k]:
+                out[k] = Fault("noisy", f"noisy: {mv:.2g} mV, {design:.2g} mV expected")
+            elif self._odd[k] >= LASTS:
+                where = "below zero" if look.signal[k] < 0 else "and the others of the pad feel nothing like it"
+                out[k] = Fault("drift", f"drift: its signal is {1e3 * look.signal[k]:+.2g} mV, {where}")
+        return out
+
+    def _drifts(self, signal: Array) -> NDArray[np.bool_]:
+        """Signals (e,) [V] that no body gives: below zero, or of one electrode alone."""
+        even = signal * self._even  # as large as each other's where a body is far
+        below = signal < -BELOW_V
+        if len(signal) < 3:
+            return below
+        order = np.sort(even)
+        others = np.where(even == order[-1], order[-2], order[-1])  # the largest of the others
+        factor = np.where(signal < FAR_V, *ALONE)
+        return below | (even > factor * np.maximum(others, 0.0) + ALONE_V)
+
+
+@lru_cache(maxsize=1)
+def _cubics() -> Array:
+    """Orthonormal basis (BLOCK, 4) of cubics."""
+    return np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, BLOCK), 4))[0]
+
+
+@lru_cache(maxsize=4)
+def _lines(samples: int, period_s: float) -> NDArray[np.complex128]:
+    """Rows that give the amplitude of each line of the mains and of the frequencies beside it; Hann's window, so that a limb's
+    motion stays below them."""
+    time = np.arange(samples) * period_s
+    window = np.hanning(samples)
+    window *= 2.0 / window.sum()
+    hz = np.array([line + beside for line in MAINS_HZ for beside in (0.0, *BESIDE_HZ)])
+    return np.asarray(window * np.exp(-2j * np.pi * hz[:, None] * time), np.complex128)
+
+
+# ---- what a whole pad is likely to be
+
+
+def arrangements(centroids: Array) -> dict[str, NDArray[np.intp]]:
+    """Ways in which a pad may sit wrongly on its mount: for each, which electrode (e,) then is where another should be.
+
+    centroids (e, 2 or 3) [m] in the pad's frame. Ways that bring no electrode to another's place are left out.
+    """
+    xy = centroids[:, :2]
+    turns = {
+        "turned by 180 degrees": ((-1.0, 0.0), (0.0, -1.0)),
+        "turned by 90 degrees": ((0.0, -1.0), (1.0, 0.0)),
+        "turned by -90 degrees": ((0.0, 1.0), (-1.0, 0.0)),
+        "mirrored left to right": ((-1.0, 0.0), (0.0, 1.0)),
+        "mirrored top to bottom": ((1.0, 0.0), (0.0, -1.0)),
+    }
+    out = {}
+    for name, turn in turns.items():
+        place = np.argmin(np.linalg.norm(xy[None] - (xy @ np.array(turn).T)[:, None], axis=2), axis=1)
+        if len(set(place)) == len(xy) and (place != np.arange(len(xy))).any():
+            out[name] = place
+    return out
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """`text`: what a pad is likely to be, None where it fits; misfit: mean squared residual of the pad as the cell file has it,
+    in variances; left: of it, what stays if `text` is right; gain: the pad's signals over the predicted ones."""
+
+    text: str | None
+    misfit: float
+    left: float
+    gain: float
+
+
+MISFIT = 4.0
+"""Mean squared residual, in variances, from which a pad does not fit, whatever the reason …"""
+SUSPECT = 0.5
+"""… and from which it does not where there is a reason that explains it."""
+EXPLAINED = 0.4
+"""What an explanation must leave of the misfit at most."""
+MODEL_ERROR = 0.05
+"""What the predicted signals are wrong by, as a share: the field model."""
+CONTRAST = 0.3
+"""Share of the pose's error that reaches the electrodes of a pad each in its own way."""
+LASTING = 0.5
+"""Share of the pose's error that stays over the moments, and looks like a gain."""
+SURE = 3.0
+"""Standard deviations at which a gain is another pad's."""
+
+
+def likely(predicted: Array, measured: Array, noise: Array, pose_error: Array, centroids: Array) -> Suspicion:
+    """Which fault of a whole pad explains what it reads.
+
+    predicted, measured (k, e) [V]: signals at k moments with a body in reach, by the field model and by the electrodes; noise
+    (k, e) or (e,) [V^2]: variance of a measured one; pose_error (k,): standard deviation of the predicted ones as a share, for
+    the error of the pose, which makes all electrodes of a pad read more or less alike; centroids (e, 2 or 3).
+    Raises ValueError for other shapes or none.
+    """
+    if predicted.shape != measured.shape or predicted.ndim != 2 or not len(predicted):
+        raise ValueError(f"signals (k, e) of the same shape expected, {predicted.shape} and {measured.shape} came")
+    own = np.hypot(MODEL_ERROR, CONTRAST * pose_error)[:, None] * np.maximum(np.abs(predicted), np.abs(measured))
+    spread = noise + own**2
+
+    def misfit(model: Array) -> float:
+        """With a covariance of diag(spread) and (pose_error model)(pose_error model)^T (Sherman and Morrison 1950)."""
+        left = measured - model
+        alike = pose_error[:, None] * model / spread
+        removed = np.sum(alike * left, axis=1) ** 2 / (1.0 + np.sum(alike * pose_error[:, None] * model, axis=1))
+        return float(np.mean(np.sum(left**2 / spread, axis=1) - removed)) / predicted.shape[1]
+
+    weighted = predicted / spread
+    gain = max(float(np.sum(weighted * measured) / max(np.sum(weighted * predicted), 1e-30)), 1e-3)
+    before = misfit(predicted)
+    guesses = {name: misfit(predicted[:, place]) for name, place in arrangements(centroids).items()}
+    best = min(guesses, key=guesses.__getitem__, default=None)
+    if best is not None and before > SUSPECT and guesses[best] < EXPLAINED * before:
+        return Suspicion(best, before, guesses[best], gain)
+    left = misfit(gain * predicted)
+    if left < MISFIT and abs(np.log(gain)) > SURE * np.hypot(MODEL_ERROR, LASTING * float(np.median(pose_error))):
+        return Suspicion(f"calibrated as another pad: its signals are {gain:.2f} times what they should be", before, left, gain)
+    text = "does not fit the pose, for no known reason" if before > MISFIT else None
+    return Suspicion(text, before, before, gain)

@@ -1,0 +1,137 @@
+"""The capacitive skin as the cell describes it: where its electrodes are and how their amplitudes [V] come about.
+
+What comes near takes field lines away: the capacitance between ring and electrode falls by a `change` [fF], and the amplitude
+is v = a3 + polarity * gain * sensitivity * change. `gain` is what a calibration finds beside the design, about one. What a limb
+at a pose changes is the field model's part (`shared.skin.response`); the paper's response law (eq. sensor_approx) stands for it
+where only the gap d to the skin is known: v = a3 + polarity * a1 / (1 + a2 d^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shared.body import anatomy
+from shared.cell import description as cells
+
+Array = NDArray[np.float64]
+
+GAIN_GAPS = (0.02, 0.05, 0.10)
+"""Gaps [m] at which a calibrated law is compared with the designed one."""
+HOME_SIGMAS = 3.0
+"""A target is within so many standard deviations of its home …"""
+RANGES = 2.0
+"""… and is felt from less than so many times a pad's range."""
+
+
+def electrode_positions(pad_type: cells.PadType) -> Array:
+    """Centroids (e, 3) [m] of a pad's electrodes in the pad's frame (z out of the pad)."""
+    return np.array([[*electrode.centroid, 0.0] for electrode in pad_type.electrodes.values()])
+
+
+class Skin:
+    """All electrodes of a cell's pads in one row, n in all, in the order of the cell file.
+
+    pads: names (p,); first (p + 1,): pad k holds electrodes first[k] to first[k + 1]; names (n,) as PAD/ELECTRODE; centroids
+    (n, 3) in the frame of each one's pad; peak (n,) = a1 [V], a2, a3, polarity (n,): the calibrated law, or where there is none
+    the designed one; gain (n,): its signal as a share of the designed one's; sensitivity (n,) [V/fF]; noise (n,) [V^2]: variance
+    of one sample of a millisecond; lsb (n,) [V]: a step of the converter; full_scale (n,) [V]: where amplitudes end.
+    Raises ValueError where the cell has no pads.
+    """
+
+    def __init__(self, cell: cells.Cell):
+        if not cell.pads:
+            raise ValueError(f"cell {cell.name} has no pads: the skin needs at least one under `pads:`")
+        self.pads = tuple(cell.pads)
+        self.links = tuple(pad.link for pad in cell.pads.values())
+        self.T_link_pads = np.array([pad.T_link_pad for pad in cell.pads.values()])
+        types = [cell.pad_types[pad.type] for pad in cell.pads.values()]
+        counts = [len(kind.electrodes) for kind in types]
+        self.first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        self.pad_of = np.repeat(np.arange(len(types)), counts)
+        self.centroids = np.concatenate([electrode_positions(kind) for kind in types])
+        self.names = tuple(f"{name}/{e}" for name, kind in zip(cell.pads, types, strict=True) for e in kind.electrodes)
+        laws = [
+            pad.calibration.get(electrode) or kind.law(electrode)
+            for pad, kind in zip(cell.pads.values(), types, strict=True)
+            for electrode in kind.electrodes
+        ]
+        self.peak, self.a2, self.a3, self.polarity, self.noise = (
+            np.array([float(getattr(law, name)) for law in laws]) for name in ("a1", "a2", "a3", "polarity", "noise")
+        )
+        designed = [e.law for kind in types for e in kind.electrodes.values()]
+        a1, a2, gaps = np.array([e.a1 for e in designed]), np.array([e.a2 for e in designed]), np.array(GAIN_GAPS)[:, None]
+        ratio = self.peak / (1.0 + self.a2 * gaps**2) / (a1 / (1.0 + a2 * gaps**2))
+        self.gain = np.exp(np.log(ratio).mean(axis=0))  # a1 alone trades off with a2
+        self.sensitivity = np.repeat([kind.chain.sensitivity for kind in types], counts)
+        self.full_scale = np.repeat([kind.chain.adc_reference / 2.0 for kind in types], counts)
+        self.lsb = np.repeat([kind.chain.adc_reference / (2.0**kind.chain.adc_bits - 1.0) for kind in types], counts)
+        self.range = np.array([kind.range for kind in types])
+
+    def __len__(self) -> int:
+        return len(self.centroids)
+
+    def of(self, pad: int) -> slice:
+        """Which electrodes belong to a pad."""
+        return slice(int(self.first[pad]), int(self.first[pad + 1]))
+
+    def T_world_pads(self, links: Mapping[str, Array] | None = None) -> Array:
+        """Pad poses (p, 4, 4) for the poses of the links that carry them, by `ROBOT/LINK`; `world` needs none."""
+        links = {"world": np.eye(4), **(links or {})}
+        missing = sorted(set(self.links) - set(links))
+        if missing:
+            raise ValueError(f"poses of the links {missing} expected: pads sit on them; came {sorted(links)}")
+        return np.stack([links[link] for link in self.links]) @ self.T_link_pads
+
+    def positions(self, T_world_pads: Array) -> Array:
+        """Electrode centroids (n, 3) [m] in the world."""
+        T = T_world_pads[self.pad_of]
+        return np.einsum("nij,nj->ni", T[:, :3, :3], self.centroids) + T[:, :3, 3]
+
+    def signal(self, amplitude: ArrayLike) -> Array:
+        """What the skin adds to an electrode's amplitude (..., n): polarity * (v - a3) [V], positive near a person."""
+        return self.polarity * (np.asarray(amplitude) - self.a3)
+
+    def amplitude(self, change: ArrayLike) -> Array:
+        """Noise-free amplitudes (..., n) [V] for changes of capacitance (..., n) [fF], up to full scale."""
+        analog = self.a3 + self.polarity * self.gain * self.sensitivity * np.asarray(change)
+        return np.clip(analog, 0.0, self.full_scale)
+
+    def volts(self, gaps: ArrayLike) -> Array:
+        """Noise-free amplitudes (..., n) [V] that the response law has at gaps (..., n) [m]; a negative gap counts as contact."""
+        d = np.maximum(gaps, 0.0)
+        return self.a3 + self.polarity * self.peak / (1.0 + self.a2 * d * d)
+
+
+@dataclass(frozen=True)
+class Near:
+    """The pads of a cell that one of its targets may come near: those on robots, and of the others those around its home. `cell`:
+    with these pads alone; pads (k,) and electrodes (m,): which ones they are in the whole cell's `Skin`."""
+
+    cell: cells.Cell
+    pads: NDArray[np.int64]
+    electrodes: NDArray[np.int64]
+
+    @staticmethod
+    def of(cell: cells.Cell, target: str) -> Near:
+        found = cell.targets[target]
+        limb = float(np.linalg.norm(anatomy.target_mesh(found, cell).vertices, axis=1).max())
+        reach = HOME_SIGMAS * found.home_spread.position + limb
+
+        def is_near(pad: cells.Pad) -> bool:
+            away = np.linalg.norm(np.subtract(pad.position, found.home.position))
+            return pad.link != "world" or bool(away < reach + RANGES * cell.pad_types[pad.type].range)
+
+        pads = {name: pad for name, pad in cell.pads.items() if is_near(pad)}
+        places = np.array([place for place, name in enumerate(cell.pads) if name in pads], dtype=np.int64)
+        counts = [len(cell.pad_types[pad.type].electrodes) for pad in cell.pads.values()]
+        whose = np.repeat(np.arange(len(counts)), counts)
+        return Near(cell.model_copy(update={"pads": pads}), places, np.flatnonzero(np.isin(whose, places)))
+
+
+def link_names(robots: Mapping[str, Mapping[str, Array]]) -> dict[str, Array]:
+    """Link poses of all robots under the names that pads use: {"panda": {"link7": T}} gives {"panda/link7": T}."""
+    return {f"{robot}/{link}": T for robot, links in robots.items() for link, T in links.items()}

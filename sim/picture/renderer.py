@@ -1,0 +1,381 @@
+"""What a camera sees of the simulated world: RGB image and class of every pixel.
+
+A frame takes four passes: a shadow map from the lamp, a z-buffer from the camera (`shared.geometry.raster`), shading of each
+pixel (textures in the bodies' own coordinates, Lambert and Blinn-Phong with shadow and ambient light), and the sensor (blur,
+noise).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from shared.body.anatomy import Mesh
+from shared.cell import description as cells
+from shared.geometry import raster, rigid
+from shared.geometry.rigid import Array
+from sim.picture.appearance import CUFF, GLOSS, TEXTURE_FIELDS, Appearance, Look, noise_volume
+
+SHADOW_PX = 256
+CREASE = math.cos(math.radians(50.0))
+"""Faces that meet at a sharper angle than this are shaded as an edge."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A mesh prepared for shading: `normals` (m, 3, 3), one per corner of every face, smooth except across creases."""
+
+    mesh: Mesh
+    normals: NDArray[np.float32] = field(repr=False)
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> Shape:
+        corners = mesh.vertices[mesh.faces]
+        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
+        # vertices at the same place count as one, so that meshes with split vertices are smooth too
+        _, vertex = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)
+        return cls(mesh, _corner_normals(vertex.reshape(-1)[mesh.faces], flat, area, CREASE).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Body:
+    """One thing in the scene."""
+
+    shape: Shape
+    T_world_body: Array
+    appearance: Appearance
+
+
+@dataclass(frozen=True)
+class Picture:
+    """`image` (h, w, 3) uint8 RGB, `labels` (h, w) uint8 classes, `bodies` (h, w) uint8 index of the body seen (255: none)."""
+
+    image: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+    bodies: NDArray[np.uint8]
+
+
+class Renderer:
+    """Renders scenes for one camera, or for a window of its image at a coarser scale (for training on crops)."""
+
+    def __init__(self, camera: cells.Camera, window: tuple[int, int, int, int] | None = None, scale: int = 1):
+        x0, y0, width, height = window or (0, 0, camera.width, camera.height)
+        self._T_camera_world = rigid.inverse(camera.T_world_camera)
+        self._k = (
+            camera.fx / scale,
+            camera.fy / scale,
+            (camera.cx - x0 - (scale - 1) / 2) / scale,
+            (camera.cy - y0 - (scale - 1) / 2) / scale,
+        )
+        self._raster = raster.Raster(width // scale, height // scale)
+        self._sky: tuple[Appearance, NDArray[np.float32]] | None = None
+        self._shadow = raster.Raster(SHADOW_PX, SHADOW_PX)
+
+    def render(self, bodies: list[Body], look: Look, rng: np.random.Generator) -> Picture:
+        """The picture of `bodies` (at most 254) under the light and sensor of `look`; `rng` draws the noise."""
+        view = self._raster
+        view.clear()
+        tables = _Tables(bodies)
+        for index, body in enumerate(bodies):
+            vertices = rigid.apply(self._T_camera_world @ body.T_world_body, body.shape.mesh.vertices)
+            view.draw(vertices, body.shape.mesh.faces, *self._k, index)
+        lamp = np.asarray(look.lamp, float)
+        T_lamp_world, lamp_f = self._cast_shadow(bodies, lamp)
+        T_world_camera = rigid.inverse(self._T_camera_world)
+        height, width = view.ids.shape
+        image = np.empty((height, width, 3), np.float32)
+        labels = np.empty((height, width), np.uint8)
+        _shade(
+            view.depth,
+            view.ids,
+            view.triangles,
+            np.array(self._k),
+            T_world_camera,
+            tables.T_body_world,
+            tables.corners,
+            tables.normals,
+            tables.labels,
+            tables.textures,
+            noise_volume(),
+            lamp,
+            np.asarray(look.lamp_colour, np.float32),
+            np.asarray(look.ambient, np.float32),
+            T_lamp_world,
+            lamp_f,
+            self._shadow.depth,
+            self._background(look.background),
+            image,
+            labels,
+        )
+        return Picture(_expose(image, look, rng), labels, view.ids.copy())
+
+    def _background(self, appearance: Appearance) -> NDArray[np.float32]:
+        """Albedo (h, w, 3) of what lies at infinity: the camera stands still, so it is made once."""
+        if self._sky is None or self._sky[0] != appearance:
+            albedo = np.empty((*self._raster.ids.shape, 3), np.float32)
+            R = rigid.inverse(self._T_camera_world)[:3, :3]
+            _paint_background(np.array(self._k), R, appearance.row()[None], noise_volume(), albedo)
+            self._sky = appearance, albedo
+        return self._sky[1]
+
+    def _cast_shadow(self, bodies: list[Body], lamp: Array) -> tuple[Array, float]:
+        """Fills the shadow map; returns T_lamp_world and the map's focal length [px]. The map covers the movable bodies."""
+        casters = [body for body in bodies if body.appearance.casts_shadow]
+        self._shadow.clear()
+        if not casters:
+            return np.eye(4), 1.0
+        centres = np.array([body.T_world_body[:3, 3] for body in casters])
+        up = (0.0, 1.0, 0.0) if abs(lamp[0]) + abs(lamp[1]) < 0.1 else (0.0, 0.0, 1.0)
+        T_lamp_world = rigid.inverse(rigid.look_at(lamp, np.median(centres, axis=0), up))
+        placed = [rigid.apply(T_lamp_world @ body.T_world_body, body.shape.mesh.vertices) for body in casters]
+        extent = max(float(np.quantile(np.abs(v[:, :2] / np.maximum(v[:, 2:], 0.1)), 0.98)) for v in placed)
+        focal = (SHADOW_PX / 2 - 2) / min(max(extent, 0.15), 1.2)
+        centre = SHADOW_PX / 2 - 0.5
+        for body, vertices in zip(casters, placed, strict=True):
+            self._shadow.draw(vertices, body.shape.mesh.faces, focal, focal, centre, centre, 0)
+        return T_lamp_world, focal
+
+    def hidden_fraction(self, picture: Picture, bodies: list[Body], index: int) -> float:
+        """The share of body `index`'s own pixels in the image that something else covers; 1 where it is wholly outside."""
+        body = bodies[index]
+        vertices = rigid.apply(self._T_camera_world @ body.T_world_body, body.shape.mesh.vertices)
+        height, width = picture.bodies.shape
+        whole = int(raster.silhouette(vertices, body.shape.mesh.faces, self._k, (0, 0, width, height)).sum())
+        return 1.0 - int((picture.bodies == index).sum()) / whole if whole else 1.0
+
+
+class _Tables:
+    """All bodies' triangles behind one another, as the shading pass reads them."""
+
+    def __init__(self, bodies: list[Body]):
+        meshes = [body.shape.mesh for body in bodies]
+        self.T_body_world = np.array([rigid.inverse(body.T_world_body) for body in bodies]).reshape(-1, 4, 4)
+        self.corners = np.concatenate(
+            [mesh.vertices[mesh.faces].astype(np.float32) for mesh in meshes] or [np.zeros((0, 3, 3), np.float32)]
+        )
+        self.normals = np.concatenate([body.shape.normals for body in bodies] or [np.zeros((0, 3, 3), np.float32)])
+        self.labels = np.concatenate([mesh.labels for mesh in meshes] or [np.zeros(0, np.uint8)])
+        self.textures = np.array([body.appearance.row() for body in bodies], np.float32).reshape(-1, TEXTURE_FIELDS)
+
+
+def _expose(image: NDArray[np.float32], look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The sensor: blur, shot and read noise, gamma of the display, 8 bits, and what JPEG leaves of them."""
+    if look.blur_px > 0:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), look.blur_px), np.float32)
+    noise = _grain()
+    start = int(rng.integers(0, noise.size - 1))
+    out = np.empty(image.shape, np.uint8)
+    _develop(image.reshape(-1), noise, start, np.float32(look.noise), np.asarray(look.gain, np.float32), out.reshape(-1))
+    if look.jpeg is not None:
+        _, packed = cv2.imencode(".jpg", cv2.cvtColor(out, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, look.jpeg])
+        return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1].copy()
+    return out
+
+
+_GRAIN: list[NDArray[np.float32]] = []
+
+
+def _grain() -> NDArray[np.float32]:
+    """White Gaussian noise, drawn once; each image reads it from another place."""
+    if not _GRAIN:
+        _GRAIN.append(np.random.default_rng(0).standard_normal(1_000_003).astype(np.float32))
+    return _GRAIN[0]
+
+
+@njit(cache=True, nogil=True)
+def _develop(image, noise, start, sigma, gain, out):
+    n = len(noise)
+    k = start
+    for i in range(len(image)):
+        value = max(image[i] * gain[i % 3], np.float32(0.0))
+        value = math.sqrt(value)  # a display's gamma, near enough
+        value += sigma * noise[k] * (np.float32(0.6) + np.float32(0.4) * value)
+        out[i] = np.uint8(min(max(value, 0.0), 1.0) * 255.0 + 0.5)
+        k += 1
+        if k == n:
+            k = 0
+
+
+@njit(cache=True)
+def _corner_normals(vertices, flat, area, crease):
+    """Area-weighted mean, at each corner, of the normals of the faces around that vertex within the crease angle."""
+    m = len(vertices)
+    count = np.zeros(vertices.max() + 2, np.int64)
+    for f in range(m):
+        for k in range(3):
+            count[vertices[f, k] + 1] += 1
+    start = np.cumsum(count)
+    around = np.empty(3 * m, np.int64)
+    fill = start.copy()
+    for f in range(m):
+        for k in range(3):
+            around[fill[vertices[f, k]]] = f
+            fill[vertices[f, k]] += 1
+    out = np.empty((m, 3, 3))
+    for f in range(m):
+        for k in range(3):
+            v = vertices[f, k]
+            total = np.zeros(3)
+            for e in range(start[v], start[v + 1]):
+                g = around[e]
+                if (flat[f] * flat[g]).sum() >= crease:
+                    total += area[g]
+            norm = math.sqrt((total * total).sum())
+            out[f, k] = total / norm if norm > 1e-15 else flat[f]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _noise(volume, x, y, z):
+    """Trilinear value noise in [0, 1] with a lattice of pitch 1, whose size is a power of two."""
+    wrap = volume.shape[0] - 1
+    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
+    a, b, c = np.float32(x - fx), np.float32(y - fy), np.float32(z - fz)
+    i, j, k = int(fx) & wrap, int(fy) & wrap, int(fz) & wrap
+    i1, j1, k1 = (i + 1) & wrap, (j + 1) & wrap, (k + 1) & wrap
+    one = np.float32(1.0)
+    low = (volume[i, j, k] * (one - a) + volume[i1, j, k] * a) * (one - b) + (
+        volume[i, j1, k] * (one - a) + volume[i1, j1, k] * a
+    ) * b
+    high = (volume[i, j, k1] * (one - a) + volume[i1, j, k1] * a) * (one - b) + (
+        volume[i, j1, k1] * (one - a) + volume[i1, j1, k1] * a
+    ) * b
+    return low * (one - c) + high * c
+
+
+@njit(cache=True, nogil=True)
+def _texture(textures, row, x, y, z, volume, out):
+    """Albedo (3,) of a row of textures (Appearance.row) at body coordinates."""
+    base = 0
+    if x < textures[row, CUFF]:  # below the cuff: the sleeve's colours
+        base = 9
+    pattern, period = int(textures[row, base]), textures[row, base + 1]
+    u, v, w = x / period, y / period, z / period
+    if pattern == 0:
+        mix = np.float32(0.0)
+    elif pattern == 1:  # blotches of two sizes
+        mix = np.float32(0.65) * _noise(volume, u, v, w) + np.float32(0.35) * _noise(volume, 3.1 * u, 3.1 * v, 3.1 * w)
+    elif pattern == 2:  # stripes
+        mix = np.float32(1.0) if (u + v + w) - math.floor(u + v + w) < 0.5 else np.float32(0.0)
+    elif pattern == 3:  # checks
+        mix = np.float32((int(math.floor(u + 0.37)) + int(math.floor(v + 0.41)) + int(math.floor(w + 0.43))) & 1)
+    elif pattern == 4:  # wood: stretched noise, in rings
+        ring = 4.0 * _noise(volume, 0.15 * u, v, w) + 0.6 * _noise(volume, u, 5.0 * v, 5.0 * w)
+        mix = np.float32(ring - math.floor(ring))
+    else:
+        mix = np.float32(0.0)
+    mix *= textures[row, base + 2]
+    for c in range(3):
+        if pattern == 5:  # each channel in steps of its own
+            mix = np.float32(math.floor(4.0 * _noise(volume, u + 9.0 * c, v, w)) / 3.0) * textures[row, base + 2]
+        out[c] = textures[row, base + 3 + c] * (np.float32(1.0) - mix) + textures[row, base + 6 + c] * mix
+
+
+@njit(cache=True, nogil=True)
+def _paint_background(k, R, textures, volume, out):
+    """Albedo (h, w, 3) of a texture on a sphere of 3 m around the camera, whose axes are the columns of R."""
+    for row in range(out.shape[0]):
+        dy = (row - k[3]) / k[1]
+        for column in range(out.shape[1]):
+            dx = (column - k[2]) / k[0]
+            x = 3.0 * (R[0, 0] * dx + R[0, 1] * dy + R[0, 2])
+            y = 3.0 * (R[1, 0] * dx + R[1, 1] * dy + R[1, 2])
+            z = 3.0 * (R[2, 0] * dx + R[2, 1] * dy + R[2, 2])
+            _texture(textures, 0, x, y, z, volume, out[row, column])
+
+
+@njit(cache=True, nogil=True)
+def _shade(
+    depth, ids, triangles, k, R, T, corners, normals, face_labels, textures, volume,
+    lamp, lamp_colour, ambient, T_lamp_world, lamp_f, shadow, background, image, labels,
+):  # fmt: skip
+    h, w = ids.shape
+    albedo = np.empty(3, np.float32)
+    size = shadow.shape[0]
+    centre = size / 2 - 0.5
+    ex, ey, ez = R[0, 3], R[1, 3], R[2, 3]
+    for row in range(h):
+        dy = (row - k[3]) / k[1]
+        for column in range(w):
+            dx = (column - k[2]) / k[0]
+            body = ids[row, column]
+            if body == 255:
+                for c in range(3):
+                    image[row, column, c] = background[row, column, c] * (ambient[c] + np.float32(0.5) * lamp_colour[c])
+                labels[row, column] = 0
+                continue
+            # the pixel's ray in the world, of unit depth
+            rx = R[0, 0] * dx + R[0, 1] * dy + R[0, 2]
+            ry = R[1, 0] * dx + R[1, 1] * dy + R[1, 2]
+            rz = R[2, 0] * dx + R[2, 1] * dy + R[2, 2]
+            z = depth[row, column]
+            px, py, pz = ex + z * rx, ey + z * ry, ez + z * rz
+            x = T[body, 0, 0] * px + T[body, 0, 1] * py + T[body, 0, 2] * pz + T[body, 0, 3]
+            y = T[body, 1, 0] * px + T[body, 1, 1] * py + T[body, 1, 2] * pz + T[body, 1, 3]
+            q = T[body, 2, 0] * px + T[body, 2, 1] * py + T[body, 2, 2] * pz + T[body, 2, 3]
+            t = triangles[row, column]
+            labels[row, column] = face_labels[t]
+            # barycentric weights of the point in its triangle
+            ax, ay, az = corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]
+            ux, uy, uz = corners[t, 1, 0] - ax, corners[t, 1, 1] - ay, corners[t, 1, 2] - az
+            vx, vy, vz = corners[t, 2, 0] - ax, corners[t, 2, 1] - ay, corners[t, 2, 2] - az
+            wx, wy, wz = x - ax, y - ay, q - az
+            uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
+            wu, wv = wx * ux + wy * uy + wz * uz, wx * vx + wy * vy + wz * vz
+            det = uu * vv - uv * uv
+            if det < 1e-14:
+                s1, s2 = 0.0, 0.0
+            else:
+                s1, s2 = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
+            s0 = 1.0 - s1 - s2
+            mx = s0 * normals[t, 0, 0] + s1 * normals[t, 1, 0] + s2 * normals[t, 2, 0]
+            my = s0 * normals[t, 0, 1] + s1 * normals[t, 1, 1] + s2 * normals[t, 2, 1]
+            mz = s0 * normals[t, 0, 2] + s1 * normals[t, 1, 2] + s2 * normals[t, 2, 2]
+            # its normal in the world: the transpose of T's rotation
+            nx = T[body, 0, 0] * mx + T[body, 1, 0] * my + T[body, 2, 0] * mz
+            ny = T[body, 0, 1] * mx + T[body, 1, 1] * my + T[body, 2, 1] * mz
+            nz = T[body, 0, 2] * mx + T[body, 1, 2] * my + T[body, 2, 2] * mz
+            length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
+            nx, ny, nz = nx / length, ny / length, nz / length
+            lx, ly, lz = lamp[0] - px, lamp[1] - py, lamp[2] - pz
+            length = math.sqrt(lx * lx + ly * ly + lz * lz)
+            lx, ly, lz = lx / length, ly / length, lz / length
+            diffuse = nx * lx + ny * ly + nz * lz
+            lit = 0.0
+            if diffuse > 0.0:
+                sx = T_lamp_world[0, 0] * px + T_lamp_world[0, 1] * py + T_lamp_world[0, 2] * pz + T_lamp_world[0, 3]
+                sy = T_lamp_world[1, 0] * px + T_lamp_world[1, 1] * py + T_lamp_world[1, 2] * pz + T_lamp_world[1, 3]
+                sz = T_lamp_world[2, 0] * px + T_lamp_world[2, 1] * py + T_lamp_world[2, 2] * pz + T_lamp_world[2, 3]
+                lit = 1.0
+                if sz > 0.1:
+                    su, sv = lamp_f * sx / sz + centre, lamp_f * sy / sz + centre
+                    i, j = int(math.floor(su)), int(math.floor(sv))
+                    if 0 <= i < size - 1 and 0 <= j < size - 1:
+                        fu, fv = su - i, sv - j
+                        edge = sz - 0.012 - 0.02 * (1.0 - diffuse)
+                        lit = ((1 - fu) * (shadow[j, i] > edge) + fu * (shadow[j, i + 1] > edge)) * (1 - fv) + (
+                            (1 - fu) * (shadow[j + 1, i] > edge) + fu * (shadow[j + 1, i + 1] > edge)
+                        ) * fv
+                diffuse *= lit
+            else:
+                diffuse = 0.0
+            _texture(textures, body, x, y, q, volume, albedo)
+            shine = 0.0
+            if textures[body, GLOSS] > 0.0 and lit > 0.0:
+                length = math.sqrt(rx * rx + ry * ry + rz * rz)
+                hx, hy, hz = lx - rx / length, ly - ry / length, lz - rz / length
+                length = math.sqrt(hx * hx + hy * hy + hz * hz) + 1e-9
+                cosine = max((nx * hx + ny * hy + nz * hz) / length, 0.0)
+                cosine *= cosine
+                cosine *= cosine
+                cosine *= cosine
+                shine = textures[body, GLOSS] * lit * cosine * cosine
+            sky = 0.75 + 0.25 * nz
+            for c in range(3):
+                image[row, column, c] = albedo[c] * (ambient[c] * sky + lamp_colour[c] * diffuse) + lamp_colour[c] * shine

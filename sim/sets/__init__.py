@@ -1,0 +1,1 @@
+"""Pictures, films and trials with their truth, for training and for benchmarks."""

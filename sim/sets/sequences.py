@@ -1,0 +1,287 @@
+"""Image sequences with class labels for training the segmentation: `render(seed, index)` is a function of its arguments.
+
+Scenes are drawn around those of the built-in cells: their cameras, motions, persons, robots and tables, each varied, with things
+that come between and leave, clutter, and all appearances that `sim.picture.renderer` draws. A sequence is seen through a window
+that stands still, at scales from those of a far arm or a coarse whole frame to those of a near one.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from shared.body.anatomy import Mesh
+from shared.body.robot import RobotModel, robot_models
+from shared.cell import description as cells
+from shared.contract.labels import Label
+from shared.geometry import rigid
+from shared.geometry.rigid import Array
+from sim.picture import appearance
+from sim.picture.appearance import Appearance
+from sim.picture.occluder import Panel, box
+from sim.picture.renderer import Body, Renderer, Shape
+from sim.world.person import Person, frame
+
+CELLS = ("table", "arm")
+PERIOD_S = 0.05
+ASTRAY = 0.12
+"""Share of sequences whose window lies anywhere in the frame."""
+
+
+@dataclass(frozen=True)
+class Variety:
+    """What is drawn. frames; size [px] of the window; scale: bounds of the focal length relative to the cell's camera; speed
+    [m/s] and turn [rad/s]: the target's largest; jitter [m]: how far the window's middle is off the target's."""
+
+    frames: int = 8
+    size: int = 192
+    scale: tuple[float, float] = (0.4, 1.5)
+    speed: float = 0.5
+    turn: float = 1.2
+    jitter: float = 0.06
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where the target is. T_camera_target (frames, 4, 4); intrinsics (4,) of the window: fx, fy, cx, cy [px]; vertices (n, 3)
+    [m] of the target's mesh, which is that of the person seen."""
+
+    T_camera_target: Array
+    intrinsics: Array
+    vertices: Array
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """images (frames, h, w, 3) uint8 RGB, labels (frames, h, w) uint8, hidden (frames,): share of the target's pixels in the
+    window that something covers; poses: None where only the labels are known."""
+
+    images: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+    hidden: NDArray[np.float64]
+    poses: Poses | None = None
+
+
+@dataclass(frozen=True)
+class Thing:
+    """A shape, its poses T_world_shape (frames, 4, 4) and its looks."""
+
+    shape: Shape
+    T: Array
+    appearance: Appearance
+
+
+def render(seed: int, index: int, variety: Variety = Variety()) -> Sequence:
+    """Sequence `index` of the endless data set `seed`."""
+    rng = np.random.default_rng([seed, index])
+    camera, things = scene(rng, variety)
+    look = appearance.look(rng, tuple(things[0].T[0, :3, 3]))
+    x0, y0 = _window(camera, things[0], variety, rng)
+    renderer = Renderer(camera, (x0, y0, variety.size, variety.size))
+    images, labels, hidden = [], [], []
+    for t in range(variety.frames):
+        bodies = [Body(thing.shape, thing.T[t], thing.appearance) for thing in things]
+        picture = renderer.render(bodies, look, rng)
+        images.append(picture.image)
+        labels.append(picture.labels)
+        hidden.append(renderer.hidden_fraction(picture, bodies, 0))
+    T_camera_target = np.stack([rigid.inverse(camera.T_world_camera) @ T for T in things[0].T])
+    poses = Poses(
+        T_camera_target, np.array([camera.fx, camera.fy, camera.cx - x0, camera.cy - y0]), things[0].shape.mesh.vertices
+    )
+    return Sequence(np.stack(images), np.stack(labels), np.array(hidden), poses)
+
+
+def _window(camera: cells.Camera, target: Thing, variety: Variety, rng: np.random.Generator) -> tuple[int, int]:
+    """The window's first column and row: around the target in the middle of the sequence, or, some times, anywhere."""
+    room = np.array([camera.width, camera.height]) - variety.size
+    if rng.random() < ASTRAY:
+        x0, y0 = rng.integers(0, room + 1)
+        return int(x0), int(y0)
+    vertices = target.shape.mesh.vertices
+    middle = rigid.apply(target.T[variety.frames // 2], (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
+    x, y, z = rigid.apply(rigid.inverse(camera.T_world_camera), middle + rng.uniform(-1.0, 1.0, 3) * variety.jitter)
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    x0, y0 = np.clip(np.round([u, v]).astype(int) - variety.size // 2, 0, room)
+    return int(x0), int(y0)
+
+
+def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells.Camera, list[Thing]]:
+    """A camera and the things in front of it, the target first."""
+    cell = _cell(CELLS[rng.integers(len(CELLS))])
+    assert cell.sim is not None
+    times: Array = np.arange(variety.frames, dtype=float) * PERIOD_S - variety.frames * PERIOD_S / 2
+    measures = {name: value * rng.uniform(0.86, 1.14) for name, value in cell.body.model_dump().items()}
+    varied = cell.model_copy(update={"body": cells.Body(**measures)})
+    shoulder = np.asarray(cell.sim.shoulder) + rng.normal(0.0, 0.06, 3)
+    target = next(iter(cell.targets.values()))
+    person = Person(varied, cell.sim.model_copy(update={"shoulder": tuple(shoulder)}), target)
+    T_target = path(cell.sim.motion, variety, times, rng)
+    clothes = appearance.person(rng)
+    things = [
+        Thing(Shape.of(mesh), T, clothes[label])
+        for label, mesh, T in zip(
+            (Label.FOREARM, Label.UPPER_ARM, Label.TORSO), person.meshes, person.poses(T_target), strict=True
+        )
+    ]
+    middle = T_target[len(times) // 2]
+    camera = _camera(next(iter(cell.cameras.values())), middle[:3, 3], variety, rng)
+    things += _robot(cell, times, rng)
+    things += furniture(cell.sim.table or (1.2, 0.8), len(times), rng)
+    for _ in range(rng.choice([0, 1, 2], p=[0.2, 0.65, 0.15])):
+        things.append(_between(camera, person.meshes[0], T_target, times, rng))
+    return camera, things
+
+
+@functools.cache
+def _cell(name: str) -> cells.Cell:
+    return cells.load(name)
+
+
+@functools.cache
+def _robots(name: str) -> dict[str, tuple[RobotModel, dict[str, Shape]]]:
+    return {
+        robot: (model, {link: Shape.of(mesh) for link, mesh in model.meshes.items()})
+        for robot, model in robot_models(_cell(name)).items()
+    }
+
+
+def path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.Generator) -> Array:
+    """Poses (frames, 4, 4) of the target at a constant twist; one sequence of seven stands still."""
+    position = rng.uniform(np.subtract(motion.low, 0.06), np.add(motion.high, 0.06))
+    rpy = 1.4 * rng.uniform(motion.rpy_low, motion.rpy_high)
+    if rng.random() < 0.15:
+        rpy += rng.normal(0.0, (1.2, 0.3, 0.5))
+    twist = np.concatenate([_direction(rng) * variety.speed, _direction(rng) * variety.turn]) * rng.random() ** 1.5
+    if rng.random() < 1.0 / 7.0:
+        twist[:] = 0.0
+    middle = rigid.from_rpy(position, rpy)
+    return np.stack([rigid.perturb(middle, twist * t) for t in times])
+
+
+def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.random.Generator) -> cells.Camera:
+    """A camera near the cell's or, one time of six, anywhere around the target; its resolution scaled."""
+    position = np.asarray(camera.position) + rng.normal(0.0, 0.1, 3)
+    look_at = np.asarray(camera.look_at or target) + rng.normal(0.0, 0.08, 3)
+    if rng.random() < 1.0 / 6.0:
+        azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.1, 1.3)
+        away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+        position, look_at = target + rng.uniform(1.1, 2.2) * away, target + rng.normal(0.0, 0.1, 3)
+    low, high = variety.scale
+    choice = rng.random()  # around 1: the crop at native resolution; around 0.5: the whole frame at scale 2
+    scale = rng.uniform(0.85, 1.15) if choice < 0.7 else rng.uniform(0.45, 0.6) if choice < 0.9 else rng.uniform(low, high)
+    scale = float(np.clip(scale, low, high))
+    width, height = (max(round(scale * n), variety.size) for n in (camera.width, camera.height))
+    return camera.model_copy(
+        update={
+            "width": width,
+            "height": height,
+            "fx": camera.fx * scale,
+            "fy": camera.fy * scale,
+            "cx": (width - 1) / 2.0,
+            "cy": (height - 1) / 2.0,
+            "position": tuple(position),
+            "look_at": tuple(look_at),
+            "rpy": None,
+        }
+    )
+
+
+def _robot(cell: cells.Cell, times: Array, rng: np.random.Generator) -> list[Thing]:
+    """The cell's robots, a little beside where they stand; the table cell borrows the other's at times."""
+    if not cell.robots:
+        if rng.random() < 0.75:
+            return []
+        cell = _cell("arm")
+    return robots(cell, times, rng, astray=0.06)[0]
+
+
+def robots(cell: cells.Cell, times: Array, rng: np.random.Generator, astray: float = 0.0) -> tuple[list[Thing], dict[str, Array]]:
+    """The robots of a built-in cell and their joints (frames, n) [rad], somewhere in and around their bounds and moving; `astray`
+    [m]: standard deviation of where they stand."""
+    assert cell.sim is not None
+    things, joints = [], {}
+    offset = np.eye(4)
+    offset[:3, 3] = rng.normal(0.0, astray, 3)
+    paint = Appearance(appearance.metal(rng), gloss=rng.uniform(0.0, 0.4))
+    plates = Appearance(appearance.metal(rng) if rng.random() < 0.5 else appearance.cloth(rng))
+    for name, (model, shapes) in _robots(cell.name).items():
+        low, high = np.asarray(cell.sim.joints_low), np.asarray(cell.sim.joints_high)
+        q = rng.uniform(low - 0.3, high + 0.3) + times[:, None] * rng.normal(0.0, 0.3, len(low))
+        links = model.link_transforms(q)
+        things += [Thing(shape, offset @ links[link], paint) for link, shape in shapes.items()]
+        plate = Shape.of(box((0.09, 0.09, 0.003), (0.0, 0.0, -0.0015), Label.ROBOT))
+        for pad in cell.pads.values():
+            things.append(Thing(plate, offset @ links[pad.link.partition("/")[2]] @ pad.T_link_pad, plates))
+        joints[name] = q
+    return things, joints
+
+
+def furniture(table: tuple[float, float], frames: int, rng: np.random.Generator) -> list[Thing]:
+    """A table, plates in it and clutter on it: all of it background."""
+    things = []
+    if rng.random() < 0.9:
+        size = np.array(table) * rng.uniform(0.8, 1.4, 2)
+        top = Appearance(appearance.tabletop(rng), casts_shadow=False)
+        things.append(_standing(box((*size, 0.03), (0.0, 0.0, -0.017), Label.BACKGROUND), np.eye(4), frames, top))
+        if rng.random() < 0.6:
+            rows, columns, pitch = rng.integers(1, 4), rng.integers(2, 6), rng.uniform(0.06, 0.1)
+            side = pitch * rng.uniform(0.7, 1.1)
+            plate = Appearance(appearance.metal(rng) if rng.random() < 0.5 else appearance.cloth(rng), casts_shadow=False)
+            for i in range(rows):
+                for k in range(columns):
+                    at = ((k - (columns - 1) / 2) * pitch, (i - (rows - 1) / 2) * pitch, -0.0015)
+                    things.append(_standing(box((side, side, 0.003), at, Label.BACKGROUND), np.eye(4), frames, plate))
+    for _ in range(rng.integers(1, 6) if rng.random() < 0.35 else 0):
+        size = rng.uniform(0.03, 0.25, 3)
+        T = rigid.from_rpy([*rng.uniform(-0.6, 0.6, 2), size[2] / 2], [0.0, 0.0, rng.uniform(0.0, np.pi)])
+        colours = Appearance(appearance.occluder(rng))
+        things.append(_standing(box(size, (0.0, 0.0, 0.0), Label.BACKGROUND), T, frames, colours))
+    return things
+
+
+def _standing(mesh: Mesh, T: Array, frames: int, looks: Appearance) -> Thing:
+    return Thing(Shape.of(mesh), np.broadcast_to(T, (frames, 4, 4)), looks)
+
+
+def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, rng: np.random.Generator) -> Thing:
+    """Something that covers a part of the target from the camera, and slides or stands: the emulator's panel, or a thing of
+    another shape somewhere on the line of sight."""
+    frames = len(times)
+    looks = Appearance(appearance.occluder(rng))
+    if rng.random() < 0.6:
+        panel = Panel(int(rng.integers(2**31)))
+        level = rng.uniform(-0.5, 1.0) + times * rng.choice([0.0, rng.normal(0.0, 2.5)])
+        poses = [panel.pose(float(np.clip(a, -0.99, 1.0)), camera, target, T) for a, T in zip(level, T_target, strict=True)]
+        return Thing(Shape.of(panel.mesh), np.stack([T for T in poses if T is not None]), looks)
+    mesh = shape(rng)
+    hidden = rigid.apply(T_target[frames // 2], target.vertices[rng.integers(len(target.vertices))])
+    eye = np.asarray(camera.position)
+    share = rng.uniform(0.35, 0.92)
+    middle = eye + share * (hidden - eye) + rng.normal(0.0, 0.05, 3)
+    rotation = rigid.from_rpy(middle, rng.uniform(-np.pi, np.pi, 3))
+    velocity = _direction(rng) * rng.uniform(0.0, 0.6) * share if rng.random() < 0.7 else np.zeros(3)
+    return Thing(Shape.of(mesh), frame(rotation[:3, :3], middle + times[:, None] * velocity), looks)
+
+
+def shape(rng: np.random.Generator) -> Mesh:
+    """A box, a board, a tube or a stone that covers the target."""
+    kind = rng.integers(4)
+    if kind == 0:
+        return box(rng.uniform(0.04, 0.3, 3), (0.0, 0.0, 0.0), Label.OCCLUDER)
+    if kind == 1:
+        return box((*rng.uniform(0.1, 0.45, 2), 0.005), (0.0, 0.0, 0.0), Label.OCCLUDER)
+    if kind == 2:
+        solid = trimesh.creation.cylinder(radius=rng.uniform(0.01, 0.09), height=rng.uniform(0.15, 0.8), sections=20)
+    else:  # a stone
+        solid = trimesh.convex.convex_hull(rng.normal(size=(14, 3)) * rng.uniform(0.03, 0.12, 3))
+    return Mesh(np.asarray(solid.vertices), solid.faces.astype(np.int32), np.full(len(solid.faces), Label.OCCLUDER, np.uint8))
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    v = rng.normal(size=3)
+    return v / np.linalg.norm(v)

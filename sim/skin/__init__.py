@@ -1,0 +1,1 @@
+"""What the simulated skin measures: fields, boards, and their faults."""

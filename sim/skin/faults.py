@@ -1,0 +1,131 @@
+"""Faults of the skin, put into clean voltages: what a broken wire, a warm amplifier or a careless mounting make of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shared.skin.faults import arrangements
+from shared.skin.layout import Skin
+
+Array = NDArray[np.float64]
+
+KINDS = {
+    "dead": "a broken wire: no amplitude and no noise",
+    "saturated": "the amplifier at its end",
+    "drift": "an offset that warms up by SIZE volts (default 0.05)",
+    "hum": "mains of SIZE volts at 50 Hz (default 0.01)",
+    "gain": "a calibration from another pad: signals times SIZE (default 1.5)",
+    "turned": "the pad mounted turned by 180 degrees",
+    "mirrored": "its left and right electrodes swapped",
+    "none": "in order again",
+}
+"""Every fault, and what it means. `turned` and `mirrored` are of a whole pad."""
+SIZES = {"drift": 0.05, "hum": 0.01, "gain": 1.5}
+LARGEST = {"drift": 1.0, "hum": 1.0, "gain": 10.0}
+ARRANGEMENTS = {"turned": "turned by 180 degrees", "mirrored": "mirrored left to right"}
+MAINS_HZ = 50.0
+WARMS_S = 30.0
+"""Time constant of a drift."""
+
+
+@dataclass(frozen=True)
+class _Fault:
+    kind: str
+    size: float
+    since_s: float
+
+
+class SkinFaults:
+    """The faults in force on the pads of a skin: a function of the commands given and of the samples' times."""
+
+    def __init__(self, skin: Skin):
+        self._skin = skin
+        self._electrodes: dict[int, _Fault] = {}
+        self._pads: dict[int, str] = {}
+
+    def command(self, words: str, time_s: float) -> None:
+        """`PAD[/ELECTRODE] FAULT [SIZE]` or `all none`: a fault of an electrode, or of all of a pad, from time_s on.
+
+        Raises ValueError that says what is possible.
+        """
+        where, kind, size = self._parse(words)
+        pads, electrodes = self._find(where)
+        if kind in ARRANGEMENTS:
+            if where not in self._skin.pads:
+                raise ValueError(f"skin: {kind} is of a whole pad: one of {', '.join(self._skin.pads)} expected, {where!r} came")
+            self._pads = {**self._pads, pads[0]: kind}
+            return
+        kept = {k: fault for k, fault in self._electrodes.items() if k not in electrodes}
+        # new dictionaries: another thread may be applying the old ones
+        self._electrodes = kept if kind == "none" else kept | dict.fromkeys(electrodes, _Fault(kind, size, time_s))
+        if kind == "none":
+            self._pads = {pad: arrangement for pad, arrangement in self._pads.items() if pad not in pads}
+
+    def describe(self) -> dict[str, str]:
+        """What is wrong by pad or electrode, as it was commanded."""
+        out = {self._skin.pads[pad]: kind for pad, kind in self._pads.items()}
+        for k, fault in sorted(self._electrodes.items()):
+            out[self._skin.names[k]] = f"{fault.kind} {fault.size:g}" if fault.kind in SIZES else fault.kind
+        return out
+
+    def apply(self, pad: int, times_s: ArrayLike, volts: Array) -> Array:
+        """What the pad at this place of the skin gives instead of clean voltages (s, e) [V] at times (s,)."""
+        skin, own = self._skin, self._skin.of(pad)
+        faults = [(k - own.start, fault) for k, fault in self._electrodes.items() if own.start <= k < own.stop]
+        arrangement = self._pads.get(pad)
+        if arrangement is None and not faults:
+            return volts
+        time = np.asarray(times_s, np.float64)
+        out = np.array(volts, np.float64)
+        if arrangement is not None:
+            out = out[:, arrangements(skin.centroids[own])[ARRANGEMENTS[arrangement]]]
+        for k, fault in faults:
+            a3 = skin.a3[own][k]
+            match fault.kind:
+                case "dead":
+                    out[:, k] = 0.0
+                case "saturated":
+                    out[:, k] = skin.full_scale[own][k]
+                case "drift":
+                    out[:, k] += fault.size * -np.expm1(-np.maximum(time - fault.since_s, 0.0) / WARMS_S)
+                case "hum":
+                    out[:, k] += fault.size * np.sin(2.0 * np.pi * MAINS_HZ * time)
+                case "gain":
+                    out[:, k] = a3 + fault.size * (out[:, k] - a3)
+        return np.clip(out, 0.0, skin.full_scale[own])
+
+    def _parse(self, words: str) -> tuple[str, str, float]:
+        parts = words.split()
+        if len(parts) not in (2, 3) or parts[1] not in KINDS or (parts[0] == "all" and parts[1] != "none"):
+            possible = "; ".join(f"{name}: {about}" for name, about in KINDS.items())
+            raise ValueError(f"skin: PAD[/ELECTRODE] FAULT [SIZE] or `all none` expected, {words!r} came. Faults: {possible}")
+        where, kind = parts[:2]
+        if len(parts) == 2:
+            return where, kind, SIZES.get(kind, 0.0)
+        if kind not in SIZES:
+            raise ValueError(f"skin: {kind} has no size, {parts[2]!r} came")
+        try:
+            size = float(parts[2])
+        except ValueError:
+            size = math.nan
+        if not 0.0 < abs(size) <= LARGEST[kind]:
+            raise ValueError(f"skin: a size of {kind} up to {LARGEST[kind]:g} expected, {parts[2]!r} came")
+        return where, kind, size
+
+    def _find(self, where: str) -> tuple[list[int], list[int]]:
+        """Pads and electrodes by their name: places in the skin."""
+        skin = self._skin
+        if where == "all":
+            return list(range(len(skin.pads))), list(range(len(skin)))
+        if where in skin.pads:
+            pad = skin.pads.index(where)
+            return [pad], list(range(len(skin)))[skin.of(pad)]
+        if where in skin.names:
+            return [], [skin.names.index(where)]
+        raise ValueError(
+            f"skin: a pad of {', '.join(skin.pads)} or one of their electrodes, such as {skin.names[0]}, expected, {where!r} came"
+        )

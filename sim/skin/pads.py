@@ -1,0 +1,45 @@
+"""What the pads read: how a limb changes the capacitance of their electrodes, and the amplitudes that come of it.
+
+The changes come from the networks that stand for the boundary-element field (`shared.skin.response`): eight pads at 1 kHz take a
+few per cent of a core. What the robot's other links change is added, as if the limb did not shade them. The person's upper arm
+and torso and other pads are not felt.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shared.cell import description as cells
+from shared.geometry.rigid import inverse
+from shared.skin.layout import Skin
+from shared.skin.response import Response
+
+Array = NDArray[np.float64]
+
+
+class SkinModel:
+    """The pads of a cell before one of its targets, n electrodes in all, in the order of `shared.skin.layout.Skin` (`.skin`)."""
+
+    def __init__(self, cell: cells.Cell, target: str):
+        self.skin = Skin(cell)
+        self._response = Response(cell, target)
+
+    def change(self, T_world_pads: Array, T_world_target: Array, joints: ArrayLike = ()) -> Array:
+        """Changes of capacitance (n,) [fF] by the target and by the robots at all their joint angles (j,), for pads (p, 4, 4)."""
+        return self.limb(T_world_pads, T_world_target) + self.rest(joints)
+
+    def limb(self, T_world_pads: Array, T_world_target: Array) -> Array:
+        """The target's part of the changes (n,) [fF]."""
+        return self._response.change(np.stack([inverse(T) for T in T_world_pads]) @ T_world_target)
+
+    def rest(self, joints: ArrayLike) -> Array:
+        """The robots' part of the changes (n,) [fF]."""
+        return self._response.rest(joints)
+
+    def volts(self, change: ArrayLike, rng: np.random.Generator) -> Array:
+        """Amplitudes (..., n) [V] of samples of a millisecond, for changes (..., n) [fF]: signal chain, white noise of the
+        calibrated variance, end of the scale. The converter's steps are lost in the hundred cycles that a sample averages."""
+        skin = self.skin
+        noisy = skin.amplitude(change) + np.sqrt(skin.noise) * rng.standard_normal(np.shape(change))
+        return np.clip(noisy, 0.0, skin.full_scale)

@@ -1,0 +1,200 @@
+"""Our bus beside Zenoh's plain bytes: the same payloads, quality of service and rings between the same two processes.
+
+`python -m tests.bench.lib.buses ENDPOINT` is the receiver: on `begin` it forgets, on `end` it prints what came as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from threading import Condition, Thread
+
+import numpy as np
+import zenoh
+
+from shared.cell import description as cells
+from shared.contract import messages, topics
+from shared.contract.topics import Topic
+from shared.runtime import bus
+from shared.runtime.node import Node
+
+CELL = cells.load("arm")
+NAMES = {"robot": "panda", "camera": "side"}
+KINDS = ("ours", "raw")
+ACK = "raw/ack"
+QUIET_S = 0.15
+"""What has not come after so long without anything does not come any more."""
+PATIENCE_S = 30.0
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A message of `bytes` on the wire, as `topic` carries it; unlimited in rate, so that the guard lets a flood through. Its
+    depth, what a reader keeps, is how many are under way at once in a flood."""
+
+    topic: Topic
+    make: Callable[[int], messages.Message]
+
+    @property
+    def names(self) -> dict[str, str]:
+        return {name: value for name, value in NAMES.items() if f"{{{name}}}" in self.topic.key}
+
+    @property
+    def raw_key(self) -> str:
+        return f"raw/{self.topic.name}"
+
+
+def _payload(topic: Topic, name: str, depth: int, make: Callable[[int], messages.Message]) -> Payload:
+    return Payload(replace(topic, name=name, key=f"{topic.key}/{name}", rate_hz=1e7, depth=depth), make)
+
+
+IMAGE = np.zeros((480, 640, 3), np.uint8)
+LABELS = np.zeros((480, 480), np.uint8)
+PAYLOADS = {
+    64: _payload(topics.JOINTS, "tiny", 16, lambda now: messages.Joints(stamp_ns=now, position=np.zeros(1))),
+    4_000: _payload(topics.JOINTS, "small", 16, lambda now: messages.Joints(stamp_ns=now, position=np.zeros(500))),
+    230_000: _payload(topics.MASK, "mask", 8, lambda now: messages.Mask(stamp_ns=now, labels=LABELS, x0=0, y0=0, scale=1)),
+    921_000: _payload(topics.FRAME, "image", 2, lambda now: messages.Frame(stamp_ns=now, image=IMAGE)),
+}
+"""By their size in bytes, roughly: 64 B, 4 kB, 230 kB and a frame; all that are under way fit into the shared memory of a small
+cell (`bus.POOL_BYTES`)."""
+
+
+class Sender:
+    """Sends a payload of each kind; the raw one is as long as ours, and carries its stamp beside it."""
+
+    def __init__(self, node: Node, payload: Payload):
+        self._node, self._payload = node, payload
+        self._bytes = messages.encode(payload.make(0))
+        self.bytes = len(self._bytes)
+        assert node.session is not None
+        self._publisher = node.session.declare_publisher(
+            payload.raw_key,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=getattr(zenoh.Priority, payload.topic.priority.value),
+        )
+
+    def send(self, kind: str) -> None:
+        now = time.time_ns()
+        if kind == "raw":
+            self._publisher.put(self._bytes, attachment=now.to_bytes(8, "little"))
+        else:
+            self._node.publish(self._payload.topic, self._payload.make(now), **self._payload.names)
+
+
+class Link:
+    """The sender's end: a node, and the process that receives."""
+
+    def __init__(self, node: Node, receiver: subprocess.Popen):
+        self._receiver = receiver
+        self._read, self._news = 0, Condition()
+        assert node.session is not None
+        self._acks = node.session.declare_subscriber(ACK, self._on_ack)
+        self.senders = {size: Sender(node, payload) for size, payload in PAYLOADS.items()}
+        for sender in self.senders.values():
+            for kind in KINDS:
+                self._until_heard(sender, kind)
+
+    def latencies_s(self, size: int, kind: str, count: int, pause_s: float) -> np.ndarray:
+        """From before a message is made until it is read, of those that came of `count`."""
+        self._ask("begin")
+        for _ in range(count):
+            self.senders[size].send(kind)
+            time.sleep(pause_s)
+        return np.array([(came - sent) * 1e-9 for came, sent in self._ask("end")])
+
+    def per_s(self, size: int, kind: str, seconds: float) -> float:
+        """Messages a second that are sent and read without losing one: as many are under way as the reader keeps."""
+        self._ask("begin")
+        self._read, sent, ends, depth = 0, 0, time.monotonic() + seconds, PAYLOADS[size].topic.depth
+        while time.monotonic() < ends:
+            with self._news:
+                if not self._news.wait_for(lambda: sent < self._read + depth, PATIENCE_S):  # noqa: B023 (called at once)
+                    raise AssertionError(f"{sent} messages were sent, {self._read} read: one was lost")
+            self.senders[size].send(kind)
+            sent += 1
+        came = self._ask("end")
+        return (len(came) - 1) / ((came[-1][0] - came[0][0]) * 1e-9)
+
+    def _on_ack(self, sample: zenoh.Sample) -> None:
+        with self._news:
+            self._read = int.from_bytes(sample.payload.to_bytes(), "little")
+            self._news.notify()
+
+    def _until_heard(self, sender: Sender, kind: str) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            self._ask("begin")
+            sender.send(kind)
+            if self._ask("end"):
+                return
+        raise AssertionError(f"nothing {kind} came within {PATIENCE_S} s")
+
+    def _ask(self, what: str) -> list[list[int]]:
+        assert self._receiver.stdin is not None and self._receiver.stdout is not None
+        self._receiver.stdin.write(f"{what}\n")
+        self._receiver.stdin.flush()
+        return json.loads(self._receiver.stdout.readline())
+
+
+@contextmanager
+def linked(endpoint: str) -> Iterator[Link]:
+    """A sender here and a receiver in a process of its own, both clients of a router."""
+    command = [sys.executable, "-m", "tests.bench.lib.buses", endpoint]
+    root = Path(__file__).parents[3]
+    receiver = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=root)
+    try:
+        with Node("sender", CELL, bus.Connection(connect=(endpoint,))) as node:
+            yield Link(node, receiver)
+    finally:
+        receiver.kill()
+        receiver.communicate()
+
+
+def receive(endpoint: str) -> None:
+    """The receiver's end, until its input ends."""
+    came: list[tuple[int, int]] = []
+    node = Node("receiver", CELL, bus.Connection(connect=(endpoint,)))
+
+    def take(payload: Payload, sent_ns: int) -> None:
+        came.append((time.time_ns(), sent_ns))
+        if len(came) % (payload.topic.depth // 2) == 0:
+            acks.put(len(came).to_bytes(8, "little"))
+
+    def hear(payload: Payload, message: messages.Message, names: dict[str, str]) -> None:
+        take(payload, message.stamp_ns)
+
+    def hear_raw(payload: Payload, subscriber: zenoh.Subscriber) -> None:
+        for sample in subscriber:
+            sample.payload.to_bytes()
+            take(payload, int.from_bytes(sample.attachment.to_bytes(), "little"))
+
+    for payload in PAYLOADS.values():
+        node.subscribe(payload.topic, partial(hear, payload), **payload.names)
+    with node:
+        assert node.session is not None
+        acks = node.session.declare_publisher(ACK)
+        for payload in PAYLOADS.values():
+            subscriber = node.session.declare_subscriber(payload.raw_key, zenoh.handlers.RingChannel(payload.topic.depth))
+            Thread(target=hear_raw, args=(payload, subscriber), daemon=True).start()
+        for line in sys.stdin:
+            if line == "begin\n":
+                came.clear()
+                print("[]", flush=True)
+                continue
+            heard = -1
+            while heard != len(came):
+                heard = len(came)
+                time.sleep(QUIET_S)
+            print(json.dumps(came), flush=True)
+
+
+if __name__ == "__main__":
+    receive(sys.argv[1])

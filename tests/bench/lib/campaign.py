@@ -1,0 +1,119 @@
+"""Many trials on several cores, each stored as soon as it is done: what was killed goes on where it was.
+
+Results lie in FOLDER/FINGERPRINT, where the fingerprint is that of all code, weights and cells that a trial depends on: a change
+of any of them begins anew and leaves the old results alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import json
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+ROOT = Path(__file__).parents[3]
+DEPENDS = ("shared", "sim", "services", "tests/support/replay.py", "tests/bench/lib/trials.py")
+"""What a trial's result depends on, of the project's files."""
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+"""Every process computes on one thread: they share the cores."""
+
+Result = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A call of a function of the project, `MODULE:NAME`, with arguments; `name` is that of its result's file."""
+
+    name: str
+    function: str
+    arguments: tuple[Any, ...]
+
+    def __call__(self) -> Result:
+        module, _, function = self.function.partition(":")
+        result: Result = getattr(importlib.import_module(module), function)(*self.arguments)
+        return result
+
+
+def fingerprint() -> str:
+    """Of the files that results depend on: their names and contents."""
+    digest = hashlib.sha256()
+    for part in DEPENDS:
+        path = ROOT / part
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.suffix in (".py", ".yaml", ".npz", ".pt"):
+                digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def run(jobs: Sequence[Job], folder: Path, processes: int, progress: Progress, what: str) -> list[Result]:
+    """The results of all jobs in their order; those that `folder` has are read, the others computed and stored there."""
+    home = folder / fingerprint()
+    home.mkdir(parents=True, exist_ok=True)
+    missing = [job for job in jobs if not (home / f"{job.name}.json").is_file()]
+    task = progress.add_task(what, total=len(jobs), completed=len(jobs) - len(missing))
+    for job, result in _computed(missing, processes):
+        partial = home / f"{job.name}.json.part"
+        partial.write_text(json.dumps(result))
+        partial.replace(home / f"{job.name}.json")
+        progress.advance(task)
+    return [json.loads((home / f"{job.name}.json").read_text()) for job in jobs]
+
+
+def bar(console: Any) -> Progress:
+    """A progress bar with how many are done and how long the rest will take."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console)
+
+
+def _computed(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Result]]:
+    if processes == 1 or len(jobs) < 2:
+        for job in jobs:
+            yield job, job()
+        return
+    with _one_thread(), ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _start) as pool:
+        pending = {pool.submit(job): job for job in jobs}
+        try:
+            for future in as_completed(pending):
+                yield pending[future], future.result()
+        finally:  # an error or Ctrl-C: what has not begun is not begun
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes that are started meanwhile compute on one thread."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+
+
+def _start() -> None:
+    """In a worker: ends without a word on Ctrl-C, and when the process that started it is gone."""
+    import torch
+
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()

@@ -1,0 +1,181 @@
+"""The benchmarks of the search: their bound, their statistics, and that they run."""
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.search import contour
+from services.search.evidence import Intrinsics
+from services.search.tracker import Searched
+from shared.contract.messages import FusedPose, VisionPose
+from shared.geometry import rigid
+from sim.sets import shots
+from tests.bench import search, tracking
+from tests.bench.lib import bound
+
+
+def rms_cm(information: np.ndarray) -> float:
+    return 100.0 * bound.position_rms([information])
+
+
+def test_the_bound_of_the_occluding_edges_is_that_of_renderings():
+    ratios = []
+    for index in range(4):
+        shot = shots.shot(41, index, images=False)
+        edges, rendered = bound.information(shot, facets=True), bound.rendered_information(shot)
+        # renderings are blurred by a pixel's share and differ over finite steps, which the fingers and the thumb feel
+        np.testing.assert_allclose(np.sqrt(np.diag(edges)), np.sqrt(np.diag(rendered)), rtol=0.15)
+        ratios.append(rms_cm(edges) / rms_cm(rendered))  # noise informs where there is next to nothing: above 1
+    assert 0.95 < np.median(ratios) < 1.2
+
+
+def test_the_bound_is_that_of_the_contour_which_the_search_would_trace_in_a_finer_picture():
+    shot, finer = shots.shot(42, 0, images=False), 8
+    camera, T = shot.camera, shot.T_camera_target
+    model, k = contour.Model(shot.mesh), Intrinsics.of_window(camera, 0, 0, 1)
+    fine = Intrinsics(k.fx * finer, k.fy * finer, (k.cx + 0.5) * finer - 0.5, (k.cy + 0.5) * finer - 0.5)
+    V = model.in_camera(T)
+    points = model.outline(V, fine, (camera.height * finer, camera.width * finer), 0.5 * finer)
+    near = bound._visible(shot, (points[:, 3:5] + 0.5) / finer - 0.5)
+    normals, X = points[near, 5:7], points[near, :3]
+    a, b = normals[:, 0] * k.fx / X[:, 2], normals[:, 1] * k.fy / X[:, 2]
+    by_position = np.column_stack([a, b, -(a * X[:, 0] + b * X[:, 1]) / X[:, 2]])
+    motion = np.hstack([by_position, np.cross(X - T[:3, 3], by_position)])
+    traced = (motion * (points[near, 7] / finer / bound.VARIANCE_PX2)[:, None]).T @ motion
+    np.testing.assert_allclose(np.diag(bound.information(shot)), np.diag(traced), rtol=0.1)
+
+
+def test_the_less_is_seen_and_the_coarser_the_picture_the_larger_is_the_bound():
+    def median(hidden: float, width: int) -> float:
+        pictures = [shots.shot(43, i, width, width * 3 // 4, 1.5, hidden, images=False) for i in range(8)]
+        return float(np.median(bound.position_errors([bound.information(shot) for shot in pictures])))
+
+    by_hidden = [median(hidden, 640) for hidden in search.HIDDEN]
+    assert all(a < b for a, b in itertools.pairwise(by_hidden))
+    assert median(0.0, 320) > 1.5 * by_hidden[0]
+
+
+def test_an_efficient_estimator_has_the_errors_of_its_information():
+    errors = bound.position_errors([np.diag([1e4, 1e4, 1e4, 1.0, 1.0, 1.0])], draws=4000)
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(0.01 * np.sqrt(3.0), rel=0.05)
+    assert np.median(errors) == pytest.approx(0.01 * 1.538, rel=0.05)  # of the Maxwell distribution
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[search.Result]:
+    """Estimates whose errors are drawn from the covariances that they tell, but for the roll."""
+    rng = np.random.default_rng(5)
+    shot = shots.shot(44, 0, 320, 240, images=False)
+    results = []
+    for _ in range(400):
+        root = rng.normal(size=(6, 6)) * np.repeat([0.003, 0.02], 3)[:, None]
+        error = root @ rng.normal(size=6)
+        error[3:] += rng.normal() * shot.T_world_target[:3, 0]  # a roll that no covariance tells
+        T = rigid.perturb(shot.T_world_target, -error)
+        results.append(search.Result(Searched(T, root @ root.T, 0.95, 0.0, "tracking", T), shot, 1.0))
+    return results
+
+
+def test_true_covariances_lie_in_the_band_and_too_small_ones_do_not(drawn):
+    small = [r for r in drawn if np.linalg.norm(r.error[3:]) < 0.3]  # a rotation vector is a vector for small ones only
+    told = search.nees(small)
+    assert told["frames"] == len(small) > 60
+    assert told["band"][0] < told["mean"] < told["band"][1]
+    boasting = [replace(r, estimate=replace(r.estimate, covariance=r.estimate.covariance / 2.0)) for r in small]
+    assert search.nees(boasting)["mean"] > search.nees(boasting)["band"][1]
+
+
+def test_errors_are_told_apart_along_and_across_the_line_of_sight_and_about_the_limb():
+    shot = shots.shot(45, 0, 320, 240, images=False)
+    sight = shot.T_world_target[:3, 3] - shot.camera.T_world_camera[:3, 3]
+    sight /= np.linalg.norm(sight)
+    roll = 0.3 * shot.T_world_target[:3, 0]
+    T = rigid.perturb(shot.T_world_target, [*(0.02 * sight), *roll])
+    result = search.Result(Searched(T, np.eye(6), 1.0, 0.0, "tracking", T), shot, 1.0)
+    assert (result.depth, result.lateral) == pytest.approx((0.02, 0.0), abs=1e-9)
+    assert (result.roll, result.axis) == pytest.approx((0.3, 0.0), abs=1e-6)
+    assert not result.is_wrong
+
+
+def test_the_area_under_the_curve_counts_pairs_in_order():
+    positive = np.array([True, True, False, False])
+    assert search.auc(np.array([3.0, 2.0, 1.0, 0.0]), positive) == 1.0
+    assert search.auc(np.array([np.inf, 1.0, 2.0, 0.0]), positive) == 0.75
+    assert search.auc(np.ones(4), positive) == 0.5
+    assert search.auc(np.ones(4), np.zeros(4, bool)) is None
+
+
+def test_a_mask_shows_the_target_where_it_agrees_with_the_truth_at_any_scale():
+    shot = shots.shot(48, 0, 320, 240, hidden=0.3, images=False)
+    window = search.window_of(shot, shot.T_world_target)
+    mask = search.exact_mask(shot, window)
+    assert search.shows_target(mask, shot)
+    coarse = replace(mask, labels=np.ascontiguousarray(mask.labels[::2, ::2]), scale=2)
+    assert search.shows_target(coarse, shot)
+    assert not search.shows_target(replace(mask, labels=np.zeros_like(mask.labels)), shot)
+    assert not search.shows_target(replace(mask, x0=mask.x0 // 2, y0=mask.y0 // 2 + 40), shot)
+
+
+def test_giving_up_is_right_where_a_mask_shows_something_else_and_the_start_was_right_by_luck():
+    def told(doubt: float, wrong: bool, shown: bool) -> bool:
+        return search.Judgement("wrong mask", doubt, wrong, shown).should_be_doubted
+
+    assert told(np.inf, False, False) and told(np.inf, True, True) and told(0.1, True, True)
+    assert not told(np.inf, False, True)  # it could have been measured
+    assert not told(0.1, False, False)  # right all the same
+
+
+def test_the_search_s_benchmark_runs_and_tells_all_rows(tmp_path):
+    out = tmp_path / "search.json"
+    assert search.main(["--seed", "46", "--quick", "--json", str(out)]) == 0
+    result = json.loads(out.read_text())
+    rows = {(r["masks"], r["width"], r["distance_m"], r["occlusion"], r["method"]) for r in result["rows"]}
+    assert len(rows) == 2 * len(search.VIEWS) * len(search.HIDDEN) * 2
+    exact = [r for r in result["rows"] if r["masks"] == "exact" and r["width"] == 640 and r["method"] == "contour"]
+    assert exact[0]["position_cm"]["median"] < 1.0  # centimetres where nothing is hidden
+    assert {"mean", "band"} <= result["nees"].keys()
+    assert result["hidden_frames"] > 0
+    assert sum(kind["frames"] for kind in result["lost"].values()) == 5 * search.QUICK.lost
+
+
+def pose(kind, stamp_ns: int, T: np.ndarray, state: str):
+    position, orientation = rigid.position_orientation(T)
+    common = {"stamp_ns": stamp_ns, "target": "forearm", "frame": "world", "position": position, "orientation": orientation}
+    if kind is VisionPose:
+        return VisionPose(**common, camera="front", covariance=np.eye(6), overlap=1.0, hidden=0.0, state=state)
+    return FusedPose(**common, velocity=np.zeros(6), covariance=np.eye(6), state=state, sources={})
+
+
+def film(hidden: list[float], states: list[str]) -> tracking.Film:
+    truths = [tracking.Truth(i, np.eye(4), share) for i, share in enumerate(hidden)]
+    vision = {i: pose(VisionPose, i, np.eye(4), state) for i, state in enumerate(states)}
+    return tracking.Film(truths, vision, {i: pose(FusedPose, i, np.eye(4), "coasting") for i in range(len(hidden))})
+
+
+def test_recovery_is_counted_from_the_first_frame_that_shows_the_arm_again():
+    hidden = [0.0, 0.6, 1.0, 1.0, 0.8, 0.4, 0.1, 0.0, 0.0]
+    states = ["tracking", "tracking", "occluded", "occluded", "lost", "lost", "lost", "tracking", "tracking"]
+    found = film(hidden, states)
+    (begin, end, back), = tracking.passes(found)  # fmt: skip
+    assert (begin, end, back) == (2, 3, 5)
+    assert tracking.recovery(found, back) == 3
+    assert tracking.recovery(film(hidden, ["lost"] * 9), back) is None
+
+
+def test_tracking_what_is_hidden_is_counted_as_false(monkeypatch):
+    monkeypatch.setattr(tracking, "SKIPPED_S", 0.0)
+    told = tracking.scored([film([0.0, 1.0, 0.97, 0.2], ["tracking", "tracking", "occluded", "lost"])])
+    assert (told["false_tracking"], told["hidden_frames"]) == (1, 2)
+    assert told["tracked"] == 0.5
+
+
+def test_the_tracking_benchmark_runs_on_both_backgrounds(tmp_path):
+    out = tmp_path / "tracking.json"
+    assert tracking.main(["--seed", "47", "--quick", "--json", str(out)]) == 0
+    rows = json.loads(out.read_text())["rows"]
+    assert [row["background"] for row in rows] == ["plain", "cluttered"]
+    assert all(row["hidden_frames"] > 0 for row in rows)
+    assert all(row["visible_cm"]["median"] is not None for row in rows[:1])

@@ -1,0 +1,1 @@
+"""The whole chain as real processes, and as a replay."""

@@ -1,0 +1,47 @@
+"""A recorded minute through all services: a changed output is a mistake, or a new reference in the same commit
+(`python -m tests.support.replay`)."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared.cell import description
+from sim.world.world import record
+from tests.support.replay import Heard, Replay, digest
+
+REFERENCE = Path(__file__).parent / "references" / "replay_table.json"
+SEED = 11
+
+
+def play() -> list[Heard]:
+    table = description.load("table")
+    return Replay(table).run(record(table, SEED, 60.0))
+
+
+@pytest.fixture(scope="module")
+def played() -> dict[str, list]:
+    return digest(play())
+
+
+@pytest.fixture(scope="module")
+def reference() -> dict[str, list]:
+    return json.loads(REFERENCE.read_text())
+
+
+def test_segmentation_gives_the_reference_s_masks(played, reference):
+    ours, theirs = np.array(played["mask"]), np.array(reference["mask"])
+    assert ours.shape == theirs.shape
+    off = np.abs(ours - theirs).sum(axis=1) / theirs.sum(axis=1)
+    assert np.median(off) < 0.005  # another processor rounds bfloat16 otherwise
+
+
+@pytest.mark.parametrize(("sense", "tolerance_m"), [("vision", 0.005), ("haptic", 0.001), ("fused", 0.003)])
+def test_each_sense_gives_the_reference_s_poses(played, reference, sense, tolerance_m):
+    ours, theirs = played[sense], reference[sense]
+    assert len(ours) == len(theirs)
+    same_state = [a[0] == b[0] for a, b in zip(ours, theirs, strict=True)]
+    assert np.mean(same_state) > 0.95
+    off = [np.linalg.norm(np.subtract(a[1:], b[1:])) for a, b, same in zip(ours, theirs, same_state, strict=True) if same]
+    assert np.median(off) < tolerance_m

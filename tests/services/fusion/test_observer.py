@@ -1,0 +1,371 @@
+"""The observers: rotations, late and shuffled data, the gate and its way out, unobserved directions."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from services.fusion import so3
+from services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, SOURCES, Refused
+from services.fusion.observer import Bank, ErrorStateObserver
+from services.fusion.paper import PaperObserver
+from services.fusion.settings import Settings
+from shared.geometry import rigid
+from shared.geometry.rigid import Array, perturb, pose_error
+from tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, ns, without_roll
+
+OBSERVERS = [ErrorStateObserver, PaperObserver]
+
+
+# ---- rotations
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-7, 9.9e-5, 1.01e-4, 0.5, 3.0, np.pi - 1e-7, np.pi - 1e-12, np.pi])
+def test_exp_log_and_quaternion_agree_with_scipy_also_near_zero_and_pi(angle: float) -> None:
+    rng = np.random.default_rng(0)
+    for axis in [*np.eye(3), *-np.eye(3), *rng.normal(size=(20, 3))]:
+        r = angle * axis / np.linalg.norm(axis)
+        R = Rotation.from_rotvec(r).as_matrix()
+        np.testing.assert_allclose(so3.exp(r), R, atol=1e-14)
+        found = so3.log(so3.exp(r))
+        # at pi both signs are the same rotation
+        np.testing.assert_allclose(so3.exp(found), R, atol=1e-12)
+        if angle < 3.1:
+            np.testing.assert_allclose(found, r, atol=1e-14, rtol=1e-9)
+        assert abs(np.dot(so3.quaternion(R), Rotation.from_matrix(R).as_quat())) == pytest.approx(1.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-5, 1.01e-4, 1.0, 3.0])
+def test_left_jacobian_inverse_is_the_derivative_of_log(angle: float) -> None:
+    r = angle * np.array([0.6, 0.0, 0.8])
+    step = 1e-6
+    columns = [(so3.log(so3.exp(d) @ so3.exp(r)) - so3.log(so3.exp(-d) @ so3.exp(r))) / (2 * step) for d in step * np.eye(3)]
+    np.testing.assert_allclose(so3.left_jacobian_inverse(r), np.column_stack(columns), atol=1e-8)
+
+
+# ---- what arrives late, twice, wrong, or not at all
+
+
+def still(observer: ErrorStateObserver | PaperObserver, T: Array, begin: float, end: float, information: Array = VISION) -> None:
+    """Perfect vision of a limb that rests at T, at 20 Hz."""
+    for t in np.arange(begin, end, 0.05):
+        observer.measure("vision", ns(t), T, information, 0.0)
+
+
+def stream(seconds: float, seed: int = 0) -> list[tuple[str, int, Array, Array]]:
+    """Vision and rank-deficient haptic poses of a moving limb, in order of their stamps."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for k in range(round(seconds * 100)):
+        T = perturb(HOME, [0.05 * np.sin(k / 30), 0.02, 0.03 * np.cos(k / 20), 0.2 * np.sin(k / 25), 0, 0.1])
+        out.append(("haptic", ns(k * 0.01), perturb(T, 0.002 * rng.normal(size=6)), without_roll(T, SKIN)))
+        if k % 5 == 0:
+            out.append(("vision", ns(k * 0.01), perturb(T, 0.01 * rng.normal(size=6)), VISION))
+    return out
+
+
+def test_late_and_shuffled_measurements_give_the_same_as_in_order() -> None:
+    in_order, shuffled = ErrorStateObserver(HOME, SPREAD), ErrorStateObserver(HOME, SPREAD)
+    measurements = stream(0.5)
+    measurements[40] = (*measurements[40][:2], perturb(HOME, [0.5, 0, 0, 0, 0, 0]), measurements[40][3])  # one that is refused
+    for measurement in measurements:
+        in_order.measure(*measurement)
+    for i in np.random.default_rng(1).permutation(len(measurements)):
+        shuffled.measure(*measurements[i])
+    for t in (0.3, 0.5, 0.7):
+        a, b = in_order.estimate(ns(t)), shuffled.estimate(ns(t))
+        np.testing.assert_allclose(a.T, b.T, atol=1e-12)
+        np.testing.assert_allclose(a.covariance, b.covariance, atol=1e-12)
+        np.testing.assert_allclose(a.velocity, b.velocity, atol=1e-12)
+        assert a.sources == b.sources
+
+
+def test_asking_changes_nothing() -> None:
+    for make in OBSERVERS:
+        asked, quiet = make(HOME, SPREAD), make(HOME, SPREAD)
+        for source, stamp_ns, T, seen in stream(0.5):
+            asked.measure(source, stamp_ns, T, seen, 0.1)
+            quiet.measure(source, stamp_ns, T, seen, 0.1)
+            for later in (0, 3_000_000, 40_000_000, 400_000_000):
+                asked.estimate(stamp_ns + later)
+        np.testing.assert_allclose(asked.estimate(ns(0.52)).T, quiet.estimate(ns(0.52)).T, atol=1e-13)
+
+
+def test_two_cameras_that_expose_together_are_both_heard_in_either_order() -> None:
+    first, second = ErrorStateObserver(HOME, SPREAD), ErrorStateObserver(HOME, SPREAD)
+    left, right = perturb(HOME, [0.004, 0, 0, 0, 0, 0]), perturb(HOME, [-0.004, 0, 0, 0, 0, 0])
+    for k in range(5):
+        for observer, order in ((first, (left, right)), (second, (right, left))):
+            for T in order:
+                assert observer.measure("vision", ns(0.05 * k), T, VISION)
+    a, b = first.estimate(ns(0.2)), second.estimate(ns(0.2))
+    np.testing.assert_array_equal(a.T, b.T)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+    assert abs(a.T[0, 3] - HOME[0, 3]) < 0.001, "one of them alone would draw it 4 mm"
+    assert not first.measure("vision", ns(0.2), right, VISION)
+    assert first.log.counts["vision"].duplicate == 1
+
+
+def test_what_comes_twice_or_after_the_history_is_refused_and_counted() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    still(observer, HOME, 0.0, 2.0)
+    before = observer.estimate(ns(2.0)).covariance
+    assert not observer.measure("vision", ns(1.95), HOME, VISION)
+    assert not observer.measure("haptic", ns(0.5), HOME, VISION)
+    counts = observer.log.counts
+    assert (counts["vision"].duplicate, counts["haptic"].late, counts["vision"].accepted) == (1, 1, 40)
+    np.testing.assert_array_equal(observer.estimate(ns(2.0)).covariance, before)
+
+
+def test_an_outlier_is_refused_and_moves_nothing() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    still(observer, HOME, 0.0, 1.0)
+    assert not observer.measure("vision", ns(1.0), perturb(HOME, [0.2, 0, 0, 0, 0, 0]), VISION)
+    assert not observer.measure("haptic", ns(1.0), perturb(HOME, [0, 0, 0, 0, 0, 1.0]), VISION)
+    assert observer.log.counts["vision"].gated == observer.log.counts["haptic"].gated == 1
+    np.testing.assert_allclose(observer.estimate(ns(1.0)).T, HOME, atol=1e-6)
+
+
+@pytest.mark.parametrize("make", OBSERVERS)
+def test_a_limb_that_jumps_is_found_again_within_three_quarters_of_a_second(make: type) -> None:
+    observer = make(HOME, SPREAD)
+    far = perturb(HOME, [3.0, -2.0, 0.1, 0.0, 0.5, 1.5])
+    still(observer, HOME, 0.0, 1.0)
+    still(observer, far, 1.0, 1.75)
+    estimate = observer.estimate(ns(1.75))
+    assert np.abs(pose_error(far, estimate.T)).max() < 0.02
+    assert estimate.state == "tracking"
+
+
+def test_a_sense_that_disagrees_for_long_is_heard_again_beside_one_that_is_believed() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    wrong = perturb(HOME, [0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
+    for k in range(250):
+        observer.measure("haptic", ns(k * 0.01), wrong, 4.0 * VISION)
+        if k >= 50 and k % 5 == 0:
+            observer.measure("vision", ns(k * 0.01), HOME, VISION)
+    vision = observer.estimate(ns(2.5)).sources["vision"]
+    assert observer.log.counts["vision"].gated >= 5
+    assert vision.age_s < 0.2 and vision.weight > 0.01
+
+
+def test_without_measurements_the_covariance_grows_and_the_state_goes_from_tracking_to_lost() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    still(observer, HOME, 0.0, 1.0)
+    estimates = [observer.estimate(ns(0.95 + age)) for age in np.arange(0.0, 4.0, 0.01)]
+    sigmas = [np.linalg.eigvalsh(e.covariance) for e in estimates]
+    assert all((b > a).all() for a, b in itertools.pairwise(sigmas))
+    states = [e.state for e in estimates]
+    assert list(dict.fromkeys(states)) == ["tracking", "coasting", "lost"]
+    assert states[20] == "tracking" and states[30] == "coasting"
+
+
+@pytest.mark.parametrize("make", OBSERVERS)
+def test_before_the_first_measurement_the_target_is_lost_at_home(make: type) -> None:
+    observer = make(HOME, SPREAD)
+    observer.log.heard("vision", ns(0.0))
+    estimate = observer.estimate(ns(1.0))
+    np.testing.assert_array_equal(estimate.T, HOME)
+    np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), np.repeat(SPREAD, 3))
+    assert estimate.state == "lost"
+    assert estimate.sources["vision"].weight == 0.0 and estimate.sources["vision"].age_s == pytest.approx(1.0)
+    assert "haptic" not in estimate.sources
+
+
+FAR = perturb(HOME, [0.03, 0.0, 0.0, 0.0, 0.0, 0.1])
+SKEW = VISION + np.diag([1e3] * 4, k=2)
+
+
+@pytest.mark.parametrize("make", OBSERVERS)
+@pytest.mark.parametrize(
+    ("T", "seen", "ahead", "kind", "text"),
+    [
+        pytest.param(np.full((4, 4), np.nan), VISION, 0.0, "pose", "a finite rigid transform", id="not a number"),
+        pytest.param(
+            np.diag([0.0, 0, 0, 1]), VISION, 0.0, "pose", "is its quaternion of length one?", id="quaternion of length 0"
+        ),
+        pytest.param(np.diag([2.0, 2, 2, 1]), VISION, 0.0, "pose", "a finite rigid transform", id="stretched"),
+        pytest.param(FAR @ np.diag([1.0, 1, -1, 1]), VISION, 0.0, "pose", "a finite rigid transform", id="mirrored"),
+        pytest.param(np.eye(3), VISION, 0.0, "pose", "(4, 4)", id="a rotation only"),
+        pytest.param(FAR, -VISION, 0.0, "information", "no negative eigenvalue expected, -1e+04 beside", id="negative"),
+        pytest.param(
+            FAR,
+            np.diag([1.0, 1, 1, 1, 1, -1]),
+            0.0,
+            "information",
+            "no negative eigenvalue expected, -1 beside 1 came",
+            id="mixed",
+        ),
+        pytest.param(FAR, SKEW, 0.0, "information", "a symmetric matrix expected", id="not symmetric"),
+        pytest.param(FAR, np.full((6, 6), np.inf), 0.0, "information", "a finite (6, 6) matrix expected", id="infinite"),
+        pytest.param(FAR, np.eye(5), 0.0, "information", "a finite (6, 6) matrix expected", id="another shape"),
+        pytest.param(FAR, VISION, 0.06, "future", "at most 0.05 s ahead of the clock expected, 0.060 s came", id="future"),
+    ],
+)
+def test_what_is_no_measurement_is_refused_with_the_reason_counted_and_changes_nothing(
+    make: type, T: Array, seen: Array, ahead: float, kind: str, text: str
+) -> None:
+    observer = make(HOME, SPREAD)
+    still(observer, HOME, 0.0, 1.0)
+    before = observer.estimate(ns(1.1))
+    with pytest.raises(Refused) as caught:
+        observer.measure("vision", ns(1.0 + ahead), T, seen, 0.0, now_ns=ns(1.0))
+    assert caught.value.kind == kind and text in str(caught.value)
+    assert observer.log.counts["vision"].refused == {kind: 1}
+    after = observer.estimate(ns(1.1))
+    np.testing.assert_array_equal(after.T, before.T)
+    np.testing.assert_array_equal(after.covariance, before.covariance)
+    assert after.sources == before.sources
+    assert observer.measure("vision", ns(1.04), HOME, VISION, 0.0, now_ns=ns(1.0)), "clocks differ a little"
+
+
+@pytest.mark.parametrize("make", OBSERVERS)
+def test_a_source_that_nobody_knows_is_refused(make: type) -> None:
+    with pytest.raises(ValueError, match="source: one of vision, haptic expected, 'sonar' came"):
+        make(HOME, SPREAD).measure("sonar", ns(0), HOME, VISION)
+
+
+# ---- many targets, many measurements
+
+
+def test_a_bank_of_targets_does_what_each_of_them_does_alone() -> None:
+    homes = [perturb(HOME, [0.1 * i, 0, 0, 0, 0, 0.3 * i]) for i in range(3)]
+    bank = Bank(np.array(homes), [SPREAD] * 3)
+    alone = [ErrorStateObserver(home, SPREAD) for home in homes]
+    streams = [stream(0.5, seed=i) for i in range(3)]
+    for rows in zip(*streams, strict=True):
+        stamps = np.array([row[1] for row in rows])
+        sources = np.array([SOURCES.index(row[0]) for row in rows])
+        T, seen = (np.array([row[column] for row in rows]) for column in (2, 3))
+        fates = bank.measure(np.arange(3), sources, stamps, T, seen)
+        for observer, row, fate in zip(alone, rows, fates, strict=True):
+            assert observer.measure(*row) == (fate == ACCEPTED)
+    for found, observer in zip(bank.estimates(ns(0.52)), alone, strict=True):
+        expected = observer.estimate(ns(0.52))
+        np.testing.assert_array_equal(found.T, expected.T)
+        np.testing.assert_array_equal(found.covariance, expected.covariance)
+        assert (found.state, found.sources) == (expected.state, expected.sources)
+    assert [log.counts for log in bank.logs] == [observer.log.counts for observer in alone]
+
+
+def test_a_bank_takes_what_is_good_beside_what_is_bad() -> None:
+    bank = Bank(np.array([HOME, HOME]), [SPREAD] * 2)
+    targets, sources, stamps = np.array([0, 1, 1, 1]), np.zeros(4, np.int64), np.full(4, ns(0.0))
+    seen = np.array([-VISION, VISION, VISION, VISION])
+    fates = bank.measure(targets, sources, stamps, np.array([HOME, np.zeros((4, 4)), FAR, FAR]), seen, now_ns=ns(0.0))
+    assert [FATES[fate] for fate in fates] == ["information", "pose", "accepted", "duplicate"]
+    assert [e.state for e in bank.estimates(ns(0.0))] == ["lost", "tracking"]
+    assert fates[3] == DUPLICATE and bank.logs[0].counts["vision"].refused == {"information": 1}
+
+
+def test_a_storm_of_measurements_shortens_the_history_and_nothing_else() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD, Settings(capacity=16))
+    for k in range(100):
+        observer.measure("haptic", ns(0.001 * k), HOME, VISION)
+    assert observer.measure("vision", ns(0.0905), HOME, VISION)
+    assert not observer.measure("vision", ns(0.0505), HOME, VISION)
+    assert observer.log.counts["vision"].late == 1
+    assert observer.estimate(ns(0.1)).state == "tracking"
+    np.testing.assert_allclose(observer.estimate(ns(0.1)).T, HOME, atol=1e-9)
+
+
+def test_no_measurement_is_believed_beyond_the_floor() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    observer.measure("vision", ns(0.0), HOME, 1e18 * np.eye(6))
+    floor = Settings().senses["vision"].floor
+    sigma = np.sqrt(np.diag(observer.estimate(ns(0.0)).covariance))
+    np.testing.assert_allclose(sigma, floor * np.array([0.1, 0.1, 0.1, 1, 1, 1]), rtol=0.02)
+
+
+# ---- directions that are not observed
+
+
+def test_a_rank_deficient_measurement_leaves_the_other_directions_alone() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    still(observer, HOME, 0.0, 0.5)
+    before = observer.estimate(ns(0.5))
+    height = np.diag([0, 0, 1e6, 0, 0, 0])
+    made_up = perturb(HOME, [0.5, -0.3, 0.005, 0.0, 0.0, 1.0])
+    assert observer.measure("haptic", ns(0.5), made_up, height)
+    after = observer.estimate(ns(0.5))
+    moved = pose_error(after.T, before.T)
+    assert 0.001 < moved[2] < 0.005
+    np.testing.assert_allclose(np.delete(moved, 2), 0.0, atol=1e-9)
+    np.testing.assert_allclose(after.covariance[:2, :2], before.covariance[:2, :2], rtol=1e-9)
+    assert after.covariance[2, 2] < before.covariance[2, 2]
+
+
+@pytest.mark.parametrize("make", OBSERVERS)
+def test_a_roll_that_is_made_up_does_not_disturb_the_axis(make: type) -> None:
+    rng = np.random.default_rng(0)
+    T = perturb(HOME, [0.03, 0.02, -0.04, 0.3, 0.2, 0.4])
+    observer = make(HOME, SPREAD)
+    for k in range(100):
+        observer.measure("haptic", ns(k * 0.01), T @ rigid.from_rpy([0, 0, 0], [rng.uniform(-2, 2), 0, 0]), without_roll(T, SKIN))
+    estimate = observer.estimate(ns(1.0))
+    assert np.linalg.norm(pose_error(T, estimate.T)[:3]) < 1e-3
+    assert rigid.axis_angle_error(T, estimate.T) < 1e-3
+    roll_variance = T[:3, 0] @ estimate.covariance[3:, 3:] @ T[:3, 0]
+    assert roll_variance > 0.5 * SPREAD[1] ** 2  # nobody saw it
+
+
+def test_the_first_haptic_pose_is_completed_by_home() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    T = perturb(HOME, [0.1, 0.05, -0.1, 0.0, 0.0, 0.5])
+    across = np.diag([0, 1e5, 1e5, 0, 1e3, 1e3])  # neither roll nor the way along the x axis
+    observer.measure("haptic", ns(0), T, across)
+    found = observer.estimate(ns(0))
+    np.testing.assert_allclose(found.T[1:3, 3], T[1:3, 3], atol=2e-3)
+    assert abs(found.T[0, 3] - HOME[0, 3]) < 1e-6
+    assert found.covariance[0, 0] == pytest.approx(SPREAD[0] ** 2, rel=0.1)
+    assert rigid.axis_angle_error(T, found.T) < 0.02
+
+
+@pytest.mark.parametrize("make", OBSERVERS)
+def test_a_turn_through_pi_is_followed(make: type) -> None:
+    observer = make(HOME, SPREAD)
+    rate = 2.0
+    worst = 0.0
+    for k in range(100):  # from -2.6 to 7.4 rad about the vertical
+        t = 0.05 * k
+        T = rigid.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, -2.6 + rate * t])
+        observer.measure("vision", ns(t), T, VISION, 0.0)
+        if t > 1.0:
+            ahead = rigid.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, -2.6 + rate * (t + 0.02)])
+            worst = max(worst, np.abs(pose_error(ahead, observer.estimate(ns(t + 0.02)).T)).max())
+    assert worst < 0.06  # 3.4 degrees, at 115 degrees a second
+
+
+def test_an_observer_that_adopts_a_published_pose_goes_on_without_a_jump() -> None:
+    old, new = ErrorStateObserver(HOME, SPREAD), ErrorStateObserver(HOME, SPREAD)
+    measurements = stream(2.0)
+    handed = ns(1.0)
+    for measurement in measurements:
+        if measurement[1] <= handed:
+            old.measure(*measurement)
+    published = old.estimate(handed + 3_000_000)
+    new.adopt(published.message(handed + 3_000_000, "forearm", "world"))
+    taken = new.estimate(handed + 3_000_000)
+    assert taken.state == published.state == "tracking"
+    np.testing.assert_allclose(taken.T, published.T, atol=1e-9)
+    np.testing.assert_allclose(taken.covariance, published.covariance, atol=1e-12)
+    np.testing.assert_allclose(taken.velocity, published.velocity)
+    for source, of in published.sources.items():
+        assert taken.sources[source].weight == pytest.approx(of.weight)
+        assert taken.sources[source].age_s == pytest.approx(of.age_s, abs=1e-6)
+    assert not new.measure("vision", handed, HOME, VISION), "it is in the published pose already"
+    assert new.log.counts["vision"].late == 1
+    for measurement in measurements:
+        if measurement[1] > handed + 3_000_000:
+            old.measure(*measurement)
+            before = new.estimate(measurement[1])
+            new.measure(*measurement)
+            after = new.estimate(measurement[1])
+            jump = pose_error(before.T, after.T)
+            assert jump @ np.linalg.solve(before.covariance, jump) < 20.0, "a jump beyond the covariance"
+            e = pose_error(old.estimate(measurement[1]).T, after.T)
+            assert np.abs(e[:3]).max() < 0.03
+    np.testing.assert_allclose(new.estimate(ns(2.0)).T, old.estimate(ns(2.0)).T, atol=5e-3)

@@ -1,0 +1,285 @@
+"""The launcher with real processes, some of them misbehaving."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from rich.console import Console
+
+from services.launcher import display, launch, supervised
+from services.launcher.fleet import Fleet, Kind
+from services.launcher.supervised import Supervised
+from shared.cell import description as cells
+from shared.contract import topics
+from shared.contract.messages import Truth
+from shared.runtime import bus
+from shared.runtime.node import Node
+from tests.support.live import connect, free_port, wait_for
+from tests.support.nodes import pose
+
+CELL = cells.load("table")
+ALWAYS_CRASHES = "import sys; sys.exit('out of luck')"
+REFUSES = "import sys; print('cell table has no camera: it has front', file=sys.stderr); sys.exit(2)"
+SLEEPS = "import time; print('up', flush=True); time.sleep(600)"
+IGNORES_SIGTERM = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(600)"
+HAS_A_CHILD = (
+    "import subprocess, sys, time; subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)']); time.sleep(600)"
+)
+
+
+def python(name, code, restart="always"):
+    return Supervised(name, [sys.executable, "-c", code], restart)
+
+
+@pytest.fixture
+def supervise():
+    """Starts processes, watches them while a condition is waited for, and stops them."""
+    started = []
+
+    def make(*processes):
+        for process in processes:
+            process.start()
+            started.append(process)
+
+        def until(condition, seconds, what):
+            def step():
+                for process in processes:
+                    process.watch()
+                return condition()
+
+            return wait_for(step, seconds, what)
+
+        return until
+
+    yield make
+    supervised.stop(started)
+
+
+def test_a_killed_process_is_started_again_and_told_why(supervise):
+    process = python("sleeper", SLEEPS)
+    until = supervise(process)
+    first = process.pid
+    os.kill(first, signal.SIGKILL)
+    until(lambda: process.pid not in (None, first), 2, "another process")
+    assert process.restarts == 1
+    assert process.note == "killed by SIGKILL"
+
+
+def test_a_crash_loop_is_reported_slows_down_and_leaves_the_others_alone(supervise):
+    crashing, steady = python("crashing", ALWAYS_CRASHES), python("steady", SLEEPS)
+    until = supervise(crashing, steady)
+    pid = steady.pid
+    started = time.monotonic()
+    until(lambda: crashing.note.startswith("crash loop: exit code 1: out of luck"), 10, "the report of a crash loop")
+    until(lambda: crashing.restarts == 4, 10, "the fourth restart")
+    assert time.monotonic() - started > 0.2 + 0.4 + 0.8 + 1.6, "the pause doubles"
+    assert (steady.pid, steady.restarts) == (pid, 0)
+
+
+def test_a_process_that_was_asked_for_nothing_it_has_fails_with_its_last_words_and_stays_down(supervise):
+    process = python("wrong", REFUSES)
+    until = supervise(process)
+    until(lambda: process.state == "failed", 3, "failure")
+    assert process.note == "exit code 2: cell table has no camera: it has front"
+    with pytest.raises(AssertionError):
+        until(lambda: process.restarts, 0.5, "a restart that must not come")
+
+
+def test_a_process_that_hangs_is_killed_and_started_again(supervise, monkeypatch):
+    monkeypatch.setattr(supervised, "SILENT_S", 0.3)
+    process = python("hanging", SLEEPS)
+    until = supervise(process)
+    first = process.pid
+    process.heard()
+    until(lambda: process.pid not in (None, first), 3, "another process")
+    assert "no answer" in process.note
+    with pytest.raises(AssertionError):
+        until(lambda: process.restarts > 1, 0.6, "a kill while it was never heard: it may still be loading")
+
+
+def test_a_process_whose_handler_hangs_is_killed_and_started_again_although_it_answers(router, monkeypatch):
+    monkeypatch.setattr(supervised, "SILENT_S", 1.5)
+    fleet = Fleet(
+        {"hanging": Kind([sys.executable, "-m", "tests.support.nodes", "hanging", "--connect", router])}, {"hanging": 1}
+    )
+    (process,) = fleet.processes
+    with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
+        node.every(0.1, lambda: node.stopping.set() if process.restarts else None)
+        launch.Launcher(node, fleet, Console(quiet=True)).run(60)
+    assert process.restarts == 1
+    assert re.fullmatch(r"timer publish of 0.01 s hangs for \d+ s, killed by SIGKILL.*", process.note)
+
+
+def test_stopping_takes_less_than_three_seconds_whatever_the_processes_do(supervise):
+    processes = [
+        python("sleeper", SLEEPS),
+        python("deaf", IGNORES_SIGTERM),
+        python("parent", HAS_A_CHILD),
+        python("crashing", ALWAYS_CRASHES),
+    ]
+    until = supervise(*processes)
+    tree = until(lambda: len(found := family(processes)) >= 4 and found, 5, "a grandchild")
+    started = time.monotonic()
+    supervised.stop(processes)
+    assert time.monotonic() - started < 3.0
+    wait_for(lambda: not any(alive(process) for process in tree), 1, "all of them to be gone")
+
+
+def family(processes):
+    own = [psutil.Process(process.pid) for process in processes if process.pid]
+    return own + [child for process in own for child in process.children(recursive=True)]
+
+
+def alive(process):
+    return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+
+
+def test_the_launcher_shows_a_service_running_and_its_topics(capsys):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    fleet = Fleet({"steady": Kind([sys.executable, "-m", "tests.support.nodes", "steady", "--connect", endpoint])}, {"steady": 1})
+    (steady,) = fleet.processes
+    node = Node("launcher", CELL, bus.Connection("router", listen=(endpoint,)))
+    with node:
+        console = Console(width=400)
+        launcher = launch.Launcher(node, fleet, console)
+        launcher.watch.refresh()
+        node.every(0.1, lambda: node.stopping.set() if is_shown(launcher, steady) else None)
+        launcher.run(20)
+        with console.capture() as drawn:
+            console.print(display.table("a cell", [steady.row()], launcher.watch))
+    assert "fused" in drawn.get()
+    assert "pose of forearm: tracking, at 0.0 0.0 20.0 cm" in drawn.get()
+    assert steady.state == "stopped"
+    assert "restarts: none" in capsys.readouterr().out
+
+
+def is_shown(launcher, process):
+    rates = {row.name: row.rate_hz for row in launcher.watch.topic_rows()}
+    return process.state == "running" and process.cpu > 0 and rates["fused"] > 50 and launcher.watch.accuracy
+
+
+def test_the_error_is_measured_against_the_truth_at_the_time_of_the_pose():
+    now = time.time_ns()
+    base = pose(now, x=0.03)
+    moving = Truth(
+        stamp_ns=now - 10**7,
+        target="forearm",
+        frame="world",
+        position=base.position - [0.05, 0.0, 0.0],
+        orientation=base.orientation,
+        velocity=np.array([3.0, 0.0, 0.0, 0.0, 0.0, 3.0]),
+        hidden=0.0,
+        gap=0.1,
+    )
+    found = display.accuracy(base, [moving])
+    assert found.position == pytest.approx(0.02)  # 5 cm away 10 ms ago, 3 cm nearer since
+    assert found.axis == pytest.approx(0.03)
+
+
+def up(*arguments, **kwargs):
+    command = [sys.executable, "-m", "services.command.cli", "up", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs)
+
+
+NOTHING = [
+    word
+    for process in launch.PROCESSES
+    if process.replicas and process.name != "router"
+    for word in ("--replicas", f"{process.name}=0")
+]
+
+
+def test_up_stops_by_itself_with_exit_code_zero_and_a_summary():
+    process = up("--port", str(free_port()), "--seconds", "1.5", *NOTHING)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 0, err
+    assert "launcher running" in out
+    assert "restarts: none" in out
+
+
+def test_up_says_that_its_port_is_taken_and_what_to_do():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with Node("router", CELL, bus.Connection("router", listen=(endpoint,))):
+        process = up("--port", endpoint.rpartition(":")[2])
+        _, err = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert err.startswith(f"penumbra up: the port of {endpoint} is taken")
+    assert "--port" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_up_refuses_replicas_of_what_does_not_exist():
+    process = up("--replicas", "magic=2")
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert "NAME one of router, emulator, segmentation" in err
+
+
+def started_by(process):
+    try:
+        return psutil.Process(process.pid).children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+
+
+@pytest.mark.parametrize(("number", "seconds"), [(signal.SIGINT, 3.0), (signal.SIGKILL, 1.0)])
+def test_nothing_is_left_behind_however_the_launcher_ends(number, seconds):
+    port = free_port()
+    process = up("--port", str(port), *NOTHING, "--replicas", "fusion=2")
+    node = Node("test", CELL, bus.Connection(connect=(f"tcp/127.0.0.1:{port}",)))
+    try:
+        with node.open(patience_s=10):
+            tokens = lambda: [r for r in node.session.liveliness().get(topics.alive("table", "fusion"), timeout=1.0) if r.ok]  # noqa: E731
+            wait_for(lambda: len(tokens()) == 2, 20, "both replicas on the bus", 0.1)
+        children = started_by(process)
+        assert len(children) == 3, "and the router"
+        started = time.monotonic()
+        process.send_signal(number)
+        wait_for(lambda: process.poll() is not None and not any(alive(child) for child in children), seconds, "the end of all")
+        print(f"{number.name}: all gone after {time.monotonic() - started:.2f} s")
+        assert process.returncode == (0 if number != signal.SIGKILL else -signal.SIGKILL)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_router_that_dies_is_started_again_and_everybody_comes_back():
+    port = free_port()
+    process = up("--port", str(port), *NOTHING, "--replicas", "fusion=1")
+    try:
+        with connect(port) as session:
+            services = ("fusion", "launcher")
+
+            def alive() -> bool:
+                found = [r.ok.key_expr for r in session.liveliness().get(topics.alive("table", "*"), timeout=1.0) if r.ok]
+                return {str(key).split("/")[-2] for key in found} >= set(services)
+
+            wait_for(alive, 30, "both on the bus")
+            (router,) = (child for child in started_by(process) if "router" in child.cmdline())
+            router.kill()
+            wait_for(lambda: not alive(), 10, "nobody to be reached")
+            wait_for(alive, 30, "both on the bus again")
+        assert process.poll() is None
+    finally:
+        process.terminate()
+        process.communicate(timeout=20)
+
+
+def test_every_line_of_the_table_is_a_package_and_every_service_is_in_the_table():
+    services = Path(launch.__file__).parent
+    assert {process.name for process in launch.PROCESSES} == {path.parent.name for path in services.glob("*/service.py")}
+
+
+@pytest.mark.parametrize(
+    ("name", "needed"), [("emulator", True), ("segmentation", False), ("search", False), ("haptics", True), ("fusion", True)]
+)
+def test_a_cell_without_cameras_needs_no_process_that_looks(name, needed):
+    blind = CELL.model_copy(update={"cameras": {}})
+    assert next(process for process in launch.PROCESSES if process.name == name).is_needed(blind) is needed

@@ -1,0 +1,112 @@
+"""The refinement of the pose on the image, on rendered pictures with their truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from services.search.tracker import Search, Searched
+from shared.contract.labels import Label
+from shared.contract.messages import Mask
+from shared.geometry import rigid
+from shared.perception.lookout import corners_of, window_around
+from sim.sets import shots
+from sim.sets.shots import Shot
+
+PRIOR = np.diag(np.repeat([0.0115**2, 0.04**2], 3))
+"""Covariance of the starts: together 2 cm and 4 degrees."""
+SEEDS = range(8)
+
+
+def pictures(hidden: float) -> list[Shot]:
+    return [shots.shot(7100, index, hidden=hidden, domain="easy") for index in SEEDS]
+
+
+@pytest.fixture(scope="module")
+def half_hidden() -> list[Shot]:
+    return pictures(0.4)
+
+
+@pytest.fixture(scope="module")
+def visible() -> list[Shot]:
+    return pictures(0.0)
+
+
+def start(shot: Shot, seed: int) -> np.ndarray:
+    return rigid.perturb(shot.T_world_target, np.random.default_rng(seed).normal(size=6) * np.sqrt(np.diag(PRIOR)))
+
+
+def mask(shot: Shot, T: np.ndarray, spoiled: float = 0.0, seed: int = 0) -> Mask:
+    """The exact mask around a pose; `spoiled` [px]: the boundary off by that everywhere, and by as much correlated noise."""
+    window = window_around(shot.camera, [(T, corners_of(shot.mesh.vertices))])
+    assert window is not None and window.scale == 1
+    labels = shot.labels[window.y0 : window.bottom, window.x0 : window.right].copy()
+    if spoiled:
+        target = np.isin(labels, (Label.FOREARM, Label.HAND)).astype(np.uint8)
+        distance = cv2.distanceTransform(target, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - target, cv2.DIST_L2, 5)
+        wobble = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=labels.shape), (0, 0), 3.0)
+        larger = distance - np.sign(distance) / 2 + spoiled * (1.0 + wobble / wobble.std()) > 0
+        labels[larger & (labels == Label.BACKGROUND)] = Label.FOREARM
+        labels[~larger & (target != 0)] = Label.BACKGROUND
+    return Mask(stamp_ns=shot.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=1)
+
+
+def error_cm(shot: Shot, estimate: Searched) -> float:
+    return 100.0 * float(np.linalg.norm(shot.T_world_target[:3, 3] - estimate.T[:3, 3]))
+
+
+def test_the_image_takes_out_what_a_mask_is_too_large(visible):
+    alone, together = [], []
+    for seed, shot in enumerate(visible):
+        T, search = start(shot, seed), Search(shot.cell)
+        spoiled = mask(shot, T, 0.7, seed)
+        alone.append(error_cm(shot, search.update(spoiled, T, PRIOR, shot.joints)))
+        estimate = search.update(spoiled, T, PRIOR, shot.joints, shot.image)
+        assert estimate.state == "tracking"
+        together.append(error_cm(shot, estimate))
+    assert np.median(together) < 0.6
+    assert np.median(together) < 0.5 * np.median(alone)
+
+
+def test_the_covariance_of_the_refined_pose_is_that_of_its_errors(visible, half_hidden):
+    nees = []
+    for seed, shot in enumerate([*visible, *half_hidden]):
+        T = start(shot, seed)
+        estimate = Search(shot.cell).update(mask(shot, T, 0.4, seed), T, PRIOR, shot.joints, shot.image)
+        if estimate.state == "tracking":
+            error = rigid.pose_error(shot.T_world_target, estimate.T)
+            nees.append(error @ np.linalg.solve(estimate.covariance, error))
+    assert len(nees) > 10
+    assert 0.5 < np.median(nees) < 9.0  # chi^2 with six degrees of freedom: 5.3
+
+
+def test_an_occluder_that_the_mask_takes_for_background_is_not_believed(half_hidden):
+    errors = []
+    for seed, shot in enumerate(half_hidden):
+        T = start(shot, seed)
+        blind = mask(shot, T)
+        labels = np.where(blind.labels == Label.OCCLUDER, np.uint8(Label.BACKGROUND), blind.labels)
+        estimate = Search(shot.cell).update(replace(blind, labels=labels), T, PRIOR, shot.joints, shot.image)
+        if estimate.state == "tracking":
+            errors.append(error_cm(shot, estimate))
+    assert len(errors) >= len(SEEDS) - 1
+    assert max(errors) < 3.0
+
+
+def test_a_mask_beside_the_limb_is_put_right_or_not_believed(visible):
+    for seed, shot in enumerate(visible):
+        T = start(shot, seed)
+        right = mask(shot, T)
+        estimate = Search(shot.cell).update(
+            replace(right, labels=np.roll(right.labels, 10, axis=1)), T, PRIOR, shot.joints, shot.image
+        )
+        assert estimate.state != "tracking" or error_cm(shot, estimate) < 1.5
+
+
+def test_an_image_of_another_camera_is_refused(visible):
+    shot = visible[0]
+    with pytest.raises(ValueError, match=r"image: 640 x 480 expected.*320 x 240 came"):
+        Search(shot.cell).update(mask(shot, shot.T_world_target), shot.T_world_target, PRIOR, shot.joints, shot.image[::2, ::2])

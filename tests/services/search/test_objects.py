@@ -1,0 +1,401 @@
+"""`search refine` and `search track`: household objects on masks as networks make them, and input that is wrong."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from services.command import cli
+from services.search.objects import meshes, tools
+from services.search.objects.pose import RigidObject, Tracker, refine
+from shared.body.anatomy import Mesh
+from shared.geometry import raster
+from shared.geometry import rigid as geometry
+from tests.bench import objects as bench
+from tests.bench.objects import CONVERGED, HEIGHT, WIDTH, K, Thing, errors, moved, scene, spoiled, thing
+
+EXACT, NOISY = (1.0, 1.0), (0.85, 0.87)
+CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": K.fx, "fy": K.fy, "cx": K.cx, "cy": K.cy}
+
+
+def mesh_of(one: Thing) -> Mesh:
+    faces = np.asarray(one.mesh.faces, np.int32)
+    return Mesh(np.asarray(one.mesh.vertices, np.float64), faces, np.zeros(len(faces), np.uint8))
+
+
+def drawn(one: Thing, T: np.ndarray) -> np.ndarray:
+    mesh = mesh_of(one)
+    return raster.silhouette(geometry.apply(T, mesh.vertices), mesh.faces, (K.fx, K.fy, K.cx, K.cy), (0, 0, WIDTH, HEIGHT))
+
+
+def nees(found, T: np.ndarray) -> float:
+    error = geometry.pose_error(T, found.T)
+    return float(error @ np.linalg.solve(found.covariance, error))
+
+
+@pytest.fixture(scope="module")
+def drill() -> Thing:
+    return thing("drill", 5)
+
+
+@pytest.fixture(scope="module")
+def rigid(drill: Thing) -> RigidObject:
+    return RigidObject(mesh_of(drill))
+
+
+# --- method -----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("degrees", "metres", "allowed"), [(20.0, 0.03, 1), (30.0, 0.05, 2)])
+def test_a_bad_mask_of_a_drill_gives_its_pose_from_far_starts(drill, rigid, degrees, metres, allowed):
+    missed = 0
+    for seed in range(8):
+        T, mask = scene(drill, (70, seed), NOISY)
+        found = refine(rigid, mask, K, moved(T, degrees, metres, np.random.default_rng(seed)))
+        missed += errors(drill, found.T, T).add > CONVERGED or found.state != "tracking"
+    assert missed <= allowed
+
+
+def test_an_exact_mask_gives_an_exact_pose(drill, rigid):
+    T, mask = scene(drill, (71, 0), EXACT)
+    found = refine(rigid, mask, K, moved(T, 20.0, 0.03, np.random.default_rng(0)))
+    error = errors(drill, found.T, T)
+    assert np.linalg.norm(error.position) < 0.005  # half a pixel in a silhouette 100 pixels wide
+    assert error.rotation < np.radians(2.0)
+    assert found.overlap > 0.97
+
+
+def test_covariances_of_bad_masks_cover_their_errors(drill, rigid):
+    values = []
+    for seed in range(9):
+        T, mask = scene(drill, (72, seed), NOISY)
+        values.append(nees(refine(rigid, mask, K, moved(T, 15.0, 0.02, np.random.default_rng(seed))), T))
+    assert np.median(values) < 12.6  # 95 % of chi^2 with six degrees of freedom
+    assert np.median(values) > 0.5  # and not by claiming nothing
+
+
+def test_what_hides_the_object_is_ignored_and_not_scored(drill, rigid):
+    T, mask = scene(drill, (73, 1), EXACT)
+    columns = np.flatnonzero(mask.any(axis=0))
+    occluder = np.zeros_like(mask)
+    occluder[:, : int(np.quantile(columns, 0.45))] = True
+    start = moved(T, 10.0, 0.02, np.random.default_rng(1))
+    told, untold = (refine(rigid, mask & ~occluder, K, start, given) for given in (occluder, None))
+    assert errors(drill, told.T, T).add < CONVERGED
+    assert errors(drill, told.T, T).add < 0.5 * errors(drill, untold.T, T).add
+
+
+def test_an_object_wholly_behind_something_is_lost(rigid, drill):
+    T, mask = scene(drill, (73, 1), EXACT)
+    found = refine(rigid, mask, K, T, np.ones_like(mask))
+    assert found.state == "lost"
+    assert found.covariance[0, 0] >= 1.0
+
+
+def test_the_border_of_the_picture_is_not_the_objects_contour(drill, rigid):
+    T = geometry.from_rpy((0.0, 0.02, 0.8), (1.2, 0.3, 0.5))
+    T[0, 3] = (15 - K.cx) / K.fx * T[2, 3]  # its middle at the left border
+    mask = drawn(drill, T)
+    assert mask[:, 0].any()
+    found = refine(rigid, mask, K, moved(T, 10.0, 0.02, np.random.default_rng(3)))
+    assert found.state == "lost" or errors(drill, found.T, T).add < CONVERGED
+
+
+def test_a_ball_keeps_the_rotation_of_its_start_and_says_that_it_does_not_know_it():
+    ball = trimesh.creation.icosphere(4, radius=0.06)
+    rigid = RigidObject(Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, np.int32), np.zeros(len(ball.faces), np.uint8)))
+    T = geometry.from_rpy((0.05, 0.0, 0.9), (0.3, 0.2, 0.1))
+    one = Thing("ball", ball, np.eye(3)[None])
+    start = moved(T, 20.0, 0.03, np.random.default_rng(0))
+    found = refine(rigid, drawn(one, T), K, start)
+    assert np.linalg.norm(found.T[:3, 3] - T[:3, 3]) < 0.01
+    assert np.sqrt(np.linalg.eigvalsh(found.covariance[3:, 3:])[0]) > np.radians(5.0)
+    assert np.linalg.norm(geometry.pose_error(start, found.T)[3:]) < np.radians(15.0)
+
+
+def test_two_blobs_of_one_object_are_lost_or_covered_by_the_covariance(drill, rigid):
+    T, mask = scene(drill, (74, 2), EXACT)
+    both = mask | np.roll(mask, 150 if np.flatnonzero(mask.any(axis=0)).mean() < WIDTH / 2 else -150, axis=1)
+    found = refine(rigid, both, K, moved(T, 10.0, 0.02, np.random.default_rng(2)))
+    assert found.state == "lost" or nees(found, T) < 22.5
+
+
+def test_a_piece_of_the_mask_that_is_another_object_is_left_out(drill, rigid):
+    T, mask = scene(drill, (74, 3), EXACT)
+    columns = np.flatnonzero(mask.any(axis=0))
+    aside = int(columns[0] - 60) if columns[0] > WIDTH - columns[-1] else int(columns[-1] + 60)
+    rows = np.mgrid[:HEIGHT, :WIDTH][0]
+    piece = np.hypot(np.arange(WIDTH) - aside, rows - HEIGHT / 2) < np.sqrt(0.3 * np.count_nonzero(mask) / np.pi)
+    assert not (piece & mask).any()
+    found = refine(rigid, mask | piece, K, moved(T, 20.0, 0.03, np.random.default_rng(4)))
+    assert errors(drill, found.T, T).add < CONVERGED
+    assert found.state == "tracking"
+
+
+def test_another_shape_is_not_tracked(rigid):
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[200:212, 100:420] = True  # a bar
+    mask[100:380, 250:262] = True  # and another across
+    found = refine(rigid, mask, K, geometry.from_rpy((-0.05, 0.0, 0.9), (1.5, 0.0, 0.0)))
+    assert found.state == "lost"
+    assert found.covariance[0, 0] >= 1.0
+
+
+@pytest.mark.parametrize("kind", ["holes", "flipped", "soup"])
+def test_a_damaged_mesh_gives_the_pose_of_the_whole_one(kind):
+    T, mask = scene(
+        Thing("drill", bench.worn(bench.drill(), 20_000, np.random.default_rng(0), "whole"), np.eye(3)[None]), (75, 1), EXACT
+    )
+    start = moved(T, 15.0, 0.02, np.random.default_rng(1))
+    one = Thing("drill", bench.worn(bench.drill(), 20_000, np.random.default_rng(0), kind), np.eye(3)[None])
+    assert errors(one, refine(RigidObject(mesh_of(one)), mask, K, start).T, T).add < 0.03
+
+
+def test_a_mended_mesh_looks_like_the_one_it_was_made_of():
+    for name in ("mug", "scissors", "drill"):
+        one = thing(name, 3)
+        mended = meshes.mend(mesh_of(one), 4000)
+        assert len(mended.faces) < 6000
+        T = bench.drawn_pose(np.random.default_rng(1))
+        other = Thing(name, trimesh.Trimesh(mended.vertices, mended.faces, process=False), one.symmetries)
+        assert bench.iou(drawn(one, T), drawn(other, T)) > 0.98
+
+
+def test_the_picture_is_sharper_than_the_mask(drill, rigid):
+    better = []
+    for seed in range(5):
+        T, mask = scene(drill, (76, seed), (0.9, 0.92))
+        truth = drawn(drill, T)[..., None]
+        rng = np.random.default_rng(seed)
+        picture = np.where(
+            truth, rng.normal((190, 60, 40), 6.0, (HEIGHT, WIDTH, 3)), rng.normal((70, 90, 110), 6.0, (HEIGHT, WIDTH, 3))
+        )
+        picture = cv2.GaussianBlur(picture, (0, 0), 0.6).clip(0, 255).astype(np.uint8)
+        start = moved(T, 15.0, 0.02, np.random.default_rng(seed))
+        by_mask, by_picture = (errors(drill, refine(rigid, mask, K, start, picture=p).T, T).add for p in (None, picture))
+        better.append(by_picture / by_mask)
+    assert np.median(better) < 0.6
+
+
+# --- sequences --------------------------------------------------------------------------------------------------------------
+
+
+def sequence(one: Thing, count: int) -> list[np.ndarray]:
+    T = geometry.from_rpy((-0.12, 0.0, 0.9), (1.2, 0.4, 0.3))
+    return [geometry.perturb(T, [0.006 * i, 0.001 * i, 0.002 * i, 0.01 * i, 0.02 * i, 0.0]) for i in range(count)]
+
+
+def test_a_sequence_is_tracked_through_a_gap_and_found_again(drill, rigid):
+    poses = sequence(drill, 24)
+    tracker = Tracker(rigid, K, moved(poses[0], 15.0, 0.02, np.random.default_rng(0)))
+    rng = np.random.default_rng(1)
+    for i, T in enumerate(poses):
+        hidden = 10 <= i < 16
+        mask = spoiled(drawn(drill, T), 0.9, rng) & (not hidden)
+        found = tracker.update(mask)
+        if hidden:
+            assert found.state == "lost"
+            assert found.covariance[0, 0] >= 1.0
+        elif i not in (16, 17):  # two frames to find it again
+            assert found.state == "tracking", i
+            assert errors(drill, found.T, T).add < CONVERGED, i
+
+
+def test_behind_a_known_occluder_the_object_is_occluded_and_not_lost(drill, rigid):
+    poses = sequence(drill, 6)
+    tracker = Tracker(rigid, K, poses[0])
+    for T in poses[:4]:
+        assert tracker.update(drawn(drill, T)).state == "tracking"
+    everything = np.ones((HEIGHT, WIDTH), bool)
+    assert tracker.update(drawn(drill, poses[4]), everything).state == "occluded"
+    assert tracker.update(drawn(drill, poses[5])).state == "tracking"
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def given(drill: Thing, tmp_path_factory) -> dict[str, Path]:
+    """The files of a good call."""
+    folder = tmp_path_factory.mktemp("given")
+    T, mask = scene(drill, (77, 0), NOISY)
+    start = moved(T, 20.0, 0.03, np.random.default_rng(0))
+    drill.mesh.copy().apply_scale(1000.0).export(folder / "mesh.ply")
+    cv2.imwrite(str(folder / "mask.png"), mask.astype(np.uint8) * 255)
+    (folder / "camera.json").write_text(json.dumps(CAMERA))
+    (folder / "init.json").write_text(json.dumps({"camera_from_object": start.tolist()}))
+    (folder / "truth.json").write_text(json.dumps({"camera_from_object": T.tolist()}))
+    return {path.stem: path for path in folder.iterdir()}
+
+
+def command(given: dict[str, Path], *more: str, unit: str = "mm", **other: Path) -> list[str]:
+    files = {name: given[name] for name in ("mesh", "mask", "camera", "init")} | other
+    return [
+        "search",
+        "refine",
+        "--mesh-unit",
+        unit,
+        *(word for name, path in files.items() for word in (f"--{name}", str(path))),
+        *more,
+    ]
+
+
+def test_refine_prints_pose_covariance_overlap_and_state(given, drill, capsys):
+    assert cli.main(command(given, "--json")) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert list(result) == ["camera_from_object", "covariance", "overlap", "state"]
+    T = tools.read_pose(given["truth"])
+    assert errors(drill, np.array(result["camera_from_object"]), T).add < CONVERGED
+    assert np.array(result["covariance"]).shape == (6, 6)
+    assert np.linalg.eigvalsh(result["covariance"])[0] > 0
+    assert result["state"] == "tracking"
+    assert 0.8 < result["overlap"] <= 1.0
+
+
+def test_refine_in_words(given, capsys):
+    assert cli.main(command(given)) == 0
+    assert capsys.readouterr().out.startswith("state      tracking, overlap 0.")
+
+
+def wrong(given: dict[str, Path], folder: Path, what: str) -> tuple[list[str], str]:
+    """A command with one thing wrong, and what its error has to say."""
+
+    def new(suffix: str) -> Path:
+        return folder / f"{len(list(folder.iterdir()))}.{suffix}"
+
+    def changed(name: str, **values: object) -> Path:
+        path = new("json")
+        path.write_text(json.dumps({**json.loads(given[name].read_text()), **values}))
+        return path
+
+    def picture(array: np.ndarray) -> Path:
+        path = new("png")
+        cv2.imwrite(str(path), array)
+        return path
+
+    def pose(T: np.ndarray) -> Path:
+        return changed("init", camera_from_object=T.tolist())
+
+    def case(error: str, unit: str = "mm", **files: Path) -> tuple[list[str], str]:
+        return command(given, unit=unit, **files), error
+
+    T = tools.read_pose(given["init"])
+    behind, mirrored, scaled, far, tiny = T.copy(), T.copy(), T.copy(), T.copy(), T.copy()
+    behind[2, 3] = -1.0
+    mirrored[:3, 0] *= -1
+    scaled[:3, :3] *= 1.1
+    far[:3, 3] *= 1000.0
+    tiny[2, 3] = 20.0
+    aside = T.copy()
+    aside[0, 3] = 30.0
+    infinite = json.loads(given["init"].read_text())["camera_from_object"]
+    infinite[0][0] = float("nan")
+    mask = cv2.imread(str(given["mask"]), cv2.IMREAD_GRAYSCALE)
+    text = folder / "text.png"
+    text.write_text("no image")
+    points = folder / "points.ply"
+    trimesh.PointCloud(np.random.default_rng(0).normal(size=(50, 3))).export(points)
+    cases = {
+        "empty mask": case("pixels that show the object expected", mask=picture(np.zeros_like(mask))),
+        "full mask": case("is it inverted?", mask=picture(np.full_like(mask, 255))),
+        "small mask": case("an image of 640 x 480 expected", mask=picture(mask[::2, ::2])),
+        "mask is text": case("an image that OpenCV reads expected", mask=text),
+        "no mask": case("an image file expected, there is none", mask=folder / "none.png"),
+        "millimetres as metres": case("if its unit is", unit="m"),
+        "points": case("a triangle mesh expected", mesh=points),
+        "mesh is text": case("a triangle mesh", mesh=text),
+        "no mesh": case("a mesh file expected, there is none", mesh=folder / "none.ply"),
+        "no camera": case("a readable JSON file expected", camera=folder / "none.json"),
+        "camera is text": case("JSON expected", camera=text),
+        "missing key": case("fy missing", camera=_without(given["camera"], "fy", folder)),
+        "focal length in millimetres": case("is it in millimetres", camera=changed("camera", fx=4.2)),
+        "principal point outside": case("do width and height belong to these intrinsics?", camera=changed("camera", cx=2000.0)),
+        "unlike focal lengths": case("fx and fy of nearly the same size", camera=changed("camera", fy=200.0)),
+        "no number": case("a finite number expected, 'wide' came", camera=changed("camera", fx="wide")),
+        "behind": case("in front of the camera expected", init=pose(behind)),
+        "mirror image": case("without scale or mirror image", init=pose(mirrored)),
+        "scaled": case("without scale or mirror image", init=pose(scaled)),
+        "pose in millimetres": case("is it in millimetres?", init=pose(far)),
+        "not finite": case("finite numbers expected", init=changed("init", camera_from_object=infinite)),
+        "three rows": case("4 rows of 4 numbers expected, a shape of (3, 4)", init=pose(T[:3])),
+        "other key": case("the key camera_from_object expected", init=given["camera"]),
+        "tiny start": case("about as large as the mask", init=pose(tiny)),
+        "outside start": case("in or near the image", init=pose(aside)),
+    }
+    return cases[what]
+
+
+def _without(path: Path, key: str, folder: Path) -> Path:
+    value = json.loads(path.read_text())
+    del value[key]
+    out = folder / "less.json"
+    out.write_text(json.dumps(value))
+    return out
+
+
+WRONG = """empty mask|full mask|small mask|mask is text|no mask|millimetres as metres|points|mesh is text|no mesh|no camera
+camera is text|missing key|focal length in millimetres|principal point outside|unlike focal lengths|no number|behind|mirror image
+scaled|pose in millimetres|not finite|three rows|other key|tiny start|outside start"""
+
+
+@pytest.mark.parametrize("what", WRONG.replace("\n", "|").split("|"))
+def test_wrong_input_is_one_line_that_says_what_to_do_and_exit_code_two(what, given, tmp_path, capsys):
+    argv, error = wrong(given, tmp_path, what)
+    assert cli.main(argv) == 2
+    out = capsys.readouterr()
+    assert out.out == ""
+    assert out.err.startswith("penumbra search refine: ")
+    assert error in out.err
+    assert len(out.err.splitlines()) == 1
+
+
+def test_track_writes_a_table_and_a_video(given, drill, tmp_path, capsys):
+    masks, out = tmp_path / "masks", tmp_path / "out"
+    masks.mkdir()
+    poses = sequence(drill, 12)
+    for i, T in enumerate(poses):
+        cv2.imwrite(str(masks / f"frame{i}.png"), drawn(drill, T).astype(np.uint8) * (0 if i in (5, 6) else 255))
+    init = tmp_path / "init.json"
+    init.write_text(json.dumps({"camera_from_object": moved(poses[0], 15.0, 0.02, np.random.default_rng(0)).tolist()}))
+    files = {"mesh": given["mesh"], "camera": given["camera"], "init": init, "masks": masks, "out": out}
+    argv = ["search", "track", "--mesh-unit", "mm", *(word for name, path in files.items() for word in (f"--{name}", str(path)))]
+    assert cli.main(argv) == 0
+    assert capsys.readouterr().out == f"12 frames: 10 tracking, 0 occluded, 2 lost; see {out}\n"
+    rows = list(csv.DictReader((out / "poses.csv").open()))
+    assert [row["frame"] for row in rows] == [f"frame{i}.png" for i in range(12)]  # by number: 2 before 10
+    assert [i for i, row in enumerate(rows) if row["state"] == "lost"] == [5, 6]
+    last = [float(rows[-1][name]) for name in ("x", "y", "z")]
+    assert np.linalg.norm(np.array(last) - poses[-1][:3, 3]) < 0.01
+    video = cv2.VideoCapture(str(out / "overlay.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 12
+
+
+def test_track_asks_for_a_picture_of_every_mask(given, tmp_path, capsys):
+    masks, images = tmp_path / "masks", tmp_path / "images"
+    masks.mkdir(), images.mkdir()
+    mask = cv2.imread(str(given["mask"]))
+    for name in ("a", "b"):
+        cv2.imwrite(str(masks / f"{name}.png"), mask)
+    cv2.imwrite(str(images / "a.png"), mask)
+    files = {"mesh": given["mesh"], "camera": given["camera"], "init": given["init"], "masks": masks, "images": images}
+    argv = ["search", "track", "--mesh-unit", "mm", *(word for name, path in files.items() for word in (f"--{name}", str(path)))]
+    assert cli.main(argv) == 2
+    assert "an image for every mask expected, by name, 1 of 2 are missing, first b" in capsys.readouterr().err
+
+
+def test_the_benchmark_writes_a_row_for_every_object_mask_and_start(tmp_path, capsys):
+    path = tmp_path / "result.json"
+    assert cli.main(["bench", "objects", "--objects", "duck", "--starts", "1", "--seed", "3", "--json", str(path)]) == 0
+    result = json.loads(path.read_text())
+    assert result["seed"] == 3
+    assert [(row["object"], row["mask_iou"], row["start_deg"]) for row in result["rows"]] == [
+        (name, mask, degrees) for name in ("duck", "all") for mask in ("exact", "0.86") for degrees in (20.0, 30.0)
+    ]
+    assert all(row["converged"] in (0.0, 1.0) and row["ms_median"] > 0 for row in result["rows"])
+    assert "share converged" in capsys.readouterr().out

@@ -1,0 +1,459 @@
+"""Real sessions and a real router on loopback."""
+
+import dataclasses
+import json
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import msgpack
+import numpy as np
+import pytest
+import zenoh
+
+from shared.cell import description as cells
+from shared.contract import messages, topics
+from shared.runtime import bus
+from shared.runtime.guard import RATE_TIMES
+from shared.runtime.node import Node
+from tests.support.live import free_port, wait_for
+from tests.support.nodes import pose
+
+CELL = cells.load("table")
+
+
+@pytest.fixture
+def endpoint():
+    """Of a router in this process."""
+    where = f"tcp/127.0.0.1:{free_port()}"
+    with Node("router", CELL, bus.Connection("router", listen=(where,))):
+        yield where
+
+
+@pytest.fixture
+def node(endpoint):
+    """Opens nodes at the router, and closes them."""
+    nodes = []
+
+    def make(service="test", cell=CELL):
+        nodes.append(Node(service, cell, bus.Connection(connect=(endpoint,))))
+        return nodes[-1]
+
+    yield make
+    for each in nodes:
+        each.close()
+
+
+@pytest.fixture
+def log(caplog):
+    """What Penumbra logs, also where an earlier test has configured its logs."""
+    logger = logging.getLogger("penumbra")
+    logger.propagate, before = True, logger.propagate
+    with caplog.at_level(logging.INFO, "penumbra"):
+        yield lambda text: [record for record in caplog.records if text in record.getMessage()]
+    logger.propagate = before
+
+
+def until(condition, publish, what, seconds=5.0):
+    """Publishes again and again until something has happened."""
+
+    def step():
+        publish()
+        return condition()
+
+    return wait_for(step, seconds, what, interval=0.01)
+
+
+def raw(node, topic, payload, **names):
+    node.session.put(topic.at(cell="table", **names), payload)
+
+
+def voltages():
+    return messages.Voltages(stamp_ns=time.time_ns(), period_ns=10**6, volts=np.ones((5, 5), np.float32))
+
+
+def test_a_message_arrives_with_the_names_in_its_key(node):
+    got = []
+    reader, writer = node(), node()
+    reader.subscribe(topics.VOLTAGES, lambda message, names: got.append((names, message.volts.shape)))
+    reader.open(), writer.open()
+    until(lambda: got, lambda: writer.publish(topics.VOLTAGES, voltages(), pad="p3"), "a message")
+    names, shape = got[0]
+    assert (names["pad"], shape) == ("p3", (5, 5))
+
+
+def test_a_reader_is_told_which_of_two_publishers_sent_a_message(node):
+    heard = {}
+    reader, writers = node(), [node(), node()]
+    reader.subscribe(topics.VOLTAGES, lambda message, names: heard.setdefault(names["publisher"], []).append(message.stamp_ns))
+    reader.open(), [writer.open() for writer in writers]
+
+    def publish():
+        for writer in writers:
+            writer.publish(topics.VOLTAGES, voltages(), pad="p3")
+
+    until(lambda: len(heard) > 1, publish, "messages of both")
+    until(lambda: all(len(stamps) > 3 for stamps in heard.values()), publish, "more of both")
+    assert len(heard) == 2 and "" not in heard
+
+
+def test_a_slow_reader_of_one_topic_does_not_hold_up_another(node):
+    slow, ages = [], []
+    reader, writer = node(), node()
+    reader.subscribe(topics.MASK, lambda message, names: (time.sleep(0.05), slow.append(time.time_ns() - message.stamp_ns)))
+    reader.subscribe(topics.FUSED, lambda message, names: ages.append(time.time_ns() - message.stamp_ns))
+    reader.open(), writer.open()
+    until(lambda: ages and slow, lambda: send(writer), "both topics")
+    del ages[:], slow[:]
+    writer.every(0.01, lambda: send(writer))  # 100 Hz: five times what the slow reader can take
+    wait_for(lambda: len(ages) >= 150, 10, "150 poses")
+    assert np.median(ages) * 1e-9 < 0.01
+    assert max(slow) * 1e-9 < 0.2, "the slow reader gets the newest, not the backlog"
+
+
+def send(writer):
+    writer.publish(
+        topics.MASK,
+        messages.Mask(stamp_ns=time.time_ns(), labels=np.zeros((4, 4), np.uint8), x0=0, y0=0, scale=1),
+        camera="front",
+    )
+    writer.publish(topics.FUSED, pose(), target="forearm")
+
+
+def test_bad_messages_are_counted_by_kind_logged_once_and_do_not_stop_the_reader(node, log):
+    got = []
+    reader, writer = node(), node()
+    reader.subscribe(topics.FUSED, lambda message, names: got.append(message))
+    reader.open(), writer.open()
+    key = topics.FUSED.at(cell="table", target="forearm")
+    bad = lambda: reader.health()["topics"][key]["bad"]  # noqa: E731
+    until(lambda: bad().get("msgpack", 0) >= 3, lambda: raw(writer, topics.FUSED, b"\xc1", target="forearm"), "three refusals")
+    until(lambda: bad().get("past"), lambda: writer.publish(topics.FUSED, pose(1), target="forearm"), "an old stamp refused")
+    until(lambda: bad().get("delete"), lambda: writer.session.delete(key), "a deletion refused")
+    until(lambda: got, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "a good message")
+    assert len(log("message refused")) == 3
+    assert {record.fields["kind"] for record in log("message refused")} == {"msgpack", "past", "delete"}
+
+
+def test_messages_of_another_version_are_ignored_counted_and_told_once_however_many_keys_they_come_on(node, log):
+    got = []
+    reader, writer = node(), node()
+    for topic in (topics.FUSED, topics.HAPTIC):
+        reader.subscribe(topic, lambda message, names: got.append(message))
+    reader.open(), writer.open()
+    tomorrow = msgpack.packb({"version": messages.VERSION + 1, "stamp_ns": time.time_ns(), "twist": [0.0]})
+    keys = [topic.at(cell="table", target="forearm") for topic in (topics.FUSED, topics.HAPTIC)]
+    refused = lambda: [reader.health()["topics"][key]["bad"].get("version", 0) for key in keys]  # noqa: E731
+    until(lambda: min(refused()) >= 3, lambda: [writer.session.put(key, tomorrow) for key in keys], "three refusals on both")
+    until(lambda: got, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "a message of our version")
+    (told,) = log("message refused")
+    assert told.fields["kind"] == "version"
+    assert f"wire version {messages.VERSION} expected, {messages.VERSION + 1} came" in told.fields["why"]
+    assert reader.health()["wire_version"] == messages.VERSION
+
+
+def test_a_message_for_a_part_that_the_cell_does_not_have_is_refused(node):
+    got = []
+    reader, writer = node(), node()
+    reader.subscribe(topics.VOLTAGES, lambda message, names: got.append(names["pad"]))
+    reader.open(), writer.open()
+    payload = messages.encode(voltages())
+    bad = lambda: reader.health()["topics"][topics.VOLTAGES.at(cell="table")]["bad"]  # noqa: E731
+    until(lambda: bad().get("key"), lambda: raw(writer, topics.VOLTAGES, payload, pad="nowhere"), "the refusal")
+    assert not got
+    assert "penumbra/table/skin/nowhere/voltages" not in reader.health()["topics"]
+
+
+def test_an_exception_of_a_handler_is_counted_and_logged_once_and_the_next_message_comes(node, log):
+    got = []
+
+    def handler(message, names):
+        got.append(message)
+        raise ZeroDivisionError("of the test")
+
+    reader, writer = node(), node()
+    reader.subscribe(topics.FUSED, handler)
+    reader.open(), writer.open()
+    until(lambda: len(got) >= 3, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "three messages")
+    (kind, count) = wait_for(lambda: next(iter(reader.health()["faults"].items()), None), 1, "the fault in the health")
+    assert kind.startswith("ZeroDivisionError at test_bus.py:")
+    assert count >= 2
+    assert len(log("of the test")) == 1
+
+
+def test_what_a_reader_missed_is_counted_from_the_publishers_numbers(node):
+    got, go = [], threading.Event()
+    reader, writer = node(), node()
+    reader.subscribe(topics.MASK, lambda message, names: (got.append(message), go.wait(5)))
+    reader.open(), writer.open()
+    until(lambda: got, lambda: send(writer), "the first mask")
+    key = topics.MASK.at(cell="table", camera="front")
+
+    def burst():
+        go.clear()
+        for _ in range(20):
+            send(writer)
+        go.set()
+
+    until(lambda: reader.health()["topics"][key]["dropped"] >= 15, burst, "dropped masks in the health")
+    row = reader.health()["topics"][key]
+    published = writer.health()["published"][key]["count"]
+    assert row["dropped"] <= published - row["count"], "a message before the subscription was not missed"
+
+
+def test_a_message_that_is_sent_again_is_refused_and_the_next_one_taken(node):
+    got = []
+    reader, writer, replayer = node(), node(), node().open()
+    key = topics.FUSED.at(cell="table", target="forearm")
+    tape = replayer.session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+    reader.subscribe(topics.FUSED, lambda message, names: got.append(message.stamp_ns))
+    reader.open(), writer.open()
+    bad = lambda: reader.health()["topics"][key]["bad"]  # noqa: E731
+    until(lambda: got, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "a pose")
+    sample = wait_for(tape.try_recv, 5, "the recorded pose")
+
+    def replay():
+        replayer.session.put(key, sample.payload, source_info=sample.source_info)
+
+    until(lambda: bad().get("replayed", 0) >= 3, replay, "three refusals")
+    before = len(got)
+    until(lambda: len(got) > before, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "the next pose")
+    assert len(set(got)) == len(got)
+
+
+def vision(age_s):
+    now = pose()
+    return messages.VisionPose(
+        stamp_ns=now.stamp_ns - int(1e9 * age_s),
+        target=now.target,
+        frame=now.frame,
+        camera="front",
+        position=now.position,
+        orientation=now.orientation,
+        covariance=now.covariance,
+        overlap=0.9,
+        hidden=0.0,
+        state="tracking",
+    )
+
+
+def test_late_vision_is_taken_and_what_is_of_a_backlog_is_refused(node):
+    ages = []
+    reader, writer = node(), node()
+    reader.subscribe(topics.VISION, lambda message, names: ages.append((time.time_ns() - message.stamp_ns) * 1e-9))
+    reader.open(), writer.open()
+    bad = lambda: reader.health()["topics"][topics.VISION.at(cell="table", target="forearm")]["bad"]  # noqa: E731
+    publish = lambda age_s: lambda: writer.publish(topics.VISION, vision(age_s), target="forearm")  # noqa: E731
+    until(lambda: bad().get("past"), publish(topics.VISION.oldest_s + 0.01), "a refusal")
+    assert not ages
+    until(lambda: ages, publish(1.0), "a pose that is a second old")
+
+
+@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
+def test_no_topic_calls_a_message_a_replay_before_it_calls_itself_stale(topic):
+    assert topic.stale_s + messages.MAX_FUTURE_S < topic.oldest_s <= messages.MAX_PAST_S
+
+
+def test_a_flood_of_one_publisher_is_cut_and_does_not_stop_the_others(node):
+    got = {"p0": 0, "p1": 0}
+    reader, flooding, steady = node(), node(), node()
+
+    def count(message, names):
+        got[names["pad"]] += 1
+
+    reader.subscribe(topics.VOLTAGES, count)
+    reader.open(), flooding.open(), steady.open()
+    started = time.monotonic()
+
+    def publish():
+        for _ in range(100):
+            flooding.publish(topics.VOLTAGES, voltages(), pad="p0")
+        steady.publish(topics.VOLTAGES, voltages(), pad="p1")
+
+    bad = lambda pad: reader.health()["topics"][topics.VOLTAGES.at(cell="table", pad=pad)]["bad"]  # noqa: E731
+    until(lambda: bad("p0").get("rate", 0) > 100 and got["p1"] >= 20, publish, "a cut flood, and the other publisher", 20.0)
+    assert got["p0"] <= RATE_TIMES * topics.VOLTAGES.rate_hz * (time.monotonic() - started + 1.0)
+    assert not bad("p1")
+
+
+def test_a_camera_may_send_at_the_rate_that_the_cell_gives_it(tmp_path):
+    path = tmp_path / "cell.yaml"
+    path.write_text((cells.BUILT_IN / "table.yaml").read_text().replace("rate_hz: 20", "rate_hz: 300", 1))
+    node = Node("test", cells.load(path))
+    rates = [node._rate_hz(topic, {"camera": "front"}) for topic in (topics.FRAME, topics.MASK)]
+    rates += [node._rate_hz(topic, {"target": "forearm"}) for topic in (topics.VISION, topics.FUSED)]
+    assert rates == [300, 300, 300, 200]
+
+
+def test_the_rate_of_a_steady_stream_is_its_rate_and_falls_when_it_ends():
+    rate = bus.Rate()
+    for k in range(400):
+        rate.add(k * 0.005)
+        if k > 10:
+            assert rate.hz(k * 0.005) == pytest.approx(200, rel=0.02)
+    assert rate.hz(2.0 + 10 * bus.RATE_WINDOW_S) < 0.1
+
+
+def test_a_query_is_answered_and_a_refusal_carries_its_text(node):
+    def answer(parameters, payload):
+        if parameters.get("format") == "xml":
+            raise ValueError("format: json expected, xml came")
+        if parameters.get("format") == "crash":
+            raise KeyError("lost")
+        return payload + json.dumps(parameters).encode(), "application/json"
+
+    server, asker = node("server").open(), node().open()
+    server.answer("penumbra/table/echo", answer)
+    wait_for(lambda: asker.query("penumbra/table/echo"), 5, "an answer")
+    assert asker.query("penumbra/table/echo", "format=json", b"hello ") == [b'hello {"format": "json"}']
+    with pytest.raises(bus.Refused, match="json expected, xml came"):
+        asker.query("penumbra/table/echo", "format=xml")
+    with pytest.raises(bus.Refused, match="server failed: KeyError"):
+        asker.query("penumbra/table/echo", "format=crash")
+    assert list(server.health()["faults"].values()) == [1]
+
+
+def test_a_query_that_nobody_answers_returns_at_once_with_nothing(node):
+    asker = node().open()
+    started = time.monotonic()
+    assert asker.query("penumbra/table/nobody", timeout_s=5.0) == []
+    assert time.monotonic() - started < 1.0
+
+
+def test_a_taken_port_is_told_with_what_to_do(endpoint):
+    with pytest.raises(bus.BusError, match=r"taken.*--port"):
+        Node("router", CELL, bus.Connection("router", listen=(endpoint,))).open()
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"), [("{mode: 'nowhere'}", "unknown variant"), ("{nonsense: 1}", "unknown field"), ("{mode:", "expected")]
+)
+def test_a_bad_configuration_file_is_told_with_its_name_and_the_reason(tmp_path, text, reason):
+    path = tmp_path / "zenoh.json5"
+    path.write_text(text)
+    with pytest.raises(bus.BusError, match=reason) as caught:
+        Node("test", CELL, bus.Connection(config=path))
+    assert str(path) in str(caught.value)
+    with pytest.raises(bus.BusError, match="No such file"):
+        bus.configuration(bus.Connection(config=tmp_path / "missing.json5"))
+
+
+def test_the_settings_of_a_configuration_file_stand_unless_a_flag_says_otherwise(tmp_path):
+    path = tmp_path / "zenoh.json5"
+    path.write_text('{mode: "peer", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, scouting: {gossip: {enabled: true}}}')
+    config = bus.configuration(bus.Connection(config=path))
+    assert json.loads(config.get_json("connect/endpoints")) == ["tcp/10.0.0.1:7447"]
+    assert json.loads(config.get_json("scouting/gossip/enabled")) is True
+    assert bus.mode(bus.Connection(config=path)) == "peer"
+    config = bus.configuration(bus.Connection("client", ("tcp/10.0.0.2:7447",), config=path))
+    assert json.loads(config.get_json("connect/endpoints")) == ["tcp/10.0.0.2:7447"]
+    assert json.loads(config.get_json("mode")) == "client"
+
+
+@pytest.mark.parametrize("endpoint", ["nonsense", "tcp/", "pigeon/127.0.0.1:7447"])
+def test_an_endpoint_that_zenoh_does_not_know_is_refused_and_not_waited_for(endpoint):
+    with pytest.raises(bus.BusError, match=r"PROTOCOL/ADDRESS expected|does not open|nothing that Zenoh takes"):
+        Node("test", CELL, bus.Connection(connect=(endpoint,))).open(patience_s=30)
+
+
+def router_process(endpoint):
+    return subprocess.Popen(
+        [sys.executable, "-m", "services.command.cli", "router", "--listen", endpoint], stderr=subprocess.DEVNULL
+    )
+
+
+def test_nodes_wait_for_the_router_and_go_on_after_it_was_away_for_five_seconds(log):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    got = []
+    reader, writer = (Node(name, CELL, bus.Connection(connect=(endpoint,))) for name in ("reader", "writer"))
+    reader.subscribe(topics.FUSED, lambda message, names: got.append(message))
+    writer.every(0.01, lambda: writer.publish(topics.FUSED, pose(), target="forearm"))
+    opening = [threading.Thread(target=each.open) for each in (reader, writer)]
+    for thread in opening:
+        thread.start()
+    wait_for(lambda: len(log("waiting for the router at")) == 2, 5, "both to say that they wait")
+    assert endpoint in log("waiting")[0].getMessage()
+    assert "`penumbra up`" in log("waiting")[0].getMessage()
+    router = router_process(endpoint)
+    try:
+        wait_for(lambda: got, 10, "a message through the router")
+        router.kill()
+        router.wait()
+        killed = time.monotonic()
+        wait_for(lambda: len(log("waiting")) == 4, 5, "both to say that the router is gone")
+        wait_for(lambda: time.monotonic() - killed > 5.0, 6, "five seconds without a router")
+        before = len(got)
+        router = router_process(endpoint)
+        wait_for(lambda: len(got) > before, 3, "messages after the router came back")
+        wait_for(lambda: len(log("the router is back")) == 2, 3, "both to say so")
+        newest = got[-1]
+        assert time.time_ns() - newest.stamp_ns < 1e9, "no backlog"
+        assert reader.query(topics.health("table", "writer")), "queryables are declared again"
+    finally:
+        router.kill()
+        router.wait()
+        reader.close(), writer.close()
+
+
+def test_a_reader_refuses_a_large_message_without_copying_it(node):
+    reader, writer = node(), node()
+    reader.subscribe(topics.FUSED, lambda message, names: None)
+    reader.open(), writer.open()
+    key = topics.FUSED.at(cell="table", target="forearm")
+    payload = bytes(messages.FusedPose.MAX_BYTES + 1)
+    until(lambda: reader.health()["topics"][key]["bad"].get("size"), lambda: writer.session.put(key, payload), "the refusal")
+
+
+def test_publishing_says_which_names_are_missing_unknown_or_not_in_the_cell(node):
+    writer = node().open()
+    with pytest.raises(ValueError, match="publishing fused needs target="):
+        writer.publish(topics.FUSED, pose())
+    with pytest.raises(cells.CellError, match="no target 'leg': it has forearm"):
+        writer.publish(topics.FUSED, pose(), target="leg")
+    with pytest.raises(ValueError, match="topic fused has the names target, not camera"):
+        writer.publish(topics.FUSED, pose(), target="forearm", camera="front")
+    with pytest.raises(messages.BadMessage, match="position"):
+        writer.publish(topics.FUSED, dataclasses.replace(pose(), position=np.zeros(4)), target="forearm")
+
+
+def test_zenoh_endpoints_are_taken_from_the_environment_where_no_flag_gives_them(monkeypatch):
+    monkeypatch.setenv("PENUMBRA_CONNECT", "tcp/router:7447")
+    options = parse([])
+    assert bus.connection(options).connect == ("tcp/router:7447",)
+    assert bus.connection(parse(["--connect", "tcp/other:7447"])).connect == ("tcp/other:7447",)
+    assert bus.connection(parse(["--mode", "router"])).connect == ()
+
+
+def parse(argv):
+    from services import flags
+
+    return flags.parser("test", "").parse_args(argv)
+
+
+def test_many_frames_a_second_pass_through_shared_memory_or_tcp_unchanged(node):
+    image = np.random.default_rng(1).integers(0, 256, (480, 640, 3), np.uint8)
+    got = []
+    reader, writer = node(), node()
+    reader.subscribe(topics.FRAME, lambda message, names: got.append(message.image), camera="front")
+    reader.open(), writer.open()
+    frame = lambda: writer.publish(topics.FRAME, messages.Frame(stamp_ns=time.time_ns(), image=image), camera="front")  # noqa: E731
+    until(lambda: len(got) >= 5, frame, "five frames")
+    assert all(np.array_equal(each, image) for each in got)
+
+
+def test_the_session_of_another_zenoh_program_reads_what_a_node_publishes(node, endpoint):
+    writer = node().open()
+    config = zenoh.Config.from_json5(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}}}')
+    with zenoh.open(config) as session:
+        subscriber = session.declare_subscriber("penumbra/table/target/forearm/pose/fused", zenoh.handlers.RingChannel(1))
+        sample = until(subscriber.try_recv, lambda: writer.publish(topics.FUSED, pose(x=0.5), target="forearm"), "a sample")
+        assert messages.decode(messages.FusedPose, sample.payload.to_bytes()).position[0] == 0.5
+
+
+def test_this_process_is_named_in_its_instance(node):
+    first, second = node(), node()
+    assert str(os.getpid()) in first.instance
+    assert first.instance != second.instance

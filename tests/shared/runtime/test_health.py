@@ -1,0 +1,203 @@
+"""Status and reasons of running processes, from within and from outside."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from rich.console import Console
+
+from services.command import cli, doctor
+from services.command import health as cell_health
+from services.launcher import display
+from services.launcher.supervised import Supervised
+from shared.cell import description as cells
+from shared.contract import topics
+from shared.runtime import bus, health
+from shared.runtime.node import Node
+from tests.support.live import free_port, wait_for
+from tests.support.nodes import pose
+
+CELL = cells.load("table")
+FUSED = topics.FUSED.at(cell="table", target="forearm")
+
+
+@pytest.fixture
+def router():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with Node("router", CELL, bus.Connection("router", listen=(endpoint,))) as node:
+        yield node
+
+
+@pytest.fixture
+def client(router):
+    """Nodes behind the router, not open yet."""
+    nodes = []
+
+    def make(service):
+        nodes.append(Node(service, CELL, bus.Connection(connect=router.connection.listen)))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.close()
+
+
+@pytest.fixture
+def worker(router):
+    """The small service of tests.support.nodes as a process; it reads a camera that nobody plays."""
+    command = [sys.executable, "-m", "tests.support.nodes", "worker", "--connect", router.connection.listen[0]]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    wait_for(lambda: [each for each in seen(router) if each.service == "worker"], 20, "the worker")
+    yield process
+    process.kill()
+    process.wait()
+
+
+def seen(node):
+    return cell_health.ask(node.session, "table")
+
+
+def test_counters_that_grew_lately_are_told_and_forgotten_after_a_while():
+    lately = health.Lately()
+    assert lately.look({("a", "past"): 3}, 0.0) == {("a", "past"): 3}
+    assert lately.look({("a", "past"): 5, ("", "ValueError"): 1}, 20.0) == {("a", "past"): 5, ("", "ValueError"): 1}
+    assert lately.look({("a", "past"): 5, ("", "ValueError"): 1}, health.LATELY_S + 1.0) == {
+        ("a", "past"): 2,
+        ("", "ValueError"): 1,
+    }
+    assert lately.look({("a", "past"): 5, ("", "ValueError"): 1}, health.LATELY_S + 21.0) == {}
+
+
+def test_a_process_with_nothing_to_say_is_ok_and_one_off_the_bus_is_down():
+    assert health.judge("", {}, {}, [], 0) == ("ok", [])
+    assert health.judge("no router at here", {}, {}, [], 0) == ("down", ["no router at here"])
+    report = Node("worker", CELL).health()
+    assert (report["status"], report["reasons"]) == ("down", ["not on the bus"])
+
+
+def test_every_reason_names_what_is_missing_and_since_when():
+    never, old, fresh = (bus.Traffic(0.3) for _ in range(3))
+    now_ns = 10**12
+    old.took(now_ns - 3_210_000_000, now_ns)
+    fresh.took(now_ns, now_ns)
+    received = {f"penumbra/table/skin/{pad}/voltages": traffic for pad, traffic in zip("abc", (never, old, fresh), strict=True)}
+    grown = {("penumbra/table/skin/c/voltages", "past"): 2, ("", "ValueError at x.py:3"): 1}
+    assert health.judge("", received, grown, ["fusion: waiting"], now_ns) == (
+        "degraded",
+        [
+            "nothing heard on skin/a/voltages yet",
+            "no skin/b/voltages for 3.2 s",
+            "refused on skin/c/voltages in the last 30 s: 2 past",
+            "faults in the last 30 s: 1 ValueError at x.py:3",
+            "fusion: waiting",
+        ],
+    )
+
+
+def test_a_node_tells_of_stale_inputs_refusals_and_faults_as_they_happen(client):
+    reader, writer = client("reader"), client("writer").open()
+    reader.subscribe(topics.FUSED, lambda message, names: 1 / 0)
+    reader.open()
+    assert reader.health()["reasons"] == ["nothing heard on target/forearm/pose/fused yet"]
+
+    def reasons_after(send, word):
+        send()
+        return next((reason for reason in reader.health()["reasons"] if word in reason), None)
+
+    publish = lambda: writer.publish(topics.FUSED, pose(), target="forearm")  # noqa: E731
+    assert "ZeroDivisionError at test_health.py" in wait_for(lambda: reasons_after(publish, "faults"), 5, "the fault")
+    garble = lambda: writer.session.put(FUSED, b"garbled")  # noqa: E731
+    assert "target/forearm/pose/fused" in wait_for(lambda: reasons_after(garble, "refused"), 5, "the refusal")
+    wait_for(lambda: reasons_after(lambda: None, "no target/forearm/pose/fused for "), 5, "a stale input")
+    assert reader.health()["status"] == "degraded"
+
+
+def test_a_node_that_lost_its_router_is_down_and_says_where_it_should_be(router, client):
+    node = client("worker").open()
+    assert node.health()["status"] == "ok"
+    router.close()
+    report = wait_for(lambda: (r := node.health())["status"] == "down" and r, 6, "the loss")
+    assert report["reasons"] == [f"no router at {router.connection.listen[0]}"]
+
+
+def test_from_outside_every_instance_is_told_and_one_that_hangs_is_down(router, worker, monkeypatch):
+    found = {each.service: each for each in seen(router)}
+    assert found["router"].status == "ok"
+    assert (found["worker"].status, found["worker"].reasons) == ("degraded", ("nothing heard on camera/front/frame yet",))
+    monkeypatch.setattr(cell_health, "ANSWER_S", 0.2)
+    worker.send_signal(signal.SIGSTOP)  # its token is there until its lease ends
+    wait_for(lambda: psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED, 5, "it to stop")
+    hung = next(each for each in seen(router) if each.service == "worker")
+    worker.send_signal(signal.SIGCONT)
+    assert hung.status == "down"
+    assert hung.reasons == ("it hangs: no answer within 0.2 s",)
+
+
+def test_doctor_tells_how_the_running_processes_fare(router, worker, capsys):
+    cli.main(["doctor", "--connect", router.connection.listen[0]])
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if " worker " in line]
+    assert line.startswith("warn worker ")
+    assert line.endswith(": degraded: nothing heard on camera/front/frame yet")
+
+
+def test_doctor_says_how_to_start_a_cell_whose_router_runs_alone(router):
+    (found,) = doctor._processes("arm", bus.Connection(connect=router.connection.listen))
+    assert (found.status, found.text, found.mend) == ("warn", "no process of cell arm runs there", "penumbra up --cell arm")
+
+
+def test_topics_hz_tells_how_the_processes_fare_but_not_itself(router, worker, capsys):
+    assert cli.main(["topics", "--hz", "--seconds", "0.5", "--connect", router.connection.listen[0]]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    services = {row[0]: row[2:] for row in rows[rows.index(["process", "instance", "status", "reasons"]) + 1 :]}
+    assert services == {"router": ["ok"], "worker": ["degraded", *["nothing", "heard", "on", "camera/front/frame", "yet"]]}
+
+
+def test_the_live_view_shows_what_a_running_process_suffers_from(router, worker):
+    watch = display.Watch(router)
+    watch.refresh()
+    process = Supervised("worker", [])
+    process.state, process.popen = "running", worker
+    row = process.row(watch.local()[worker.pid])
+    assert (row.state, row.note) == ("degraded", "nothing heard on camera/front/frame yet")
+    console = Console(width=200)
+    with console.capture() as drawn:
+        console.print(display.table("a cell", [row], watch))
+    assert "degraded" in drawn.get() and "nothing heard on camera/front/frame yet" in drawn.get()
+    assert process.row({"status": "ok", "reasons": []}).state == "running"
+
+
+def test_the_heartbeat_tells_the_status_and_the_health_check_of_the_containers_reads_it(router, client, monkeypatch, tmp_path):
+    path = tmp_path / "heartbeat"
+    monkeypatch.setenv("PENUMBRA_HEARTBEAT", str(path))
+    node = client("worker").open()
+    wait_for(path.exists, 5, "the heartbeat")
+    assert path.read_text() == "ok\n"
+    written = path.stat().st_mtime_ns
+    wait_for(lambda: path.stat().st_mtime_ns > written, 5, "the next heartbeat")
+    assert checked(path) == (0, "ok")
+    node.fault("here", RuntimeError("odd"))
+    wait_for(lambda: path.read_text().startswith("degraded: faults in the last 30 s: 1 RuntimeError"), 5, "the fault in words")
+    assert checked(path)[0] == 0, "starting it again would not help"
+    router.close()
+    wait_for(lambda: path.read_text().startswith("down: no router at "), 6, "the loss of the router in words")
+    code, said = checked(path)
+    assert (code, said.startswith("down: no router at ")) == (1, True)
+    node.close()
+    path.write_text("ok\n")
+    os.utime(path, (time.time() - 6, time.time() - 6))
+    assert checked(path)[0] == 1, "a process that hangs writes no more"
+
+
+def checked(path):
+    """Exit code and first line of the check in the Dockerfile."""
+    text = (Path(__file__).parents[3] / "docker" / "Dockerfile").read_text()
+    program = text.partition('CMD ["python", "-S", "-c", "')[2].partition('"]')[0]
+    result = subprocess.run(
+        [sys.executable, "-S", "-c", program.replace("/tmp/heartbeat", str(path))], capture_output=True, text=True
+    )
+    return result.returncode, result.stdout.partition("\n")[0]

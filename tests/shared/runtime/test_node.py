@@ -1,0 +1,451 @@
+"""Nodes as whole processes: replicas, health, logs, and how they end."""
+
+import contextlib
+import itertools
+import json
+import logging
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from shared.cell import description as cells
+from shared.contract import topics
+from shared.runtime import bus, logs
+from shared.runtime.hang import Turn
+from shared.runtime.node import CLOSE_S, Node
+from shared.runtime.replicas import Clock, Replicas, Share
+from tests.support import injected
+from tests.support.live import free_port, wait_for
+from tests.support.nodes import pose
+
+CELL = cells.load("table")
+STREAMS = [f"stream/{k}" for k in range(60)]
+
+
+@pytest.fixture
+def router():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with Node("router", CELL, bus.Connection("router", listen=(endpoint,))) as node:
+        yield node
+
+
+@pytest.fixture
+def replica(router):
+    """Opens replicas of one service in this process."""
+    nodes = []
+
+    def make():
+        nodes.append(Node("worker", CELL, bus.Connection(connect=router.connection.listen)).open())
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.close()
+
+
+@pytest.fixture
+def process(router):
+    """Starts the small service of tests.support.nodes as a process of its own."""
+    started = []
+
+    def make(service="worker", *arguments, **environment):
+        command = [sys.executable, "-m", "tests.support.nodes", service, "--connect", router.connection.listen[0], *arguments]
+        started.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **environment}))
+        return started[-1]
+
+    yield make
+    for each in started:
+        each.kill()
+        each.communicate()
+
+
+def living(node, service="worker"):
+    replies = node.session.liveliness().get(topics.alive("table", service), timeout=1.0)
+    return {str(reply.ok.key_expr).rpartition("/")[2] for reply in replies if reply.ok}
+
+
+def health(node, service="worker"):
+    return [json.loads(answer) for answer in node.query(topics.health("table", service))]
+
+
+def owners(nodes):
+    """The owner of each stream, once all agree on exactly one; None before."""
+    found = [[node for node in nodes if node.owns(stream)] for stream in STREAMS]
+    return [each[0] for each in found] if all(len(each) == 1 for each in found) else None
+
+
+def test_a_replica_that_leaves_takes_nothing_over():
+    opened = []
+    for leaves in (False, True):
+        replicas = Replicas("penumbra/table/health/x/one")
+        replicas.wait()
+        replicas.share(Share(("stream",), [], lambda leaves=leaves: opened.append(leaves)))
+        if leaves:
+            assert replicas.leave() == []
+        replicas.withdraw()  # counts who is there: nobody else
+    assert opened == [False]
+
+
+def test_every_stream_has_one_owner_and_only_the_dead_ones_streams_move(replica):
+    nodes = [replica() for _ in range(3)]
+    before = wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    assert {id(owner) for owner in before} == {id(node) for node in nodes}, "every replica has some of sixty streams"
+    nodes[1].close()
+    survivors = [nodes[0], nodes[2]]
+    after = wait_for(lambda: owners(survivors), 5, "one owner for every stream after a death")
+    assert all(new is old for old, new in zip(before, after, strict=True) if old is not nodes[1])
+
+
+def test_a_replica_that_runs_alone_owns_everything_even_before_it_is_on_the_bus():
+    node = Node("worker", CELL)
+    assert all(node.owns(stream) for stream in STREAMS)
+
+
+def test_the_streams_of_a_frozen_process_move_to_the_living_one(replica, process):
+    frozen = process()
+    node = replica()
+    wait_for(lambda: not all(map(node.owns, STREAMS)), 10, "the other process to own some streams")
+    frozen.send_signal(signal.SIGSTOP)
+    stopped = time.monotonic()
+    wait_for(lambda: all(map(node.owns, STREAMS)), 3, "its streams")
+    assert time.monotonic() - stopped < 2.0
+    frozen.send_signal(signal.SIGCONT)
+    wait_for(lambda: not all(map(node.owns, STREAMS)), 5, "it to own some again after it thawed")
+
+
+def test_a_replica_receives_only_the_messages_of_its_own_streams(router, replica, process):
+    process("camera")
+    nodes = [replica() for _ in range(2)]
+    key = topics.FRAME.at(cell="table", camera="front")
+    heard = {node.instance: [] for node in nodes}
+    for node in nodes:
+        stream = next(s for s in STREAMS)
+        node.subscribe(topics.FRAME, lambda m, n, node=node: heard[node.instance].append(m.stamp_ns), [stream], camera="front")
+    owner = wait_for(lambda: owners(nodes), 5, "one owner")[0]
+    (other,) = (node for node in nodes if node is not owner)
+    wait_for(lambda: len(heard[owner.instance]) > 10, 10, "frames at the owner")
+    del heard[other.instance][:]
+    wait_for(lambda: len(heard[owner.instance]) > 30, 10, "more frames at the owner")
+    assert not heard[other.instance]
+    assert key not in other.health()["stale"], "what another replica reads is not missed here"
+    owner.close()
+    wait_for(lambda: heard[other.instance], 5, "frames at the other one, which owns the stream now")
+    third = replica()
+    third.subscribe(topics.FRAME, lambda m, n: heard.setdefault(third.instance, []).append(m.stamp_ns), STREAMS, camera="front")
+    wait_for(lambda: heard.get(third.instance), 10, "frames at a replica that has come")
+
+
+def test_the_next_in_rank_is_the_one_that_takes_over(replica):
+    nodes = [replica() for _ in range(3)]
+    wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    for stream in STREAMS[:8]:
+        assert sorted(node.rank(stream) for node in nodes) == [0, 1, 2]
+    (owner,), (second,) = ([node for node in nodes if node.rank(STREAMS[0]) == rank] for rank in (0, 1))
+    owner.close()
+    wait_for(lambda: second.owns(STREAMS[0]), 5, "the second to own it")
+
+
+def test_health_of_all_instances_is_one_wildcard_query(router, process):
+    process("worker"), process("helper")
+    wait_for(lambda: len(living(router, "*")) >= 3, 10, "both processes")
+    found = {report["service"]: report for report in map(json.loads, router.query(topics.health("table")))}
+    assert found.keys() == {"router", "worker", "helper"}
+    published = wait_for(lambda: health(router)[0]["published"], 5, "a published topic")
+    assert published.keys() == {"penumbra/table/target/forearm/pose/fused"}
+    key = "penumbra/table/camera/front/frame"
+    assert found["worker"]["topics"][key]["count"] == 0
+    assert found["worker"]["stale"] == [key], "a topic that never came is stale"
+
+
+def test_health_tells_rate_age_cpu_and_memory_of_a_steady_publisher(router, process):
+    reader = Node("reader", CELL, bus.Connection(connect=router.connection.listen))
+    reader.subscribe(topics.FUSED, lambda message, names: None)
+    with reader:
+        worker = process()
+        key = topics.FUSED.at(cell="table", target="forearm")
+        row = wait_for(lambda: (r := reader.health()["topics"][key])["count"] >= 150 and r, 10, "150 poses")
+        assert row["rate_hz"] == pytest.approx(100, rel=0.2)
+        assert row["age_s"] < topics.FUSED.stale_s
+        assert row["delay_s"] < 0.05
+        assert row["dropped"] == 0
+        assert not row["stale"]
+        (report,) = health(router)
+        assert report["pid"] == worker.pid
+        assert 0 < report["cpu"] < 1
+        assert 20 < report["memory_mb"] < 500
+        worker.kill()
+        wait_for(lambda: reader.health()["topics"][key]["stale"], 2, "the topic to be stale after its publisher died")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_a_process_in_no_time_with_exit_code_zero(router, process, number):
+    worker = process()
+    wait_for(lambda: living(router), 10, "the process")
+    started = time.monotonic()
+    worker.send_signal(number)
+    assert worker.wait(5) == 0
+    assert time.monotonic() - started < 2.0, "0.1 s on an idle machine"
+    assert not living(router)
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="looks into /proc")
+def test_processes_that_end_leave_nothing_in_shared_memory():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    nodes = [["tests.support.nodes", name, "--connect", endpoint] for name in ("worker", "camera")]
+    commands = [["services.command.cli", "router", "--listen", endpoint], *nodes]
+    processes = [subprocess.Popen([sys.executable, "-m", *command], stderr=subprocess.DEVNULL) for command in commands]
+    try:
+        segments = wait_for(lambda: segments_of(processes[2]), 30, "frames in shared memory")
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+            process.wait(5)
+    assert not [segment for segment in segments if segment.exists()]
+
+
+def segments_of(process):
+    maps = Path(f"/proc/{process.pid}/maps").read_text().split()
+    found = {Path(word) for word in maps if word.startswith("/dev/shm/") and word.endswith(".zenoh")}
+    with contextlib.suppress(FileNotFoundError):  # another process, that has ended since
+        return found if any(segment.stat().st_size > 640 * 480 * 3 for segment in found) else None
+
+
+def test_a_process_that_waits_for_its_router_ends_on_a_signal():
+    command = [sys.executable, "-m", "tests.support.nodes", "worker", "--connect", f"tcp/127.0.0.1:{free_port()}"]
+    worker = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        assert "waiting for the router" in worker.stderr.readline()
+        worker.terminate()
+        assert worker.wait(5) == 0
+    finally:
+        worker.kill()
+        worker.communicate()
+
+
+def test_a_handler_that_hangs_does_not_keep_the_node_from_closing(router):
+    node = Node("worker", CELL, bus.Connection(connect=router.connection.listen)).open()
+    node.every(0.01, lambda: time.sleep(30))
+    started = time.monotonic()
+    node.close()
+    assert time.monotonic() - started < CLOSE_S + 0.5
+
+
+def test_a_timer_keeps_its_rhythm_and_goes_on_after_an_exception(replica):
+    calls = []
+
+    def tick():
+        calls.append(time.monotonic())
+        if len(calls) == 3:
+            raise RuntimeError("third")
+
+    node = replica()
+    node.every(0.01, tick)
+    wait_for(lambda: len(calls) >= 100, 5, "a hundred turns")
+    assert (calls[99] - calls[4]) / 95 == pytest.approx(0.01, rel=0.1)
+    assert list(node.health()["faults"].values()) == [1]
+
+
+def test_turns_that_a_timer_misses_are_not_made_up_for(replica):
+    calls = []
+
+    def tick():
+        calls.append(time.monotonic())
+        if len(calls) == 1:
+            wait_for(lambda: time.monotonic() - calls[0] > 0.3, 1, "a long turn")
+
+    replica().every(0.02, tick)
+    wait_for(lambda: len(calls) >= 6, 5, "six turns")
+    gaps = [b - a for a, b in itertools.pairwise(calls[1:])]
+    assert sum(gap < 0.01 for gap in gaps) <= 1
+
+
+def record(message, *values, **fields):
+    out = logging.makeLogRecord(
+        {"name": "penumbra.fusion", "levelname": "WARNING", "msg": message, "args": values, "fields": fields}
+    )
+    out.created = 0.0
+    return out
+
+
+def test_a_log_line_is_a_sentence_and_its_fields():
+    text = logs._Text().format(record("lost %d", 3, target="forearm", why="no sense", gain=0.123456789, instance="host-1"))
+    assert text == '1970-01-01T00:00:00.000Z warning fusion: lost 3 target=forearm why="no sense" gain=0.123457'
+
+
+def test_a_json_log_line_is_an_object_with_its_fields_apart():
+    line = json.loads(logs._Json().format(record("lost", gain=0.5, instance="host-1")))
+    assert line == {
+        "time": "1970-01-01T00:00:00.000Z",
+        "level": "warning",
+        "service": "fusion",
+        "instance": "host-1",
+        "message": "lost",
+        "fields": {"gain": 0.5},
+    }
+
+
+@pytest.mark.parametrize(
+    ("flags", "environment"), [(["--log-format", "json"], {}), ([], {"PENUMBRA_LOG_FORMAT": "json"})], ids=["flag", "environment"]
+)
+def test_a_process_logs_json_when_asked_to(flags, environment):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = [sys.executable, "-m", "tests.support.nodes", "worker", "--connect", endpoint, *flags]
+    worker = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **environment})
+    try:
+        line = json.loads(worker.stderr.readline())
+    finally:
+        worker.kill()
+        worker.communicate()
+    assert line.keys() == {"time", "level", "service", "instance", "message", "fields"}
+    assert (line["service"], line["level"]) == ("worker", "warning")
+    assert endpoint in line["message"]
+    assert str(worker.pid) in line["instance"]
+
+
+SAYS_ALL_SORTS = """
+import logging, threading, warnings
+from shared import logs
+logs.configure("info", "json", "worker")
+logging.getLogger("library").warning("of a library")
+warnings.warn("of Python")
+thread = threading.Thread(target=lambda: {}["of a thread"])
+thread.start()
+thread.join()
+raise RuntimeError("the end")
+"""
+
+
+def test_as_json_everything_that_a_process_says_is_an_object_a_line_also_its_last_words():
+    err = subprocess.run([sys.executable, "-c", SAYS_ALL_SORTS], capture_output=True, text=True).stderr
+    library, python, thread, end = map(json.loads, err.splitlines())
+    assert (library["service"], library["message"]) == ("library", "of a library")
+    assert "of Python" in python["message"]
+    assert (thread["service"], thread["message"]) == ("worker", "KeyError: 'of a thread'")
+    assert end["message"] == "RuntimeError: the end"
+    assert end["trace"].startswith("Traceback")
+    assert logs.sentence(err.splitlines()[-1]) == "RuntimeError: the end"
+
+
+@pytest.mark.parametrize("line", ["Killed", "3", "[1]", "{}", '{"note": 1}', "{"])
+def test_a_line_that_is_none_of_ours_says_what_it_says(line):
+    assert logs.sentence(line) == line
+
+
+@pytest.mark.parametrize("where", ["timer", "reader"])
+def test_a_replica_with_a_hanging_handler_leaves_its_streams_to_the_others_until_it_returns(replica, where):
+    hanging, other = nodes = [replica(), replica()]
+    before = wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    let_go = threading.Event()
+    if where == "timer":
+        hanging.every(0.01, let_go.wait)
+    else:
+        hanging.subscribe(topics.FUSED, lambda message, names: let_go.wait())
+        other.every(0.05, lambda: other.publish(topics.FUSED, pose(), target="forearm"))
+    wait_for(lambda: owners(nodes) == [other] * len(STREAMS), 10, "all streams to be the other one's")
+    assert living(other) == {other.instance}
+    (report,) = [report for report in health(other) if report["instance"] == hanging.instance]
+    assert not report["ready"] and report["status"] == "degraded"
+    assert any(where in reason and "hangs for" in reason for reason in report["reasons"])
+    let_go.set()
+    wait_for(lambda: owners(nodes) == before, 10, "the streams to come back")
+    assert hanging.health()["hangs"] == ""
+
+
+def test_a_replica_that_is_slow_but_alive_leaves_its_streams_to_the_others(replica, process):
+    slow = psutil.Process(process().pid)
+    other = replica()
+    wait_for(lambda: len(living(other)) == 2, 10, "two replicas")
+    assert not all(map(other.owns, STREAMS))
+    with injected.slowed(slow):
+        wait_for(lambda: all(map(other.owns, STREAMS)), 20, "all streams to be the other one's")
+        time.sleep(1.0)
+        assert all(map(other.owns, STREAMS)), "they stay there while it is slow"
+    wait_for(lambda: not all(map(other.owns, STREAMS)), 20, "the streams to come back")
+
+
+def test_a_process_whose_watch_itself_hangs_says_so(replica, monkeypatch):
+    node, let_go = replica(), threading.Event()
+    assert node.health()["hangs"] == ""
+    monkeypatch.setattr(Clock, "judge", lambda *_: let_go.wait() and "")
+    wait_for(lambda: "nobody has looked" in node.health()["hangs"], 20, "the health to tell")
+    let_go.set()
+    wait_for(lambda: node.health()["hangs"] == "", 20, "the health to be well again")
+
+
+def test_a_replica_that_hangs_alone_keeps_its_streams(replica):
+    alone, let_go = replica(), threading.Event()
+    alone.every(0.01, let_go.wait)
+    wait_for(lambda: alone.health()["hangs"], 10, "the hang to be noticed")
+    assert all(map(alone.owns, STREAMS))
+    let_go.set()
+
+
+def test_a_replica_whose_clock_is_off_leaves_its_streams_to_the_others_until_it_is_right(replica, router, monkeypatch):
+    off, other = nodes = [replica(), replica()]
+    ahead_ns = [0]
+    monkeypatch.setattr(off, "now_ns", lambda: time.time_ns() + ahead_ns[0])
+    before = wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    for node in nodes:
+        node.subscribe(topics.FUSED, lambda message, names: None)
+    router.every(0.01, lambda: router.publish(topics.FUSED, pose(), target="forearm"))
+    ahead_ns[0] = 3600 * 10**9
+    wait_for(lambda: owners(nodes) == [other] * len(STREAMS), 10, "all streams to be the other one's")
+    assert off.health()["status"] == "degraded"
+    assert any("check the clock" in reason for reason in off.health()["reasons"])
+    ahead_ns[0] = 0
+    wait_for(lambda: owners(nodes) == before, 10, "the streams to come back")
+    assert not any("check the clock" in reason for reason in off.health()["reasons"])
+
+
+def test_a_handler_that_always_takes_long_does_not_hang(replica):
+    patient = replica()
+    patient.every(0.01, patient.stopping.wait, math.inf)
+    slow = Turn("slow", 0.1)
+    for _ in range(30):
+        with slow:
+            time.sleep(0.05)
+    with slow:
+        assert slow.hangs_s(time.monotonic() + 0.12) == 0.0, "0.1 s longer than usual"
+        wait_for(lambda: slow.hangs_s(time.monotonic()), 10, "a turn that hangs")
+    assert slow.hangs_s(time.monotonic() + 100.0) == 0.0
+    assert patient.health()["hangs"] == "", "it may take as long as it likes"
+
+
+def test_whoever_runs_out_of_memory_in_a_handler_does_not_go_on_as_if_it_were_the_message(router):
+    node = Node("worker", CELL, bus.Connection(connect=router.connection.listen))
+    node.fault("reader", ValueError("a bad picture"))
+    with pytest.raises(MemoryError):
+        node.fault("reader", MemoryError("18 MB"))
+    assert sum(node.health()["faults"].values()) == 1
+
+
+def test_a_log_on_a_full_disk_loses_lines_and_a_closed_one_is_told():
+    with open("/dev/full", "w") as full:
+        stream = logs.Lossy(full)
+        for _ in range(10_000):
+            assert stream.write("a line that does not fit\n") == 25
+        stream.flush()
+        assert not stream.isatty()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())  # room again
+    reading, writing = os.pipe()
+    os.close(reading)
+    with pytest.raises(BrokenPipeError), os.fdopen(writing, "w") as gone:
+        stream = logs.Lossy(gone)
+        stream.write("nobody reads\n")
+        stream.flush()
+
+
+def test_a_process_whose_thread_fails_ends_and_says_why():
+    code = "import threading, time; from services import cli; cli._die_with_thread(); "
+    code += "threading.Thread(target=lambda: 1 / 0).start(); time.sleep(60)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    assert ended.returncode == 1
+    assert "ZeroDivisionError" in ended.stderr

@@ -1,0 +1,1 @@
+"""Helpers of tests and benchmarks: real processes, faults, networks, recordings."""

@@ -1,0 +1,47 @@
+"""Limbs, senses and their errors for the tests of fusion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.fusion.records import UNITS
+from services.fusion.settings import Sense
+from shared.geometry import rigid
+from shared.geometry.rigid import Array
+
+T0_NS = 1_700_000_000_000_000_000
+HOME = rigid.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0])
+SPREAD = (0.12, 0.4)
+VISION = np.diag(1.0 / np.square([0.01, 0.01, 0.01, 0.03, 0.03, 0.03]))
+"""Information of a camera's pose."""
+SKIN = [0.006, 0.003, 0.002, 1.0, 0.02, 0.03]
+"""Standard deviations of a haptic pose along the limb's axes."""
+NO_ROLL = np.diag([1.0, 1.0, 1.0, 0.0, 1.0, 1.0])
+
+
+def ns(seconds: float) -> int:
+    """A stamp."""
+    return T0_NS + round(seconds * 1e9)
+
+
+class Errors:
+    """A sense's pose errors, a lasting and a white part, none where nothing is observed."""
+
+    def __init__(self, sense: Sense, period: float, rng: np.random.Generator):
+        self._sense, self._rng = sense, rng
+        self._keep = np.exp(-period / sense.time_constant)
+        self._bias = rng.normal(size=6)
+
+    def draw(self, seen: Array) -> Array:
+        """An error (6,) for a measurement of information (6, 6)."""
+        self._bias = self._keep * self._bias + np.sqrt(1 - self._keep**2) * self._rng.normal(size=6)
+        w, V = np.linalg.eigh(seen * np.outer(UNITS, UNITS))
+        root = (V * np.where(w > 1e-6, np.abs(w), np.inf) ** -0.5) @ V.T
+        white = self._rng.normal(size=6)
+        return UNITS * (root @ (np.sqrt(self._sense.lasting) * self._bias + np.sqrt(1 - self._sense.lasting) * white))
+
+
+def without_roll(T: Array, sigma: list[float]) -> Array:
+    """Information (6, 6) of a measurement with these standard deviations along the limb's axes that does not see its roll."""
+    B = np.kron(np.eye(2), T[:3, :3])
+    return B @ NO_ROLL @ np.diag(1.0 / np.square(sigma)) @ B.T

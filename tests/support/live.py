@@ -1,0 +1,144 @@
+"""Helpers of the tests and benchmarks that start real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import psutil
+import zenoh
+
+from shared.cell import description as cells
+from shared.contract import messages, topics
+
+
+def wait_for(condition: Callable[[], Any], seconds: float, what: str, interval: float = 0.02) -> Any:
+    """The first true value of `condition`; fails with `what` where none comes within `seconds`."""
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        if time.monotonic() > deadline:
+            raise AssertionError(f"waited {seconds} s in vain for {what}")
+        time.sleep(interval)
+    return value
+
+
+def free_port() -> int:
+    """A TCP port that is free on loopback now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def connect(port: int = 7447) -> zenoh.Session:
+    """A client session at a router on loopback, as any user of the bus would open it."""
+    return zenoh.open(
+        zenoh.Config.from_json5(
+            f'{{mode: "client", connect: {{endpoints: ["tcp/127.0.0.1:{port}"], timeout_ms: -1, exit_on_failure: false}}, '
+            "scouting: {multicast: {enabled: false}}}"
+        )
+    )
+
+
+@dataclass
+class Running:
+    """`penumbra up` and a session beside it."""
+
+    cell: str
+    port: int
+    launcher: subprocess.Popen
+    session: zenoh.Session
+
+    def pose(self, target: str = "forearm") -> dict | None:
+        """The answer to the pose query, or None where nobody answers."""
+        for reply in self.session.get(topics.current_pose(self.cell, target) + "?format=json", timeout=1.0):
+            if reply.ok:
+                return json.loads(reply.ok.payload.to_string())
+        return None
+
+    def is_tracking(self, after_ns: int = 0) -> bool:
+        pose = self.pose()
+        return pose is not None and pose["state"] == "tracking" and pose["stamp_ns"] > after_ns
+
+    def control(self, command: dict) -> dict | None:
+        """The emulator's answer to a control command, or None where nobody answers."""
+        for reply in self.session.get(topics.control(self.cell), payload=json.dumps(command), timeout=1.0):
+            if reply.ok:
+                return json.loads(reply.ok.payload.to_string())
+        return None
+
+    def health(self) -> dict[str, dict]:
+        """The health of every living instance by service."""
+        replies = self.session.get(topics.health(self.cell), timeout=1.0)
+        found = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
+        return {item["service"]: item for item in found}
+
+    def processes(self) -> dict[str, psutil.Process]:
+        """The launcher and its services by name, from their command lines."""
+        launcher = psutil.Process(self.launcher.pid)
+        out = {"launcher": launcher}
+        for child in launcher.children(recursive=True):
+            try:
+                words = child.cmdline()
+            except psutil.NoSuchProcess:  # it has ended since
+                continue
+            if "services.command.cli" in words:
+                name = words[words.index("services.command.cli") + 1]
+                out[name if name not in out else f"{name}-{child.pid}"] = child
+        return out
+
+
+@contextmanager
+def penumbra_up(
+    cell: str, seed: int, *arguments: str, port: int | None = None, environment: Mapping[str, str] | None = None, **streams: Any
+) -> Iterator[Running]:
+    """The whole chain as real processes, stopped as by Ctrl-C at the end.
+
+    port: of the router on loopback, a free one if none is given. environment: beside that of this process. streams: where stdout
+    (default: nowhere) and stderr of the launcher go.
+    """
+    port = port or free_port()
+    command = [
+        sys.executable,
+        "-m",
+        "services.command.cli",
+        "up",
+        "--cell",
+        cell,
+        "--seed",
+        str(seed),
+        "--port",
+        str(port),
+        *arguments,
+    ]
+    launcher = subprocess.Popen(command, env={**os.environ, **(environment or {})}, **({"stdout": subprocess.DEVNULL} | streams))
+    try:
+        with connect(port) as session:
+            yield Running(cells.load(cell).name, port, launcher, session)
+    finally:
+        launcher.terminate()
+        launcher.wait(10)
+
+
+def hold_in_reach(running: Running) -> None:
+    """Waits until the arm is tracked in sight of the camera and above the pads, and stops it there: what happens to the pose from
+    then on is the test's doing."""
+    wait_for(running.is_tracking, 180, "a tracked pose", 0.2)
+    wait_for(lambda: running.control({"command": "occlude", "value": 0}), 10, "the emulator's answer")
+    truths = running.session.declare_subscriber(topics.TRUTH.at(cell=running.cell))
+    wait_for(lambda: _is_in_reach(truths.recv()), 60, "the arm above the pads", 0.0)
+    wait_for(lambda: running.control({"command": "motion", "value": "off"}), 10, "the emulator's answer")
+    truths.undeclare()
+    both = lambda: running.is_tracking() and len(running.pose()["sources"]) == 2  # noqa: E731
+    wait_for(both, 60, "a tracked pose of the resting arm, by both senses", 0.2)
+
+
+def _is_in_reach(sample: zenoh.Sample) -> bool:
+    return 0.04 < messages.decode(messages.Truth, sample.payload.to_bytes()).gap < 0.09

@@ -1,0 +1,257 @@
+"""What a fault does to a running chain, as any client of the bus sees it: gaps, recovery, repeats and false tracking."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from shared.contract import messages, topics
+from shared.geometry import rigid
+from tests.support.live import Running
+
+READ = (topics.FUSED, topics.VISION, topics.HAPTIC, topics.TRUTH, topics.MASK, topics.FRAME, topics.VOLTAGES)
+DECODED = {topics.FUSED.name, topics.VISION.name, topics.HAPTIC.name, topics.TRUTH.name}
+"""Of the others only the time of arrival is kept: a frame is a megabyte."""
+OUTPUTS = {
+    "emulator": (topics.FRAME, topics.VOLTAGES, topics.TRUTH),
+    "segmentation": (topics.MASK,),
+    "search": (topics.VISION,),
+    "haptics": (topics.HAPTIC,),
+    "fusion": (topics.FUSED,),
+}
+"""What each service says; all of it where all are meant."""
+SENSES = ((topics.VISION, "tracking"), (topics.HAPTIC, "in_range"))
+"""The senses, and the state of their poses that fusion takes."""
+CHI2_3_SIGMA = 20.06
+"""Squared Mahalanobis distance of six dimensions that 99.73 % of all errors stay within: three standard deviations of one."""
+SHARE, WINDOW_S = 0.75, 0.5
+"""A rate is back when so much of it is seen in two windows of this length, one after the other: below is no hiccup."""
+FAR_S = 0.5
+"""A pose stamped further from the truth of its time of arrival is not of that time."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One message: when it came [s, steady clock], what it was, None where only its arrival counts, and who sent it as which of
+    all that it has sent, None where it does not say."""
+
+    at_s: float
+    message: Any = None
+    publisher: str = ""
+    number: int | None = None
+
+
+class Outside:
+    """Listens to a chain from outside, but not to what its own session sends. Everything is decoded afterwards."""
+
+    def __init__(self, session: zenoh.Session, cell: str, target: str, pad: str):
+        self._rows: dict[str, list[tuple[float, bytes, zenoh.SourceInfo | None]]] = {}
+        self._subscribers = []
+        for topic in READ:
+            rows = self._rows.setdefault(topic.name, [])
+            key = topic.at(cell=cell, target=target, pad=pad)
+            ring, others = zenoh.handlers.RingChannel(1024), zenoh.Locality.REMOTE
+            subscriber = session.declare_subscriber(key, ring, allowed_origin=others)
+            threading.Thread(target=self._read, args=(subscriber, rows, topic.name in DECODED), daemon=True).start()
+            self._subscribers.append(subscriber)
+
+    @staticmethod
+    def _read(subscriber: Any, rows: list[tuple[float, bytes, zenoh.SourceInfo | None]], is_decoded: bool) -> None:
+        for sample in subscriber:
+            rows.append((time.monotonic(), sample.payload.to_bytes() if is_decoded else b"", sample.source_info))
+
+    def __enter__(self) -> Outside:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+
+    def seen(self, topic: topics.Topic, begin_s: float = -np.inf, end_s: float = np.inf) -> list[Seen]:
+        """What came on a topic between two times of the steady clock."""
+        out = []
+        for at_s, payload, source in list(self._rows[topic.name]):
+            if not begin_s <= at_s <= end_s:
+                continue
+            message = messages.decode(topic.message, payload) if topic.name in DECODED else None
+            publisher = "" if source is None else f"{source.source_id.zid}/{source.source_id.eid}"
+            out.append(Seen(at_s, message, publisher, None if source is None else source.source_sn))
+        return out
+
+    def forget(self) -> None:
+        """Drops what came until now, but for the last message of each topic, from which the next are counted on."""
+        for rows in self._rows.values():
+            del rows[:-1]
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """What a fault did. gap_ms: longest time without a fused pose that is not lost while a sense was alive; recovery_s: until all
+    of a service's topics had their old rate, None where they never had; reused: measurements used twice; false_tracking: poses
+    called tracking, of `tracking` in all, whose error was beyond three sigma of their own covariance; worst_cm: the largest error
+    of their positions."""
+
+    gap_ms: float
+    recovery_s: float | None
+    reused: int
+    false_tracking: int
+    tracking: int
+    worst_cm: float
+
+
+def gap_s(fused: Sequence[Seen], senses: Iterable[tuple[topics.Topic, Sequence[Seen]]], end_s: float) -> float:
+    """The longest time between two fused poses that are not lost, not counting what no sense was alive of it: a sense is alive
+    until its last pose that can be used is stale."""
+    usable = {topic.name: state for topic, state in SENSES}
+    alive = _union(
+        (seen.at_s, min(seen.at_s + topic.stale_s, end_s))
+        for topic, all_seen in senses
+        for seen in all_seen
+        if seen.message.state == usable[topic.name]
+    )
+    times = [seen.at_s for seen in fused if seen.message.state != "lost"]
+    if not alive:
+        return 0.0
+    edges = [alive[0][0], *(t for t in times if t > alive[0][0]), end_s]
+    starts, ends = np.array(alive).T
+    overlap = lambda a, b: float(np.clip(np.minimum(ends, b) - np.maximum(starts, a), 0.0, None).sum())  # noqa: E731
+    return max(overlap(a, b) for a, b in itertools.pairwise(edges))
+
+
+def _union(spans: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    out: list[tuple[float, float]] = []
+    for begin, end in sorted(spans):
+        if out and begin <= out[-1][1]:
+            out[-1] = out[-1][0], max(end, out[-1][1])
+        else:
+            out.append((begin, end))
+    return out
+
+
+def recovery_s(times: Sequence[float], rate_hz: float, fault_s: float, end_s: float) -> float | None:
+    """Seconds from a fault until a stream of messages with these times of arrival has its old rate, and keeps it for two windows;
+    None where it has not by the end."""
+    wanted = SHARE * rate_hz * WINDOW_S
+    after = np.array([t for t in times if t >= fault_s])
+    for t in (fault_s, *after.tolist()):
+        if t + 2 * WINDOW_S > end_s:
+            return None
+        first, second, last = np.searchsorted(after, [t, t + WINDOW_S, t + 2 * WINDOW_S])
+        if min(second - first, last - second) >= wanted:
+            return t - fault_s
+    return None
+
+
+def repeats(seen: Iterable[Seen]) -> int:
+    """How many messages tell again what was told: the same stamp."""
+    stamps = [each.message.stamp_ns for each in seen]
+    return len(stamps) - len(set(stamps))
+
+
+def offered(seen: Sequence[Seen], usable: str) -> int:
+    """How many measurements that can be used there were, each once, with those that were lost on their way to us: where the count
+    of a publisher, which numbers all that it says, has gaps."""
+    numbers: dict[str, list[int]] = {}
+    for each in seen:
+        if each.number is not None:
+            numbers.setdefault(each.publisher, []).append(each.number)
+    missed = sum(max(of) - min(of) + 1 - len(set(of)) for of in numbers.values())
+    return missed + len(
+        {(getattr(each.message, "camera", ""), each.message.stamp_ns) for each in seen if each.message.state == usable}
+    )
+
+
+def tracking_errors(fused: Iterable[Seen], truth: Sequence[Seen], epoch_ns: int) -> np.ndarray:
+    """Of every pose that is called tracking while the truth is heard (n, 2): the squared Mahalanobis distance of its error by its
+    own covariance, and the error of its position [m], at its own stamp; both infinite where that is of another time than the
+    truth that came with it. Where it is the truth that is stamped with another time than ours, nothing is said.
+
+    epoch_ns: what our wall clock says when the steady clock says zero."""
+    rows = []
+    order = sorted(truth, key=lambda each: each.message.stamp_ns)
+    stamps, arrivals = np.array([each.message.stamp_ns for each in order]), np.array([each.at_s for each in truth])
+    for each in fused if truth else ():
+        pose = each.message
+        beside = int(np.argmin(np.abs(arrivals - each.at_s)))
+        if pose.state != "tracking" or abs(arrivals[beside] - each.at_s) > topics.TRUTH.stale_s:
+            continue
+        if abs(truth[beside].message.stamp_ns - pose.stamp_ns) > FAR_S * 1e9:
+            if abs(epoch_ns + each.at_s * 1e9 - pose.stamp_ns) > FAR_S * 1e9:
+                rows.append((np.inf, np.inf))
+            continue
+        nearest = order[int(np.argmin(np.abs(stamps - pose.stamp_ns)))].message
+        moved = nearest.velocity * ((pose.stamp_ns - nearest.stamp_ns) * 1e-9)
+        T_true = rigid.perturb(rigid.transform(nearest.position, nearest.orientation), moved)
+        error = rigid.pose_error(T_true, rigid.transform(pose.position, pose.orientation))
+        rows.append((float(error @ np.linalg.solve(pose.covariance, error)), float(np.linalg.norm(error[:3]))))
+    return np.array(rows).reshape(-1, 2)
+
+
+def epoch_ns() -> int:
+    """What the wall clock says when the steady clock says zero."""
+    return time.time_ns() - time.monotonic_ns()
+
+
+# ---- fusion's own counters
+
+
+def health(running: Running, service: str = "*") -> list[dict[str, Any]]:
+    """The health of every instance that answers, or of those of one service."""
+    replies = running.session.get(topics.health(running.cell, service), timeout=1.0)
+    return [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
+
+
+def taken(running: Running) -> dict[tuple[str, str], int]:
+    """How many measurements each instance of fusion has accepted of each sense."""
+    return {
+        (report["instance"], sense): target[sense]["accepted"]
+        for report in health(running, "fusion")
+        for target in report.get("report", {}).values()
+        for sense in ("vision", "haptic")
+    }
+
+
+def reused(outside: Outside, before: dict[tuple[str, str], int], after: dict[tuple[str, str], int]) -> int:
+    """How many measurements an instance of fusion has accepted more than there were: by its own counters, between two times,
+    before the first of which we listened already."""
+    there_were = {topic.name: offered(outside.seen(topic), usable) for topic, usable in SENSES}
+    return sum(max(0, n - before.get((instance, sense), 0) - there_were[sense]) for (instance, sense), n in after.items())
+
+
+def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: float, end_s: float, reused: int) -> Numbers:
+    """What was seen of a fault of a service until end_s; old_hz: by topic, before it; reused: what fusion has used again."""
+    begin_s = fault_s - WINDOW_S
+    fused, truth = outside.seen(topics.FUSED, begin_s, end_s), outside.seen(topics.TRUTH, begin_s, end_s)
+    senses = [(topic, outside.seen(topic, begin_s, end_s)) for topic in (topics.VISION, topics.HAPTIC)]
+    recoveries = [
+        recovery_s([seen.at_s for seen in known_poses(outside.seen(topic, fault_s, end_s))], old_hz[topic.name], fault_s, end_s)
+        for topic in OUTPUTS.get(service, READ)
+    ]
+    known = [each for each in recoveries if each is not None]
+    errors = tracking_errors(fused, truth, epoch_ns())
+    return Numbers(
+        round(1e3 * gap_s(fused, senses, end_s), 1),
+        round(max(known), 3) if len(known) == len(recoveries) else None,
+        reused + repeats(fused),
+        int((errors[:, 0] > CHI2_3_SIGMA).sum()),
+        len(errors),
+        round(100 * float(errors[:, 1].max(initial=0.0)), 2),
+    )
+
+
+def rates_hz(outside: Outside, begin_s: float, end_s: float) -> dict[str, float]:
+    """By topic, the messages a second of all its keys that are listened to."""
+    return {topic.name: len(known_poses(outside.seen(topic, begin_s, end_s))) / (end_s - begin_s) for topic in READ}
+
+
+def known_poses(seen: Iterable[Seen]) -> list[Seen]:
+    """Without the fused poses that are lost: saying so is no service."""
+    return [each for each in seen if not (isinstance(each.message, messages.FusedPose) and each.message.state == "lost")]

@@ -1,0 +1,173 @@
+"""A recording played through the services in one process, deterministically: the stamps in the data drive everything.
+
+Each service is wired by its own `start`, to a `ReplayNode` in place of the bus; a message is delivered after the time that its
+making takes on a real machine, so that fusion sees vision late, as it does live.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import importlib
+import itertools
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from shared.cell import description as cells
+from shared.contract import topics
+from shared.contract.messages import Message, decode, encode
+from shared.contract.topics import Topic
+from shared.runtime import logs
+
+SERVICES = ("segmentation", "search", "haptics", "fusion")
+DELAY_NS = {topics.FRAME: 2_000_000, topics.MASK: 30_000_000, topics.VISION: 5_000_000, topics.HAPTIC: 1_000_000}
+"""From the cause of a message to its arrival; what is not named arrives at once."""
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A message of the recording or of a service, when it arrived, and its names."""
+
+    time_ns: int
+    topic: Topic
+    names: dict[str, str]
+    message: Any
+
+
+class Replay:
+    """The clock, the messages on their way and who listens. `heard`: all messages delivered, in order."""
+
+    def __init__(self, cell: cells.Cell, services: Iterable[str] = SERVICES, arguments: dict[str, list[str]] | None = None):
+        self.cell, self.now_ns = cell, 0
+        self.heard: list[Heard] = []
+        self._listeners: list[tuple[Topic, dict[str, str], Callable[[Any, dict[str, str]], None]]] = []
+        self._timers: list[tuple[int, Callable[[], None]]] = []
+        self._answers: dict[str, Callable[[dict[str, str], bytes], Any]] = {}
+        self._queue: list[tuple[int, int, Callable[[], None]]] = []
+        self._count = itertools.count()
+        for name in services:
+            module = importlib.import_module(f"services.{name}.service")
+            parser = argparse.ArgumentParser()
+            module.arguments(parser)
+            module.start(ReplayNode(self, name), parser.parse_args((arguments or {}).get(name, [])))
+
+    def run(self, recording: Iterable[tuple[Topic, dict[str, str], Message]]) -> list[Heard]:
+        """Plays messages in the order of their stamps; returns all that was heard."""
+        for topic, names, message in recording:
+            if not self.now_ns:
+                self.now_ns = message.stamp_ns
+                for period_ns, function in self._timers:
+                    self._tick(message.stamp_ns, period_ns, function)
+            self._advance(message.stamp_ns)
+            self.send(topic, names, message, message.stamp_ns)
+        self._advance(self.now_ns + max(DELAY_NS.values()))
+        return self.heard
+
+    def send(self, topic: Topic, names: dict[str, str], message: Message, cause_ns: int) -> None:
+        copy = decode(topic.message, encode(message))  # as over the wire: nobody shares an array
+        self._at(cause_ns + DELAY_NS.get(topic, 0), lambda: self._deliver(topic, names, copy))
+
+    def listen(self, topic: Topic, names: dict[str, str], handler: Callable[[Any, dict[str, str]], None]) -> None:
+        self._listeners.append((topic, names, handler))
+
+    def ask(self, key: str, **parameters: str) -> Any:
+        """What a service answers to a query of this key."""
+        return self._answers[key](parameters, b"")
+
+    def answer(self, key: str, function: Callable[[dict[str, str], bytes], Any]) -> None:
+        self._answers[key] = function
+
+    def every(self, period_ns: int, function: Callable[[], None]) -> None:
+        self._timers.append((period_ns, function))
+
+    def _at(self, time_ns: int, function: Callable[[], None]) -> None:
+        heapq.heappush(self._queue, (time_ns, next(self._count), function))
+
+    def _tick(self, time_ns: int, period_ns: int, function: Callable[[], None]) -> None:
+        def fire() -> None:
+            function()
+            self._tick(time_ns + period_ns, period_ns, function)
+
+        self._at(time_ns + period_ns, fire)
+
+    def _advance(self, until_ns: int) -> None:
+        while self._queue and self._queue[0][0] <= until_ns:
+            self.now_ns, _, function = heapq.heappop(self._queue)
+            function()
+        self.now_ns = until_ns
+
+    def _deliver(self, topic: Topic, names: dict[str, str], message: Any) -> None:
+        self.heard.append(Heard(self.now_ns, topic, names, message))
+        for wanted, chosen, handler in self._listeners:
+            if wanted is topic and chosen.items() <= names.items():
+                handler(message, names | {"publisher": topic.publisher})
+
+
+class ReplayNode:
+    """What a service's `start` sees of `shared.runtime.node.Node`, on the replay's clock; a handler's exception ends it."""
+
+    def __init__(self, replay: Replay, service: str):
+        self._replay, self.cell, self.log = replay, replay.cell, logs.get(service)
+        self.report: dict[str, Callable[[], Any]] = {}
+        self.is_warm: Callable[[], bool] = lambda: True
+
+    def now_ns(self) -> int:
+        return self._replay.now_ns
+
+    def publish(self, topic: Topic, message: Message, **names: str) -> None:
+        self._replay.send(topic, names, message, self._replay.now_ns)
+
+    def subscribe(
+        self,
+        topic: Topic,
+        handler: Callable[[Any, dict[str, str]], None],
+        streams: Sequence[str] = (),
+        from_others: bool = False,
+        **names: str,
+    ) -> None:
+        """There is one replica of each service: all streams are its own, and there are no others."""
+        if not from_others:
+            self._replay.listen(topic, names, handler)
+
+    def every(self, period_s: float, function: Callable[[], None]) -> None:
+        self._replay.every(round(period_s * 1e9), function)
+
+    def answer(self, key: str, function: Callable[[dict[str, str], bytes], Any]) -> None:
+        self._replay.answer(key, function)
+
+    def owns(self, stream: str) -> bool:
+        return True
+
+    def rank(self, stream: str) -> float:
+        return 0.0
+
+
+def digest(heard: list[Heard], period_s: float = 1.0) -> dict[str, list[Any]]:
+    """What each service said, thinned to one message a period: mask areas, positions and axes of poses, and states."""
+    out: dict[str, list[Any]] = {topic.name: [] for topic in (topics.MASK, topics.VISION, topics.HAPTIC, topics.FUSED)}
+    due = dict.fromkeys(out, 0)
+    for item in heard:
+        name = item.topic.name
+        if name not in out or item.time_ns < due[name]:
+            continue
+        due[name] = item.time_ns + round(period_s * 1e9)
+        if item.topic is topics.MASK:
+            out[name].append(np.bincount(item.message.labels.ravel(), minlength=7).tolist())
+        else:
+            out[name].append([item.message.state, *np.round(item.message.position, 5).tolist()])
+    return out
+
+
+def main() -> None:
+    """`python -m tests.support.replay`: writes the reference of tests/chain/test_replay.py again."""
+    from tests.chain.test_replay import REFERENCE, play
+
+    REFERENCE.write_text(json.dumps(digest(play()), indent=None).replace("], [", "],\n  [") + "\n")
+
+
+if __name__ == "__main__":
+    main()
