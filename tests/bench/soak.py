@@ -123,17 +123,8 @@ class Life:
         """`penumbra restart`: all that can be, one after another."""
         if self._restart is None or self._restart.poll() is not None:
             endpoint = f"tcp/127.0.0.1:{self.router.port}"
-            command = [
-                sys.executable,
-                "-m",
-                "services.command.cli",
-                "restart",
-                "--cell",
-                self.running.cell,
-                "--connect",
-                endpoint,
-            ]
-            self._restart = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+            restart = ["restart", "--cell", self.running.cell, "--connect", endpoint]
+            self._restart = subprocess.Popen([sys.executable, "-m", "services.command.cli", *restart], stdout=subprocess.DEVNULL)
 
     def router_loss(self) -> None:
         """The router dies, and another one takes its place."""
