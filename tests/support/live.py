@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import random
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import IO, Any
 
 import psutil
 import zenoh
@@ -30,11 +33,26 @@ def wait_for(condition: Callable[[], Any], seconds: float, what: str, interval: 
     return value
 
 
+PORTS = range(20_000, 30_000)
+"""Ports for tests: below those that the kernel gives away (from 32,768 on), so that no connection takes one meanwhile."""
+_HELD: list[IO[str]] = []
+"""Locked files, one a port, until this process ends."""
+
+
 def free_port() -> int:
-    """A TCP port that is free on loopback now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A TCP port on loopback that nobody listens on, and that no other test gets before this process has ended."""
+    for port in random.sample(PORTS, len(PORTS)):
+        lock = open(f"{tempfile.gettempdir()}/penumbra-test-port-{port}", "w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with socket.socket() as probe:
+                probe.bind(("127.0.0.1", port))
+        except OSError:  # another test's, or somebody listens
+            lock.close()
+            continue
+        _HELD.append(lock)
+        return port
+    raise AssertionError(f"no free port in {PORTS}")
 
 
 def connect(port: int = 7447) -> zenoh.Session:
