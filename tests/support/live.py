@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import IO, Any
+from typing import Any
 
 import psutil
 import zenoh
@@ -35,22 +35,22 @@ def wait_for(condition: Callable[[], Any], seconds: float, what: str, interval: 
 
 PORTS = range(20_000, 30_000)
 """Ports for tests: below those that the kernel gives away (from 32,768 on), so that no connection takes one meanwhile."""
-_HELD: list[IO[str]] = []
-"""Locked files, one a port, until this process ends."""
+_held: list[int] = []
+"""Descriptors of locked files, one per port, kept until this process ends."""
 
 
 def free_port() -> int:
     """A TCP port on loopback that nobody listens on, and that no other test gets before this process has ended."""
     for port in random.sample(PORTS, len(PORTS)):
-        lock = open(f"{tempfile.gettempdir()}/penumbra-test-port-{port}", "w")
+        lock = os.open(f"{tempfile.gettempdir()}/penumbra-test-port-{port}", os.O_CREAT | os.O_RDWR, 0o666)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             with socket.socket() as probe:
                 probe.bind(("127.0.0.1", port))
         except OSError:  # another test's, or somebody listens
-            lock.close()
+            os.close(lock)
             continue
-        _HELD.append(lock)
+        _held.append(lock)
         return port
     raise AssertionError(f"no free port in {PORTS}")
 
