@@ -11,7 +11,7 @@ from shared.cell import description
 from sim.world.world import record
 from tests.support.replay import Heard, Replay, digest
 
-REFERENCE = Path(__file__).parent / "references" / "replay_table.json"
+REFERENCE = Path(__file__).parents[1] / "references" / "replay_table.json"
 SEED = 11
 
 
