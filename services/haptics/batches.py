@@ -22,8 +22,9 @@ NEVER = -(1 << 62)
 
 @dataclass(frozen=True)
 class VoltageWindow:
-    """The mean voltages of all electrodes over a stretch of time. stamp_ns: the middle of the samples; newest_ns: the last one; amplitude (n,) [V]: means; samples (n,): how many are
-    in each, none for electrodes that are not to be believed; faults: the reasons, by PAD or PAD/ELECTRODE."""
+    """The mean voltages of all electrodes over a stretch of time. stamp_ns: the middle of the samples; newest_ns: the last one;
+    amplitude (n,) [V]: means; samples (n,): how many are in each, none for electrodes that are not to be believed; faults: the
+    reasons, by PAD or PAD/ELECTRODE."""
 
     stamp_ns: int
     newest_ns: int

@@ -28,8 +28,8 @@ class Limb:
 
 
 class Starts:
-    """The poses that a solve from scratch begins with, by number from 0 to len() - 1. home (4, 4): T_world_target; by_network: the
-    network's pose of a reading, the last of the starts."""
+    """The poses that a solve from scratch begins with, by number from 0 to len() - 1. home (4, 4): T_world_target; by_network:
+    gives the network's pose of a reading, the last of the starts."""
 
     def __init__(self, home: Array, limb: Limb, by_network: Callable[[Reading], Array], settings: HapticSettings):
         self._home, self._limb, self._by_network, self._settings = home, limb, by_network, settings

@@ -37,7 +37,7 @@ class Home:
     def __init__(self, T: Array, spread: ArrayLike, settings: HapticSettings):
         self.T = T
         self.place = Place(T, np.diag(np.asarray(spread, dtype=float) ** 2))
-        self.information = np.linalg.inv(self.place.covariance)
+        self.information: Array = np.asarray(np.linalg.inv(self.place.covariance), np.float64)
         self._settings = settings
 
     def decayed(self, place: Place, elapsed_s: float) -> Place:

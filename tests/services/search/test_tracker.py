@@ -286,7 +286,7 @@ def test_a_mask_of_another_camera_is_refused_with_what_came(search):
         search.update(Mask(stamp_ns=0, labels=np.zeros((10, 2000), np.uint8), x0=0, y0=0, scale=1))
     with pytest.raises(ValueError, match="at scale 0 came"):
         search.update(Mask(stamp_ns=0, labels=np.zeros((10, 10), np.uint8), x0=0, y0=0, scale=0))
-    with pytest.raises(ValueError, match="default, paper expected, got 'best'"):
+    with pytest.raises(ValueError, match="expected one of default, paper, got 'best'"):
         Search(CELL, method="best")
 
 
