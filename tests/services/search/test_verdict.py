@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from services.search.settings import ONE_IN_10, ONE_IN_100, ONE_IN_10_000, SearchSettings
+from services.search.settings import ONE_IN_10, ONE_IN_10_000, ONE_IN_100, SearchSettings
 from services.search.verdict import Findings, Verdict, explains_mask, verdict
 
 SETTINGS = SearchSettings()
