@@ -12,18 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.geometry.rigid import Array
 from shared.skin.faults import Watch
 from shared.skin.layout import Skin
 
-Array = NDArray[np.float64]
-
 NEVER = -(1 << 62)
+"""The stamp [ns] of something that has not come yet: before every other stamp."""
 
 
 @dataclass(frozen=True)
-class Window:
-    """stamp_ns: the middle of the samples; newest_ns: the last one; amplitude (n,) [V]: means; samples (n,): how many are
-    in each, none for electrodes that are not to be believed; faults: the reasons, by PAD or PAD/ELECTRODE."""
+class VoltageWindow:
+    """The mean voltages of all electrodes over a stretch of time. stamp_ns: the middle of the samples; newest_ns: the last one;
+    amplitude (n,) [V]: means; samples (n,): how many are in each, none for electrodes that are not to be believed; faults: the
+    reasons, by PAD or PAD/ELECTRODE."""
 
     stamp_ns: int
     newest_ns: int
@@ -66,7 +67,7 @@ class Collector:
         self._newest = np.full(len(skin.pads), NEVER, dtype=np.int64)
         self._done_ns = self._born_ns = NEVER
 
-    def add(self, pad: str, stamp_ns: int, period_ns: int, volts: Array) -> Window | None:
+    def add(self, pad: str, stamp_ns: int, period_ns: int, volts: Array) -> VoltageWindow | None:
         """Take a batch (samples, electrodes) whose last row has stamp_ns; returns a window when one is complete.
 
         Raises ValueError for an unknown pad, another number of electrodes than the cell has, or a period that is not positive.
@@ -92,7 +93,7 @@ class Collector:
         self._newest[k] = stamp_ns
         return self._window(period_ns)
 
-    def _window(self, period_ns: int) -> Window | None:
+    def _window(self, period_ns: int) -> VoltageWindow | None:
         newest_ns = int(self._newest.max())
         if (self._newest == NEVER).any() and newest_ns - self._born_ns < self.patience_ns:
             return None  # at the start every pad has a chance to be heard
@@ -126,7 +127,7 @@ class Collector:
             middles.append(float((stamps - begin_ns).mean()))
         self._done_ns = end_ns
         middle = int(np.mean(middles)) if middles else self.length_ns // 2
-        return Window(begin_ns + middle, end_ns, amplitude, samples, faults)
+        return VoltageWindow(begin_ns + middle, end_ns, amplitude, samples, faults)
 
     def _forget(self) -> None:
         for k in range(len(self.skin.pads)):

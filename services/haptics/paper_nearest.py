@@ -15,11 +15,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from shared.geometry.rigid import Array
 from shared.skin.layout import Skin
-
-Array = NDArray[np.float64]
 
 LIMB_RADIUS = 0.045
 """r [m]: halfway between a wrist and an elbow."""
@@ -28,6 +26,7 @@ EXPECTED_GAP = 0.15
 EXPECTED_TILT = 0.4
 """Standard deviation of each part of g before anything is measured."""
 ITERATIONS = 6
+"""Number of Gauss-Newton steps of the fit."""
 
 
 def nearest_points(skin: Skin, signal: Array, variance: Array) -> tuple[Array, Array]:

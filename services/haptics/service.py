@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.haptics import paper_network
-from services.haptics.batches import Backlog, Collector, Window
-from services.haptics.estimator import FOREIGN, Estimate, Estimator
+from services.haptics.batches import Backlog, Collector, VoltageWindow
+from services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
 from services.haptics.pad_poses import PadPoses
 from shared.body.anatomy import target_mesh
 from shared.body.robot import robot_models
@@ -67,7 +67,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
         if window is not None and not backlog.is_late(window.newest_ns, node.now_ns()):
             on_window(window)
 
-    def on_window(window: Window) -> None:
+    def on_window(window: VoltageWindow) -> None:
         found = poses.at(window.stamp_ns)
         faults = dict(window.faults)
         if found is None:
@@ -127,7 +127,7 @@ class Misfits:
         self._node = node
         self._means: dict[str, float] = {}
 
-    def update(self, estimate: Estimate, skin: Skin, samples: NDArray[np.int64]) -> None:
+    def update(self, estimate: HapticEstimate, skin: Skin, samples: NDArray[np.int64]) -> None:
         """Takes the residuals (n,) of a window on a skin, with so many samples (n,) each."""
         if not estimate.in_range:
             return
@@ -176,7 +176,7 @@ def seen(fused: FusedPose | None, stamp_ns: int) -> FusedPose | None:
     return fused if camera.age_s + (stamp_ns - fused.stamp_ns) * 1e-9 < LONGEST_S else None
 
 
-def _message(estimate: Estimate, window: Window, target: str, frame: str) -> HapticPose:
+def _message(estimate: HapticEstimate, window: VoltageWindow, target: str, frame: str) -> HapticPose:
     position, orientation = position_orientation(estimate.T)
     return HapticPose(
         stamp_ns=window.stamp_ns,

@@ -13,27 +13,32 @@ from services.haptics.solve import marginal
 from shared.geometry.rigid import Array
 
 SIZE = np.array([0.0, -0.08])
-"""Log length and log girth of a limb, as shares of the target's mesh, before anything is felt …"""
+"""Log length and log girth of an average limb, relative to the target's mesh."""
 SIZE_SPREAD = np.array([0.06, 0.11])
-"""… and their standard deviations: the 5th percentile woman to the 95th man (ANSUR II) lie at log girths of -0.27 to 0.11."""
+"""Standard deviations of log length and log girth between people: the 5th percentile woman to the 95th man (ANSUR II) lie at log
+girths of -0.27 to 0.11."""
 SIZE_MEASURED = np.array([0.015, 0.03])
-"""The same of a person who was measured, around the target's stated size."""
+"""The same standard deviations for a person whose size the cell file states, around the stated size."""
 SIZE_GAP = 0.06
-"""Nearer than this [m] the size is learnt."""
+"""Largest gap [m] at which the size is learnt. Farther away the size is only considered (see above)."""
 SIZE_MEMORY_S = 20.0
+"""Time constant [s] with which the learnt size decays to the average one."""
 SIZE_LASTING = 200.0
-"""The model's error is nearly the same while a limb rests: for the size it counts with so many times its variance."""
+"""Number of windows in which the field model makes about the same error while a limb rests: for the size, its variance is
+multiplied by it."""
 PERSON_S = 5.0
-"""A limb that was away for so long may be another person's."""
+"""Time [s] without a limb in range after which the next one may be another person's."""
 TARE_S = 10.0
-"""Time constant with which rests follow …"""
+"""Time constant [s] with which the rests follow the voltages."""
 QUIET_S = 3.0
-"""… where nothing was in range for so long …"""
+"""Time [s] for which nothing may have been in range before the rests follow."""
 STEADY = 3.0
-"""… and the smoothed signals stay within so many standard deviations of where they were."""
+"""Distance of a signal from its smoothed value, in standard deviations, above which the electrode counts as moved: the rests
+follow only while at most a tenth of the electrodes has moved."""
 SMOOTH_S = 1.0
+"""Time constant [s] of the smoothed signals."""
 FARTHEST_TARE = 0.02
-"""A rest that is off by more [V] is a fault and no drift."""
+"""Largest correction of a rest [V]. A rest that is farther off is a fault and no drift."""
 
 
 class Size:
@@ -69,6 +74,16 @@ class Size:
         total = self.information + left[6:, 6:]
         self.mean = size + np.linalg.solve(total, self.information @ (self.mean - size) + pull[6:])
         self.information = total
+
+    def marginalised(self, information: Array, gradient: Array, size: Array, lasting: float = 1.0) -> tuple[Array, Array]:
+        """Information (6, 6) and gradient (6,) of the pose, from a likelihood (8, 8), (8,) by pose and size at a solution of this
+        size (2,), after the size was marginalised. lasting: the factor on the covariance of what is known of the size, whose
+        error is the same in many windows."""
+        information, gradient = information.copy(), gradient.copy()
+        information[6:, 6:] += self.information / lasting
+        gradient[6:] += self.information @ (self.mean - size) / lasting
+        information, gradient = marginal(information, gradient, np.eye(8)[:, 6:])
+        return information[:6, :6], gradient[:6]
 
 
 class Tare:

@@ -20,13 +20,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from shared.geometry.rigid import perturb, pose_error
+from shared.geometry.rigid import Array, perturb, pose_error
 from shared.skin.layout import Skin
 from shared.skin.response import Response
-
-Array = NDArray[np.float64]
 
 NEAR_ERROR = 0.06
 """What the response gets wrong grows, where an electrode is nearly touched, by this share with the signal over NEAR_SIGNAL."""
@@ -72,16 +70,18 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class Window:
-    """What is measured: signal, variance (n,): mean voltage less its rest [V], positive near a person, and its variance, infinite
-    for an electrode to leave out; T_world_pads (p, 4, 4); distrust (n,): a factor of at least one on all variances of an
-    electrode, whose pad has not fitted lately; doubt (n,) [V]: standard deviation of a rest that was only predicted."""
+class Reading:
+    """What is measured in one window: signal, variance (n,): mean voltage less its rest [V], positive near a person, and its
+    variance, infinite for an electrode to leave out; T_world_pads (p, 4, 4); distrust (n,): a factor of at least one on all
+    variances of an electrode, whose pad has not fitted lately; doubt (n,) [V]: standard deviation of a rest that was only
+    predicted; joints (j,) [rad]: of the robots, which only the network reads."""
 
     signal: Array
     variance: Array
     T_world_pads: Array
     distrust: Array
     doubt: Array
+    joints: ArrayLike = ()
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Solver:
         self._pad_of = skin.pad_of
         self._scale = np.log(skin.gain * skin.sensitivity)
 
-    def solve(self, window: Window, prior: Prior, T: Array, size: Array, coarse: int = 12, fine: int = 8) -> Solution:
+    def solve(self, window: Reading, prior: Prior, T: Array, size: Array, coarse: int = 12, fine: int = 8) -> Solution:
         """The most probable pose and size near a start T (4, 4), size (2,), by at most so many steps on logs and on volts."""
         here = self._point(window, T, size)
         for steps, is_coarse in ((coarse, True), (fine, False)):
@@ -150,7 +150,7 @@ class Solver:
         predicted = np.exp(here.logs)
         return Solution(here.T, here.size, cost, _misfit(window, predicted, z), z, predicted, here)
 
-    def likelihood(self, window: Window, solution: Solution, lasting: float = 1.0) -> tuple[Array, Array]:
+    def likelihood(self, window: Reading, solution: Solution, lasting: float = 1.0) -> tuple[Array, Array]:
         """Information (8, 8) and gradient (8,) of the voltages alone at a solution, by pose and size. lasting: the model's error
         counts with so many times its variance."""
         H, g = np.zeros((8, 8)), np.zeros(8)
@@ -158,7 +158,7 @@ class Solver:
         _normal_equations(*self._given(window), at.logs, at.rows, False, lasting, H, g, z)
         return H, g
 
-    def _point(self, window: Window, T: Array, size: Array, rows: Array | None = None) -> Point:
+    def _point(self, window: Reading, T: Array, size: Array, rows: Array | None = None) -> Point:
         """What is predicted at a pose and size; derivatives that are not given cost six times as much as all else."""
         T_world_pads = window.T_world_pads
         R = T_world_pads[:, :3, :3]
@@ -173,11 +173,11 @@ class Solver:
         _to_world(T_world_pads, self._pad_of, jacobian, rows)
         return Point(T, size, logs + self._scale, rows)
 
-    def _given(self, window: Window) -> tuple[Array, Array, Array, Array, Array]:
+    def _given(self, window: Reading) -> tuple[Array, Array, Array, Array, Array]:
         return window.signal, window.variance, window.distrust, window.doubt, self.response.error
 
     def _posterior(
-        self, window: Window, prior: Prior, at: Point, coarse: bool, z: Array | None = None
+        self, window: Reading, prior: Prior, at: Point, coarse: bool, z: Array | None = None
     ) -> tuple[Array, Array, float]:
         H, g = np.zeros((8, 8)), np.zeros(8)
         z = np.zeros(len(at.logs)) if z is None else z
@@ -191,7 +191,7 @@ class Solver:
         return H, g, cost + 0.5 * float(toward @ pull) + 0.5 * float(toward_size @ pull_size)
 
 
-def _misfit(window: Window, predicted: Array, z: Array) -> float:
+def _misfit(window: Reading, predicted: Array, z: Array) -> float:
     """Mean squared residual [variances] of the electrodes that feel something, or should; one faulty electrode counts no more
     than OUTLIER."""
     used = np.isfinite(window.variance)

@@ -15,8 +15,7 @@ from services.search.evidence import TARGET, Evidence
 from shared.contract.labels import Label
 from shared.contract.messages import Mask
 from shared.geometry import rigid
-
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 SMALLEST_PX = 150
 """A region of fewer pixels has no shape to start from."""

@@ -38,7 +38,7 @@ NEAREST = 1
 
 
 @dataclass(frozen=True)
-class Settings:
+class ImageSettings:
     """How a picture's colours are believed. `passes`: at most; `spacing` of contour points [px]; `pooling`: standard deviation of
     the pooling along the contour [px]; `floor`: least standard deviation of a colour [of 255]; `clipped`: squared Mahalanobis
     distance that a pixel counts at most; `temperature`: pixels of a line that say the same; `mask`: standard deviation of the
@@ -90,21 +90,21 @@ def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uin
     )
 
 
-def refine(
+def fit_image(
     model: Model,
     first: Fit,
     image: NDArray[np.uint8],
     evidence: Evidence,
     T_prior: Array,
     prior: Array,
-    settings: Settings | None = None,
+    settings: ImageSettings | None = None,
     limits: Limits | None = None,
 ) -> Fit:
     """The pose near `first` whose contour lies on an edge of colours in the image (h, w, 3) uint8 RGB that the mask is of.
 
     `prior` (6, 6): information about T_prior (4 x 4) along the camera's axes, taken out of the result again as by `fit`.
     """
-    settings, limits = settings or Settings(), limits or Limits()
+    settings, limits = settings or ImageSettings(), limits or Limits()
     regular = np.zeros((7, 7))
     regular[:6, :6] = prior + limits.information
     regular[6, 6] = settings.dilation**-2
@@ -135,7 +135,8 @@ def refine(
 @dataclass(frozen=True)
 class _Pass:
     """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
-    square of the offsets left [px], the share of the roll that is believed, and the right sides (7, k) of `Settings.wave`."""
+    square of the offsets left [px], the share of the roll that is believed, and the right sides (7, k) of
+    `ImageSettings.wave`."""
 
     T: Array
     moved: Array
@@ -154,7 +155,7 @@ class _Picture:
     model: Model
     image: NDArray[np.uint8]
     evidence: Evidence
-    settings: Settings
+    settings: ImageSettings
     T_prior: Array
     regular: Array
 
@@ -249,7 +250,7 @@ def _waves(points: Array, T: Array) -> list[Array]:
 TYPICAL = 0.2
 """Offsets left [px] up to which the covariance is that of the settings; of larger ones it grows with their fourth power."""
 SHARP = 0.3
-"""Offsets of the image's edges left [px], each counted up to `Settings.huber`, with which a pose is believed."""
+"""Offsets of the image's edges left [px], each counted up to `ImageSettings.huber`, with which a pose is believed."""
 MAX_STEP = np.array([0.02, 0.02, 0.05, 0.1, 0.1, 0.1])
 """Largest step of a pass [m, rad]."""
 CONVERGED = 2e-4
@@ -263,7 +264,7 @@ _MIXED = 3
 @njit(cache=True, nogil=True)
 def offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped, temperature, mask_sigma):
     """Offset [px] of the edge along the outward normal of each contour point, its standard deviation and whether it was measured
-    (DROPPED, MEASURED). The arguments after `mask_kind` are those of `Settings`."""
+    (DROPPED, MEASURED). The arguments after `mask_kind` are those of `ImageSettings`."""
     n = len(points)
     colours = np.empty((n, _SAMPLES, 3), np.float32)
     first, last = np.empty(n, np.int64), np.empty(n, np.int64)  # of the samples that nothing covers

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from services.search.contour import Model, match, normal_equations
 from services.search.evidence import Evidence, compare
 from shared.geometry import rigid
-
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 SPACING_PX = 3.0
 """Distance of the sampled contour points: closer ones bring no new information."""
@@ -61,12 +60,14 @@ class Limits:
         return np.diag([self.position**-2.0] * 3 + [self.rotation**-2.0] * 3)
 
 
-COARSE, FINE = (24.0, 5.0, 4), (8.0, 2.0, 8)
-"""Reach of the walk [px], Huber's threshold [px], passes at most."""
+COARSE = (24.0, 5.0, 4)
+"""Reach of the walk [px], Huber's threshold [px] and largest number of passes, where the fit starts again from far."""
+FINE = (8.0, 2.0, 8)
+"""The same of the passes that end a fit."""
 CONVERGED = 1e-3
-"""Of a pass of which nothing finer follows [m]."""
+"""Step [m] below which a fit ends that nothing finer follows."""
 ROUGH = 4e-3
-"""Of a pass after which the image is asked [m]: a pixel or two."""
+"""Step [m] below which a fit ends that the image refines: a pixel or two."""
 MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
 """Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
 DAMPING = (1e-3, 10.0, 1e2)
@@ -74,8 +75,10 @@ DAMPING = (1e-3, 10.0, 1e2)
 KEPT = 0.05
 """Share of the prior's information that stays in the measurement: without any, what the contour hardly shows would be
 extrapolated far beyond where the problem is linear."""
-GOOD, MISFIT = 2.0, 3.0
-"""A smaller `Fit.misfit` has nearly every fit that is right; a larger one has one of a hundred, and most that are wrong."""
+GOOD = 2.0
+"""`Fit.misfit` below which nearly every right fit is."""
+MISFIT = 3.0
+"""`Fit.misfit` above which one of a hundred right fits is, and most wrong ones are."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,8 @@ class Fit:
     """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
     `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
     `cost`: chi^2 of contour, dilation and prior together; `misfit`: the same per measurement, 1 to 3 where the pose
-    is right; `both`, `either`, `free`: see `compare`; `sharp`: whether the image has edges along the contour (`refine`)."""
+    is right; `both`, `either`, `free`: see `compare`; `sharp`: whether the image has edges along the contour
+    (`image_fit.fit_image`)."""
 
     T: Array
     covariance: Array

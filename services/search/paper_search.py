@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from services.search.contour import Model
 from services.search.evidence import Intrinsics
 from shared.geometry import rigid
-
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from services.search.evidence import Intrinsics
 from shared.cell.description import Cell
 from shared.geometry import rigid
 from shared.geometry.raster import Raster
-
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 
 class RobotDepth:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import threading
 from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
 
 from services.search.tracker import METHODS, Search
 from shared.contract.messages import Frame, FusedPose, Joints, Mask
@@ -15,7 +19,10 @@ from shared.runtime.node import Node
 
 NAME = "search"
 FRAMES_KEPT = 4
-"""Of a camera, until their masks come."""
+"""Number of frames of a camera that are kept until their masks come."""
+JOINTS_NEAR_NS = 200_000_000
+"""Largest distance [ns] of a frame from the joint angles with which robots are drawn into it. Chosen: a mask without any knowledge
+of the robot is worse than one with a robot that has moved a little."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,6 +32,24 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--camera", help="search only the masks of this camera (default: of all)")
     parser.add_argument("--target", help="search only this target (default: all)")
+
+
+class RecentFrames:
+    """The last frames of a camera. The bus calls the handlers of frames and of masks on different threads."""
+
+    def __init__(self) -> None:
+        self._frames: deque[Frame] = deque(maxlen=FRAMES_KEPT)
+        self._lock = threading.Lock()
+
+    def add(self, frame: Frame) -> None:
+        """Keeps a frame, the oldest one goes."""
+        with self._lock:
+            self._frames.append(frame)
+
+    def image_at(self, stamp_ns: int) -> NDArray[np.uint8] | None:
+        """The image (h, w, 3) of the frame with this stamp, None where it is not kept."""
+        with self._lock:
+            return next((frame.image for frame in self._frames if frame.stamp_ns == stamp_ns), None)
 
 
 def start(node: Node, options: argparse.Namespace) -> None:
@@ -39,12 +64,12 @@ def start(node: Node, options: argparse.Namespace) -> None:
             node.log.warning("no target's home is in the picture: nothing is searched there", camera=camera)
     for search in searches.values():
         search.prepare()
-    history = {robot: JointHistory() for robot in cell.robots}
+    history = {robot: JointHistory(JOINTS_NEAR_NS) for robot in cell.robots}
     fused: dict[str, FusedPose] = {}
-    frames: dict[str, deque[Frame]] = {camera: deque(maxlen=FRAMES_KEPT) for camera in cameras}
+    frames = {camera: RecentFrames() for camera in cameras}
 
     def on_frame(message: Frame, names: dict[str, str]) -> None:
-        frames[names["camera"]].append(message)
+        frames[names["camera"]].add(message)
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
         robot, expected = names["robot"], len(cell.robots[names["robot"]].joints)
@@ -56,7 +81,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
         fused[names["target"]] = message
 
     def on_mask(message: Mask, names: dict[str, str]) -> None:
-        image = next((frame.image for frame in frames[names["camera"]] if frame.stamp_ns == message.stamp_ns), None)
+        image = frames[names["camera"]].image_at(message.stamp_ns)
         joints = {robot: q for robot, h in history.items() if (q := h.at(message.stamp_ns)) is not None}
         for (camera, target), search in searches.items():
             if camera != names["camera"] or not node.owns(f"{camera}/{target}"):

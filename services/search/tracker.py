@@ -10,62 +10,20 @@ from numpy.typing import NDArray
 
 from services.search import contour, detect, evidence, paper_search
 from services.search.evidence import TARGET, Evidence, Intrinsics
-from services.search.image_fit import refine
+from services.search.image_fit import fit_image
 from services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
 from services.search.robot_depth import RobotDepth
+from services.search.settings import SearchSettings
+from services.search.verdict import Findings, explains_mask, least_overlap, verdict
 from shared.body import anatomy
 from shared.cell.description import Cell
 from shared.contract.messages import Mask
 from shared.geometry import rigid
+from shared.geometry.rigid import Array
 from shared.perception.vision import State, VisionEstimate
 
-Array = NDArray[np.float64]
-
 METHODS = ("default", "paper")
-HIDDEN = 0.95
-"""A larger hidden share leaves too little to measure a pose."""
-SHORTEST_PX = 30.0
-"""Least contour measured [px] for a pose: about four independent points."""
-FITS, FITS_WELL = 0.8, 0.9
-"""Overlap below which the target is not where the fit says, and from which no other explanation is tried. Network masks reach
-0.93 to 0.97 at the right pose."""
-FITS_EXPECTED = 0.6
-"""The same of a pose that the image confirms where a sure prediction expects it: a mask that takes an occluder for the wall is
-no reason to give up."""
-WRONG = 6.0
-"""`Fit.misfit` from which a pose is wrong whatever its overlap."""
-GATE = 27.9
-"""Squared Mahalanobis distance, six degrees of freedom, that one in 10^4 right poses exceeds."""
-RECOGNISED = 0.5
-"""Up to this hidden share a shape is the target's; a smaller piece may be anything, and is believed only where a sure prediction
-expects it."""
-RECOGNISED_PX = 80.0
-"""Least contour of a shape [px] that nothing sure expects."""
-SURE = 0.05
-"""Standard deviation of the position [m] along its worst direction up to which a prediction is sure."""
-EXPECTED = 10.6
-"""Squared Mahalanobis distance, six degrees of freedom, from such a prediction that one in 10 right poses exceeds."""
-PRIOR_INFLATION = 2.0
-PRIOR_FLOOR = (0.02, 0.09)
-"""The prediction's standard deviations are doubled, and these [m, rad] added, before the solve leans on it: it shall only keep
-the fit from wandering off."""
-JOINT_MARGIN = 0.02
-"""Along the limb [m]: how far beyond its predicted near end the mask is still believed, for the prediction may be off."""
-DETECT_REACH = 1.2
-"""Lengths of the target around a region of the mask that belong to it: the region may be either end."""
-HOME_GATE = 16.8
-"""Squared Mahalanobis distance from where the target is expected, six degrees of freedom, that one in 100 right poses exceeds:
-a shape further away is not believed to be the target."""
-DETECT_EVERY_NS = {"lost": 250_000_000, "doubtful": 1_000_000_000}
-"""Least time between two detections, for each takes as long as twenty frames that are tracked."""
-EXPLAINED = 0.5
-"""Overlap with all of a region, a bare upper arm included, from which no other region is tried."""
-DETECT_FITS = 4
-"""Hypotheses that are fitted, of those that overlap best."""
-HOME_WEIGHT = 0.005
-"""Overlap that one standard deviation from home costs a detection: decides between mirror images, which overlap equally."""
-PAPER_SIGMA = (0.02, 0.09)
-"""The paper gives its search no covariance, but an average error of less than 2 cm [m]; the rotation [rad] is ours."""
+"""Values of `--method`: least squares on the contour, and the paper's ascent on f_m."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +43,15 @@ class Search:
         target: str | None = None,
         method: str = "default",
         noise: Noise | None = None,
+        settings: SearchSettings | None = None,
     ):
         if method not in METHODS:
-            raise ValueError(f"method: one of {', '.join(METHODS)} expected, got {method!r}")
-        self.method = method
+            raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+        self.method, self.settings = method, settings or SearchSettings()
         self._camera = cell.cameras[cell.one("cameras", camera)]
         self._target = cell.targets[cell.one("targets", target)]
         self._model = contour.Model(anatomy.target_mesh(self._target, cell))
-        self._reach = DETECT_REACH * float(np.ptp(self._model.vertices, axis=0).max())
+        self._reach = self.settings.detect_reach * float(np.ptp(self._model.vertices, axis=0).max())
         self._noise, self._limits = noise or Noise(), Limits()
         self._T_camera_world = rigid.inverse(self._camera.T_world_camera)
         self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])  # covariances: camera axes to world axes
@@ -144,7 +103,7 @@ class Search:
             tracked = seen, best
             if certain:
                 return self._judge(*tracked, image is not None, T_start, prior_covariance)
-        usable = tracked is not None and tracked[1].overlap >= FITS and tracked[1].misfit < WRONG
+        usable = tracked is not None and explains_mask(tracked[1].overlap, tracked[1].misfit, self.settings)
         due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost")
         other = self._detect(mask, T_start, joints) if due else None
         if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
@@ -172,7 +131,7 @@ class Search:
             best = self._closer(seen, first, T_start, prior, image)
         if image is not None and not best.sharp and seen.seen_px >= detect.SMALLEST_PX:
             seen, best = self._behind_unknown(seen, mask.labels, T_start, prior, image) or (seen, best)
-        fits = best.sharp or (first.overlap >= FITS_WELL and first.misfit < WRONG)
+        fits = best.sharp or (first.overlap >= self.settings.fits_well and first.misfit < self.settings.wrong_misfit)
         return seen, best, fits or seen.seen_px < detect.SMALLEST_PX
 
     def _behind_unknown(
@@ -190,10 +149,10 @@ class Search:
         """A fit, or where the image shows edges at a pose near it, that pose."""
         if image is None or seen.seen_px < detect.SMALLEST_PX:
             return found
-        closer = refine(self._model, found, image, seen, T_prior, prior)
+        closer = fit_image(self._model, found, image, seen, T_prior, prior)
         away = rigid.pose_error(closer.T, T_prior)
-        expected = prior.any() and away @ prior @ away < EXPECTED
-        return closer if closer.sharp and closer.overlap >= (FITS_EXPECTED if expected else FITS) else found
+        is_expected = bool(prior.any() and away @ prior @ away < self.settings.expected)
+        return closer if closer.sharp and closer.overlap >= least_overlap(is_expected, self.settings) else found
 
     def _gather(self, mask: Mask, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None) -> Evidence:
         """`limb`: T_camera_target of the limb, where it is known; beyond its near end nothing is believed."""
@@ -203,7 +162,7 @@ class Search:
         state = evidence.classify(mask.labels, self._target.label_values, depth, (float(z.min()), float(z.max())))
         evidence.cover_outside(state, mask.x0, mask.y0, mask.scale, self._camera)
         if limb is not None:
-            evidence.cover_beyond(state, limb, float(self._model.vertices[:, 0].min()) - JOINT_MARGIN, k)
+            evidence.cover_beyond(state, limb, float(self._model.vertices[:, 0].min()) - self.settings.joint_margin, k)
         return evidence.gather(state, mask.labels, k, mask.x0, mask.y0, mask.scale)
 
     @property
@@ -213,14 +172,14 @@ class Search:
 
     def _predicted(self, prior_covariance: Array | None) -> tuple[Array, Array]:
         """The prediction's covariance along the camera's axes, and the floor that is added to it."""
-        floor = np.diag(np.repeat(np.square(PRIOR_FLOOR), 3))
+        floor = np.diag(np.repeat(np.square(self.settings.prior_floor), 3))
         covariance = np.zeros((6, 6)) if prior_covariance is None else self._axes.T @ prior_covariance @ self._axes
         return covariance, floor
 
     def _leaning(self, prior_covariance: Array | None) -> Array:
         """The information (6, 6) about the prediction that the solve leans on."""
         covariance, floor = self._predicted(prior_covariance)
-        return np.asarray(np.linalg.inv(PRIOR_INFLATION**2 * covariance + floor), np.float64)
+        return np.asarray(np.linalg.inv(self.settings.prior_inflation**2 * covariance + floor), np.float64)
 
     def _settled(self, seen: Evidence, first: Fit, T_prior: Array, prior: Array) -> Fit:
         """A fit, or where it is bad a better one beside it: what went wrong is mostly the roll, or the tilt's sign."""
@@ -231,27 +190,28 @@ class Search:
 
     def _is_better(self, other: Fit, first: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
         """Whether another pose explains the mask better, and the prediction allows it or itself fails."""
-        if other.overlap <= max(first.overlap, FITS):
+        if other.overlap <= max(first.overlap, self.settings.fits):
             return False
         covariance, floor = self._predicted(prior_covariance)
         error = rigid.pose_error(other.T, T_start)
-        return bool(first.overlap < FITS or error @ np.linalg.solve(covariance + floor + other.covariance, error) < GATE)
+        distance = error @ np.linalg.solve(covariance + floor + other.covariance, error)
+        return bool(first.overlap < self.settings.fits or distance < self.settings.gate)
 
     def _is_expected(self, found: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
         """Whether the prediction is sure, and the pose found is where it says."""
         covariance, floor = self._predicted(prior_covariance)
-        if np.linalg.eigvalsh(covariance[:3, :3])[-1] > SURE**2:
+        if np.linalg.eigvalsh(covariance[:3, :3])[-1] > self.settings.sure**2:
             return False
         error = rigid.pose_error(found.T, T_start)
         uncertain = covariance + found.covariance + (floor if prior_covariance is None else 0.0)
-        return bool(error @ np.linalg.solve(uncertain, error) < EXPECTED)
+        return bool(error @ np.linalg.solve(uncertain, error) < self.settings.expected)
 
     def _with_mirror(self, seen: Evidence, first: Fit, T_start: Array, prior: Array) -> Fit:
         """The first fit, from the prediction, and that from its mirror image where both may be right: an axis nearly parallel
         to the image looks the same tilted either way. Merged by their likelihoods, so that the covariance covers both."""
         T_mirror = detect.mirrored(first.T_searched)[0]
         away = rigid.pose_error(T_mirror, T_start)
-        if first.overlap < FITS or (first.misfit < GOOD and away @ prior @ away > GATE):
+        if first.overlap < self.settings.fits or (first.misfit < GOOD and away @ prior @ away > self.settings.gate):
             return first
         other = self._fit(seen, T_mirror, T_start, prior)
         if other.cost < first.cost:
@@ -264,7 +224,7 @@ class Search:
         return replace(first, T=rigid.perturb(first.T, share * apart), covariance=covariance)
 
     def _is_detection_due(self, stamp_ns: int, case: str) -> bool:
-        if self._detected_ns is not None and 0 < stamp_ns - self._detected_ns < DETECT_EVERY_NS[case]:
+        if self._detected_ns is not None and 0 < stamp_ns - self._detected_ns < self.settings.detect_every_ns[case]:
             return False
         self._detected_ns = stamp_ns
         return True
@@ -282,12 +242,13 @@ class Search:
                 seen = self._gather(window, T, joints, limb=T)
                 found = self._settled(seen, self._fit(seen, T, T_home, information), T_home, information)
                 away = rigid.pose_error(found.T_searched, T_home)
-                fits = found.overlap >= FITS and found.misfit < WRONG, self._overlap(whole, found.T_searched)
-                if away @ information @ away < HOME_GATE and fits > most:
+                explains = explains_mask(found.overlap, found.misfit, self.settings)
+                fits = explains, self._overlap(whole, found.T_searched)
+                if away @ information @ away < self.settings.home_gate and fits > most:
                     best, most = (seen, found), fits
-                if most > (True, FITS):
+                if most > (True, self.settings.fits):
                     return best
-            if most > (True, EXPLAINED):
+            if most > (True, self.settings.explained):
                 break
         return best
 
@@ -298,7 +259,7 @@ class Search:
         def score(share: float, T: Array) -> float:
             angle = np.arccos(np.clip((np.sum(T[:3, :3] * T_home[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
             distance = np.linalg.norm(T[:3, 3] - T_home[:3, 3])
-            return share - HOME_WEIGHT * float(np.hypot(distance / spread.position, angle / spread.rotation))
+            return share - self.settings.home_weight * float(np.hypot(distance / spread.position, angle / spread.rotation))
 
         def fitted(T: Array) -> tuple[float, Fit]:
             found = self._fit(seen, T, T_home, information)
@@ -308,7 +269,7 @@ class Search:
         if not starts:
             return None
         ranked = sorted(starts, key=lambda T: -score(self._overlap(seen, T), T))
-        best = max((fitted(T) for T in ranked[:DETECT_FITS]), key=lambda pair: pair[0])
+        best = max((fitted(T) for T in ranked[: self.settings.detect_fits]), key=lambda pair: pair[0])
         for T in detect.mirrored(best[1].T_searched):
             best = max(best, fitted(T), key=lambda pair: pair[0])
         return best[1].T_searched
@@ -326,23 +287,30 @@ class Search:
     ) -> Searched:
         """The estimate of a fit; `with_image`: an image was there to confirm it; T_prior: T_camera_target as predicted, None
         where nothing is known."""
-        fits = best.sharp if with_image else best.misfit < WRONG
-        expected, T_probable = False, best.T_searched
+        is_expected, T_probable = False, best.T_searched
         if T_prior is not None:
-            expected = self._is_expected(best, T_prior, prior_covariance)
+            is_expected = self._is_expected(best, T_prior, prior_covariance)
             if prior_covariance is not None:
                 information = np.asarray(np.linalg.inv(self._predicted(prior_covariance)[0]), np.float64)
                 T_probable = with_prior(best.T, best.covariance, T_prior, information)
-        amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
-        hidden = float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0))
-        explained = 1.0 - (best.both + best.free) / amodal  # covered, or outside the window
-        if hidden > (HIDDEN if expected else RECOGNISED) or best.length < (SHORTEST_PX if expected else RECOGNISED_PX):
-            state: State = "occluded" if explained > 0.5 else "lost"
-        else:
-            state = "tracking" if best.overlap >= (FITS_EXPECTED if expected and best.sharp else FITS) and fits else "lost"
+        found = self._findings(seen, best, with_image, is_expected)
+        state = verdict(found, self.settings).state
         if state == "tracking":
-            return self._estimate(best.T, best.covariance, best.overlap, hidden, state, T_probable)
-        return self._estimate(best.T_searched, self._limits.covariance, best.overlap, hidden, state, best.T_searched)
+            return self._estimate(best.T, best.covariance, best.overlap, found.hidden, state, T_probable)
+        return self._estimate(best.T_searched, self._limits.covariance, best.overlap, found.hidden, state, best.T_searched)
+
+    def _findings(self, seen: Evidence, best: Fit, with_image: bool, is_expected: bool) -> Findings:
+        amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
+        return Findings(
+            overlap=best.overlap,
+            misfit=best.misfit,
+            is_sharp=best.sharp,
+            contour_px=best.length,
+            hidden=float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0)),
+            covered=1.0 - (best.both + best.free) / amodal,
+            has_image=with_image,
+            is_expected=is_expected,
+        )
 
     def _amodal_px(self, T: Array, k: Intrinsics) -> int:
         """Pixels of the whole silhouette, whatever covers it and wherever the window ends."""
@@ -357,8 +325,9 @@ class Search:
     def _paper(self, seen: Evidence, T_start: Array) -> Searched:
         T, value = paper_search.ascend(self._model, T_start, seen.state == TARGET, seen.intrinsics)
         hidden = float(np.clip(1.0 - seen.seen_px / max(self._amodal_px(T, seen.intrinsics), 1), 0.0, 1.0))
-        covariance = np.diag(np.repeat(np.square(PAPER_SIGMA), 3))
-        return self._estimate(T, covariance, (value + 1.0) / 2.0, hidden, "occluded" if hidden > HIDDEN else "tracking", T)
+        covariance = np.diag(np.repeat(np.square(self.settings.paper_sigma), 3))
+        state: State = "occluded" if hidden > self.settings.hidden else "tracking"
+        return self._estimate(T, covariance, (value + 1.0) / 2.0, hidden, state, T)
 
     def _lost(self, T: Array) -> Searched:
         return self._estimate(T, self._limits.covariance, 0.0, 1.0, "lost", T)

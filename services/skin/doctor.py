@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
@@ -23,13 +22,11 @@ from shared.body.robot import robot_models
 from shared.cell import description as cells
 from shared.contract import topics
 from shared.contract.messages import FusedPose, Joints, Voltages
-from shared.geometry.rigid import inverse, transform
+from shared.geometry.rigid import Array, inverse, transform
 from shared.runtime import bus
 from shared.runtime.node import Node
 from shared.skin.faults import MENDS, MISFIT, Fault, Look, Watch, likely
 from shared.skin.layout import Skin, link_names
-
-Array = NDArray[np.float64]
 
 PATIENCE_S = 1.0
 NEAR_NS = 15_000_000

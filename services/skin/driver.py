@@ -23,10 +23,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.geometry.rigid import Array
 from shared.skin import board
 from shared.skin.board import Command, Kind, PacketError
 
-Array = NDArray[np.float64]
 Components = NDArray[np.complex128]
 
 SWEEP_HZ = (80e3, 115e3, 1e3)

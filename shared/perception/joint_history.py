@@ -1,42 +1,48 @@
-"""Where the robot's joints were when a frame was exposed."""
+"""Where a robot's joints were at a moment: when a frame was exposed, or voltages were sampled."""
 
 from __future__ import annotations
 
+import threading
+from bisect import bisect_left
 from collections import deque
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
-
-STALE_NS = 200_000_000
-"""Joints further than this from the stamp that is asked for are not used."""
+from shared.geometry.rigid import Array
 
 
 class JointHistory:
-    """The last joint angles of one robot, to be read at the stamp of a frame."""
+    """The last joint angles of one robot, to be read at any moment near them. Messages may come from another thread than the
+    questions.
 
-    def __init__(self, size: int = 256):
+    tolerance_ns: largest distance of that moment from the nearest message; is_carried_on: whether moments after the newest
+    message get its angles moved on with the last velocity, or just its angles; size: number of messages kept.
+    """
+
+    def __init__(self, tolerance_ns: int, is_carried_on: bool = False, size: int = 256):
+        self._tolerance_ns, self._is_carried_on = tolerance_ns, is_carried_on
         self._samples: deque[tuple[int, Array]] = deque(maxlen=size)
+        self._lock = threading.Lock()
 
-    def add(self, stamp_ns: int, q: Array) -> None:
-        """Keeps the joints q (n,) of a stamp; one that is not newer than the last is left out, one that is much older begins
-        anew: the clock of the robot's source was set back."""
-        if self._samples and stamp_ns < self._samples[-1][0] - STALE_NS:
-            self._samples.clear()
-        if not self._samples or stamp_ns > self._samples[-1][0]:
-            self._samples.append((stamp_ns, q))
+    def add(self, stamp_ns: int, joints: Array) -> None:
+        """Keeps joint angles (n,) [rad] of a stamp. A stamp that is not newer than the last one is left out; one that is older by
+        more than the tolerance begins a new history, for the clock of the robot's source was set back."""
+        with self._lock:
+            if self._samples and stamp_ns < self._samples[-1][0] - self._tolerance_ns:
+                self._samples.clear()
+            if not self._samples or stamp_ns > self._samples[-1][0]:
+                self._samples.append((stamp_ns, joints))
 
     def at(self, stamp_ns: int) -> Array | None:
-        """Joints (n,) at a stamp, interpolated, or the nearest sample's; None where none is within STALE_NS."""
-        samples = list(self._samples)
-        if not samples:
+        """Joint angles (n,) [rad] at a stamp: linear between the messages before and after it, held before the first. None where
+        no message is within the tolerance."""
+        with self._lock:
+            samples = list(self._samples)
+        after = bisect_left(samples, stamp_ns, key=lambda sample: sample[0])
+        around = samples[max(after - 1, 0) : after + 1]
+        if not around or min(abs(stamp_ns - stamp) for stamp, _ in around) > self._tolerance_ns:
             return None
-        stamps = np.array([stamp for stamp, _ in samples], np.int64)
-        right = int(np.searchsorted(stamps, stamp_ns))
-        if 0 < right < len(samples):
-            (t0, q0), (t1, q1) = samples[right - 1], samples[right]
-            if t1 - t0 <= STALE_NS and q0.shape == q1.shape:
-                return q0 + (q1 - q0) * ((stamp_ns - t0) / (t1 - t0))
-        nearest = samples[int(np.argmin(np.abs(stamps - stamp_ns)))]
-        return nearest[1] if abs(nearest[0] - stamp_ns) <= STALE_NS else None
+        if after == len(samples) and self._is_carried_on and len(samples) > 1:
+            after -= 1  # the last two messages, beyond which the line goes on
+        elif after in (0, len(samples)):
+            return around[0][1]
+        (t0, q0), (t1, q1) = samples[after - 1], samples[after]
+        return q0 + (q1 - q0) * ((stamp_ns - t0) / (t1 - t0))

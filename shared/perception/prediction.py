@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shared.contract.messages import FusedPose
 from shared.geometry import rigid
-
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 LONGEST_S = 0.5
 """A fused pose further away in time than this predicts nothing."""

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shared.cell import description as cells
-
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 BAUD = 500_000
 BYTE_S = 10 / BAUD

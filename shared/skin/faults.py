@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.geometry.rigid import Array
 from shared.skin.layout import Skin
 
-Array = NDArray[np.float64]
 Kind = Literal["saturated", "dead", "noisy", "hum", "drift"]
 
 BLOCK = 20

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from shared.body import anatomy
 from shared.cell import description as cells
-
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 GAIN_GAPS = (0.02, 0.05, 0.10)
 """Gaps [m] at which a calibrated law is compared with the designed one."""

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
+from shared.geometry.rigid import Array
 from shared.skin import board
 from shared.skin.board import Command, Kind
-
-Array = NDArray[np.float64]
 
 OVERHEAD_S = 0.48e-3
 """What the firmware takes for a request beside cycles and line: it makes 231 replies a second at 128 cycles, 298 at 32."""

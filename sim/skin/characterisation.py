@@ -16,11 +16,9 @@ from scipy.spatial.transform import Rotation
 from shared.body.anatomy import target_mesh
 from shared.cell import description as cells
 from shared.contract.labels import Label
-from shared.geometry.rigid import inverse
+from shared.geometry.rigid import Array, inverse
 from shared.geometry.surface import Surface
 from sim.skin.field import PadField, limb
-
-Array = NDArray[np.float64]
 
 GAPS_M = np.arange(2, 41) * 0.005
 ANGLES_DEG = np.arange(10) * 10.0

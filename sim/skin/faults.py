@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from shared.geometry.rigid import Array
 from shared.skin.faults import arrangements
 from shared.skin.layout import Skin
-
-Array = NDArray[np.float64]
 
 KINDS = {
     "dead": "a broken wire: no amplitude and no noise",

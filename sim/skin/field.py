@@ -22,8 +22,7 @@ from scipy.spatial import ConvexHull
 
 from shared.body.anatomy import Mesh
 from shared.cell import description as cells
-
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 FEMTOFARAD = 4.0 * np.pi * 8.8541878128e-12 * 1e15
 """A unit of charge at one volt [fF]."""

@@ -8,14 +8,12 @@ and torso and other pads are not felt.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from shared.cell import description as cells
-from shared.geometry.rigid import inverse
+from shared.geometry.rigid import Array, inverse
 from shared.skin.layout import Skin
 from shared.skin.response import Response
-
-Array = NDArray[np.float64]
 
 
 class SkinModel:

@@ -21,12 +21,12 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from services.search.evidence import Intrinsics
-from services.search.objects.pose import RigidObject, refine
+from services.search.objects.pose import RigidObject, find_pose
 from shared.body.anatomy import Mesh
 from shared.geometry import raster
 from shared.geometry import rigid as geometry
+from shared.geometry.rigid import Array
 
-Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 WIDTH, HEIGHT = 640, 480
@@ -374,7 +374,7 @@ def measure(name: str, seed: int, count: int) -> list[dict[str, Any]]:
             for i, (T_true, mask) in enumerate(scenes):
                 start = moved(T_true, degrees, metres, np.random.default_rng((seed, index, i, int(degrees))))
                 begun = time.perf_counter()
-                result = refine(rigid, mask, K, start)
+                result = find_pose(rigid, mask, K, start)
                 ms = (time.perf_counter() - begun) * 1e3
                 error = errors(one, result.T, T_true)
                 e = geometry.pose_error(error.nearest, result.T)

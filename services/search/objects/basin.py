@@ -24,16 +24,16 @@ from services.search.contour import DROPPED, NEAR, Model, match
 from services.search.evidence import COVERED, FREE, TARGET, Evidence, Intrinsics
 from services.search.mask_fit import Noise
 from shared.geometry import rigid
+from shared.geometry.rigid import Array
 
-Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 COARSE_PX, FINE_PX = 45.0, 200.0
 """Square root of the mask's area [px] that a picture is made smaller for."""
 TURNS = (14.0, 28.0)
-"""The starts are turned by these angles [deg] ..."""
+"""Angles [deg] by which the starts are turned."""
 AXES = 16
-"""... about so many axes."""
+"""Number of axes about which the starts are turned."""
 SURVIVORS = (14, 5)
 """Hypotheses that go on after the alignment, and to the full picture."""
 SAME = (0.01, 0.06)

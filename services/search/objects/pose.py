@@ -1,4 +1,4 @@
-"""One pose of any rigid mesh on any mask (`refine`), and a sequence of them (`Tracker`).
+"""One pose of any rigid mesh on any mask (`find_pose`), and a sequence of them (`Tracker`).
 
 The start counts as a weak measurement beside the mask: a mask that is a few per cent too large says less about the depth than a
 start that is a few centimetres off. The covariance is that of both together. How much the mask is believed is measured on the
@@ -21,10 +21,11 @@ from services.search.evidence import COVERED, FREE, TARGET, Intrinsics
 from services.search.mask_fit import Fit, Limits, Noise
 from services.search.objects import basin, meshes
 from services.search.objects.basin import Level, Prior, Pyramid, Score, Shape
+from services.search.settings import ONE_IN_10_000
 from shared.body.anatomy import Mesh
 from shared.geometry import rigid as geometry
+from shared.geometry.rigid import Array
 
-Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 State = Literal["tracking", "occluded", "lost"]
 
@@ -46,7 +47,7 @@ the boundary errs: fitted to the masks of `penumbra bench objects`."""
 
 
 class RigidObject:
-    """A mesh prepared for contours, about its own middle. Raises InputError for a mesh without a surface."""
+    """A mesh prepared for contours, about its own middle. Raises FileError for a mesh without a surface."""
 
     def __init__(self, mesh: Mesh):
         mesh = meshes.mend(mesh, FACES[1])
@@ -57,7 +58,7 @@ class RigidObject:
         self.shape = Shape(Model(meshes.mend(mesh, FACES[0])), Model(mesh))
         self.diameter = float(np.linalg.norm(high - low))
 
-    def published(self, found: Estimate) -> Estimate:
+    def published(self, found: ObjectEstimate) -> ObjectEstimate:
         """An estimate of the middle's pose, T_camera_middle, as one of the object's own frame."""
         x, y, z = found.T[:3, :3] @ self.T_middle_object[:3, 3]
         A = np.eye(6)
@@ -67,7 +68,7 @@ class RigidObject:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ObjectEstimate:
     """T_camera_object, covariance (6, 6) along the camera's axes, overlap in [0, 1] and state."""
 
     T: Array
@@ -89,7 +90,7 @@ def started(rigid: RigidObject, T_start: Array, spread: tuple[float, float] = ST
     return Prior(T_start @ rigid.T_object_middle, np.diag(np.repeat(np.square(spread) ** -1.0, 3)))
 
 
-def refine(
+def find_pose(
     rigid: RigidObject,
     mask: Bool,
     k: Intrinsics,
@@ -97,7 +98,7 @@ def refine(
     occluder: Bool | None = None,
     picture: NDArray[np.uint8] | None = None,
     spread: tuple[float, float] = START,
-) -> Estimate:
+) -> ObjectEstimate:
     """The pose of an object in a mask (h, w), from a start T_camera_object (4 x 4) that may be 30 degrees and 5 cm off.
 
     `occluder` (h, w): pixels that show something in front of the object; `picture` (h, w, 3) uint8 RGB: the image that the mask
@@ -112,7 +113,7 @@ def refine(
 
 def judged(
     shape: Shape, masks: Pyramid, found: list[tuple[Score, Array]], prior: Prior, picture: NDArray[np.uint8] | None = None
-) -> Estimate:
+) -> ObjectEstimate:
     """The estimate of the middle's pose, T_camera_middle, from those that `basin` found, best first."""
     model, at = shape.fine, masks.fine
     noise = measured_noise(model, at, found[0][1])
@@ -130,12 +131,12 @@ def judged(
     covariance = covariance + apart / weights.sum()
     if picture is not None:
         T, covariance = _on_picture(shape, masks, T, covariance, best, noise, picture)
-    if prior.cost(T) > GATE:  # nothing that the start allows explains the mask
+    if prior.cost(T) > ONE_IN_10_000:  # nothing that the start allows explains the mask
         return _lost(T, best.overlap)
     state = _state(best, contour.points[contour.kind == MEASURED, 7].sum() * at.scale)
     if state == "lost":
         return _lost(T, best.overlap)
-    return Estimate(T, covariance, best.overlap, state)
+    return ObjectEstimate(T, covariance, best.overlap, state)
 
 
 def measured_noise(model: Model, at: Level, T: Array) -> Noise:
@@ -159,16 +160,14 @@ def _on_picture(
         (h, w), e = at.shape, at.evidence
         window = picture[e.y0 : e.y0 + h * e.scale, e.x0 : e.x0 + w * e.scale]
         small = np.asarray(cv2.resize(window, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
-        settings = colours.Settings(mask=max(noise.edge / at.scale, 0.8))
-        found = colours.refine(model, found, small, replace(e, x0=0, y0=0, scale=1), T, prior, settings)
+        settings = colours.ImageSettings(mask=max(noise.edge / at.scale, 0.8))
+        found = colours.fit_image(model, found, small, replace(e, x0=0, y0=0, scale=1), T, prior, settings)
     error = geometry.pose_error(found.T_searched, T)
-    if found.length < SHORTEST * masks.fine.evidence.boundary_px or error @ prior @ error > GATE:
+    if found.length < SHORTEST * masks.fine.evidence.boundary_px or error @ prior @ error > ONE_IN_10_000:
         return T, covariance
     return found.T_searched, np.asarray(np.linalg.inv(np.linalg.inv(found.covariance) + prior), np.float64)
 
 
-GATE = 27.9
-"""Squared Mahalanobis distance, six degrees of freedom, that one in 10^4 right poses exceeds."""
 SHORTEST = 0.4
 """Share of the mask's boundary along which the picture has to show an edge."""
 
@@ -179,8 +178,8 @@ def _state(best: Score, length: float) -> State:
     return "occluded" if best.covered > COVERS * (best.covered + best.both) else "tracking"
 
 
-def _lost(T: Array, overlap: float = 0.0) -> Estimate:
-    return Estimate(T, Limits().covariance, overlap, "lost")
+def _lost(T: Array, overlap: float = 0.0) -> ObjectEstimate:
+    return ObjectEstimate(T, Limits().covariance, overlap, "lost")
 
 
 FRAME_WIDTHS = (8.0, 6.0, 5.0, 5.0, 5.0)
@@ -211,8 +210,8 @@ class Tracker:
         self._velocity, self._usual = np.zeros(6), 0.0
         self._missed = -1  # frames since the last pose; there was none before the start
 
-    def update(self, mask: Bool, occluder: Bool | None = None, picture: NDArray[np.uint8] | None = None) -> Estimate:
-        """The pose in the next frame; arguments as of `refine`. Lost, the pose is the last one and the covariance wide."""
+    def update(self, mask: Bool, occluder: Bool | None = None, picture: NDArray[np.uint8] | None = None) -> ObjectEstimate:
+        """The pose in the next frame; arguments as of `find_pose`. Lost, the pose is the last one and the covariance wide."""
         state = observed(mask, occluder)
         T = geometry.perturb(self._T, self._velocity * self._dt)
         bridged = min(1.0 + self._missed, max(LONGEST_S / self._dt, 1.0))
@@ -228,7 +227,7 @@ class Tracker:
         self._T, self._covariance, self._missed = found.T, found.covariance, 0
         return self._rigid.published(found)
 
-    def _look(self, state: NDArray[np.uint8], prior: Prior, picture: NDArray[np.uint8] | None) -> Estimate | None:
+    def _look(self, state: NDArray[np.uint8], prior: Prior, picture: NDArray[np.uint8] | None) -> ObjectEstimate | None:
         if np.count_nonzero(state == TARGET) < SMALLEST_PX:
             return None
         model, masks = self._rigid.shape.fine, basin.pyramid(state, self._k)
@@ -239,7 +238,7 @@ class Tracker:
                 return judged(self._rigid.shape, masks, near, prior, picture)
         return judged(self._rigid.shape, masks, basin.search(self._rigid.shape, masks, prior), prior, picture)
 
-    def _miss(self, state: NDArray[np.uint8], found: Estimate | None) -> Estimate:
+    def _miss(self, state: NDArray[np.uint8], found: ObjectEstimate | None) -> ObjectEstimate:
         """The object is where it was, as far as is known: covered where something stands there."""
         self._missed = max(self._missed, 0) + 1
         self._velocity = np.zeros(6)
@@ -247,5 +246,5 @@ class Tracker:
         silhouette = self._rigid.shape.fine.silhouette(self._T, self._k, (0, 0, w, h))
         drawn = int(np.count_nonzero(silhouette))
         covered = drawn > 0 and np.count_nonzero(silhouette & (state == COVERED)) > COVERS * drawn
-        lost = Estimate(self._T, Limits().covariance, found.overlap if found else 0.0, "occluded" if covered else "lost")
+        lost = ObjectEstimate(self._T, Limits().covariance, found.overlap if found else 0.0, "occluded" if covered else "lost")
         return self._rigid.published(lost)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -22,14 +21,13 @@ from ruamel.yaml.error import YAMLError
 
 from services import flags
 from services.skin.calibration import law, recording
-from services.skin.calibration.law import Fit, InputError
+from services.skin.calibration.law import Fit, RecordingError
 from services.skin.calibration.recording import Recording
 from shared.cell import description as cells
 from shared.contract import topics
 from shared.contract.messages import Voltages
+from shared.geometry.rigid import Array
 from shared.runtime import bus
-
-Array = NDArray[np.float64]
 
 GAPS_M = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08, 0.12, 0.16, 0.20)
 """Asked for by default: even steps of the signal's logarithm."""
@@ -45,7 +43,7 @@ def main(argv: list[str]) -> int:
     """0, or 2 for readings or a cell file that are wrong."""
     try:
         _calibrate(argv)
-    except (InputError, cells.CellError, bus.BusError) as error:
+    except (RecordingError, cells.CellError, bus.BusError) as error:
         for line in str(error).splitlines():
             print(f"penumbra skin calibrate: {line}", file=sys.stderr)
         return 2
@@ -113,10 +111,10 @@ def _gap(text: str) -> float:
 
 
 def destination(cell: str, out: Path | None) -> Path:
-    """The file that a calibration goes into. Raises InputError for a built-in cell without `out`."""
+    """The file that a calibration goes into. Raises RecordingError for a built-in cell without `out`."""
     source = cells.source(cell)
     if out is None and source.parent == cells.BUILT_IN:
-        raise InputError(f"the built-in cell {cell} is not overwritten: give --out FILE, and use that with --cell")
+        raise RecordingError(f"the built-in cell {cell} is not overwritten: give --out FILE, and use that with --cell")
     return out or source
 
 
@@ -133,23 +131,23 @@ def _recorded(cell: cells.Cell, options: argparse.Namespace) -> dict[str, Record
         unknown = sorted(set(named) - set(cell.pads))
         if unknown:
             came = ", ".join(unknown)
-            raise InputError(f"{options.csv}: pads of cell {cell.name} expected ({', '.join(cell.pads)}), came {came}")
+            raise RecordingError(f"{options.csv}: pads of cell {cell.name} expected ({', '.join(cell.pads)}), came {came}")
         wanted = [name for name in cell.pads if (named == name).any()]
     else:
         wanted = [pad]
         if (named != "").any() and not (named == pad).any():
-            raise InputError(f"{options.csv}: no row of pad {pad}: it has {', '.join(sorted(set(named)))}")
+            raise RecordingError(f"{options.csv}: no row of pad {pad}: it has {', '.join(sorted(set(named)))}")
     on_axis = (found.numbers["angle_deg"] == 0.0) & (found.labels["scan"] != "plane")
     out = {}
     for name in wanted:
         own = on_axis & ((named == name) | (named == ""))
         if tuple(cell.pad_types[cell.pads[name].type].electrodes) != found.electrodes:
-            raise InputError(f"pad {name} has other electrodes than {pad}: one file a pad type expected")
+            raise RecordingError(f"pad {name} has other electrodes than {pad}: one file a pad type expected")
         objects = sorted(set(found.labels["object"][own]) - {"", "empty"})
         if len(objects) > 1:
             own &= np.isin(found.labels["object"], ["", "empty", "forearm"]) if "forearm" in objects else own
             if "forearm" not in objects:
-                raise InputError(f"{options.csv}: one object expected, or a forearm among them, came {', '.join(objects)}")
+                raise RecordingError(f"{options.csv}: one object expected, or a forearm among them, came {', '.join(objects)}")
         out[name] = found.where(own)
     return out
 
@@ -157,8 +155,8 @@ def _recorded(cell: cells.Cell, options: argparse.Namespace) -> dict[str, Record
 def guided(
     cell: cells.Cell, pad: str, connection: bus.Connection, gaps: Sequence[float], seconds: float, console: Console
 ) -> Recording:
-    """Asks for the empty scene and each gap on the terminal (or a pipe of Enters) and records each. Raises InputError where the
-    answers end early, BusError where no voltages come."""
+    """Asks for the empty scene and each gap on the terminal (or a pipe of Enters) and records each. Raises RecordingError where
+    the answers end early, BusError where no voltages come."""
     from shared.runtime.node import Node
 
     electrodes = tuple(cell.pad_types[cell.pads[pad].type].electrodes)
@@ -183,13 +181,15 @@ def guided(
                     f"on cell {cell.name}?"
                 )
             if volts.shape[1] != len(electrodes):
-                raise InputError(f"pad {pad}: {len(electrodes)} electrodes expected as in the cell file, {volts.shape[1]} came")
+                raise RecordingError(
+                    f"pad {pad}: {len(electrodes)} electrodes expected as in the cell file, {volts.shape[1]} came"
+                )
             means = "  ".join(f"{name} {mean:.4f} V" for name, mean in zip(electrodes, volts.mean(axis=0), strict=True))
             console.print(f"  {len(volts)} samples, {means}")
             gap_rows.append(np.full(len(volts), gap))
             volts_rows.append(volts)
     if not gap_rows:
-        raise InputError("nothing was recorded: press Enter at each gap")
+        raise RecordingError("nothing was recorded: press Enter at each gap")
     s = sum(map(len, gap_rows))
     labels = {name: np.full(s, pad if name == "pad" else "") for name in recording.LABELS}
     numbers = {name: np.zeros(s) for name in recording.NUMBERS}
@@ -200,7 +200,9 @@ def _answer() -> str:
     try:
         return input().strip().lower()
     except EOFError:
-        raise InputError("the answers ended before the last gap: Enter for each of them expected, or q to end early") from None
+        raise RecordingError(
+            "the answers ended before the last gap: Enter for each of them expected, or q to end early"
+        ) from None
 
 
 class _Ear:
@@ -235,7 +237,7 @@ class _Ear:
 
 
 def calibrate(cell: cells.Cell, pad: str, recorded: Recording, placing: float = law.PLACING) -> dict[str, Fit]:
-    """The fit of every electrode of a pad. Raises InputError that names all electrodes that cannot be fitted."""
+    """The fit of every electrode of a pad. Raises RecordingError that names all electrodes that cannot be fitted."""
     kind = cell.pad_types[cell.pads[pad].type]
     chain = kind.chain
     full_scale, lsb = chain.adc_reference / 2.0, chain.adc_reference / (2.0**chain.adc_bits - 1.0)
@@ -244,15 +246,15 @@ def calibrate(cell: cells.Cell, pad: str, recorded: Recording, placing: float = 
         try:
             read = law.readings(recorded.gap, recorded.volts[:, k], full_scale, lsb, f"{pad}/{name}")
             fits[name] = law.fit(read, kind.law(name), f"{pad}/{name}", placing)
-        except InputError as error:
+        except RecordingError as error:
             wrong.append(str(error))
     if wrong:
-        raise InputError("\n".join(wrong))
+        raise RecordingError("\n".join(wrong))
     ways = {fit.law.polarity for fit in fits.values()}
     if len(ways) > 1:
         rising = [name for name, fit in fits.items() if fit.law.polarity > 0]
         falling = [name for name in fits if name not in rising]
-        raise InputError(
+        raise RecordingError(
             f"pad {pad}: mixed polarity: as the limb comes near {', '.join(rising)} rise and {', '.join(falling)} fall: one "
             "amplifier makes all go one way. Is a channel not connected, or assigned to the wrong electrode?"
         )
@@ -303,7 +305,7 @@ def _show(console: Console, pad: str, fits: dict[str, Fit], notes: Sequence[str]
 
 def write(source: Path, path: Path, laws: dict[str, dict[str, cells.Law]]) -> None:
     """The cell file at `source` with the laws of these pads, at `path`; its comments and layout stay. The file is replaced
-    only by one that loads. Raises InputError where it cannot be written."""
+    only by one that loads. Raises RecordingError where it cannot be written."""
     editor = YAML()
     editor.preserve_quotes = True
     editor.width = 1 << 20  # breaks no line
@@ -321,11 +323,13 @@ def write(source: Path, path: Path, laws: dict[str, dict[str, cells.Law]]) -> No
             cells.load(draft)
             draft.replace(path)
         except cells.CellError as error:
-            raise InputError(f"{path}: the cell would not load from there: {str(error).replace(str(draft), str(path))}") from None
+            raise RecordingError(
+                f"{path}: the cell would not load from there: {str(error).replace(str(draft), str(path))}"
+            ) from None
         finally:
             draft.unlink(missing_ok=True)
     except (OSError, YAMLError) as error:
-        raise InputError(f"{path}: cannot be written: {error}") from None
+        raise RecordingError(f"{path}: cannot be written: {error}") from None
 
 
 def _block(entries: dict[str, CommentedMap]) -> CommentedMap:

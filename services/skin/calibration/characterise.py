@@ -28,14 +28,14 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from services import flags
 from services.skin.calibration import calibrate, law, recording
-from services.skin.calibration.law import InputError
+from services.skin.calibration.law import RecordingError
 from services.skin.calibration.recording import Recording
 from shared.cell import description as cells
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 HELD_OUT = 5
 """Every fifth place of the distances and angles is kept from a second regression, which is judged by it."""
@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
     """0, or 2 for a recording or a cell that cannot be used."""
     try:
         _characterise(argv)
-    except (InputError, cells.CellError) as error:
+    except (RecordingError, cells.CellError) as error:
         for line in str(error).splitlines():
             print(f"penumbra skin characterise: {line}", file=sys.stderr)
         return 2
@@ -159,7 +159,7 @@ def emulated(cell: cells.Cell, pad: str, target: str, samples: int, step: float,
 
 
 def characterise(cell: cells.Cell, pad: str, recorded: Recording, out: Path) -> dict[str, Any]:
-    """Writes tables and pictures of a recording into a folder; what it found, as JSON. Raises InputError
+    """Writes tables and pictures of a recording into a folder; what it found, as JSON. Raises RecordingError
     where it lacks distances."""
     plane = recorded.labels["scan"] == "plane"
     distances = recorded.where(~plane)

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from shared.cell import description as cells
-
-Array = NDArray[np.float64]
+from shared.geometry.rigid import Array
 
 LAW_ERROR = 0.04
 """What the law is wrong by, as a share of the signal: that of the field model's responses around it, 1 to 20 cm."""
@@ -39,7 +38,7 @@ MIXED = 0.25
 """Share of the way there that the signal may go back with the gap before its polarity is unclear."""
 
 
-class InputError(ValueError):
+class RecordingError(ValueError):
     """Readings that no law can be fitted to; the text says what was expected, what came and what to do."""
 
 
@@ -101,14 +100,14 @@ def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str
     """The samples of an electrode, brought together by gap.
 
     gaps (s,) [m], infinite for an empty scene; volts (s,) in the order of time, NaN where a sample is missing; full_scale, lsb
-    [V]: the converter's. Raises InputError where too little is left.
+    [V]: the converter's. Raises RecordingError where too little is left.
     """
     notes = []
     missing = ~np.isfinite(volts)
     if missing.any():
         notes.append(f"{missing.sum()} of {len(volts)} samples are missing or not a number: left out")
     if 2 * missing.sum() > len(volts):
-        raise InputError(f"electrode {name}: {missing.sum()} of {len(volts)} samples are not numbers: record them again")
+        raise RecordingError(f"electrode {name}: {missing.sum()} of {len(volts)} samples are not numbers: record them again")
     gaps, volts = gaps[~missing], volts[~missing]
     rows: list[tuple[float, float, float]] = []
     variances = []
@@ -126,7 +125,7 @@ def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str
         notes.append(f"saturated at {where} (an amplitude of 0 or from {full_scale:.3g} V on): left out")
     if len(rows) < FEWEST:
         why = f"; {notes[-1]}" if clipped else ""
-        raise InputError(
+        raise RecordingError(
             f"electrode {name}: at least {FEWEST} gaps expected (the empty scene may be one), {len(rows)} came{why}: record "
             "more, from 1 to 20 cm" + (", and turn the amplifier down" if clipped else "")
         )
@@ -139,12 +138,12 @@ def fit(read: Readings, nominal: cells.Law, name: str, placing: float = PLACING)
     """The law that an electrode follows.
 
     nominal: its law as designed (the start, and for a2 a weak prior); placing [m]: standard deviation of the gaps.
-    Raises InputError where the readings have no contrast, mixed polarity or too short a range.
+    Raises RecordingError where the readings have no contrast, mixed polarity or too short a range.
     """
     notes = list(read.notes)
     near = np.isfinite(read.gap)
     if near.sum() < FEWEST - 1 or read.gap[near].max() < 2.0 * max(read.gap[near].min(), SAME_GAP):
-        raise InputError(
+        raise RecordingError(
             f"electrode {name}: gaps expected of which the farthest is at least twice the nearest, "
             f"{', '.join(map(_gap, read.gap[near])) or 'none'} came: record from 1 to 20 cm"
         )
@@ -153,7 +152,7 @@ def fit(read: Readings, nominal: cells.Law, name: str, placing: float = PLACING)
         notes.append("fewer than 10 samples at every gap: the noise stays as designed")
     noise = nominal.noise if read.noise is None else read.noise
     if noise == 0.0:
-        raise InputError(f"electrode {name}: no noise at all in its samples: record raw samples, not means or a simulation's")
+        raise RecordingError(f"electrode {name}: no noise at all in its samples: record raw samples, not means or a simulation's")
     prior = np.log(nominal.a2)
     x = _start(read, polarity, prior)
 
@@ -177,7 +176,9 @@ def fit(read: Readings, nominal: cells.Law, name: str, placing: float = PLACING)
     residual = standard(x, deviation)[:-1]
     excess = max(1.0, float(2.0 * found.cost) / max(len(residual) - 3, 1))
     if x[2] < 0.0:
-        raise InputError(f"electrode {name}: the fit's offset a3 is {x[2]:.3g} V, an amplitude is never below 0: check the gaps")
+        raise RecordingError(
+            f"electrode {name}: the fit's offset a3 is {x[2]:.3g} V, an amplitude is never below 0: check the gaps"
+        )
     law = cells.Law(a1=float(np.exp(x[0])), a2=float(np.exp(x[1])), a3=float(x[2]), polarity=polarity, noise=noise)
     gain = float(np.exp(np.mean(np.log(signal(law, read.gap[near]) / signal(nominal, read.gap[near])))))
     for gap, r in zip(read.gap, residual, strict=True):
@@ -219,7 +220,7 @@ def _polarity(read: Readings, name: str) -> Literal[-1, 1]:
     low, high = int(np.argmin(read.mean)), int(np.argmax(read.mean))
     span = read.mean[high] - read.mean[low]
     if span < SURE * np.hypot(read.error[low], read.error[high]):
-        raise InputError(
+        raise RecordingError(
             f"electrode {name}: no contrast: it reads {read.mean.mean():.4f} V at every gap, within {1e3 * span:.2g} mV: "
             "is it connected, and was the limb above this pad?"
         )
@@ -229,7 +230,7 @@ def _polarity(read: Readings, name: str) -> Literal[-1, 1]:
     if min(falls, rises) > MIXED * max(falls, rises):
         way = steps < 0 if falls < rises else steps > 0
         odd = int(np.argmax(np.where(sure & way, np.abs(steps), 0.0)))
-        raise InputError(
+        raise RecordingError(
             f"electrode {name}: mixed polarity: with the gap its amplitude rises by {1e3 * rises:.3g} mV and falls by "
             f"{1e3 * falls:.3g} mV, the other way from {_gap(read.gap[odd])} to {_gap(read.gap[odd + 1])}: "
             "were gaps mixed up, or was something else near?"

@@ -13,11 +13,11 @@ import trimesh
 from services.fusion.observer import ErrorStateObserver
 from services.haptics import paper_network as networks
 from services.haptics import train
-from services.haptics.estimator import FOREIGN, Estimate, Estimator
+from services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
 from services.haptics.paper_nearest import nearest_points
 from services.haptics.paper_network import Relative
 from services.haptics.size_and_rest import SIZE, SIZE_SPREAD, Size, Tare
-from services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, Prior, Solver, Window, marginal, peak
+from services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, Prior, Reading, Solver, marginal, peak
 from shared.body.anatomy import target_mesh
 from shared.cell import description as cells
 from shared.geometry import rigid
@@ -89,14 +89,14 @@ def estimator(skin: Skin, response: Response, surface: Surface, home: np.ndarray
     return Estimator(skin, response, surface, home, spread)
 
 
-def windows(which: Estimator, skin: Skin, signals: np.ndarray, count: int, seed: int, begin: int = 0) -> list[Estimate]:
+def windows(which: Estimator, skin: Skin, signals: np.ndarray, count: int, seed: int, begin: int = 0) -> list[HapticEstimate]:
     """What the estimator says about a thing that rests, window by window."""
     rng = np.random.default_rng(seed)
     used = np.full(len(skin), 10)
     return [which.update(10 * MS * (begin + i + 1), feel(skin, signals, rng), used, skin.T_world_pads()) for i in range(count)]
 
 
-def nees(T: np.ndarray, estimate: Estimate) -> float:
+def nees(T: np.ndarray, estimate: HapticEstimate) -> float:
     """Squared error over the published covariance, per known direction."""
     values = np.linalg.eigvalsh(estimate.information)
     error = rigid.pose_error(T, estimate.T)
@@ -143,7 +143,7 @@ def test_the_information_is_that_of_the_voltages_derivatives(skin: Skin, respons
     T, step = rigid.from_rpy((0.01, -0.02, 0.14), (0.1, -0.1, 0.2)), 1e-3
     solver = Solver(skin, response)
     prior = Prior(T, 1e-9 * np.eye(6), SIZES, 1e-9 * np.eye(2))
-    window = Window(signal(skin, response, T), skin.noise / 10, pads, np.ones(len(skin)), np.zeros(len(skin)))
+    window = Reading(signal(skin, response, T), skin.noise / 10, pads, np.ones(len(skin)), np.zeros(len(skin)))
     information, gradient = solver.likelihood(window, solver.solve(window, prior, T, SIZES, 0, 0))
     moved = [
         [signal(skin, response, rigid.perturb(T, s * step * e[:6]), SIZES + s * step * e[6:]) for s in (1, -1)] for e in np.eye(8)
@@ -164,7 +164,7 @@ def test_the_solve_finds_pose_and_size_from_centimetres_away(
     solver = Solver(skin, response)
     away = rigid.perturb(T, np.array([0.02, -0.02, 0.03, 0.1, 0.1, -0.1]))
     prior = Prior(away, np.diag(np.repeat([0.02, 0.1], 3) ** -2.0), SIZE, np.diag(SIZE_SPREAD**-2))
-    window = Window(signal(skin, response, T), skin.noise / 1000, pads, np.ones(len(skin)), np.zeros(len(skin)))
+    window = Reading(signal(skin, response, T), skin.noise / 1000, pads, np.ones(len(skin)), np.zeros(len(skin)))
     found = solver.solve(window, prior, away, SIZE)
     at_truth = solver.solve(window, prior, T, SIZES)
     assert found.cost == pytest.approx(at_truth.cost, abs=0.2)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services.haptics import service
-from services.haptics.batches import Backlog, Collector, Window
+from services.haptics.batches import Backlog, Collector, VoltageWindow
 from services.haptics.pad_poses import PadPoses
 from shared.body.robot import robot_models
 from shared.cell import description as cells
@@ -275,7 +275,7 @@ def test_a_turned_pad_stands_out_by_its_misfit_in_the_health(table: cells.Cell, 
     rng = np.random.default_rng(0)
     for i in range(100):
         amplitude = skin.amplitude(signals / skin.gain / skin.sensitivity) + np.sqrt(skin.noise / 10) * rng.standard_normal(40)
-        window = Window((i + 1) * 10 * MS, (i + 1) * 10 * MS, amplitude, np.full(40, 10), {})
+        window = VoltageWindow((i + 1) * 10 * MS, (i + 1) * 10 * MS, amplitude, np.full(40, 10), {})
         estimate = which.update(window.stamp_ns, window.amplitude, window.samples, skin.T_world_pads())
         misfits.update(estimate, skin, window.samples)
     told = {name: tell() for name, tell in node.report.items()}

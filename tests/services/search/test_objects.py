@@ -13,7 +13,7 @@ import trimesh
 
 from services.command import cli
 from services.search.objects import meshes, tools
-from services.search.objects.pose import RigidObject, Tracker, refine
+from services.search.objects.pose import RigidObject, Tracker, find_pose
 from shared.body.anatomy import Mesh
 from shared.geometry import raster
 from shared.geometry import rigid as geometry
@@ -57,14 +57,14 @@ def test_a_bad_mask_of_a_drill_gives_its_pose_from_far_starts(drill, rigid, degr
     missed = 0
     for seed in range(8):
         T, mask = scene(drill, (70, seed), NOISY)
-        found = refine(rigid, mask, K, moved(T, degrees, metres, np.random.default_rng(seed)))
+        found = find_pose(rigid, mask, K, moved(T, degrees, metres, np.random.default_rng(seed)))
         missed += errors(drill, found.T, T).add > CONVERGED or found.state != "tracking"
     assert missed <= allowed
 
 
 def test_an_exact_mask_gives_an_exact_pose(drill, rigid):
     T, mask = scene(drill, (71, 0), EXACT)
-    found = refine(rigid, mask, K, moved(T, 20.0, 0.03, np.random.default_rng(0)))
+    found = find_pose(rigid, mask, K, moved(T, 20.0, 0.03, np.random.default_rng(0)))
     error = errors(drill, found.T, T)
     assert np.linalg.norm(error.position) < 0.005  # half a pixel in a silhouette 100 pixels wide
     assert error.rotation < np.radians(2.0)
@@ -75,7 +75,7 @@ def test_covariances_of_bad_masks_cover_their_errors(drill, rigid):
     values = []
     for seed in range(9):
         T, mask = scene(drill, (72, seed), NOISY)
-        values.append(nees(refine(rigid, mask, K, moved(T, 15.0, 0.02, np.random.default_rng(seed))), T))
+        values.append(nees(find_pose(rigid, mask, K, moved(T, 15.0, 0.02, np.random.default_rng(seed))), T))
     assert np.median(values) < 12.6  # 95 % of chi^2 with six degrees of freedom
     assert np.median(values) > 0.5  # and not by claiming nothing
 
@@ -86,14 +86,14 @@ def test_what_hides_the_object_is_ignored_and_not_scored(drill, rigid):
     occluder = np.zeros_like(mask)
     occluder[:, : int(np.quantile(columns, 0.45))] = True
     start = moved(T, 10.0, 0.02, np.random.default_rng(1))
-    told, untold = (refine(rigid, mask & ~occluder, K, start, given) for given in (occluder, None))
+    told, untold = (find_pose(rigid, mask & ~occluder, K, start, given) for given in (occluder, None))
     assert errors(drill, told.T, T).add < CONVERGED
     assert errors(drill, told.T, T).add < 0.5 * errors(drill, untold.T, T).add
 
 
 def test_an_object_wholly_behind_something_is_lost(rigid, drill):
     T, mask = scene(drill, (73, 1), EXACT)
-    found = refine(rigid, mask, K, T, np.ones_like(mask))
+    found = find_pose(rigid, mask, K, T, np.ones_like(mask))
     assert found.state == "lost"
     assert found.covariance[0, 0] >= 1.0
 
@@ -103,7 +103,7 @@ def test_the_border_of_the_picture_is_not_the_objects_contour(drill, rigid):
     T[0, 3] = (15 - K.cx) / K.fx * T[2, 3]  # its middle at the left border
     mask = drawn(drill, T)
     assert mask[:, 0].any()
-    found = refine(rigid, mask, K, moved(T, 10.0, 0.02, np.random.default_rng(3)))
+    found = find_pose(rigid, mask, K, moved(T, 10.0, 0.02, np.random.default_rng(3)))
     assert found.state == "lost" or errors(drill, found.T, T).add < CONVERGED
 
 
@@ -113,7 +113,7 @@ def test_a_ball_keeps_the_rotation_of_its_start_and_says_that_it_does_not_know_i
     T = geometry.from_rpy((0.05, 0.0, 0.9), (0.3, 0.2, 0.1))
     one = Thing("ball", ball, np.eye(3)[None])
     start = moved(T, 20.0, 0.03, np.random.default_rng(0))
-    found = refine(rigid, drawn(one, T), K, start)
+    found = find_pose(rigid, drawn(one, T), K, start)
     assert np.linalg.norm(found.T[:3, 3] - T[:3, 3]) < 0.01
     assert np.sqrt(np.linalg.eigvalsh(found.covariance[3:, 3:])[0]) > np.radians(5.0)
     assert np.linalg.norm(geometry.pose_error(start, found.T)[3:]) < np.radians(15.0)
@@ -122,7 +122,7 @@ def test_a_ball_keeps_the_rotation_of_its_start_and_says_that_it_does_not_know_i
 def test_two_blobs_of_one_object_are_lost_or_covered_by_the_covariance(drill, rigid):
     T, mask = scene(drill, (74, 2), EXACT)
     both = mask | np.roll(mask, 150 if np.flatnonzero(mask.any(axis=0)).mean() < WIDTH / 2 else -150, axis=1)
-    found = refine(rigid, both, K, moved(T, 10.0, 0.02, np.random.default_rng(2)))
+    found = find_pose(rigid, both, K, moved(T, 10.0, 0.02, np.random.default_rng(2)))
     assert found.state == "lost" or nees(found, T) < 22.5
 
 
@@ -133,7 +133,7 @@ def test_a_piece_of_the_mask_that_is_another_object_is_left_out(drill, rigid):
     rows = np.mgrid[:HEIGHT, :WIDTH][0]
     piece = np.hypot(np.arange(WIDTH) - aside, rows - HEIGHT / 2) < np.sqrt(0.3 * np.count_nonzero(mask) / np.pi)
     assert not (piece & mask).any()
-    found = refine(rigid, mask | piece, K, moved(T, 20.0, 0.03, np.random.default_rng(4)))
+    found = find_pose(rigid, mask | piece, K, moved(T, 20.0, 0.03, np.random.default_rng(4)))
     assert errors(drill, found.T, T).add < CONVERGED
     assert found.state == "tracking"
 
@@ -142,7 +142,7 @@ def test_another_shape_is_not_tracked(rigid):
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[200:212, 100:420] = True  # a bar
     mask[100:380, 250:262] = True  # and another across
-    found = refine(rigid, mask, K, geometry.from_rpy((-0.05, 0.0, 0.9), (1.5, 0.0, 0.0)))
+    found = find_pose(rigid, mask, K, geometry.from_rpy((-0.05, 0.0, 0.9), (1.5, 0.0, 0.0)))
     assert found.state == "lost"
     assert found.covariance[0, 0] >= 1.0
 
@@ -154,7 +154,7 @@ def test_a_damaged_mesh_gives_the_pose_of_the_whole_one(kind):
     )
     start = moved(T, 15.0, 0.02, np.random.default_rng(1))
     one = Thing("drill", bench.worn(bench.drill(), 20_000, np.random.default_rng(0), kind), np.eye(3)[None])
-    assert errors(one, refine(RigidObject(mesh_of(one)), mask, K, start).T, T).add < 0.03
+    assert errors(one, find_pose(RigidObject(mesh_of(one)), mask, K, start).T, T).add < 0.03
 
 
 def test_a_mended_mesh_looks_like_the_one_it_was_made_of():
@@ -178,7 +178,7 @@ def test_the_picture_is_sharper_than_the_mask(drill, rigid):
         )
         picture = cv2.GaussianBlur(picture, (0, 0), 0.6).clip(0, 255).astype(np.uint8)
         start = moved(T, 15.0, 0.02, np.random.default_rng(seed))
-        by_mask, by_picture = (errors(drill, refine(rigid, mask, K, start, picture=p).T, T).add for p in (None, picture))
+        by_mask, by_picture = (errors(drill, find_pose(rigid, mask, K, start, picture=p).T, T).add for p in (None, picture))
         better.append(by_picture / by_mask)
     assert np.median(better) < 0.6
 

@@ -18,7 +18,6 @@ from shared.cell import description
 from shared.contract.labels import Label
 from shared.contract.messages import FusedPose, Mask
 from shared.geometry import raster, rigid
-from shared.perception.joint_history import JointHistory
 from shared.perception.prediction import predict
 
 CELL = description.load("table")
@@ -286,7 +285,7 @@ def test_a_mask_of_another_camera_is_refused_with_what_came(search):
         search.update(Mask(stamp_ns=0, labels=np.zeros((10, 2000), np.uint8), x0=0, y0=0, scale=1))
     with pytest.raises(ValueError, match="at scale 0 came"):
         search.update(Mask(stamp_ns=0, labels=np.zeros((10, 10), np.uint8), x0=0, y0=0, scale=0))
-    with pytest.raises(ValueError, match="default, paper expected, got 'best'"):
+    with pytest.raises(ValueError, match="expected one of default, paper, got 'best'"):
         Search(CELL, method="best")
 
 
@@ -352,19 +351,6 @@ def test_a_robot_is_drawn_where_its_joints_put_it():
     np.testing.assert_array_equal(
         robots.render({"panda": np.array([0.0, 0.3, 0.0, -1.5, 0.0, 1.8, 0.0])}, window, (64, 96)), straight[50:114, 100:196]
     )
-
-
-def test_joints_are_interpolated_at_the_stamp_and_never_invented():
-    history = JointHistory()
-    assert history.at(0) is None
-    for stamp, q in ((0, 0.0), (5_000_000, 1.0), (2_000_000, 9.0), (10_000_000, 2.0)):  # the third came late
-        history.add(stamp, np.array([q]))
-    assert history.at(7_500_000) == pytest.approx(1.5)
-    assert history.at(12_000_000) == pytest.approx(2.0)
-    assert history.at(10_000_000_000) is None
-    history.add(-3_600_000_000_000, np.array([5.0]))
-    assert history.at(-3_600_000_000_000) == pytest.approx(5.0), "the clock was set back"
-    assert history.at(10_000_000) is None
 
 
 def test_the_prediction_moves_with_the_velocity_and_ends_with_the_track():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from services.command import cli
 from services.skin.calibration import calibrate, law, recording
-from services.skin.calibration.law import InputError
+from services.skin.calibration.law import RecordingError
 from shared.cell import description as cells
 from shared.contract import topics
 from shared.contract.messages import Voltages
@@ -115,7 +115,7 @@ def test_readings_that_no_law_fits_are_refused_with_the_reason(change, text):
     gaps = np.repeat(GAPS, 200)
     volts = read_volts(KIND.law("c"), GAPS, 200, np.random.default_rng(2))
     gaps, volts = change(gaps, volts)
-    with pytest.raises(InputError, match=text):
+    with pytest.raises(RecordingError, match=text):
         law.fit(law.readings(gaps, volts, FULL_SCALE, LSB, "p0/c"), KIND.law("c"), "p0/c")
 
 
@@ -133,7 +133,7 @@ def test_electrodes_that_go_different_ways_are_refused_by_name():
     mixed = made([1.0] * 5)
     volts = mixed.volts.copy()
     volts[:, 2] = 0.4 - volts[:, 2] + 0.2
-    with pytest.raises(InputError, match=r"pad p0: mixed polarity: .* c, r, t, b rise and l fall"):
+    with pytest.raises(RecordingError, match=r"pad p0: mixed polarity: .* c, r, t, b rise and l fall"):
         calibrate.calibrate(CELL, "p0", recording.Recording(mixed.gap, volts, ELECTRODES, mixed.labels, mixed.numbers))
 
 
@@ -189,7 +189,7 @@ def test_a_recording_that_is_written_is_read_the_same(tmp_path):
 def test_a_bad_recording_is_refused_with_its_line(tmp_path, text, complaint):
     path = tmp_path / "r.csv"
     path.write_text(text)
-    with pytest.raises(InputError, match=complaint):
+    with pytest.raises(RecordingError, match=complaint):
         recording.read(path, ELECTRODES)
 
 

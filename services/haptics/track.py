@@ -1,0 +1,133 @@
+"""Where the limb is followed: a place, a rival where a second one is possible, and the odds between the two.
+
+Far from the pads thick and thin parts of a limb feel alike, so one window may be explained at two places. Both are then kept and
+solved in every window; the evidence of the windows adds up in the odds until it has decided.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from services.haptics.settings import HapticSettings
+from services.haptics.solve import marginal
+from shared.geometry.rigid import Array, perturb, pose_error
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the limb may be: T_world_target (4, 4) and its covariance (6, 6)."""
+
+    T: Array
+    covariance: Array
+
+    def is_apart(self, other: Place, settings: HapticSettings) -> bool:
+        """Whether the distance of two places is more than their covariances explain."""
+        offset = self.T[:3, 3] - other.T[:3, 3]
+        spread = (self.covariance + other.covariance)[:3, :3] + settings.same_place**2 * np.eye(3)
+        return float(offset @ np.linalg.solve(spread, offset)) > settings.apart
+
+
+class Home:
+    """Where the limb is expected while nothing is felt, and how a place decays towards it. T (4, 4): T_world_target; spread (6,):
+    standard deviations [m, rad] of the pose about it; place: both together; information (6, 6): the inverse of its covariance."""
+
+    def __init__(self, T: Array, spread: ArrayLike, settings: HapticSettings):
+        self.T = T
+        self.place = Place(T, np.diag(np.asarray(spread, dtype=float) ** 2))
+        self.information: Array = np.asarray(np.linalg.inv(self.place.covariance), np.float64)
+        self._settings = settings
+
+    def decayed(self, place: Place, elapsed_s: float) -> Place:
+        """A place after so many seconds in which nothing was felt: an Ornstein-Uhlenbeck process about home, whose spread never
+        exceeds home's. The roll about the limb's axis decays with a time constant of its own."""
+        keep = np.exp(-elapsed_s / self._settings.memory_s)
+        T = perturb(self.T, keep * pose_error(place.T, self.T))
+        covariance = keep**2 * place.covariance + (1.0 - keep**2) * self.place.covariance
+        forgotten = 1.0 - np.exp(-elapsed_s / self._settings.roll_memory_s)
+        T = perturb(T, -forgotten * self._roll(T) * roll_axis(T))
+        axis = roll_axis(T)
+        spread = float(axis @ self.place.covariance @ axis) - float(axis @ covariance @ axis)
+        return Place(T, covariance + max(0.0, (1.0 - (1.0 - forgotten) ** 2) * spread) * np.outer(axis, axis))
+
+    def without_roll(self, T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
+        """Information (6, 6) and gradient (6,) at a pose T (4, 4) after the roll about the limb's axis was marginalised, which is
+        known as well as at home. The voltages would decide on it by the flatness of wrist and hand alone, with several solutions
+        that look equally certain."""
+        axis = roll_axis(T)
+        known = float(axis @ self.information @ axis)
+        gradient = gradient + axis * (known * float(axis @ pose_error(self.T, T)))
+        return marginal(information + known * np.outer(axis, axis), gradient, axis[:, None])
+
+    def _roll(self, T: Array) -> float:
+        """The turn about the limb's axis [rad] from home: the twist of the rotation between them."""
+        R = self.T[:3, :3].T @ T[:3, :3]
+        return float(2.0 * np.arctan2(R[2, 1] - R[1, 2], 1.0 + np.trace(R)))
+
+
+class Track:
+    """The place that is followed, its rival (None where one place alone is possible) and odds: the log odds of the place to the
+    rival, never negative."""
+
+    def __init__(self, home: Home, settings: HapticSettings):
+        self._home, self._settings = home, settings
+        self.forget()
+
+    def forget(self) -> None:
+        """Starts again at home."""
+        self.place, self.odds = self._home.place, 0.0
+        self.rival: Place | None = None
+
+    def decay(self, elapsed_s: float) -> None:
+        """Takes both places over so many seconds in which nothing is felt."""
+        self.place = self._home.decayed(self.place, elapsed_s)
+        self.rival = None if self.rival is None else self._home.decayed(self.rival, elapsed_s)
+
+    def expect(self, T: Array, covariance: Array) -> bool:
+        """Moves the track to a fused pose (4, 4) with its covariance (6, 6) where that is known well enough, and returns whether
+        it was. The track then has no rival."""
+        settings = self._settings
+        known = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < settings.expected_sigma**2
+        if known:
+            floor = np.diag(np.repeat(np.square(settings.expected_floor), 3))
+            self.place, self.rival = Place(T, settings.expected_inflation**2 * covariance + floor), None
+        return known
+
+    def contest(self, rival: Place, odds: float) -> None:
+        """Keeps a rival with these log odds of the track to it, where it is another place and still possible."""
+        possible = odds < self._settings.odds_decided and rival.is_apart(self.place, self._settings)
+        self.rival, self.odds = rival if possible else None, max(odds, 0.0)
+
+    def weigh(self, rival: Place, evidence: float) -> bool:
+        """Adds a window's evidence, the log likelihood of the track less that of its rival, to the odds. The rival is given as
+        the window left it. Returns whether the two changed places."""
+        self.odds += self.limited(evidence)
+        is_overtaken = self.odds < 0.0
+        if is_overtaken:
+            self.place, rival, self.odds = rival, self.place, -self.odds
+        self.contest(rival, self.odds)
+        return is_overtaken
+
+    def limited(self, evidence: float) -> float:
+        """The evidence of one window, limited to what one window may change."""
+        return float(np.clip(evidence, -self._settings.odds_step, self._settings.odds_step))
+
+    def mixed(self, information: Array, gradient: Array) -> tuple[Array, Array]:
+        """A likelihood at the track, as information (6, 6) and gradient (6,), widened to the mixture of the track and its
+        rival. The scatter between the two lasts as long as the model's error does."""
+        if self.rival is None:
+            return information, gradient
+        offset, share = pose_error(self.rival.T, self.place.T), 1.0 / (1.0 + np.exp(self.odds))
+        mean, scatter = share * offset, share * (1.0 - share) * np.outer(offset, offset)
+        if scatter.any():
+            keep = np.linalg.inv(np.eye(6) + self._settings.error_lasts * information @ scatter)
+            gradient = keep @ (gradient + information @ mean)
+            information = keep @ information
+        return information, gradient
+
+
+def roll_axis(T: Array) -> Array:
+    """The pose error (6,) of a turn by one radian about the limb's axis."""
+    return np.concatenate([np.zeros(3), T[:3, 0]])

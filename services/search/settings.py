@@ -1,0 +1,88 @@
+"""The numbers of the search of a target that somebody may want to change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+# Squared Mahalanobis distances of six degrees of freedom: quantiles of the chi-square distribution.
+ONE_IN_10 = 10.6
+"""Squared Mahalanobis distance that one in 10 right poses exceeds."""
+ONE_IN_100 = 16.8
+"""Squared Mahalanobis distance that one in 100 right poses exceeds."""
+ONE_IN_10_000 = 27.9
+"""Squared Mahalanobis distance that one in 10,000 right poses exceeds."""
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Settings of `tracker.Search`. Every field states its unit and where its value comes from.
+
+    "Chosen" means by hand; `penumbra bench search` shows what a change does. An overlap is the share of the scored pixels of mask
+    and silhouette that both have, in [0, 1]; a misfit is a mean squared offset of the contour, 1 to 3 where the pose is right.
+    """
+
+    # ---- Whether a pose is right
+
+    fits: float = 0.8
+    """Least overlap of a pose that is right. Measured: masks of the network reach 0.93 to 0.97 at the right pose."""
+    fits_well: float = 0.9
+    """Overlap from which no other explanation is looked for. Chosen between `fits` and what right poses reach."""
+    fits_expected: float = 0.6
+    """Least overlap of a pose that the image confirms where a sure prediction expects it. Chosen: a mask that takes an occluder
+    for the wall behind it is no reason to give up."""
+    wrong_misfit: float = 6.0
+    """Misfit from which a pose is wrong whatever its overlap. Chosen: twice what one right pose in a hundred exceeds."""
+    gate: float = ONE_IN_10_000
+    """Squared Mahalanobis distance between the prediction and another pose, above which the other pose is not believed."""
+
+    # ---- Whether enough of the target shows
+
+    hidden: float = 0.95
+    """Largest hidden share with which a pose is measured where a sure prediction expects it. Chosen."""
+    shortest_px: float = 30.0
+    """Least measured contour [px] of such a pose. Derived: about four independent points."""
+    recognised: float = 0.5
+    """Largest hidden share of a shape that nothing sure expects. Chosen: a smaller piece may be anything."""
+    recognised_px: float = 80.0
+    """Least measured contour [px] of such a shape. Chosen."""
+    covers: float = 0.5
+    """Share of the silhouette that must be covered, or outside the picture, for a target that does not show enough to be called
+    occluded. Otherwise it is lost. Chosen."""
+
+    # ---- What the prediction tells
+
+    sure: float = 0.05
+    """Largest standard deviation of the position [m], along its worst direction, of a prediction that is called sure. Chosen."""
+    expected: float = ONE_IN_10
+    """Squared Mahalanobis distance up to which a pose is where the prediction says."""
+    prior_inflation: float = 2.0
+    """Factor on the prediction's standard deviations before the fit leans on it. Chosen: the prediction shall only keep the fit
+    from wandering off."""
+    prior_floor: tuple[float, float] = (0.02, 0.09)
+    """Standard deviations [m, rad] added to the prediction's for the same reason. Chosen."""
+    joint_margin: float = 0.02
+    """Length [m] beyond the limb's predicted near end in which the mask is still believed. Chosen: the prediction may be off."""
+
+    # ---- Finding the target again
+
+    detect_reach: float = 1.2
+    """Reach of a region of the mask, in lengths of the target: what is nearer belongs to the region. Chosen above one, because
+    the region may show either end."""
+    home_gate: float = ONE_IN_100
+    """Squared Mahalanobis distance from the target's home above which a shape is not believed to be the target."""
+    detect_every_ns: dict[str, int] = field(default_factory=lambda: {"lost": 250_000_000, "doubtful": 1_000_000_000})
+    """Least time [ns] between two detections, while the target is lost and while its pose is only doubtful. Chosen: a detection
+    takes as long as twenty tracked frames."""
+    explained: float = 0.5
+    """Overlap with all of a region, a bare upper arm included, from which no other region is tried. Chosen."""
+    detect_fits: int = 4
+    """Number of hypotheses that are fitted in a region: those that overlap best. Chosen for time."""
+    home_weight: float = 0.005
+    """Overlap that one standard deviation from home costs a hypothesis. Chosen small: it decides between mirror images, which
+    overlap equally."""
+
+    # ---- The paper's method
+
+    paper_sigma: tuple[float, float] = (0.02, 0.09)
+    """Standard deviations [m, rad] published by `--method paper`. The position's is from the paper, which gives no covariance but
+    an average error of less than 2 cm; the rotation's is chosen."""

@@ -1,0 +1,65 @@
+"""What is said of a fitted pose: tracking, occluded or lost, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from services.search.settings import SearchSettings
+from shared.perception.vision import State
+
+
+class Verdict(Enum):
+    """The cases. `state`: what is published; `reason`: in words."""
+
+    RIGHT = "tracking", "mask, and image where there is one, confirm the pose"
+    COVERED = "occluded", "too little shows, and most of the target is covered or outside the picture"
+    TOO_LITTLE = "lost", "too little shows, and nothing covers the rest"
+    ELSEWHERE = "lost", "mask and silhouette overlap too little"
+    UNCONFIRMED = "lost", "the image shows no edges along the contour"
+    MISSHAPEN = "lost", "the mask's boundary is not the contour's"
+
+    def __init__(self, state: State, reason: str):
+        self.state, self.reason = state, reason
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What is known of a fitted pose before it is judged. overlap, misfit, is_sharp: as of `mask_fit.Fit`; contour_px: contour
+    measured [px]; hidden: share of the silhouette in [0, 1] that the mask does not show; covered: share that something covers, or
+    that lies outside the window; has_image: whether an image was there to confirm the pose; is_expected: whether a sure
+    prediction says that the target is there."""
+
+    overlap: float
+    misfit: float
+    is_sharp: bool
+    contour_px: float
+    hidden: float
+    covered: float
+    has_image: bool
+    is_expected: bool
+
+
+def verdict(found: Findings, settings: SearchSettings) -> Verdict:
+    """Judges a fitted pose. A small piece of a target is believed only where a sure prediction expects it."""
+    largest_hidden = settings.hidden if found.is_expected else settings.recognised
+    shortest_px = settings.shortest_px if found.is_expected else settings.recognised_px
+    if found.hidden > largest_hidden or found.contour_px < shortest_px:
+        return Verdict.COVERED if found.covered > settings.covers else Verdict.TOO_LITTLE
+    if found.overlap < least_overlap(found.is_expected and found.is_sharp, settings):
+        return Verdict.ELSEWHERE
+    if found.has_image and not found.is_sharp:
+        return Verdict.UNCONFIRMED
+    if not found.has_image and found.misfit >= settings.wrong_misfit:
+        return Verdict.MISSHAPEN
+    return Verdict.RIGHT
+
+
+def least_overlap(is_confirmed: bool, settings: SearchSettings) -> float:
+    """The least overlap of a right pose. is_confirmed: the image confirms the pose where a sure prediction expects it."""
+    return settings.fits_expected if is_confirmed else settings.fits
+
+
+def explains_mask(overlap: float, misfit: float, settings: SearchSettings) -> bool:
+    """Whether a pose explains the mask by itself, without an image or a prediction."""
+    return overlap >= settings.fits and misfit < settings.wrong_misfit

@@ -1,0 +1,75 @@
+"""The cases of the judgement of a fitted pose, one by one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from services.search.settings import ONE_IN_10, ONE_IN_10_000, ONE_IN_100, SearchSettings
+from services.search.verdict import Findings, Verdict, explains_mask, verdict
+
+SETTINGS = SearchSettings()
+GOOD = Findings(
+    overlap=0.95,
+    misfit=1.0,
+    is_sharp=True,
+    contour_px=400.0,
+    hidden=0.1,
+    covered=0.05,
+    has_image=True,
+    is_expected=False,
+)
+
+
+def judged(**changes: object) -> Verdict:
+    return verdict(replace(GOOD, **changes), SETTINGS)  # type: ignore[arg-type]
+
+
+def test_a_pose_that_mask_and_image_confirm_is_tracked():
+    assert judged() is Verdict.RIGHT
+    assert judged(has_image=False, is_sharp=False) is Verdict.RIGHT
+
+
+def test_a_pose_without_edges_in_the_image_is_lost_whatever_its_mask():
+    assert judged(is_sharp=False) is Verdict.UNCONFIRMED
+    assert judged(is_sharp=False, is_expected=True) is Verdict.UNCONFIRMED
+
+
+def test_without_an_image_the_mask_s_boundary_decides():
+    assert judged(has_image=False, misfit=SETTINGS.wrong_misfit) is Verdict.MISSHAPEN
+    assert judged(has_image=False, misfit=0.99 * SETTINGS.wrong_misfit) is Verdict.RIGHT
+    assert judged(has_image=True, misfit=SETTINGS.wrong_misfit) is Verdict.RIGHT  # the image is the better witness
+
+
+@pytest.mark.parametrize("overlap", [SETTINGS.fits_expected, 0.99 * SETTINGS.fits])
+def test_a_poor_overlap_is_enough_only_for_a_sharp_pose_that_is_expected(overlap):
+    assert judged(overlap=overlap) is Verdict.ELSEWHERE
+    assert judged(overlap=overlap, is_expected=True) is Verdict.RIGHT
+    assert judged(overlap=overlap, is_expected=True, has_image=False, is_sharp=False) is Verdict.ELSEWHERE
+
+
+def test_a_small_piece_is_believed_only_where_it_is_expected():
+    for small in ({"hidden": 0.6}, {"contour_px": 50.0}):
+        assert judged(**small) is Verdict.TOO_LITTLE
+        assert judged(**small, is_expected=True) is Verdict.RIGHT
+    for smaller in ({"hidden": 0.96}, {"contour_px": 29.0}):
+        assert judged(**smaller, is_expected=True) is Verdict.TOO_LITTLE
+
+
+def test_what_shows_too_little_is_occluded_where_something_covers_it_and_lost_where_nothing_does():
+    assert judged(hidden=0.99, covered=0.9) is Verdict.COVERED
+    assert judged(hidden=0.99, covered=0.5) is Verdict.TOO_LITTLE
+    assert {case.state for case in Verdict} == {"tracking", "occluded", "lost"}
+    assert Verdict.COVERED.state == "occluded" and Verdict.TOO_LITTLE.state == "lost"
+
+
+def test_a_pose_explains_a_mask_by_overlap_and_boundary_together():
+    assert explains_mask(SETTINGS.fits, 1.0, SETTINGS)
+    assert not explains_mask(0.99 * SETTINGS.fits, 1.0, SETTINGS)
+    assert not explains_mask(SETTINGS.fits, SETTINGS.wrong_misfit, SETTINGS)
+
+
+def test_the_gates_are_the_quantiles_that_their_names_say():
+    shares = [0.9, 0.99, 0.9999]
+    np.testing.assert_allclose([ONE_IN_10, ONE_IN_100, ONE_IN_10_000], chi2.ppf(shares, 6), atol=0.05)  # rounded to a tenth
