@@ -101,7 +101,7 @@ def list_topics(argv: list[str]) -> int:
             key = topic.key.replace("{cell}", cell.name)
             table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", f"{topic.slow_hz:g}",
                           topic.qos.name.lower().replace("_", " "), topic.priority.name.lower(), f"{topic.stale_s:g} s",
-                          topic.publisher, escape(topic.about))  # fmt: skip
+                          " or ".join(topic.publishers), escape(topic.about))  # fmt: skip
         console.print(table)
         return 0
     report, instances = listen(cell, bus.connection(options), options.seconds)
