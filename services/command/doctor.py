@@ -18,8 +18,8 @@ from rich.markup import escape
 
 from services import flags
 from services.command import health
-from services.launcher.launch import PROCESSES
 from shared.cell import description as cells
+from shared.contract.processes import PROCESSES
 from shared.runtime import bus
 
 ROOT = Path(__file__).parents[2]

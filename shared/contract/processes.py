@@ -38,8 +38,8 @@ class Metric:
     """A number in a service's own health report that becomes a metric, one per entry of the report.
 
     `name`: of the metric; `each`: the label that names the entry; `field`: where the number is; `within`: the part of the report
-    that holds the entries, empty for the whole; `values`: the words that the field can be, each of which becomes a gauge of 0 or
-    1; `is_counter`: whether it only grows.
+    that holds the entries, empty for the whole; `values`: the words that the field can be, each of which becomes a gauge of 0
+    or 1; `is_counter`: whether it only grows.
     """
 
     name: str

@@ -54,8 +54,8 @@ class Topic:
 
 FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, ("emulator",), "one RGB image",
               Priority.IMAGE, 0)  # fmt: skip
-JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, ("emulator",), "joint angles [rad]",
-               Priority.SIGNAL, 20)  # fmt: skip
+JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, ("emulator",),
+               "joint angles [rad]", Priority.SIGNAL, 20)  # fmt: skip
 VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1, ("emulator", "skin"),
                  "electrode amplitudes [V], 1 kHz in batches", Priority.SIGNAL, 0)  # fmt: skip
 TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 50, 16, 0.2, ("emulator",),

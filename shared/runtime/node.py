@@ -450,7 +450,7 @@ class Node:
 
     def fault(self, where: str, error: Exception) -> None:
         """Counts an exception; the first of its kind and place is logged with its trace. Raises a MemoryError again: what is out
-        of memory does nothing well any more, and ends to begin anew (`services.command.cli.serve`)."""
+        of memory does nothing well any more, and ends to begin anew (`services.run.serve`)."""
         if isinstance(error, MemoryError):
             raise error
         frames = traceback.extract_tb(error.__traceback__)

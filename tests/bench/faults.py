@@ -28,7 +28,7 @@ from shared.cell import description as cells
 from shared.contract import topics
 from shared.contract.topics import Topic
 from tests.support import injected, observed
-from tests.support.live import Running, penumbra_up, wait_for
+from tests.support.live import Running, penumbra_up, service_of, wait_for
 
 SERVICES = ("emulator", "segmentation", "search", "haptics", "fusion")
 REPLICATED = SERVICES[1:]
@@ -135,8 +135,7 @@ def _memory(chain: Chain, process: psutil.Process) -> AbstractContextManager[Non
 
 @contextmanager
 def _crash_loop(chain: Chain, process: psutil.Process) -> Iterator[None]:
-    words = process.cmdline()
-    service = words[words.index("services.command.cli") + 1]
+    service = service_of(process) or ""
     spared = {each.pid for each in chain.instances(service)} - {process.pid}
     with injected.crash_loop(lambda: [each for each in chain.instances(service) if each.pid not in spared]):
         yield

@@ -32,7 +32,7 @@ from rich.table import Table
 from shared.cell import description as cells
 from shared.contract import topics
 from tests.support import injected
-from tests.support.live import Running, connect, penumbra_up, wait_for
+from tests.support.live import Running, connect, penumbra_up, service_of, wait_for
 
 DAY_S = 86_400.0
 SAMPLE_S = 5.0
@@ -212,10 +212,8 @@ class Gauge:
             yield "router", psutil.Process(self._router.popen.pid)
         with suppress(psutil.NoSuchProcess):
             for child in self._launcher.children():
-                with suppress(psutil.NoSuchProcess):
-                    words = child.cmdline()
-                    if "services.command.cli" in words:
-                        yield words[words.index("services.command.cli") + 1], child
+                if name := service_of(child):
+                    yield name, child
 
     def rows(self, warm_up_s: float) -> list[Row]:
         """By service, what grew after the warm-up of each process."""

@@ -238,9 +238,9 @@ def test_what_is_compiled_runs_also_where_there_is_no_room_to_keep_it(tmp_path):
     code = """
 import sys
 import numba
-from services import cli
+from services import run
 if "mended" in sys.argv:
-    cli._compile_on_full_disk()
+    run._compile_on_full_disk()
 @numba.njit(cache=True)
 def more(x):
     return x + 1
