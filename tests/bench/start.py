@@ -37,12 +37,12 @@ ROOT = Path(__file__).parents[2]
 LEFT_OUT = ("__pycache__", ".*", "build", "runs", "*.egg-info")
 """What a fresh clone does not hold: everything compiled or cached."""
 PATIENCE_S = 300.0
-"""After which a start without a tracked pose counts as failed."""
+"""After which a start that is not complete counts as failed."""
 LOOK_S = 0.02
 
 
 class Failed(RuntimeError):
-    """A start ended without a tracked pose; the text holds the launcher's last words."""
+    """A start ended before every process had shown itself; the text holds the launcher's last words."""
 
 
 @dataclass
@@ -62,7 +62,6 @@ class Listener:
 
     def __init__(self, cell: cells.Cell, port: int):
         self._cell, self.first_s = cell, dict[str, float]()
-        self.is_done = threading.Event()
         config = {
             "mode": "client",
             "connect": {
@@ -93,11 +92,15 @@ class Listener:
                     if messages.decode(messages.FusedPose, sample.payload.to_bytes()).state != "tracking":
                         continue
                     self.first_s.setdefault("fusion", time.monotonic())
-                    self.is_done.set()
                 else:  # of two that may publish it one runs: posecnn in place of search, skin beside the emulator
                     self.first_s.setdefault(next(name for name in topic.publishers if name in self.names), time.monotonic())
                 subscriber.undeclare()
                 return
+
+    @property
+    def is_done(self) -> bool:
+        """Whether every process has shown itself."""
+        return self.first_s.keys() >= set(self.names)
 
     @property
     def names(self) -> list[str]:
@@ -111,7 +114,7 @@ class Listener:
 
 
 def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
-    """Starts the cell from the checkout in `folder`, and ends it when its pose is tracked. Raises Failed."""
+    """Starts the cell from the checkout in `folder`, and ends it when all of it has shown itself. Raises Failed."""
     port = free_port()
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     environment |= {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(home)}
@@ -128,28 +131,30 @@ def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
             launcher.terminate()
             launcher.wait()
         listener.close()
-        if not listener.is_done.is_set():
+        if not listener.is_done:
             log.seek(0)
-            raise Failed(f"no tracked pose of cell {cell} within {PATIENCE_S:.0f} s: {log.read()[-2000:]}")
+            missing = ", ".join(sorted(set(listener.names) - listener.first_s.keys()))
+            raise Failed(f"nothing of {missing} in cell {cell} within {PATIENCE_S:.0f} s: {log.read()[-2000:]}")
     names = [name for name in (*listener.names, processes.LAUNCHER.name) if name in listener.first_s]
     return Start(
         {name: round(listener.first_s[name] - began_s, 2) for name in names}, {name: used_s.get(name, 0.0) for name in names}
     )
 
 
-def _until_done(listener: Listener, launcher: subprocess.Popen[str]) -> dict[str, float]:
-    """CPU [s] of each service's processes at its first message; returns when the pose is tracked."""
+def _until_done(listener: Listener, launcher: subprocess.Popen[bytes]) -> dict[str, float]:
+    """CPU [s] of each service's processes at its first message; returns when all have shown themselves."""
     used_s: dict[str, float] = {}
     known: dict[int, tuple[str, psutil.Process]] = {}
     deadline_s = time.monotonic() + PATIENCE_S
-    while not listener.is_done.wait(LOOK_S) and launcher.poll() is None and time.monotonic() < deadline_s:
+    while not listener.is_done and launcher.poll() is None and time.monotonic() < deadline_s:
         _measure(listener, launcher, known, used_s)
+        time.sleep(LOOK_S)
     _measure(listener, launcher, known, used_s)
     return used_s
 
 
 def _measure(
-    listener: Listener, launcher: subprocess.Popen[str], known: dict[int, tuple[str, psutil.Process]], used_s: dict[str, float]
+    listener: Listener, launcher: subprocess.Popen[bytes], known: dict[int, tuple[str, psutil.Process]], used_s: dict[str, float]
 ) -> None:
     with contextlib.suppress(psutil.NoSuchProcess):
         for child in psutil.Process(launcher.pid).children():

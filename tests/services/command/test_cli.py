@@ -103,7 +103,9 @@ def test_a_missing_package_is_one_line_with_the_extra_that_installs_it():
 
 def test_an_import_error_in_our_own_code_is_not_explained_away():
     with pytest.raises(ImportError):
-        cli._explain_import("fusion", ImportError("cannot import name 'x' from 'shared.runtime.bus'", name="shared.runtime.bus"))
+        cli._explain_import(
+            "fusion", [], ImportError("cannot import name 'x' from 'shared.runtime.bus'", name="shared.runtime.bus")
+        )
 
 
 def test_help_lists_every_command(capsys):

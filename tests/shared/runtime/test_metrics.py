@@ -89,10 +89,8 @@ def test_one_page_covers_many_processes_with_their_restarts_and_the_state_of_the
     samples = page(served(lambda: [launcher, fusion]))
     assert value(samples, "penumbra_restarts_total", service="launcher", process="fusion") == 3
     assert value(samples, "penumbra_running", process="fusion") == 1
-    states = {
-        state: value(samples, "penumbra_fused_state", target="forearm", state=state) for state in ("tracking", "coasting", "lost")
-    }
-    assert states == {"tracking": 0, "coasting": 1, "lost": 0}
+    expected = {"tracking": 0, "coasting": 1, "lost": 0}
+    assert {state: value(samples, "penumbra_fused_state", target="forearm", state=state) for state in expected} == expected
     assert {value(samples, "penumbra_cpu_cores", service=service) for service in ("launcher", "fusion")} == {0.5}
 
 
