@@ -19,7 +19,7 @@ class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line that says what to do, and which takes no abbreviated flags: they would hide mistakes."""
 
     def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, allow_abbrev=False, **kwargs)
+        super().__init__(*args, **{"allow_abbrev": False, **kwargs})
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
@@ -46,9 +46,9 @@ def seconds(text: str) -> float:
     return _number(text, lambda value: value > 0, "a time above 0, in seconds,")
 
 
-def finite_seconds(text: str) -> float:
-    """Type of a flag: a time [s] above 0."""
-    return _number(text, lambda value: 0 < value < math.inf, "a finite time above 0, in seconds,")
+def above_zero(text: str) -> float:
+    """Type of a flag: a finite number above 0."""
+    return _number(text, lambda value: 0 < value < math.inf, "a number above 0,")
 
 
 def positive(text: str) -> int:

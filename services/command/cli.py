@@ -11,6 +11,7 @@ from pathlib import Path
 
 from shared.contract import processes
 from shared.contract.processes import PROCESSES, Process
+from shared.runtime.logs import FULL
 
 
 @dataclass(frozen=True)
@@ -59,15 +60,21 @@ def main(argv: list[str] | None = None) -> int:
         print(f"penumbra: no command {command!r}: one of {', '.join(COMMANDS)} expected", file=sys.stderr)
         return 2
     try:
-        return _run(command, rest)
+        code = _run(command, rest)
+        sys.stdout.flush()
+        return code
     except ImportError as error:
         return _explain_import(command, rest, error)
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # `penumbra topics | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
         return 0
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in FULL and error.filename is None:  # `penumbra pose > /dev/full`
+            _discard_output()
+            _complain(command, f"the output cannot be written: {error.strerror}")
+            return 1
         if not _is_ours(error):
             raise
         for line in str(error).splitlines():
@@ -85,6 +92,11 @@ def _run(command: str, argv: list[str]) -> int:
     module, _, function = found.function.partition(":")
     call: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
     return call(argv[1:] if tool else argv) or 0
+
+
+def _discard_output() -> None:
+    """Nobody takes what is still to be written: Python would complain of it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def bench(argv: list[str]) -> int:

@@ -149,8 +149,11 @@ class Node:
 
     @contextmanager
     def until_signal(self) -> Iterator[None]:
-        """Within it SIGINT and SIGTERM set `stopping`; at its end the node is closed."""
-        previous = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        """Within it SIGINT, SIGTERM and SIGHUP (a terminal that is closed) set `stopping`; at its end the node is closed."""
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # else: run by nohup
+            numbers.append(signal.SIGHUP)
+        previous = {number: signal.signal(number, self._on_signal) for number in numbers}
         try:
             yield
         finally:

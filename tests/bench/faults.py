@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from services.flags import Parser
 from shared.cell import description as cells
 from shared.contract import topics
 from shared.contract.topics import Topic
@@ -313,7 +314,7 @@ def show(rows: Sequence[Row], console: Console) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench faults", description=__doc__)
+    parser = Parser(prog="penumbra bench faults", description=__doc__)
     parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
     parser.add_argument("--seed", type=int, default=1, help="draws motion and appearance")
     parser.add_argument("--json", type=Path, help="write the numbers to this file, after every row")
