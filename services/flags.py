@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from shared.runtime import bus, logs
 
@@ -15,7 +16,10 @@ if TYPE_CHECKING:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line that says what to do."""
+    """A parser whose errors are one line that says what to do, and which takes no abbreviated flags: they would hide mistakes."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"allow_abbrev": False, **kwargs})
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
@@ -28,6 +32,40 @@ def parser(command: str, about: str) -> Parser:
     bus.add_arguments(out)
     add_log(out)
     return out
+
+
+def port(text: str) -> int:
+    """Type of a flag: a TCP port."""
+    if not text.isdecimal() or not 0 < int(text) < 65536:
+        raise argparse.ArgumentTypeError(f"expected a port from 1 to 65535, got {text!r}")
+    return int(text)
+
+
+def seconds(text: str) -> float:
+    """Type of a flag: a time [s] above 0, or inf."""
+    return _number(text, lambda value: value > 0, "a time above 0, in seconds,")
+
+
+def above_zero(text: str) -> float:
+    """Type of a flag: a finite number above 0."""
+    return _number(text, lambda value: 0 < value < math.inf, "a number above 0,")
+
+
+def positive(text: str) -> int:
+    """Type of a flag: how many, at least 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a number from 1, got {text!r}")
+    return int(text)
+
+
+def _number(text: str, is_good: Callable[[float], bool], what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not is_good(value):  # of nan no comparison is true
+        raise argparse.ArgumentTypeError(f"expected {what} got {text!r}")
+    return value
 
 
 def add_cell(out: argparse.ArgumentParser) -> None:
@@ -66,10 +104,13 @@ def add_metrics(out: argparse.ArgumentParser) -> None:
 
 
 def _metrics_port(text: str) -> tuple[str, int]:
-    address, _, port = text.rpartition(":")
-    if not port.isdecimal() or not 0 < int(port) < 65536:
-        raise argparse.ArgumentTypeError(f"a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, expected, {text!r} came")
-    return address or "127.0.0.1", int(port)
+    address, _, number = text.rpartition(":")
+    try:
+        return address or "127.0.0.1", port(number)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(
+            f"a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, expected, {text!r} came"
+        ) from None
 
 
 @contextmanager

@@ -6,7 +6,6 @@ which hypothesis makes small and prints. Processor time per input and memory are
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import resource
 import sys
@@ -21,6 +20,7 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from rich.progress import Progress
 
+from services.flags import Parser
 from services.skin import decode as skin_decode
 from shared.cell import description as cells
 from shared.contract import messages
@@ -144,7 +144,7 @@ def memory_mb() -> float:
 
 
 def main(argv: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser = Parser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=100_000, help="of all decoders together (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(argv)

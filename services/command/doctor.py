@@ -7,9 +7,10 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,28 +19,15 @@ from rich.markup import escape
 
 from services import flags
 from services.command import health
-from services.launcher.launch import PROCESSES
 from shared.cell import description as cells
+from shared.contract.processes import PROCESSES
 from shared.runtime import bus
 
 ROOT = Path(__file__).parents[2]
 SHM_BYTES = 128 << 20
 """Frames cross between processes in shared memory; Docker's default of 64 MB is too little for two cameras."""
-CORE = ("eclipse-zenoh", "msgpack", "numpy", "scipy", "pydantic", "pyyaml", "prometheus_client", "psutil", "rich")
-EXTRAS = {
-    "torch": "segmentation",
-    "openvino": "segmentation",
-    "numba": "search",
-    "opencv-python-headless": "search",
-    "matplotlib": "skin",
-    "ruamel.yaml": "skin",
-    "scikit-learn": "skin",
-    "trimesh": "mesh",
-    "pybullet": "robot",
-    "pyserial": "skin",
-}
 STYLES = {"ok": "green", "warn": "yellow", "fail": "red"}
-FOUND = {"ok": "ok", "degraded": "warn", "down": "fail"}
+FOUND = {"ok": "ok", "starting": "ok", "degraded": "warn", "down": "fail"}
 
 
 @dataclass(frozen=True)
@@ -55,7 +43,8 @@ def main(argv: list[str]) -> int:
     """Prints every finding; 1 if any failed."""
     parser = flags.parser("doctor", "Looks at this machine and says how to mend what is wrong.")
     parser.add_argument("--skin", action="store_true", help="look at the pads of the running cell instead, by their voltages")
-    parser.add_argument("--seconds", type=float, default=6.0, help="of --skin: how long to listen (default: %(default)s)")
+    listening = "of --skin: how long to listen (default: %(default)s)"
+    parser.add_argument("--seconds", type=flags.above_zero, default=6.0, help=listening)
     parser.add_argument("--json", action="store_true", help="of --skin: print what was found as JSON")
     options = parser.parse_args(argv)
     if options.skin:
@@ -92,13 +81,48 @@ def _python() -> Finding:
 
 
 def _packages() -> Iterator[Finding]:
-    for name in (*CORE, *EXTRAS):
-        try:
-            yield Finding("ok", f"{name} {importlib.metadata.version(name)}")
-        except importlib.metadata.PackageNotFoundError:
-            extra = EXTRAS.get(name)
-            status = "warn" if extra else "fail"
-            yield Finding(status, f"{name} is not installed", f"pip install -e '.[{extra}]'" if extra else "pip install -e .")
+    """What every process needs, and then, by the extras of the table of processes, what single ones need."""
+    try:
+        needed = requirements()
+    except importlib.metadata.PackageNotFoundError:
+        yield Finding("fail", "penumbra is not installed", "pip install -e '.[all]'")
+        return
+    told: set[str] = set()
+    for extra in ("", *dict.fromkeys(process.extra for process in PROCESSES)):
+        for name in closure(extra, needed):
+            if name in told:
+                continue
+            told.add(name)
+            try:
+                yield Finding("ok", f"{name} {importlib.metadata.version(name)}")
+            except importlib.metadata.PackageNotFoundError:
+                install = f"pip install -e '.[{extra}]'" if extra else "pip install -e ."
+                yield Finding("warn" if extra else "fail", f"{name} is not installed", install)
+
+
+def requirements(lines: Iterable[str] | None = None) -> dict[str, list[str]]:
+    """The requirements of this project by extra, "" for those that it always has; an extra of its own is named `penumbra[EXTRA]`.
+
+    lines: as in a package's metadata, `numba<1,>=0.60; extra == "fusion"` (default: those of the installed project). Raises
+    importlib.metadata.PackageNotFoundError where it is not installed.
+    """
+    out: dict[str, list[str]] = {}
+    for line in importlib.metadata.requires("penumbra") or () if lines is None else lines:
+        requirement, _, marker = line.partition(";")
+        extra = re.search(r"extra == ['\"]([\w-]+)", marker)
+        name = re.match(r"[\w.-]+(\[[\w,-]+\])?", requirement.strip())
+        assert name is not None, line
+        out.setdefault(extra[1] if extra else "", []).append(name[0])
+    return out
+
+
+def closure(extras: str, needed: dict[str, list[str]]) -> list[str]:
+    """The packages that extras (`robot`, or `skin,robot`) install, those of the extras that they name in turn included."""
+    out: list[str] = []
+    for name in (name for extra in extras.split(",") for name in needed.get(extra, ())):
+        own = re.fullmatch(r"penumbra\[([\w,-]+)\]", name)
+        out += closure(own[1], needed) if own else [name]
+    return list(dict.fromkeys(out))
 
 
 def _cores() -> Finding:
@@ -130,13 +154,13 @@ def _cell(cell: str) -> Iterator[Finding]:
 
 
 def _weights() -> Iterator[Finding]:
-    """Every learned service has weights, each with its card beside it."""
+    """Every trained service that is installed has weights, each with its card beside it."""
     for process in PROCESSES:
         folder = ROOT / "services" / process.name
-        if not (folder / "train.py").is_file():
+        if not process.trained_by or not folder.is_dir():
             continue
         weights = [path for path in sorted((folder / "weights").glob("*")) if path.suffix in (".npz", ".pt")]
-        train = f"penumbra {process.name} train"
+        train = f"penumbra {process.name} {process.trained_by}"
         if not weights:
             yield Finding("fail", f"{process.name} has no weights", train)
         for path in weights:
@@ -172,4 +196,4 @@ def _processes(cell: str, connection: bus.Connection) -> Iterator[Finding]:
         yield Finding("warn", f"no process of cell {name} runs there", f"penumbra up --cell {cell}")
     for instance in instances:
         mend = f"penumbra restart {instance.service}" if instance.status == "down" else ""
-        yield Finding(FOUND[instance.status], str(instance), mend)
+        yield Finding(FOUND.get(instance.status, "warn"), str(instance), mend)

@@ -90,7 +90,7 @@ def list_topics(argv: list[str]) -> int:
 
     parser = flags.parser("topics", "Lists the table of topics, and with --hz what really arrives.")
     parser.add_argument("--hz", action="store_true", help="listen to everything; print what arrives and how the processes fare")
-    parser.add_argument("--seconds", type=float, default=3.0, help="how long to listen (default: %(default)s)")
+    parser.add_argument("--seconds", type=flags.above_zero, default=3.0, help="how long to listen (default: %(default)s)")
     options = parser.parse_args(argv)
     cell = cells.load(options.cell)
     console = Console(width=None if sys.stdout.isatty() else 200)
@@ -101,7 +101,7 @@ def list_topics(argv: list[str]) -> int:
             key = topic.key.replace("{cell}", cell.name)
             table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", f"{topic.slow_hz:g}",
                           topic.qos.name.lower().replace("_", " "), topic.priority.name.lower(), f"{topic.stale_s:g} s",
-                          topic.publisher, escape(topic.about))  # fmt: skip
+                          " or ".join(topic.publishers), escape(topic.about))  # fmt: skip
         console.print(table)
         return 0
     report, instances = listen(cell, bus.connection(options), options.seconds)

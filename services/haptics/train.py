@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from scipy.spatial.transform import Rotation
 
+from services.flags import Parser, above_zero, positive
 from services.haptics.estimator import Estimator
 from services.haptics.paper_network import PoseNetwork, Regression, Relative, features, fingerprint
 from services.haptics.size_and_rest import SIZE, SIZE_SPREAD
@@ -296,13 +297,13 @@ def save(network: PoseNetwork, path: Path, key: str) -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="penumbra haptics train", description="Train the skin's pose network for a cell.")
+    parser = Parser(prog="penumbra haptics train", description="Train the skin's pose network for a cell.")
     parser.add_argument("--cell", default="table", help="built-in cell or YAML file (default: %(default)s)")
     parser.add_argument("--target", help="the target's name (default: the first)")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--steps", type=int, default=12_000, help="training steps (default: %(default)s)")
-    parser.add_argument("--minutes", type=float, help="stop the schedule after this time instead of --steps")
-    parser.add_argument("--scenes", type=int, default=4000, help="held-out scenes for the card (default: %(default)s)")
+    parser.add_argument("--steps", type=positive, default=12_000, help="training steps (default: %(default)s)")
+    parser.add_argument("--minutes", type=above_zero, help="stop the schedule after this time instead of --steps")
+    parser.add_argument("--scenes", type=positive, default=4000, help="held-out scenes for the card (default: %(default)s)")
     parser.add_argument("--out", type=Path, help="weights file (default: the one that the service loads)")
     parser.add_argument("--checkpoint", type=Path, help="resume here and save here (default: runs/haptics-CELL-TARGET.pt)")
     options = parser.parse_args(argv)

@@ -6,6 +6,7 @@ import json
 import math
 import socket
 import time
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from services.launcher.supervised import ProcessRow
 from shared.contract import topics
 from shared.contract.messages import BadMessage, FusedPose, Truth, decode
 from shared.geometry import rigid
@@ -27,32 +29,21 @@ ANSWER_S = 2.0
 STYLES = {"running": "green", "starting": "yellow", "degraded": "yellow"}
 
 
-@dataclass(frozen=True)
-class ProcessRow:
-    """One process: `note` says why it is not running, or not as it should."""
-
-    name: str
-    state: str
-    pid: int | None
-    cpu: float
-    memory_mb: float
-    restarts: int
-    note: str = ""
-
-
 @dataclass
 class TopicRow:
-    """All keys of one topic: mean rate of a key, largest delay to a reader, sums of what was dropped and refused."""
+    """All keys of one topic: rates by key, of all replicas that publish it together; delays to readers; sums of what was dropped
+    and refused."""
 
     name: str
-    rates: list[float] = field(default_factory=list)
+    rates: Counter[str] = field(default_factory=Counter)
     delays_s: list[float] = field(default_factory=list)
     dropped: int = 0
     bad: int = 0
 
     @property
     def rate_hz(self) -> float:
-        return sum(self.rates) / len(self.rates) if self.rates else 0.0
+        """Mean rate of a key."""
+        return sum(self.rates.values()) / len(self.rates) if self.rates else 0.0
 
 
 @dataclass(frozen=True)
@@ -81,6 +72,7 @@ class Watch:
         self.health: dict[str, dict[str, Any]] = {}
         self.accuracy: Accuracy | None = None
         self.errors: list[tuple[float, float]] = []
+        self.has_tracked = False  # whether a fused pose was `tracking` at some look
 
     def refresh(self) -> None:
         """Asks all instances how they are; `health` is then their answers by instance."""
@@ -104,6 +96,7 @@ class Watch:
         if pose is None:
             self.accuracy = None
             return
+        self.has_tracked |= pose.state == "tracking"
         self.accuracy = accuracy(pose, near)
         if math.isfinite(self.accuracy.position):
             self.errors.append((self.accuracy.position, self.accuracy.axis))
@@ -114,7 +107,7 @@ class Watch:
         for report in self.health.values():
             for key, traffic in report["published"].items():
                 if (topic := bus.topic_of(key)) is not None and topic.name in rows:
-                    rows[topic.name].rates.append(traffic["rate_hz"])
+                    rows[topic.name].rates[key] += traffic["rate_hz"]
             for key, traffic in report["topics"].items():
                 if (topic := bus.topic_of(key.partition(" #")[0])) is not None and topic.name in rows:
                     row = rows[topic.name]

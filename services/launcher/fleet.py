@@ -31,15 +31,19 @@ class ChangeFailed(RuntimeError):
 
 @dataclass(frozen=True)
 class Kind:
-    """How a service's processes are started. beside: whether two may run at once, so that a new one can take over from an old."""
+    """How a service's processes are started. beside: whether two may run at once, so that a new one can take over from an old;
+    is_required: whether the others need one."""
 
     command: list[str]
     restart: str = "always"
     environment: dict[str, str] = field(default_factory=dict)
     beside: bool = True
+    is_required: bool = False
 
     def check(self, service: str, number: int) -> None:
         """Raises ValueError for a number of replicas that cannot be."""
+        if self.is_required and number != 1:
+            raise ValueError(f"{service}: expected 1, got {number}: all other processes meet there")
         most = MOST if self.beside else 1
         if not 0 <= number <= most:
             why = "" if self.beside else ", because it stands for what there is but once"
@@ -104,9 +108,16 @@ class Fleet:
         wait(self.processes, seconds)
 
     def stop(self) -> None:
+        """Ends all, and what the others need last: nobody misses it."""
         if self._forkserver is not None:
             self._forkserver.stop()
-        stop(self.processes)
+        for is_required in (False, True):
+            stop([
+                process
+                for name, group in self._groups.items()
+                if self._kinds[name].is_required == is_required
+                for process in tuple(group)
+            ])  # fmt: skip
 
     # ---- what is asked for on the bus
 
@@ -172,7 +183,7 @@ class Fleet:
 
     def _replace(self, service: str, old: Supervised) -> Iterator[str]:
         if self._kinds[service].beside:  # the old one serves until the new one does
-            new = yield from self._add(service)
+            new = yield from self._add(service, is_afresh=True)
             yield from self._remove(service, old)
         else:
             yield from self._end(old)
@@ -180,7 +191,7 @@ class Fleet:
             group = self._groups[service]
             group[group.index(old)] = new
             self._name()
-            new.start()
+            new.start(is_afresh=True)
             yield from self._until_ready(new)
         new.restarts += old.restarts
 
@@ -191,11 +202,11 @@ class Fleet:
         while len(group) > number:
             yield from self._remove(service, group[-1])
 
-    def _add(self, service: str) -> Generator[str, None, Supervised]:
+    def _add(self, service: str, is_afresh: bool = False) -> Generator[str, None, Supervised]:
         new = self._make(service)
         self._groups[service].append(new)
         self._name()
-        new.start()
+        new.start(is_afresh)
         try:
             yield from self._until_ready(new)
         except ChangeFailed:

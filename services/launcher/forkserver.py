@@ -1,8 +1,8 @@
-"""A process that has imported what the services need, and from which one that died is forked: in some tens of milliseconds, where
-a plain start takes a second or two.
+"""A process that has imported what the services share, and from which they are forked: in some tens of milliseconds, where a
+plain start takes a second or two.
 
     launcher ---- command, environment, stderr ----> fork server ----> in between ----> service
-    launcher <------------------------------- its pid -------------------------------------'
+    launcher <--------------- its pid --------------------'  (the one in between has ended)
     launcher -------------------------------- go ------------------------------------> `python -m MODULE ...`
 
 The one in between ends at once, and the launcher adopts its child: it waits for it, ends it, and takes it along when it ends
@@ -10,6 +10,9 @@ itself, as if it had started it. A service depends on the fork server no longer 
 
 The fork server opens no Zenoh session and has one thread: of a process that is forked only the thread that forks goes on, and
 what another one holds stays locked.
+
+At first it imports what all services share, and is ready: the cell starts from it. When the cell runs, it also imports the
+services themselves, so that one that dies is back at once.
 """
 
 from __future__ import annotations
@@ -30,19 +33,41 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
+ROOT = Path(__file__).parents[2]
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "passive",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
+"""Every process is one worker: pools of threads that spin would take the cores from the others."""
+COMMON = ("shared.runtime.node", "services.flags", "services.run", "prometheus_client")
+"""Imported before the first service is forked. What only some services need they import themselves, side by side."""
 ANSWER_S = 2.0
 """A fork takes some milliseconds, on a machine that is far too busy a second. A fork server that takes longer is ended, and the
 service is started plainly."""
 AGAIN_S = 10.0
 """After which a fork server that ended is started again."""
-MOST_BYTES = 1 << 17
-"""Of a request: the command and the environment."""
+MAX_BYTES = 1 << 17
+"""Size limit of a request: the command and the environment."""
 READY = b"ready"
+IMPORT = b"import"
 GO = b"1"
 
 
+def environment(own: Mapping[str, str] | None = None) -> dict[str, str]:
+    """The environment of the launcher's processes; own: what one of them has besides.
+
+    They import this checkout or installation and nothing from the current folder, whatever it holds.
+    """
+    path = [str(ROOT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    ours = {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(path), "PENUMBRA_PARENT": str(os.getpid())}
+    return {**ONE_THREAD, **os.environ, **ours, **(own or {})}
+
+
 class Forked:
-    """A service that was forked: as much of `subprocess.Popen` as its supervisor needs. stderr: what it says."""
+    """A service that was forked: as much of `subprocess.Popen` as its supervisor needs. stderr: what it writes there."""
 
     def __init__(self, command: list[str], pid: int, stderr: TextIO):
         self.args, self.pid, self.stderr = command, pid, stderr
@@ -68,13 +93,15 @@ class Forked:
 
 
 class ForkServer:
-    """The launcher's side. modules: what is imported before a service is forked. Linux only."""
+    """The launcher's side. common: modules that are imported before it is ready; modules: those that it imports once the cell
+    runs. Linux only: elsewhere it is never ready, and services are started plainly."""
 
-    def __init__(self, modules: Sequence[str], environment: Mapping[str, str]):
-        self._modules, self._environment = modules, environment
+    def __init__(self, common: Sequence[str] = COMMON, modules: Sequence[str] = ()):
+        self.modules = modules
+        self._common = common
         self._popen: subprocess.Popen[bytes] | None = None
         self._channel: socket.socket | None = None
-        self._is_ready = False
+        self._is_ready = self._has_modules = False
         self._due = 0.0
 
     @property
@@ -83,20 +110,49 @@ class ForkServer:
 
     @property
     def is_ready(self) -> bool:
-        """Whether it has imported everything."""
-        if self._channel is not None and not self._is_ready:
+        """Whether a service can be forked now."""
+        return self.wait(0.0)
+
+    @property
+    def has_modules(self) -> bool:
+        """Whether it has imported the services themselves."""
+        return self._has_modules and self.is_ready
+
+    def start(self) -> None:
+        """Starts it. To be called from the main thread, with which the kernel ends it."""
+        if sys.platform != "linux":
+            return
+        PR_SET_CHILD_SUBREAPER = 36
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # adopts what it forks
+        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            self._popen = subprocess.Popen(
+                [sys.executable, "-m", "services.launcher.forkserver", str(theirs.fileno()), *self._common],
+                env=environment(),
+                stdin=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+
+    def wait(self, seconds: float) -> bool:
+        """Whether a service can be forked, at the latest after `seconds`; False at once where it has ended."""
+        if self._channel is not None and not self._is_ready and select.select([self._channel], [], [], seconds)[0]:
             with contextlib.suppress(OSError):
                 self._is_ready = self._channel.recv(len(READY), socket.MSG_DONTWAIT) == READY
         return self._is_ready
 
     def watch(self, is_calm: bool) -> None:
-        """Starts it as soon as nothing else is starting, and again where it has ended. To be called from the main thread, with
-        which the kernel ends it."""
+        """Has it import the services as soon as nothing else is starting (`is_calm`), and starts it again where it has ended. To
+        be called from the main thread."""
         if self._popen is None:
             if is_calm and time.monotonic() >= self._due:
-                self._start()
+                self.start()
         elif self._popen.poll() is not None:
             self.stop()
+        elif is_calm and self.is_ready and not self._has_modules and self._channel is not None:
+            self._has_modules, self._is_ready = True, False
+            with contextlib.suppress(OSError):
+                self._channel.send(b"\n".join([IMPORT, *(module.encode() for module in self.modules)]))
 
     def renew(self) -> None:
         """Lets the next service be forked from what is installed now."""
@@ -105,12 +161,12 @@ class ForkServer:
 
     def stop(self) -> None:
         """Ends it. The services that came from it go on."""
-        if self._channel is not None:
-            self._channel.close()
         if self._popen is not None:
             self._popen.kill()
             self._popen.wait()
-        self._popen, self._channel, self._is_ready = None, None, False
+        if self._channel is not None:
+            self._channel.close()
+        self._popen, self._channel, self._is_ready, self._has_modules = None, None, False, False
         self._due = time.monotonic() + AGAIN_S
 
     def fork(self, command: list[str], environment: Mapping[str, str]) -> Forked | None:
@@ -135,70 +191,59 @@ class ForkServer:
             for descriptor in (*ours, *theirs):
                 os.close(descriptor)
 
-    def _start(self) -> None:
-        PR_SET_CHILD_SUBREAPER = 36
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # adopts what it forks
-        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            self._popen = subprocess.Popen(
-                [sys.executable, "-m", "services.launcher.forkserver", str(theirs.fileno()), *self._modules, ROOM],
-                env={**self._environment, "PENUMBRA_PARENT": str(os.getpid())},
-                stdin=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,
-            )
-
-
-ROOM = " " * 1024
-"""Where a service's command line is written, which is longer than the fork server's."""
-
 
 def main(channel: socket.socket, modules: Sequence[str]) -> None:
     """The fork server, and in its children the service."""
-    _entitle(["python", "-m", "services.launcher.forkserver", *modules])
+    _import(modules)
+    with contextlib.suppress(OSError):  # the launcher has ended
+        channel.send(READY)
+        request = _serve(channel)
+        if request is not None:
+            channel.close()
+            _become(*request)
+
+
+def _import(modules: Sequence[str]) -> None:
     for module in modules:
         with contextlib.suppress(ImportError):  # its service says what is not installed
             importlib.import_module(module)
-    if "numba" in sys.modules:  # the first function of a process makes it load what it knows of types
-        sys.modules["numba"].njit(lambda x: x + 1.0)(1.0)
     threads = os.listdir("/proc/self/task")
     if len(threads) > 1:
-        sys.exit(f"fork server: one thread expected after its imports, {len(threads)} came: services are started plainly")
+        sys.exit(f"fork server: expected one thread after its imports, got {len(threads)}: services are started plainly")
     gc.collect()
     gc.freeze()  # a collection in a child would copy the pages that all share
-    channel.send(READY)
-    request = _serve(channel)
-    if request is not None:
-        _become(channel, *request)
 
 
 def _serve(channel: socket.socket) -> tuple[list[str], dict[str, str], int, int] | None:
     """Forks for every request. In the child: its command, environment, stderr and what to wait for; None at the end."""
     while True:
-        request, descriptors, _, _ = socket.recv_fds(channel, MOST_BYTES, 2)
+        request, descriptors, _, _ = socket.recv_fds(channel, MAX_BYTES, 2)
         if not request:  # the launcher is gone
             return None
+        if request.startswith(IMPORT):
+            _import(request.decode().splitlines()[1:])
+            channel.send(READY)
+            continue
+        read, write = os.pipe()
         between = os.fork()
         if not between:
             if os.fork():
                 os._exit(0)
+            os.setsid()
+            os.write(write, str(os.getpid()).encode())
+            os.close(read)
+            os.close(write)
             asked = json.loads(request)
             return asked["command"], asked["environment"], descriptors[0], descriptors[1]
-        for descriptor in descriptors:
+        os.waitpid(between, 0)  # from now on the launcher is its parent
+        for descriptor in (write, *descriptors):
             os.close(descriptor)
-        os.waitpid(between, 0)
+        channel.send(os.read(read, 32))
+        os.close(read)
 
 
-def _become(channel: socket.socket, command: list[str], environment: dict[str, str], stderr: int, go: int) -> None:
+def _become(command: list[str], environment: dict[str, str], stderr: int, go: int) -> None:
     """Runs `python -m MODULE ...` in this process, once the launcher has adopted it and knows its pid."""
-    os.setsid()
-    deadline = time.monotonic() + ANSWER_S
-    while os.getppid() != int(environment["PENUMBRA_PARENT"]):
-        if time.monotonic() > deadline:
-            os._exit(1)
-        time.sleep(0.0005)
-    channel.send(str(os.getpid()).encode())
-    channel.close()
     if os.read(go, len(GO)) != GO:
         os._exit(1)
     os.close(go)
@@ -206,22 +251,14 @@ def _become(channel: socket.socket, command: list[str], environment: dict[str, s
     os.close(stderr)
     os.environ.clear()
     os.environ.update(environment)
-    _entitle(command)
     module, sys.argv = command[2], command[2:]
     sys.modules.pop(module, None)  # it runs as __main__
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 
-def _entitle(command: Sequence[str]) -> None:
-    """Shows a command line as that of this process, in ps."""
-    fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-    begin, end = int(fields[45]), int(fields[46])  # arg_start and arg_end of proc(5)
-    shown = "\0".join(command).encode()[: end - begin - 1]
-    ctypes.memmove(begin, shown.ljust(end - begin, b"\0"), end - begin)
-
-
 if __name__ == "__main__":
-    from services.command.cli import die_with_parent
+    from services.run import die_with_parent, entitle
 
     die_with_parent()
-    main(socket.socket(fileno=int(sys.argv[1])), sys.argv[2:-1])
+    entitle("penumbra fork server")
+    main(socket.socket(fileno=int(sys.argv[1])), sys.argv[2:])

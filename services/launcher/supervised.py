@@ -12,12 +12,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import psutil
 
-from services.launcher import display
-from services.launcher.forkserver import Forked, ForkServer
+from services.launcher.forkserver import Forked, ForkServer, environment
 from shared.runtime import logs
 
 BACKOFF_S = (0.2, 10.0)
@@ -31,21 +31,25 @@ TERMINATE_S = 1.5
 ASKED_FOR_NOTHING = 2
 """Exit code of a process whose flags, cell or installation cannot work: starting it again changes nothing."""
 
-# Every process is one worker: pools of threads that spin would take the two cores from the others.
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "OMP_WAIT_POLICY": "passive",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
-}
+
+@dataclass(frozen=True)
+class ProcessRow:
+    """What is known of one process. `note` says why it is not running, or not as it should; `cpu`: cores."""
+
+    name: str
+    state: str
+    pid: int | None
+    cpu: float
+    memory_mb: float
+    restarts: int
+    note: str = ""
 
 
 class Supervised:
     """One process that is started, watched and started again.
 
     state: starting, running, waiting (for its next start), failed (it will not be started again), stopping or stopped. is_ready:
-    it does its part for the others. forkserver: where it comes from when it has died, if that is possible.
+    it does its part for the others. forkserver: where it comes from, if that is possible.
     """
 
     def __init__(
@@ -56,7 +60,8 @@ class Supervised:
         environment: dict[str, str] | None = None,
         forkserver: ForkServer | None = None,
     ):
-        self.name, self.command, self.restart = name, command, restart
+        self.service = self.name = name  # several of a service are numbered in their names
+        self.command, self.restart = command, restart
         self.state, self.note, self.restarts = "stopped", "", 0
         self.is_ready = False
         self.popen: subprocess.Popen[str] | Forked | None = None
@@ -81,9 +86,15 @@ class Supervised:
         """Whether it died again and again, and has not run for STABLE_S since."""
         return self._crashes >= CRASH_LOOP
 
-    def start(self) -> None:
-        """Starts it, from the launcher's main thread: the kernel ends it when that thread ends."""
-        popen = subprocess.Popen(
+    def start(self, is_afresh: bool = False) -> None:
+        """Starts it, from the launcher's main thread: the kernel ends it when that thread ends. is_afresh: from what is installed
+        now, and not from the fork server, which has imported what was installed before."""
+        server = None if is_afresh else self._forkserver
+        forked = server.fork(self.command, environment(self._environment)) if server else None
+        self._attend(forked or self._plain())
+
+    def _plain(self) -> subprocess.Popen[str]:
+        return subprocess.Popen(
             self.command,
             env=environment(self._environment),
             stdin=subprocess.DEVNULL,
@@ -92,15 +103,10 @@ class Supervised:
             errors="replace",
             start_new_session=True,  # Ctrl-C reaches the launcher alone, which then stops the others in order
         )
-        self._attend(popen)
 
     def _start_again(self) -> None:
         self.restarts += 1
-        forked = self._forkserver.fork(self.command, environment(self._environment)) if self._forkserver else None
-        if forked is None:
-            self.start()
-        else:
-            self._attend(forked)
+        self.start()
 
     def _attend(self, popen: subprocess.Popen[str] | Forked) -> None:
         """Begins to look after a process that has just begun."""
@@ -217,17 +223,12 @@ class Supervised:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.popen.pid, number)
 
-    def row(self, health: dict[str, Any] | None = None) -> display.ProcessRow:
+    def row(self, health: dict[str, Any] | None = None) -> ProcessRow:
         """For the table; health: its own report, where it gave one."""
         state, note = self.state, self.note
         if state == "running" and health is not None and health["status"] != "ok":
             state, note = health["status"], "; ".join([*([note] if note else []), *health["reasons"]])
-        return display.ProcessRow(self.name, state, self.pid, self.cpu, self.memory_mb, self.restarts, note)
-
-
-def environment(own: dict[str, str]) -> dict[str, str]:
-    """The environment of the launcher's processes; own: what one of them has besides."""
-    return {**ONE_THREAD, **os.environ, **own, "PENUMBRA_PARENT": str(os.getpid())}
+        return ProcessRow(self.name, state, self.pid, self.cpu, self.memory_mb, self.restarts, note)
 
 
 def wait(processes: Iterable[Supervised], seconds: float) -> None:

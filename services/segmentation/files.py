@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
+from services.flags import Parser
 from services.segmentation import inference
 from shared.contract.labels import Label
 from shared.perception.lookout import STEP, Window, whole_frame
@@ -40,7 +41,7 @@ class FileError(ValueError):
 
 def arguments() -> argparse.ArgumentParser:
     """The flags of `penumbra segmentation infer`."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="penumbra segmentation infer",
         description="Write masks and overlays of pictures and films. For NAME.png: NAME_mask.png, one channel of class indices ("
         + ", ".join(f"{label.value} {label.name.lower()}" for label in Label)

@@ -1,4 +1,4 @@
-"""Who may say what on a secured bus: the router's rules, from the one table of topics.
+"""Who may say what on a secured bus: the router's rules, from the tables of topics and of processes.
 
 A certificate's common name is the name of its holder. Sensors and methods publish what the table says, speak for nobody's health
 but their own, and read everything; a viewer only reads and asks; an operator also steers the emulator and the launcher. What no
@@ -10,17 +10,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from shared.contract import topics
+from shared.contract import processes, topics
 from shared.contract.topics import TOPICS, Topic
 
-SERVICES = ("emulator", "skin", "segmentation", "search", "posecnn", "haptics", "fusion", "launcher")
-"""Processes with a health of their own …"""
-ROUTER, OPERATOR, VIEWER = "router", "operator", "viewer"
-"""… the meeting point, which passes on what other routers have let through, and people's commands."""
+SERVICES = tuple(process.name for process in processes.REPORTING)
+"""Processes that publish, answer and report their own health."""
+ROUTER, OPERATOR, VIEWER = processes.ROUTER.name, "operator", "viewer"
+"""The meeting point, which passes on what other routers have let through, and people's commands."""
 HOLDERS = (*SERVICES, ROUTER, OPERATOR, VIEWER)
 
-ANSWERS = {"fusion": topics.current_pose("*", "*"), "emulator": topics.control("*"), "launcher": topics.launcher("*")}
-"""Queryables beside the health, by who answers them."""
+ANSWERS = {
+    process.name: [topics.QUERYABLES[name].format(cell="*", target="*") for name in process.answers]
+    for process in processes.REPORTING
+}
+"""Queryables beside the health, by the process that answers them."""
 EVERYTHING = ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
               "liveliness_token", "liveliness_query", "declare_liveliness_subscriber")  # fmt: skip
 
@@ -54,7 +57,7 @@ def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES)
         own = [
             _rule(f"{service} lives", ["liveliness_token"], [topics.alive("*", service)]),
             _rule(f"{service} answers", ["declare_queryable", "reply"],
-                  [topics.health("*", service), *([ANSWERS[service]] if service in ANSWERS else [])]),
+                  [topics.health("*", service), *ANSWERS.get(service, ())]),
         ]  # fmt: skip
         if says := [topic.at() for topic in table if service in topic.publishers]:
             own.append(_rule(f"{service} publishes", ["put"], says))

@@ -26,8 +26,8 @@ class Priority(Enum):
 @dataclass(frozen=True)
 class Topic:
     """`key` with its {names} to fill in; nominal `rate_hz`; `depth`: samples that a reader keeps while busy;
-    `stale_s`: the age after which a reader calls the topic stale; `publisher`: the service that may publish it, or
-    either of two; `slow_hz`: how often a slow link carries a key's messages, 0 for never (`penumbra router --slow`)."""
+    `stale_s`: the age after which a reader calls the topic stale; `publishers`: the processes (`shared.contract.processes`) that
+    may publish it; `slow_hz`: how often a slow link carries a key's messages, 0 for never (`penumbra router --slow`)."""
 
     name: str
     key: str
@@ -35,16 +35,11 @@ class Topic:
     rate_hz: float
     depth: int
     stale_s: float
-    publisher: str
+    publishers: tuple[str, ...]
     about: str
     priority: Priority
     slow_hz: float
     qos: QoS = QoS.LATEST_WINS
-
-    @property
-    def publishers(self) -> tuple[str, ...]:
-        """The services that may publish it."""
-        return tuple(self.publisher.split(" or "))
 
     @property
     def oldest_s(self) -> float:
@@ -57,39 +52,47 @@ class Topic:
         return self.key.format(**{name: names.get(name, "*") for name in wanted})
 
 
-FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, "emulator", "one RGB image",
+FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, ("emulator",), "one RGB image",
               Priority.IMAGE, 0)  # fmt: skip
-JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, "emulator", "joint angles [rad]",
-               Priority.SIGNAL, 20)  # fmt: skip
-VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1, "emulator or skin",
+JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, ("emulator",),
+               "joint angles [rad]", Priority.SIGNAL, 20)  # fmt: skip
+VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1, ("emulator", "skin"),
                  "electrode amplitudes [V], 1 kHz in batches", Priority.SIGNAL, 0)  # fmt: skip
-TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 50, 16, 0.2, "emulator",
+TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 50, 16, 0.2, ("emulator",),
               "what the emulator knows", Priority.SIGNAL, 5)  # fmt: skip
-MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, "segmentation",
+MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, ("segmentation",),
              "class indices of a window of a frame", Priority.IMAGE, 0)  # fmt: skip
-VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, "search or posecnn",
+VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, ("search", "posecnn"),
                "the camera's pose and covariance", Priority.POSE, 20)  # fmt: skip
-HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 50, 16, 0.1, "haptics",
+HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 50, 16, 0.1, ("haptics",),
                "the skin's pose and information", Priority.POSE, 20)  # fmt: skip
-FUSED = Topic("fused", "penumbra/{cell}/target/{target}/pose/fused", messages.FusedPose, 200, 4, 0.1, "fusion", "the one pose",
+FUSED = Topic("fused", "penumbra/{cell}/target/{target}/pose/fused", messages.FusedPose, 200, 4, 0.1, ("fusion",), "the one pose",
               Priority.POSE, 20)  # fmt: skip
 
 TOPICS = (FRAME, JOINTS, VOLTAGES, TRUTH, MASK, VISION, HAPTIC, FUSED)
 
 
+QUERYABLES = {
+    "current_pose": "penumbra/{cell}/target/{target}/pose",
+    "control": "penumbra/{cell}/sim/control",
+    "launcher": "penumbra/{cell}/launcher/control",
+}
+"""Keys of what processes answer beside their health, by the names that `shared.contract.processes` uses for them."""
+
+
 def current_pose(cell: str, target: str) -> str:
     """Queryable: the current fused pose, MessagePack of FusedPose, or JSON with `?format=json`."""
-    return f"penumbra/{cell}/target/{target}/pose"
+    return QUERYABLES["current_pose"].format(cell=cell, target=target)
 
 
 def control(cell: str) -> str:
     """Queryable of the emulator: what `penumbra sim` asks, JSON in and out."""
-    return f"penumbra/{cell}/sim/control"
+    return QUERYABLES["control"].format(cell=cell)
 
 
 def launcher(cell: str) -> str:
     """Queryable of `penumbra up`: what `penumbra restart` and `penumbra scale` ask, JSON in and out."""
-    return f"penumbra/{cell}/launcher/control"
+    return QUERYABLES["launcher"].format(cell=cell)
 
 
 def alive(cell: str, service: str = "*", instance: str = "*") -> str:

@@ -13,10 +13,10 @@ from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from shared.contract import processes
 from shared.runtime import bus
 
 STATUSES = ("ok", "degraded", "down")
-FUSED_STATES = ("tracking", "coasting", "lost")
 WHO = ("cell", "service", "instance", "host")
 """The labels of every metric."""
 
@@ -61,16 +61,24 @@ def metrics(reports: Iterable[Mapping[str, Any]]) -> Iterator[Metric]:
             _traffic(families, "received", who, key, traffic)
         for key, traffic in report["published"].items():
             _traffic(families, "published", who, key, traffic)
-        if report["service"] == "launcher":
-            for process, row in report.get("report", {}).get("processes", {}).items():
-                families.counter("restarts", "times that a process was started again", who, row["restarts"], process=process)
-                families.gauge("running", "1 for a process that answers", who, row["state"] == "running", process=process)
-        if report["service"] == "fusion":
-            for target, row in report.get("report", {}).items():
-                for state in FUSED_STATES:
-                    is_it = row["state"] == state
-                    families.gauge("fused_state", "1 for the state of the target's pose", who, is_it, target=target, state=state)
+        _own(families, who, report)
     return iter(families)
+
+
+def _own(families: _Families, who: tuple[str, ...], report: Mapping[str, Any]) -> None:
+    """The metrics of a service's own report that its row of the table of processes names."""
+    process = processes.find(report["service"])
+    told = report.get("report", {})
+    for metric in process.metrics if process else ():
+        for entry, row in (told.get(metric.within, {}) if metric.within else told).items():
+            label = {metric.each: entry}
+            if metric.is_counter:
+                families.counter(metric.name, metric.about, who, row[metric.field], **label)
+            elif metric.values:
+                for value in metric.values:
+                    families.gauge(metric.name, metric.about, who, row[metric.field] == value, **label, **{metric.field: value})
+            else:
+                families.gauge(metric.name, metric.about, who, row[metric.field], **label)
 
 
 def _traffic(families: _Families, way: str, who: tuple[str, ...], key: str, traffic: Mapping[str, Any]) -> None:

@@ -149,8 +149,11 @@ class Node:
 
     @contextmanager
     def until_signal(self) -> Iterator[None]:
-        """Within it SIGINT and SIGTERM set `stopping`; at its end the node is closed."""
-        previous = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        """Within it SIGINT, SIGTERM and SIGHUP (a terminal that is closed) set `stopping`; at its end the node is closed."""
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # else: run by nohup
+            numbers.append(signal.SIGHUP)
+        previous = {number: signal.signal(number, self._on_signal) for number in numbers}
         try:
             yield
         finally:
@@ -450,7 +453,7 @@ class Node:
 
     def fault(self, where: str, error: Exception) -> None:
         """Counts an exception; the first of its kind and place is logged with its trace. Raises a MemoryError again: what is out
-        of memory does nothing well any more, and ends to begin anew (`services.command.cli.serve`)."""
+        of memory does nothing well any more, and ends to begin anew (`services.run.serve`)."""
         if isinstance(error, MemoryError):
             raise error
         frames = traceback.extract_tb(error.__traceback__)

@@ -8,7 +8,6 @@ bench segmentation` does. It says which variant learns faster, not what each can
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 from dataclasses import replace
@@ -20,6 +19,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from services.flags import Parser, above_zero, positive
 from services.segmentation import inference
 from services.segmentation.prednet import Settings
 from services.segmentation.training import evaluate, train
@@ -72,9 +72,9 @@ def score(trainer: train.Trainer, data: train.Data, seed: int) -> dict[str, Any]
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench ablation", description=__doc__)
-    parser.add_argument("--minutes", type=float, default=7.0, help="training of the first variant (default: 7)")
-    parser.add_argument("--steps", type=int, help="steps of every variant instead")
+    parser = Parser(prog="penumbra bench ablation", description=__doc__)
+    parser.add_argument("--minutes", type=above_zero, default=7.0, help="training of the first variant (default: 7)")
+    parser.add_argument("--steps", type=positive, help="steps of every variant instead")
     parser.add_argument("--seed", type=int, default=1, help="draws weights, training data and, far away, held-out data")
     parser.add_argument("--cache", type=Path, help="folder of rendered sequences (default: rendered anew, then deleted)")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")

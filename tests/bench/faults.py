@@ -24,11 +24,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from services.flags import Parser
 from shared.cell import description as cells
 from shared.contract import topics
 from shared.contract.topics import Topic
 from tests.support import injected, observed
-from tests.support.live import Running, penumbra_up, wait_for
+from tests.support.live import Running, penumbra_up, service_of, wait_for
 
 SERVICES = ("emulator", "segmentation", "search", "haptics", "fusion")
 REPLICATED = SERVICES[1:]
@@ -135,8 +136,7 @@ def _memory(chain: Chain, process: psutil.Process) -> AbstractContextManager[Non
 
 @contextmanager
 def _crash_loop(chain: Chain, process: psutil.Process) -> Iterator[None]:
-    words = process.cmdline()
-    service = words[words.index("services.command.cli") + 1]
+    service = service_of(process) or ""
     spared = {each.pid for each in chain.instances(service)} - {process.pid}
     with injected.crash_loop(lambda: [each for each in chain.instances(service) if each.pid not in spared]):
         yield
@@ -314,7 +314,7 @@ def show(rows: Sequence[Row], console: Console) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench faults", description=__doc__)
+    parser = Parser(prog="penumbra bench faults", description=__doc__)
     parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
     parser.add_argument("--seed", type=int, default=1, help="draws motion and appearance")
     parser.add_argument("--json", type=Path, help="write the numbers to this file, after every row")

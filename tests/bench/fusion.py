@@ -22,7 +22,6 @@ and the average hold the newest measurement of each sense, gtsam's smoother and 
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import time
@@ -38,6 +37,7 @@ from rich.progress import Progress
 from rich.table import Table
 from scipy.stats import chi2
 
+from services.flags import Parser, above_zero, positive
 from services.fusion.estimate import SOURCES, Estimate
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
@@ -435,11 +435,11 @@ def _marked(text: str, reached: bool) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench fusion", description=__doc__)
+    parser = Parser(prog="penumbra bench fusion", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="draws limbs, errors and delays")
-    parser.add_argument("--runs", type=int, default=100, help="of each situation (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=20.0, help="length of a run (default: %(default)s)")
-    parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("--runs", type=positive, default=100, help="of each situation (default: %(default)s)")
+    parser.add_argument("--seconds", type=above_zero, default=20.0, help="length of a run (default: %(default)s)")
+    parser.add_argument("--jobs", type=positive, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)
     found = measured(options.seed, options.runs, options.seconds, options.jobs, Console(stderr=True))

@@ -11,7 +11,6 @@ limbs that move through all gaps, and things that are no limb.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -28,6 +27,7 @@ from rich.table import Table
 from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
+from services.flags import Parser
 from services.fusion.observer import ErrorStateObserver
 from services.haptics import paper_network
 from services.haptics.batches import Collector
@@ -539,7 +539,7 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench haptics", description=(__doc__ or "").partition("\n\n")[0])
+    parser = Parser(prog="penumbra bench haptics", description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--picture", type=Path, help="draw error against gap here (PNG, PDF or SVG)")

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from services.flags import Parser, above_zero
 from shared.cell import description as cells
 from shared.contract import messages, topics
 from tests.support.live import penumbra_up, wait_for
@@ -218,9 +219,9 @@ def show_errors(result: dict[str, Any], console: Console) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench live", description=__doc__)
+    parser = Parser(prog="penumbra bench live", description=__doc__)
     parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of the measurement")
+    parser.add_argument("--seconds", type=above_zero, default=60.0, help="length of the measurement")
     parser.add_argument("--seed", type=int, default=1, help="draws motion, occlusion and appearance")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     parser.add_argument("--up", nargs=argparse.REMAINDER, default=[], help="further arguments for `penumbra up` (last)")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -20,6 +19,7 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial import cKDTree
 
+from services.flags import Parser, positive
 from services.search.evidence import Intrinsics
 from services.search.objects.pose import RigidObject, find_pose
 from shared.body.anatomy import Mesh
@@ -429,9 +429,9 @@ def averages(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench objects", description=__doc__)
+    parser = Parser(prog="penumbra bench objects", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="draws poses, masks and starts")
-    parser.add_argument("--starts", type=int, default=30, help="of each object, mask and distance")
+    parser.add_argument("--starts", type=positive, default=30, help="of each object, mask and distance")
     parser.add_argument("--objects", nargs="+", choices=MAKERS, default=list(MAKERS), metavar="NAME", help=", ".join(MAKERS))
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)

@@ -6,7 +6,6 @@ runs are kept in FOLDER/runs: a run that was killed goes on where it was.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
+from services.flags import Parser
 from sim.sets import trial
 from tests.bench import table1
 from tests.bench.lib import campaign, curves, page, pictures, trials
@@ -55,7 +55,7 @@ def draw(found: dict[str, Any], results: Sequence[trials.Played], others: Sequen
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench paper", description=(__doc__ or "").partition("\n\n")[0])
+    parser = Parser(prog="penumbra bench paper", description=(__doc__ or "").partition("\n\n")[0])
     table1.arguments(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where pictures, data and index.html go")
     options = parser.parse_args(argv)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from pathlib import Path
 
 from rich.console import Console
 
+from services.flags import Parser, above_zero
 from shared.cell import description as cells
 from shared.contract import topics
 from sim.world.world import record
@@ -17,9 +17,9 @@ from tests.support.replay import SERVICES, Replay
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench replay", description=__doc__)
+    parser = Parser(prog="penumbra bench replay", description=__doc__)
     parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of the recording")
+    parser.add_argument("--seconds", type=above_zero, default=60.0, help="length of the recording")
     parser.add_argument("--seed", type=int, default=1, help="draws motion, occlusion and appearance")
     parser.add_argument("--skip", type=float, default=2.0, help="seconds at the start that are not scored")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")

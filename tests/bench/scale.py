@@ -7,7 +7,6 @@ counters.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -23,6 +22,7 @@ import zenoh
 from rich.console import Console
 from rich.table import Table
 
+from services.flags import Parser, above_zero
 from shared.cell import description as cells
 from shared.contract import messages, topics
 from shared.runtime import bus
@@ -216,10 +216,12 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench scale", description=__doc__)
+    parser = Parser(prog="penumbra bench scale", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="draws motion, occlusion and appearance")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of each cell's measurement (default: %(default)s)")
-    parser.add_argument("--rate", type=float, metavar="HZ", help="of the cameras (default: as in the table cell)")
+    parser.add_argument(
+        "--seconds", type=above_zero, default=10.0, help="length of each cell's measurement (default: %(default)s)"
+    )
+    parser.add_argument("--rate", type=above_zero, metavar="HZ", help="of the cameras (default: as in the table cell)")
     parser.add_argument("--quick", action="store_true", help="small cells, one replica, few rounds: shows that it works")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)

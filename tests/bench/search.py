@@ -9,7 +9,6 @@ it out.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -25,6 +24,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, rankdata
 
+from services.flags import Parser, positive
 from services.search.mask_fit import Noise
 from services.search.tracker import Search, Searched
 from services.segmentation.inference import Segmenter, load_segmenter
@@ -541,9 +541,9 @@ def _goal(row: dict[str, Any], paper: dict[str, Any] | None) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench search", description=__doc__)
+    parser = Parser(prog="penumbra bench search", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="draws scenes and starts")
-    parser.add_argument("--frames", type=int, help=f"scenes of each row (default {FULL.scenes}; at least 200 for the NEES)")
+    parser.add_argument("--frames", type=positive, help=f"scenes of each row (default {FULL.scenes}; at least 200 for the NEES)")
     parser.add_argument("--quick", action="store_true", help="a few scenes of everything, to see that it runs")
     parser.add_argument("--domain", choices=("wide", "easy"), default="wide", help="looks of the network's scenes")
     parser.add_argument("--parts", nargs="+", choices=("exact", "network", "judged"), default=["exact", "network", "judged"])

@@ -8,7 +8,6 @@ stand for, at poses and sizes that they were not fitted to. `--seed` draws those
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -20,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import brentq, least_squares
 
+from services.flags import Parser, positive
 from services.skin import model
 from shared.body.anatomy import Mesh, target_mesh
 from shared.cell import description as cells
@@ -167,9 +167,9 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench skin", description=__doc__)
+    parser = Parser(prog="penumbra bench skin", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="draws the poses of the live comparison")
-    parser.add_argument("--poses", type=int, default=160, help="for each gap of the live comparison (default: %(default)s)")
+    parser.add_argument("--poses", type=positive, default=160, help="for each gap of the live comparison (default: %(default)s)")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)
     table, arm = cells.load("table"), cells.load("arm")

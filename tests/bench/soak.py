@@ -9,7 +9,6 @@ shows as in a day, one of a message as in `--minutes`; growth is given per hour 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -29,10 +28,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from services.flags import Parser, above_zero
 from shared.cell import description as cells
 from shared.contract import topics
 from tests.support import injected
-from tests.support.live import Running, connect, penumbra_up, wait_for
+from tests.support.live import Running, connect, penumbra_up, service_of, wait_for
 
 DAY_S = 86_400.0
 SAMPLE_S = 5.0
@@ -203,10 +203,8 @@ class Gauge:
             yield "router", psutil.Process(self._router.popen.pid)
         with suppress(psutil.NoSuchProcess):
             for child in self._launcher.children():
-                with suppress(psutil.NoSuchProcess):
-                    words = child.cmdline()
-                    if "services.command.cli" in words:
-                        yield words[words.index("services.command.cli") + 1], child
+                if name := service_of(child):
+                    yield name, child
 
     def rows(self, warm_up_s: float) -> list[Row]:
         """By service, what grew after the warm-up of each process."""
@@ -309,11 +307,13 @@ def show(result: dict, console: Console) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench soak", description=__doc__)
+    parser = Parser(prog="penumbra bench soak", description=__doc__)
     parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
     parser.add_argument("--seed", type=int, default=1, help="draws motion and what happens")
-    parser.add_argument("--minutes", type=float, default=30.0, help="how long (default: %(default)g, a day at --speed 48)")
-    parser.add_argument("--speed", type=float, default=48.0, help="events, times as often as on a day (default: %(default)g)")
+    parser.add_argument("--minutes", type=above_zero, default=30.0, help="how long (default: %(default)g, a day at --speed 48)")
+    parser.add_argument(
+        "--speed", type=above_zero, default=48.0, help="events, times as often as on a day (default: %(default)g)"
+    )
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)
     result = soak(options.cell, options.seed, options.minutes, options.speed)

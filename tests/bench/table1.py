@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from services.flags import Parser, positive
 from sim.sets import trial
 from sim.sets.trial import SETTINGS, Setting
 from tests.bench.lib import campaign, trials
@@ -256,13 +257,13 @@ def measure(options: argparse.Namespace, folder: Path, progress: Progress) -> tu
 def arguments(parser: argparse.ArgumentParser) -> None:
     """The flags that `penumbra bench paper` has too."""
     parser.add_argument("--seed", type=int, default=1, help="draws persons, motions, looks, occluders and the camera's places")
-    parser.add_argument("--trials", type=int, default=TRIALS, help="runs of each cell of the table (default: %(default)s)")
+    parser.add_argument("--trials", type=positive, default=TRIALS, help="runs of each cell of the table (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="one short run a cell: whether it runs, no numbers to believe")
-    parser.add_argument("--jobs", type=int, default=2, help="processes, each on one core (default: %(default)s)")
+    parser.add_argument("--jobs", type=positive, default=2, help="processes, each on one core (default: %(default)s)")
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench table1", description=(__doc__ or "").partition("\n\n")[0])
+    parser = Parser(prog="penumbra bench table1", description=(__doc__ or "").partition("\n\n")[0])
     arguments(parser)
     parser.add_argument("--resume", type=Path, metavar="FOLDER", help="keep finished runs here, and take those that are there")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")

@@ -7,7 +7,6 @@ own poses (errors, false reports of tracking, frames until recovered), and the f
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from services.flags import Parser, above_zero, positive
 from shared.contract import topics
 from shared.contract.messages import Frame, FusedPose, Message, VisionPose
 from shared.contract.topics import Topic
@@ -186,10 +186,10 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="penumbra bench tracking", description=__doc__)
+    parser = Parser(prog="penumbra bench tracking", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="draws persons, motions, occluders and looks")
-    parser.add_argument("--films", type=int, default=4, help="films with each background")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of a film")
+    parser.add_argument("--films", type=positive, default=4, help="films with each background")
+    parser.add_argument("--seconds", type=above_zero, default=10.0, help="length of a film")
     parser.add_argument("--quick", action="store_true", help="one film of 4 s each, to see that it runs")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)

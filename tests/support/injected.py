@@ -22,7 +22,7 @@ import psutil
 import zenoh
 
 from shared.contract import messages, topics
-from tests.support.live import Running, free_port, penumbra_up
+from tests.support.live import Running, free_port, penumbra_up, service_of
 
 CLOCK_SOURCE = Path(__file__).parent / "clock_shift.c"
 PIDS = 1 << 22
@@ -338,12 +338,7 @@ def breakable(cell: str, seed: int, *arguments: str) -> Iterator[Breakable]:
 
 
 def instances(launcher: psutil.Process, service: str) -> list[psutil.Process]:
-    """The running processes of a service, by their command lines."""
-    found = []
+    """The running processes of a service, by their titles."""
     with suppress(psutil.NoSuchProcess):
-        for child in launcher.children(recursive=True):
-            with suppress(psutil.NoSuchProcess):
-                words = child.cmdline()
-                if "services.command.cli" in words and words[words.index("services.command.cli") + 1] == service:
-                    found.append(child)
-    return found
+        return [child for child in launcher.children(recursive=True) if service_of(child) == service]
+    return []

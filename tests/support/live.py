@@ -20,7 +20,7 @@ import psutil
 import zenoh
 
 from shared.cell import description as cells
-from shared.contract import messages, topics
+from shared.contract import messages, processes, topics
 
 
 def wait_for(condition: Callable[[], Any], seconds: float, what: str, interval: float = 0.02) -> Any:
@@ -99,18 +99,22 @@ class Running:
         return {item["service"]: item for item in found}
 
     def processes(self) -> dict[str, psutil.Process]:
-        """The launcher and its services by name, from their command lines."""
+        """The launcher and its services by name, from their titles."""
         launcher = psutil.Process(self.launcher.pid)
         out = {"launcher": launcher}
         for child in launcher.children(recursive=True):
-            try:
-                words = child.cmdline()
-            except psutil.NoSuchProcess:  # it has ended since
-                continue
-            if "services.command.cli" in words:
-                name = words[words.index("services.command.cli") + 1]
+            if name := service_of(child):
                 out[name if name not in out else f"{name}-{child.pid}"] = child
         return out
+
+
+def service_of(process: psutil.Process) -> str | None:
+    """The service that a process runs, by its title; None for any other process, one that has ended, and one that only begins."""
+    try:
+        words = " ".join(process.cmdline()).split()
+    except psutil.NoSuchProcess:
+        return None
+    return words[1] if len(words) > 1 and words[0] == "penumbra" and processes.find(words[1]) else None
 
 
 @contextmanager

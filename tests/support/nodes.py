@@ -13,8 +13,7 @@ import time
 
 import numpy as np
 
-from services import flags
-from services.command import cli
+from services import flags, run
 from shared.cell import description as cells
 from shared.contract import messages, topics
 from shared.runtime import bus, logs
@@ -78,7 +77,7 @@ def main() -> None:
     node = Node(sys.argv[1], cells.load(options.cell), bus.connection(options))
     start(node)
     node.run()
-    sys.exit(cli.leave())
+    sys.exit(run.leave())
 
 
 if __name__ == "__main__":

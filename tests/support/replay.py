@@ -104,7 +104,7 @@ class Replay:
         self.heard.append(Heard(self.now_ns, topic, names, message))
         for wanted, chosen, handler in self._listeners:
             if wanted is topic and chosen.items() <= names.items():
-                handler(message, names | {"publisher": topic.publisher})
+                handler(message, names | {"publisher": topic.publishers[0]})
 
 
 class ReplayNode:

@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from services.flags import Parser, positive
 from services.posecnn import network, patch
 from services.posecnn.estimator import WEIGHTS
 from services.posecnn.network import REFERENCE_PX, STRIDE, Network, Settings, proportions
@@ -307,13 +308,13 @@ def export(trainer: Trainer, out: Path, each: int) -> dict[str, Any]:
 
 def arguments() -> argparse.ArgumentParser:
     """The flags of `penumbra posecnn train`."""
-    parser = argparse.ArgumentParser(prog="penumbra posecnn train", description="Train PoseCNN on simulated pictures.")
+    parser = Parser(prog="penumbra posecnn train", description="Train PoseCNN on simulated pictures.")
     training.add_arguments(parser, "posecnn", 75.0)
     parser.add_argument("--cache", type=Path, default=Path("posecnn-data"), help="folder of rendered pictures (6 GB)")
     parser.add_argument(
         "--out", type=Path, default=WEIGHTS, help="the weights, their card beside them (default: the committed ones)"
     )
-    parser.add_argument("--held-out", type=int, default=500, help="pictures for the calibration, and as many for the score")
+    parser.add_argument("--held-out", type=positive, default=500, help="pictures for the calibration, and as many for the score")
     return parser
 
 

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from services.flags import Parser, positive
 from services.segmentation import inference, prednet
 from services.segmentation.prednet import PredNet, Settings
 from services.segmentation.training import loss, recordings
@@ -281,7 +282,7 @@ def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
 
 def arguments() -> argparse.ArgumentParser:
     """The flags of `penumbra segmentation train`."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="penumbra segmentation train",
         description="Train the segmentation network on simulated sequences, or on your own frames and masks.",
         epilog=recordings.__doc__,
@@ -304,7 +305,9 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument(
         "--out", type=Path, help="the weights, their card beside them (default: the committed ones; with --data segmentation.npz)"
     )
-    parser.add_argument("--held-out", type=int, default=60, help="simulated sequences for calibration, and as many for the score")
+    parser.add_argument(
+        "--held-out", type=positive, default=60, help="simulated sequences for calibration, and as many for the score"
+    )
     return parser
 
 

@@ -20,13 +20,13 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import track
 from scipy.spatial import cKDTree
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from services import flags
+from services.progress import track
 from services.skin.calibration import calibrate, law, recording
 from services.skin.calibration.law import RecordingError
 from services.skin.calibration.recording import Recording
@@ -134,8 +134,7 @@ def emulated(cell: cells.Cell, pad: str, target: str, samples: int, step: float,
 
     kind = cell.pads[pad].type
     poses = characterisation.poses(cell, target, kind, step)[:: max(1, sparse)]
-    show = lambda held: iter(track(held, "fields", console=Console(stderr=True)))  # noqa: E731
-    volts = characterisation.measure(cell, target, kind, poses, samples, seed, show)
+    volts = characterisation.measure(cell, target, kind, poses, samples, seed, lambda held: track(held, "fields"))
     counts = [len(rows) for rows in volts]
 
     def spread(values: Iterable[Any], kind: Any) -> NDArray:
@@ -172,7 +171,7 @@ def characterise(cell: cells.Cell, pad: str, recorded: Recording, out: Path) -> 
     grid = _grid(near)
     points = _points(near.gap, near.angle)
     models: list[Regression] = []
-    for k, name in enumerate(track(fits, "regression", console=Console(stderr=True))):
+    for k, name in enumerate(track(fits, "regression")):
         models.append(Regression(points, near.signal[:, k], near.deviation[:, k]))
         kept = np.arange(len(near.gap)) % HELD_OUT != HELD_OUT // 2
         part = Regression(points[kept], near.signal[kept, k], near.deviation[kept, k], models[-1].kernel)
@@ -275,7 +274,7 @@ def _plane(out: Path, part: str, scan: Places, names: list[str], noise: Array) -
     xs, ys = (np.linspace(axis.min(), axis.max(), 80) for axis in (scan.x, scan.y))
     fine = np.stack([grid.ravel() for grid in np.meshgrid(xs, ys)], axis=1)
     models: list[Regression] = []
-    for k, _ in enumerate(track(names, f"plane, {part}", console=Console(stderr=True))):
+    for k, _ in enumerate(track(names, f"plane, {part}")):
         models.append(Regression(points, scan.signal[:, k], scan.deviation[:, k], models[0].kernel if models else None))
     with (out / f"plane_{part}.csv").open("w", newline="") as file:
         writer = csv.writer(file)

@@ -103,7 +103,9 @@ def test_a_missing_package_is_one_line_with_the_extra_that_installs_it():
 
 def test_an_import_error_in_our_own_code_is_not_explained_away():
     with pytest.raises(ImportError):
-        cli._explain_import("fusion", ImportError("cannot import name 'x' from 'shared.runtime.bus'", name="shared.runtime.bus"))
+        cli._explain_import(
+            "fusion", [], ImportError("cannot import name 'x' from 'shared.runtime.bus'", name="shared.runtime.bus")
+        )
 
 
 def test_help_lists_every_command(capsys):
@@ -238,9 +240,9 @@ def test_what_is_compiled_runs_also_where_there_is_no_room_to_keep_it(tmp_path):
     code = """
 import sys
 import numba
-from services import cli
+from services import run
 if "mended" in sys.argv:
-    cli._compile_on_full_disk()
+    run._compile_on_full_disk()
 @numba.njit(cache=True)
 def more(x):
     return x + 1

@@ -18,6 +18,7 @@ from services.command import certs, cli
 from services.launcher import launch
 from shared.cell import description as cells
 from shared.contract import access, messages, topics
+from shared.contract.processes import PROCESSES
 from shared.runtime import bus
 from shared.runtime.node import Node
 from tests.support.live import free_port, wait_for
@@ -366,23 +367,23 @@ def test_the_switch_is_a_flag_or_the_environment_and_off_without(folder, monkeyp
 
 def test_the_launcher_stays_on_loopback_unless_secured_and_hands_the_switch_on(folder):
     def options(**changed):
-        plain = {"connect": None, "port": 7, "secure": None, "replicas": [], "vision": "procnet", "cell": "table"}
+        plain = {"connect": [], "port": 7, "secure": None, "replicas": [], "vision": "procnet", "cell": "table"}
         flags = {"seed": None, "observer": None, "method": None, "log_level": "info", "log_format": "text"}
         return argparse.Namespace(**{**plain, **flags, **changed})
 
-    assert (launch.listening(options()), launch.meeting_point(options())) == ("tcp/127.0.0.1:7", "tcp/127.0.0.1:7")
+    assert (launch.listening(options()), launch.meeting_points(options())) == ("tcp/127.0.0.1:7", ("tcp/127.0.0.1:7",))
     secured = options(secure=folder)
-    assert (launch.listening(secured), launch.meeting_point(secured)) == ("tls/0.0.0.0:7", "tls/127.0.0.1:7")
-    for process in launch.fleet(CELL, secured, launch.meeting_point(secured)).processes:
+    assert (launch.listening(secured), launch.meeting_points(secured)) == ("tls/0.0.0.0:7", ("tls/127.0.0.1:7",))
+    for process in launch.fleet(CELL, secured).processes:
         at = process.command.index("--secure")
         assert process.command[at + 1] == str(folder)
-    assert not any("--secure" in process.command for process in launch.fleet(CELL, options(), "tcp/127.0.0.1:7").processes)
+    assert not any("--secure" in process.command for process in launch.fleet(CELL, options()).processes)
 
 
 def test_every_process_of_the_launcher_and_every_publisher_has_a_certificate():
     publishers = {name for topic in topics.TOPICS for name in topic.publishers}
     assert publishers <= set(access.SERVICES)
-    assert {process.name for process in launch.PROCESSES} <= set(access.HOLDERS)
+    assert {process.name for process in PROCESSES} <= set(access.HOLDERS)
 
 
 # ---- penumbra certs

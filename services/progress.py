@@ -1,0 +1,29 @@
+"""How far a long command is: a bar on a terminal, and a line now and then where its output goes to a file or a pipe."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Collection, Iterator
+from typing import TypeVar
+
+T = TypeVar("T")
+LINE_S = 10.0
+"""Between two lines."""
+
+
+def track(items: Collection[T], what: str) -> Iterator[T]:
+    """The items, one after another, while standard error shows how many of them are done."""
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import track
+
+        yield from track(items, what, console=Console(stderr=True))
+        return
+    due = 0.0
+    for k, item in enumerate(items):
+        if (now := time.monotonic()) >= due:
+            print(f"{what}: {k} of {len(items)}", file=sys.stderr, flush=True)
+            due = now + LINE_S
+        yield item
+    print(f"{what}: {len(items)} of {len(items)}", file=sys.stderr, flush=True)

@@ -1,0 +1,111 @@
+"""What a process does before, while and after it runs a service: it ends with its launcher, and with the first of its threads
+that fails."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import logging
+import os
+import signal
+import sys
+import threading
+from typing import Any
+
+SWITCH_S = 0.0005
+"""A reader thread waits at most this long for a computing one; Python's 5 ms would be half of the skin's period."""
+
+
+def serve(name: str, argv: list[str]) -> int:
+    """Runs one service until SIGINT or SIGTERM; returns its exit code."""
+    die_with_parent()
+    entitle(" ".join(["penumbra", name, *argv]))
+    sys.setswitchinterval(SWITCH_S)
+    from services import flags
+    from shared.cell import description
+    from shared.contract import processes
+    from shared.runtime import bus, logs
+    from shared.runtime.node import Node
+
+    process = processes.find(name)
+    assert process is not None, f"{name} is not in the table of processes"
+    module = importlib.import_module(process.module)
+    _compile_on_full_disk()
+    parser = flags.parser(name, module.__doc__ or process.about)
+    flags.add_metrics(parser)
+    module.arguments(parser)
+    options = parser.parse_args(argv)
+    options.mode = options.mode or getattr(module, "MODE", None)
+    logs.configure(options.log_level, options.log_format, name)
+    _die_with_thread()
+    node = Node(module.NAME, description.load(options.cell), bus.connection(options))
+    with flags.metrics(parser, options.metrics_port, lambda: [node.health()]):
+        module.start(node, options)
+        node.run()
+    return leave()
+
+
+def leave() -> int:
+    """Lets a process end whose node has run."""
+    if threading.active_count() > 1:  # something hangs: it must not keep the process, even if Zenoh cannot clean /dev/shm then
+        logging.shutdown()
+        sys.stdout.flush()
+        os._exit(0)
+    return 0
+
+
+def entitle(title: str) -> None:
+    """Shows a title as the command line of this process, in ps and top."""
+    import setproctitle
+
+    setproctitle.setproctitle(title)
+
+
+def die_with_parent() -> None:
+    """Ties a process to the launcher that started it: it must not stay behind, even if the launcher is killed with SIGKILL."""
+    parent = os.environ.get("PENUMBRA_PARENT")
+    if parent is None:
+        return
+    if sys.platform == "linux":
+        PR_SET_PDEATHSIG = 1
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != int(parent):  # it died before we asked
+        sys.exit(1)
+
+
+def _die_with_thread() -> None:
+    """Ends the process with the first of its threads that fails: it would look alive and do a part of its work only. Whoever
+    started it starts it again. A thread without the memory to begin is one, for which its starter would wait for ever."""
+    tell, tell_unraisable = threading.excepthook, sys.unraisablehook
+
+    def end(failed: threading.ExceptHookArgs) -> None:
+        try:
+            tell(failed)
+        finally:  # also without memory for words
+            os._exit(1)
+
+    def end_without_memory(failed: sys.UnraisableHookArgs) -> None:
+        try:
+            tell_unraisable(failed)
+        finally:
+            if failed.exc_type is MemoryError:
+                os._exit(1)
+
+    threading.excepthook, sys.unraisablehook = end, end_without_memory
+
+
+def _compile_on_full_disk() -> None:
+    """Lets numba go on where there is no room to keep what it has compiled: it would fail, and the service with it."""
+    if "numba" not in sys.modules:
+        return
+    from numba.core.caching import IndexDataCacheFile
+
+    from shared.runtime import logs
+
+    save = IndexDataCacheFile.save
+
+    def save_where_there_is_room(file: IndexDataCacheFile, key: Any, data: Any) -> None:
+        with logs.lost_where_full():
+            save(file, key, data)
+
+    IndexDataCacheFile.save = save_where_there_is_room  # type: ignore[method-assign]

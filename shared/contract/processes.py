@@ -1,0 +1,216 @@
+"""The one table of processes. Launcher, command line, access rules, doctor and metrics are derived from it; import contracts,
+Dockerfile and compose file are tested against it.
+
+To add a service, add a row here and a folder `services/NAME` whose `service.py` has NAME, `arguments` and `start`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from shared.cell.description import Cell
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A command beside a service, such as `penumbra segmentation train`. `function`: `MODULE:FUNCTION`, called with the arguments
+    that follow; `extra`: what it needs of `pip install -e '.[EXTRA]'`."""
+
+    name: str
+    function: str
+    extra: str
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A flag of a service that `penumbra up` takes too and passes on. `choices`: its values, where they are few."""
+
+    name: str
+    about: str
+    choices: tuple[str, ...] = ()
+    type: type[int] | type[str] = str
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number in a service's own health report that becomes a metric, one per entry of the report.
+
+    `name`: of the metric; `each`: the label that names the entry; `field`: where the number is; `within`: the part of the report
+    that holds the entries, empty for the whole; `values`: the words that the field can be, each of which becomes a gauge of 0
+    or 1; `is_counter`: whether it only grows.
+    """
+
+    name: str
+    about: str
+    each: str
+    field: str
+    within: str = ""
+    values: tuple[str, ...] = ()
+    is_counter: bool = False
+
+
+@dataclass(frozen=True)
+class Process:
+    """One row of the table.
+
+    `about`: the line of `penumbra --help`; `extra`: what it needs of `pip install -e '.[EXTRA]'`; `needs`: the part of the cell
+    without which it has nothing to do; `vision`: the way to see that it belongs to, None where to all; `replicas`: how many
+    `penumbra up` starts; `restart`: whether one that died is started again; `flags`: those that `penumbra up` passes on;
+    `beside`: whether a second one may run, which shares the streams with the first; `is_required`: whether the cell is cut off
+    without it; `tools`: commands beside the service; `trained_by`: the tool that makes its weights; `answers`: names of the
+    queryables that it answers beside its health (`shared.contract.topics.QUERYABLES`); `metrics`: what of its report becomes
+    metrics; `in_compose`: whether `docker compose` runs it; `imports_sim`: whether its image holds the simulated world.
+    """
+
+    name: str
+    about: str
+    extra: str
+    needs: Literal["cameras", "pads", "sim"] | None = None
+    vision: str | None = None
+    replicas: int = 1
+    restart: Literal["always", "never"] = "always"
+    flags: tuple[Flag, ...] = ()
+    beside: bool = True
+    is_required: bool = False
+    tools: tuple[Tool, ...] = ()
+    trained_by: str | None = None
+    answers: tuple[str, ...] = ()
+    metrics: tuple[Metric, ...] = ()
+    in_compose: bool = True
+    imports_sim: bool = False
+
+    @property
+    def module(self) -> str:
+        """The module that wires it to the bus."""
+        return f"services.{self.name}.service"
+
+    def is_needed(self, cell: Cell) -> bool:
+        """Whether the cell has what this process works on."""
+        return self.needs is None or bool(getattr(cell, self.needs))
+
+
+PROCESSES = (
+    Process(
+        "router",
+        "the meeting point of all processes",
+        extra="router",
+        beside=False,
+        is_required=True,
+    ),
+    Process(
+        "emulator",
+        "a simulated cell: frames, joints, skin and truth",
+        extra="emulator",
+        needs="sim",
+        flags=(Flag("seed", "of the emulator", type=int),),
+        beside=False,
+        answers=("control",),
+        imports_sim=True,
+    ),
+    Process(
+        "segmentation",
+        "frames to masks (`segmentation infer`: of files; `segmentation train`: learn the network again)",
+        extra="segmentation",
+        needs="cameras",
+        vision="procnet",
+        tools=(
+            Tool("train", "services.segmentation.training.train:main", extra="segmentation,training"),
+            Tool("infer", "services.segmentation.files:main", extra="segmentation"),
+        ),
+        trained_by="train",
+    ),
+    Process(
+        "search",
+        "masks to the camera's pose (`search refine`, `search track`: of any rigid mesh on mask files)",
+        extra="search",
+        needs="cameras",
+        vision="procnet",
+        flags=(Flag("method", "of the search", choices=("default", "paper")),),
+        tools=(
+            Tool("refine", "services.search.objects.tools:refine", extra="search"),
+            Tool("track", "services.search.objects.tools:track", extra="search"),
+        ),
+    ),
+    Process(
+        "posecnn",
+        "frames to the camera's pose, in place of segmentation and search (`posecnn train`: learn the network again)",
+        extra="posecnn",
+        needs="cameras",
+        vision="posecnn",
+        tools=(Tool("train", "services.posecnn.training.train:main", extra="posecnn,training"),),
+        trained_by="train",
+    ),
+    Process(
+        "skin",
+        "sensing boards on serial ports to voltages (`skin decode`, `calibrate`, `characterise`, `model`: see each --help)",
+        extra="skin",
+        needs="pads",
+        replicas=0,  # belongs to a machine with boards, which name their ports
+        beside=False,
+        tools=(
+            Tool("decode", "services.skin.decode:main", extra="skin"),
+            Tool("calibrate", "services.skin.calibration.calibrate:main", extra="skin"),
+            Tool("characterise", "services.skin.calibration.characterise:main", extra="skin,emulator"),
+            Tool("model", "services.skin.model:main", extra="training"),
+        ),
+        in_compose=False,
+    ),
+    Process(
+        "haptics",
+        "voltages to the skin's pose (`haptics train`: learn the network again)",
+        extra="haptics",
+        needs="pads",
+        tools=(Tool("train", "services.haptics.train:main", extra="haptics,training"),),
+        trained_by="train",
+    ),
+    Process(
+        "fusion",
+        "both poses to the one pose",
+        extra="fusion",
+        replicas=2,  # the pose must not pause where one of them dies
+        flags=(Flag("observer", "of the fusion", choices=("default", "paper")),),
+        answers=("current_pose",),
+        metrics=(
+            Metric(
+                "fused_state",
+                "1 for the state of the target's pose",
+                each="target",
+                field="state",
+                values=("tracking", "coasting", "lost"),
+            ),
+        ),
+    ),
+)
+
+LAUNCHER = Process(
+    "launcher",
+    "`penumbra up`",
+    extra="all",
+    beside=False,
+    answers=("launcher",),
+    metrics=(
+        Metric("restarts", "times that a process was started again", "process", "restarts", within="processes", is_counter=True),
+        Metric("running", "1 for a process that answers", "process", "is_running", within="processes"),
+    ),
+    in_compose=False,
+)
+"""The launcher is a process on the bus like those that it starts, but not one of them."""
+
+ROUTER = PROCESSES[0]
+REPORTING = (*(process for process in PROCESSES if process is not ROUTER), LAUNCHER)
+"""Processes with a certificate of their own and what it allows; the router's allows it to pass on everything."""
+VISION = tuple(dict.fromkeys(process.vision for process in PROCESSES if process.vision))
+"""Ways to see: segmentation and search of its masks, or the paper's rival in place of both. The first is the default."""
+
+
+def find(name: str) -> Process | None:
+    """The process of that name, the launcher included; None where there is none."""
+    return next((process for process in (*PROCESSES, LAUNCHER) if process.name == name), None)
+
+
+def tool(service: str, name: str) -> Tool | None:
+    """The tool of a service; None where it has none of that name."""
+    process = find(service)
+    return next((tool for tool in process.tools if tool.name == name), None) if process else None

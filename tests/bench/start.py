@@ -1,0 +1,239 @@
+"""`penumbra bench start`: how long `penumbra up` takes to a tracked pose, cold and warm, and what of it is compiling.
+
+Cold: a copy of this checkout in which nothing is compiled and nothing cached, with the caches of a home of its own. Warm: the
+same copy once more. Times run from before the launcher is started until this process receives a service's first message: for
+fusion the first pose that is `tracking`; a process that publishes nothing counts from when it is alive on the bus. A service's
+compiling CPU is what its processes used until then, cold minus warm.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+import zenoh
+from rich.console import Console
+from rich.table import Table
+
+from services import flags
+from shared.cell import description as cells
+from shared.contract import messages, processes, topics
+from tests.support.live import free_port, service_of
+
+ROOT = Path(__file__).parents[2]
+LEFT_OUT = ("__pycache__", ".*", "build", "runs", "*.egg-info")
+"""What a fresh clone does not hold: everything compiled or cached."""
+PATIENCE_S = 300.0
+"""After which a start that is not complete counts as failed."""
+LOOK_S = 0.02
+
+
+class Failed(RuntimeError):
+    """A start ended before every process had shown itself; the text holds the launcher's last words."""
+
+
+@dataclass
+class Start:
+    """One start. `seconds` and `cpu_s` until each process' first message, by the name of its row in the table."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    cpu_s: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def tracking_s(self) -> float:
+        return self.seconds["fusion"]
+
+
+class Listener:
+    """Receives the first message of every process of a cell, on a bus whose router is only about to come."""
+
+    def __init__(self, cell: cells.Cell, port: int):
+        self._cell, self.first_s = cell, dict[str, float]()
+        config = {
+            "mode": "client",
+            "connect": {
+                "endpoints": [f"tcp/127.0.0.1:{port}"],
+                "timeout_ms": -1,
+                "retry": {"period_init_ms": 20, "period_max_ms": 20, "period_increase_factor": 1},
+            },
+            "scouting": {"multicast": {"enabled": False}},
+        }
+        self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        self._tokens = self._session.liveliness().declare_subscriber(topics.alive(cell.name), self._on_token, history=True)
+        for topic in topics.TOPICS:
+            subscriber = self._session.declare_subscriber(topic.at(cell=cell.name), zenoh.handlers.RingChannel(1))
+            threading.Thread(target=self._listen, args=(topic, subscriber), daemon=True).start()
+
+    def close(self) -> None:
+        self._session.close()
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        service = str(sample.key_expr).split("/")[-2]
+        if not any(service in topic.publishers for topic in topics.TOPICS):
+            self.first_s.setdefault(service, time.monotonic())
+
+    def _listen(self, topic: topics.Topic, subscriber: Any) -> None:
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            for sample in subscriber:
+                if topic is topics.FUSED:
+                    if messages.decode(messages.FusedPose, sample.payload.to_bytes()).state != "tracking":
+                        continue
+                    self.first_s.setdefault("fusion", time.monotonic())
+                else:  # of two that may publish it one runs: posecnn in place of search, skin beside the emulator
+                    self.first_s.setdefault(next(name for name in topic.publishers if name in self.names), time.monotonic())
+                subscriber.undeclare()
+                return
+
+    @property
+    def is_done(self) -> bool:
+        """Whether every process has shown itself."""
+        return self.first_s.keys() >= set(self.names)
+
+    @property
+    def names(self) -> list[str]:
+        """The processes that `penumbra up` starts for the cell."""
+        chosen = (None, processes.VISION[0])
+        return [
+            process.name
+            for process in processes.PROCESSES
+            if process.replicas and process.vision in chosen and process.is_needed(self._cell)
+        ]
+
+
+def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
+    """Starts the cell from the checkout in `folder`, and ends it when all of it has shown itself. Raises Failed."""
+    port = free_port()
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment |= {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(home)}
+    command = [sys.executable, "-m", "services.command.cli", "up", "--cell", cell, "--seed", str(seed), "--port", str(port)]
+    with tempfile.TemporaryFile("w+") as log:
+        began_s = time.monotonic()
+        launcher = subprocess.Popen(
+            command, env=environment, cwd=home, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+        )
+        try:
+            listener = Listener(cells.load(cell), port)
+            used_s = _until_done(listener, launcher)
+        finally:
+            launcher.terminate()
+            launcher.wait()
+        listener.close()
+        if not listener.is_done:
+            log.seek(0)
+            missing = ", ".join(sorted(set(listener.names) - listener.first_s.keys()))
+            raise Failed(f"nothing of {missing} in cell {cell} within {PATIENCE_S:.0f} s: {log.read()[-2000:]}")
+    names = [name for name in (*listener.names, processes.LAUNCHER.name) if name in listener.first_s]
+    return Start(
+        {name: round(listener.first_s[name] - began_s, 2) for name in names}, {name: used_s.get(name, 0.0) for name in names}
+    )
+
+
+def _until_done(listener: Listener, launcher: subprocess.Popen[bytes]) -> dict[str, float]:
+    """CPU [s] of each service's processes at its first message; returns when all have shown themselves."""
+    used_s: dict[str, float] = {}
+    known: dict[int, tuple[str, psutil.Process]] = {}
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not listener.is_done and launcher.poll() is None and time.monotonic() < deadline_s:
+        _measure(listener, launcher, known, used_s)
+        time.sleep(LOOK_S)
+    _measure(listener, launcher, known, used_s)
+    return used_s
+
+
+def _measure(
+    listener: Listener, launcher: subprocess.Popen[bytes], known: dict[int, tuple[str, psutil.Process]], used_s: dict[str, float]
+) -> None:
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for child in psutil.Process(launcher.pid).children():
+            if child.pid not in known and (name := service_of(child)):
+                known[child.pid] = name, child
+        known[launcher.pid] = processes.LAUNCHER.name, psutil.Process(launcher.pid)
+    now_s: dict[str, float] = {}
+    for name, child in known.values():
+        with contextlib.suppress(psutil.NoSuchProcess):
+            times = child.cpu_times()
+            now_s[name] = now_s.get(name, 0.0) + times.user + times.system
+    for name, seconds in now_s.items():
+        if name not in listener.first_s or name not in used_s:
+            used_s[name] = seconds
+
+
+@contextlib.contextmanager
+def fresh() -> Iterator[Path]:
+    """A folder with a copy of this checkout, `checkout`, in which nothing is compiled, and an empty one for caches, `home`."""
+    with tempfile.TemporaryDirectory(prefix="penumbra-start-") as name:
+        folder = Path(name)
+        shutil.copytree(ROOT, folder / "checkout", ignore=shutil.ignore_patterns(*LEFT_OUT))
+        (folder / "home").mkdir()
+        yield folder
+
+
+def measure(cell: str, seed: int, runs: int) -> dict[str, Any]:
+    """The medians of `runs` cold and as many warm starts of a cell, as JSON."""
+    cold, warm = [], []
+    for k in range(runs):
+        with fresh() as folder:
+            cold.append(start(folder / "checkout", cell, seed + k, folder / "home"))
+            warm.append(start(folder / "checkout", cell, seed + k, folder / "home"))
+    services = {}
+    for name in cold[0].seconds:
+        pairs = [(c.cpu_s, w.cpu_s) for c, w in zip(cold, warm, strict=True)]
+        compiling_s = [c[name] - w[name] for c, w in pairs if name in c and name in w]
+        services[name] = {
+            "cold_s": _median([c.seconds[name] for c in cold if name in c.seconds]),
+            "warm_s": _median([w.seconds[name] for w in warm if name in w.seconds]),
+            "compile_cpu_s": max(0.0, _median(compiling_s)),
+        }
+    return {
+        "cold_s": _median([c.tracking_s for c in cold]),
+        "warm_s": _median([w.tracking_s for w in warm]),
+        "runs": {"cold_s": [c.tracking_s for c in cold], "warm_s": [w.tracking_s for w in warm]},
+        "services": services,
+    }
+
+
+def _median(values: list[float]) -> float:
+    return round(statistics.median(values), 2) if values else float("nan")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """`penumbra bench start`"""
+    parser = flags.Parser(prog="penumbra bench start", description=(__doc__ or "").partition("\n\n")[0])
+    parser.add_argument("--cell", action="append", metavar="CELL", help="may be repeated (default: table and arm)")
+    parser.add_argument("--runs", type=flags.positive, default=1, help="cold and warm starts of each (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="of the emulator")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file")
+    options = parser.parse_args(argv)
+    found = {}
+    for cell in options.cell or ["table", "arm"]:
+        found[cells.load(cell).name] = measure(cell, options.seed, options.runs)
+    _show(found, Console())
+    if options.json:
+        options.json.write_text(json.dumps({"cells": found}, indent=1) + "\n")
+    return 0
+
+
+def _show(found: dict[str, dict[str, Any]], console: Console) -> None:
+    for cell, result in found.items():
+        table = Table("process", "cold s", "warm s", "compiling, CPU s", title=f"cell {cell}", box=None)
+        for name, row in result["services"].items():
+            table.add_row(name, *(f"{row[column]:.2f}" for column in ("cold_s", "warm_s", "compile_cpu_s")))
+        table.add_row("to a tracked pose", f"{result['cold_s']:.2f}", f"{result['warm_s']:.2f}", "", style="bold")
+        console.print(table)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
