@@ -1,5 +1,6 @@
 """Fixtures that several files share."""
 
+import importlib.util
 import logging
 import threading
 from collections.abc import Iterator
@@ -8,6 +9,9 @@ import pytest
 
 from shared.runtime import bus
 from tests.support.live import Running, free_port, hold_in_reach, penumbra_up
+
+collect_ignore = [] if importlib.util.find_spec("pybullet") else ["test_pybullet.py", "test_dynamics.py"]
+"""What only pybullet can answer; it has wheels up to CPython 3.11."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

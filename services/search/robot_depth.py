@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.search.evidence import Intrinsics
+from shared.body.robot import robot_models
 from shared.cell.description import Cell
 from shared.geometry import rigid
 from shared.geometry.raster import Raster
@@ -19,11 +20,7 @@ class RobotDepth:
 
     def __init__(self, cell: Cell, T_camera_world: Array):
         self.robots = cell.robots
-        self._models = {}
-        if cell.robots:
-            from shared.body.robot import robot_models  # reads URDFs with pybullet, which a cell without robots does not need
-
-            self._models = robot_models(cell)
+        self._models = robot_models(cell)
         self._T_camera_world = T_camera_world
         self._bounds = {
             (name, link): (mesh.vertices.mean(axis=0), float(np.ptp(mesh.vertices, axis=0).max()))

@@ -1,21 +1,18 @@
 """Kinematics and hull of a robot from its URDF.
 
-pybullet (an own client without graphics) reads the URDF once: the tree of joints and the collision shapes. After that
-nothing of it is needed: forward kinematics is a chain of small matrix products, safe to call from any thread.
+The URDF is read once. Forward kinematics is then a chain of small matrix products, safe to call from any thread.
 """
 
 from __future__ import annotations
 
 import functools
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pybullet
-import pybullet_data
 from numpy.typing import ArrayLike
 
+from shared.body import urdf
 from shared.body.anatomy import Mesh
 from shared.cell import description as cells
 from shared.contract.labels import Label
@@ -25,14 +22,15 @@ from shared.geometry.rigid import Array
 if TYPE_CHECKING:
     import trimesh
 
-_PYBULLET = threading.Lock()  # connecting and loading share state inside pybullet
-
 
 class RobotModel:
     """A robot of the cell.
 
     joints: names of the joints that move, in the order of every `q`; lower, upper: their limits (n,), infinite where the URDF
-    sets none. links: names of all links.
+    sets none. links: names of all links, a parent before its children; parents: the index of each link's parent, -1 for the base.
+    description: what the URDF says.
+
+    A moving joint that the cell does not name is held where it is as near to zero as its limits allow.
 
     Raises CellError where the URDF cannot be read or does not have a joint.
     """
@@ -40,66 +38,48 @@ class RobotModel:
     def __init__(self, robot: cells.Robot, folder: Path = Path(".")):
         self.joints = robot.joints
         self.T_world_base = robot.base.transform
-        path = _urdf_path(robot.urdf, folder)
-        with _PYBULLET:
-            client = pybullet.connect(pybullet.DIRECT)
-            try:
-                self._read(path, client)
-            finally:
-                pybullet.disconnect(client)
-
-    def _read(self, path: Path, client: int) -> None:
         try:
-            # without the flag a cylinder comes back as a mesh without a file
-            flags = pybullet.URDF_USE_IMPLICIT_CYLINDER
-            body = pybullet.loadURDF(str(path), useFixedBase=True, flags=flags, physicsClientId=client)
-        except pybullet.error as error:
-            raise cells.CellError(
-                f"{path}: a URDF expected that pybullet can load, and all its meshes: {error} It says more on stdout."
-            ) from None
-        infos = [pybullet.getJointInfo(body, i, physicsClientId=client) for i in range(pybullet.getNumJoints(body, client))]
-        base = pybullet.getBodyInfo(body, client)[0].decode()
-        self.links = (base, *(info[12].decode() for info in infos))
-        self._parent = [-1, *(info[16] + 1 for info in infos)]
-        moving = {info[1].decode(): i for i, info in enumerate(infos, start=1) if info[2] in _MOVING}
-        unknown = [name for name in self.joints if name not in moving]
-        if unknown:
-            raise cells.CellError(f"{path}: no moving joint {', '.join(unknown)}: it has {', '.join(moving) or 'none'}")
-        limits = np.array([_limits(infos[moving[name] - 1]) for name in self.joints]).reshape(-1, 2)
-        self.lower, self.upper = limits[:, 0], limits[:, 1]
+            self.description = urdf.read(cells.urdf_path(robot, folder))
+        except (cells.CellError, urdf.UrdfError) as error:
+            raise cells.CellError(f"robot: {error}") from None
+        if fault := self.description.fault(robot.joints):
+            raise cells.CellError(f"robot: {fault}")
+        self.links = tuple(link.name for link in self.description.links)
+        self.parents = (-1, *(self.links.index(joint.parent) for joint in self.description.joints))
+        moving = {joint.name: joint for joint in self.description.joints}
+        self.lower = np.array([moving[name].lower for name in self.joints])
+        self.upper = np.array([moving[name].upper for name in self.joints])
 
         # A joint's transform is origin + s sine + c (1 - cos), s = sin q for a revolute joint and q for a prismatic one.
-        # Origin and axis are measured by moving the joint: pybullet's own fields refer to inertial frames.
         n = len(self.links)
-        still = _relative_transforms(body, client, self._parent)
-        self._origin, self._sine, self._cosine = still.copy(), np.zeros((n, 4, 4)), np.zeros((n, 4, 4))
+        self._origin, self._sine, self._cosine = np.zeros((n, 4, 4)), np.zeros((n, 4, 4)), np.zeros((n, 4, 4))
         self._index = np.full(n, -1)
-        self._prismatic = np.zeros(n, bool)
-        for name, i in moving.items():
-            pybullet.resetJointState(body, i - 1, 1.0, physicsClientId=client)
-            moved = rigid.inverse(still[i]) @ _relative_transforms(body, client, self._parent)[i]
-            pybullet.resetJointState(body, i - 1, 0.0, physicsClientId=client)
-            generator = np.zeros((4, 4))
-            self._prismatic[i] = infos[i - 1][2] == pybullet.JOINT_PRISMATIC
-            if self._prismatic[i]:
-                generator[:3, 3] = moved[:3, 3]
-            else:  # a turn by 1 rad: the skew part is sin(1) [axis]x
-                generator[:3, :3] = (moved[:3, :3] - moved[:3, :3].T) / (2.0 * np.sin(1.0))
-            if name in self.joints:
-                self._index[i] = self.joints.index(name)
-                self._sine[i] = still[i] @ generator
-                self._cosine[i] = self._sine[i] @ generator  # zero for a prismatic joint
-            else:  # held where it is as near to zero as its limits allow
-                q = np.clip(0.0, *_limits(infos[i - 1]))
-                s, c = (q, 0.0) if self._prismatic[i] else (np.sin(q), 1.0 - np.cos(q))
-                self._origin[i] = still[i] @ (np.eye(4) + s * generator + c * generator @ generator)
+        self._prismatic = np.array([False, *(joint.kind == "prismatic" for joint in self.description.joints)])
         self._origin[0] = self.T_world_base
-        self._shapes = {name: shapes for i, name in enumerate(self.links) if (shapes := _collision_shapes(body, i - 1, client))}
+        for i, joint in enumerate(self.description.joints, start=1):
+            generator = _generator(joint)
+            if joint.name in self.joints:
+                self._index[i] = self.joints.index(joint.name)
+                self._origin[i] = joint.T_parent_child
+                self._sine[i] = joint.T_parent_child @ generator
+                self._cosine[i] = self._sine[i] @ generator  # zero for a prismatic joint
+            else:
+                q = np.clip(0.0, joint.lower, joint.upper)
+                s, c = (q, 0.0) if self._prismatic[i] else (np.sin(q), 1.0 - np.cos(q))
+                self._origin[i] = joint.T_parent_child @ (np.eye(4) + s * generator + c * generator @ generator)
+
+    @property
+    def T_parent_link(self) -> Array:
+        """(n, 4, 4) of all links where the cell's joints are at zero; of the base: T_world_base."""
+        return self._origin
 
     @functools.cached_property
     def meshes(self) -> dict[str, Mesh]:
-        """The collision mesh of each link that has one, in the link's frame. Kinematics need none: made when asked for."""
-        return {name: _mesh(shapes) for name, shapes in self._shapes.items()}
+        """The collision mesh of each link that has one, in the link's frame. Kinematics need none: made when asked for.
+
+        Raises CellError where a mesh file cannot be read.
+        """
+        return {link.name: _mesh(link.solids, self.description.path) for link in self.description.links if link.solids}
 
     def link_transforms(self, q: ArrayLike) -> dict[str, Array]:
         """T_world_link (..., 4, 4) of every link at joint angles [rad] or displacements [m] q (..., n).
@@ -113,7 +93,7 @@ class RobotModel:
         s = np.where(self._prismatic, padded, np.sin(padded))[..., None, None]
         c = np.where(self._prismatic, 0.0, 1.0 - np.cos(padded))[..., None, None]
         T = np.ascontiguousarray(np.moveaxis(self._origin + s * self._sine + c * self._cosine, -3, 0))
-        for i, parent in enumerate(self._parent[1:], start=1):  # a parent comes before its children
+        for i, parent in enumerate(self.parents[1:], start=1):  # a parent comes before its children
             T[i] = T[parent] @ T[i]
         return dict(zip(self.links, T, strict=True))
 
@@ -132,73 +112,74 @@ def robot_models(cell: cells.Cell) -> dict[str, RobotModel]:
 
 @functools.lru_cache(maxsize=8)
 def _model(robot: cells.Robot, folder: Path) -> RobotModel:
-    """Read once: pybullet takes half a second for a Panda, and everything of a process may use the same model."""
+    """Read once: everything of a process may use the same model and its meshes."""
     return RobotModel(robot, folder)
 
 
-_MOVING = (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)
+def _generator(joint: urdf.Joint) -> Array:
+    """The derivative (4, 4) of the joint's motion at zero: [axis]x for a turn, the axis as translation for a slide."""
+    out = np.zeros((4, 4))
+    if joint.kind == "prismatic":
+        out[:3, 3] = joint.axis
+    elif joint.moves:
+        x, y, z = joint.axis
+        out[:3, :3] = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+    return out
 
 
-def _urdf_path(urdf: str, folder: Path) -> Path:
-    in_data = urdf.removeprefix("pybullet:")
-    path = Path(pybullet_data.getDataPath()) / in_data if in_data != urdf else folder / urdf
-    if not path.is_file():
-        raise cells.CellError(f"robot: no file {path}: give pybullet:PATH (in pybullet's data) or a URDF beside the cell file")
-    return path
-
-
-def _limits(info: tuple) -> tuple[float, float]:
-    """The limits of a joint; a URDF without limits reads as lower >= upper."""
-    return (info[8], info[9]) if info[8] < info[9] else (-np.inf, np.inf)
-
-
-def _relative_transforms(body: int, client: int, parent: list[int]) -> Array:
-    """T_parent_link (n, 4, 4) of all links in pybullet's present state; the first, the base, is the identity."""
-    T = np.tile(np.eye(4), (len(parent), 1, 1))
-    inertial = pybullet.getDynamicsInfo(body, -1, client)[3:5]
-    position, orientation = pybullet.getBasePositionAndOrientation(body, client)
-    T[0] = rigid.transform(position, orientation) @ rigid.inverse(rigid.transform(*inertial))
-    for i in range(1, len(parent)):
-        state = pybullet.getLinkState(body, i - 1, computeForwardKinematics=True, physicsClientId=client)
-        T[i] = rigid.transform(state[4], state[5])
-    relative = np.array([T[i] if parent[i] < 0 else rigid.inverse(T[parent[i]]) @ T[i] for i in range(len(parent))])
-    relative[0] = np.eye(4)
-    return relative
-
-
-Solid = tuple[int, tuple[float, float, float], str]
-"""A collision shape: pybullet's kind, its dimensions [m] or, of a mesh, its scale, and the mesh's file."""
-
-
-def _collision_shapes(body: int, link: int, client: int) -> list[tuple[Solid, Array]]:
-    """The collision shapes of a link, each with its transform to the link's frame."""
-    T_link_inertial = rigid.transform(*pybullet.getDynamicsInfo(body, link, client)[3:5])
-    return [
-        ((kind, dimensions, file.decode()), T_link_inertial @ rigid.transform(position, orientation))
-        for _, _, kind, dimensions, file, position, orientation in pybullet.getCollisionShapeData(body, link, client)
-    ]
-
-
-def _mesh(shapes: list[tuple[Solid, Array]]) -> Mesh:
-    """All shapes of a link as one mesh in the link's frame."""
-    parts = [_solid(*solid).apply_transform(T) for solid, T in shapes]
-    counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + first for part, first in zip(parts, counts, strict=False)]).astype(np.int32)
+def _mesh(solids: tuple[urdf.Solid, ...], path: Path) -> Mesh:
+    """All collision shapes of a link as one mesh in the link's frame."""
+    parts = [(rigid.apply(solid.T_link_solid, vertices), faces) for solid in solids for vertices, faces in [_solid(solid, path)]]
+    counts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    vertices = np.concatenate([vertices for vertices, _ in parts])
+    faces = np.concatenate([faces + first for (_, faces), first in zip(parts, counts, strict=False)]).astype(np.int32)
     return Mesh(vertices, faces, np.full(len(faces), Label.ROBOT, np.uint8))
 
 
-def _solid(kind: int, dimensions: tuple[float, float, float], file: str) -> trimesh.Trimesh:
+def _solid(solid: urdf.Solid, path: Path) -> tuple[Array, Array]:
+    """Vertices (n, 3) [m] and faces (m, 3) of a collision shape, in its own frame."""
+    if solid.file is not None:
+        vertices, faces = _plain_obj(solid.file) or _mesh_file(solid.file, f"{path}:{solid.line}")
+        return vertices * solid.size, faces
+    primitive = _primitive(solid.kind, solid.size)
+    return np.asarray(primitive.vertices), np.asarray(primitive.faces)
+
+
+def _plain_obj(file: Path) -> tuple[Array, Array] | None:
+    """Vertices and faces of an OBJ file of nothing but `v x y z` and `f a b c`, as those of the built-in robot are; None for any
+    other file. trimesh would read them too, but its import costs 0.4 s of CPU."""
+    if file.suffix.lower() != ".obj":
+        return None
+    lines = [line.split() for line in file.read_text(errors="replace").splitlines() if line.strip() and not line.startswith("#")]
+    if any(line[0] not in ("v", "f") or len(line) != 4 for line in lines):
+        return None
+    try:
+        vertices = np.array([line[1:] for line in lines if line[0] == "v"], float)
+        faces = np.array([line[1:] for line in lines if line[0] == "f"], int) - 1
+    except ValueError:  # a face with texture coordinates or normals
+        return None
+    return (vertices, faces) if faces.size and faces.min() >= 0 and faces.max() < len(vertices) else None
+
+
+def _mesh_file(file: Path, place: str) -> tuple[Array, Array]:
     import trimesh
 
-    if kind == pybullet.GEOM_MESH:
-        return trimesh.load_mesh(file).apply_scale(dimensions)
-    if kind == pybullet.GEOM_BOX:
-        return trimesh.creation.box(extents=dimensions)
-    if kind == pybullet.GEOM_SPHERE:
-        return trimesh.creation.icosphere(subdivisions=2, radius=dimensions[0])
-    if kind == pybullet.GEOM_CYLINDER:
-        return trimesh.creation.cylinder(height=dimensions[0], radius=dimensions[1], sections=24)
-    if kind == pybullet.GEOM_CAPSULE:
-        return trimesh.creation.capsule(height=dimensions[0], radius=dimensions[1], count=[24, 12])
-    raise cells.CellError(f"robot: collision shapes mesh, box, sphere, cylinder or capsule expected, pybullet's kind {kind} came")
+    try:
+        mesh = trimesh.load_mesh(file)
+    except Exception as error:  # trimesh's readers raise whatever they meet
+        raise cells.CellError(f"{place}: expected a mesh that trimesh reads (STL, OBJ, PLY, GLB), got {file}: {error}") from None
+    if not len(getattr(mesh, "faces", ())):
+        raise cells.CellError(f"{place}: expected a mesh with triangles, got none in {file}")
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def _primitive(kind: urdf.SolidKind, size: tuple[float, ...]) -> trimesh.Trimesh:
+    from trimesh import creation
+
+    if kind == "box":
+        return creation.box(extents=size)
+    if kind == "sphere":
+        return creation.icosphere(subdivisions=2, radius=size[0])
+    if kind == "cylinder":
+        return creation.cylinder(radius=size[0], height=size[1], sections=24)
+    return creation.capsule(radius=size[0], height=size[1], count=[24, 12])

@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from shared.body import urdf
 from shared.contract.labels import Label
 from shared.geometry import rigid
 
@@ -83,7 +84,8 @@ class Camera(_Model):
 
 
 class Robot(_Model):
-    """A robot: its URDF (a path beside the cell file, or `pybullet:PATH` in pybullet's data), base and moving joints."""
+    """A robot: its URDF (a path beside the cell file, or beside the built-in ones: `panda/panda.urdf`), base and moving
+    joints."""
 
     urdf: str
     base: Placement = Placement()
@@ -285,15 +287,24 @@ class Motion(_Model):
         return self
 
 
+class Payload(_Model):
+    """What a robot carries: its mass [kg], as a point at `position` [m] in the frame of `link`."""
+
+    mass: Positive
+    link: str
+    position: Vector3 = (0.0, 0.0, 0.0)
+
+
 class Sim(_Model):
     """What only the emulator needs. `shoulder`: where the person's right shoulder would be [m] if the arm were long enough;
-    `joints_low`, `joints_high`: the bounds of all robots' joints, one after the other; `table`: length and breadth [m] of a table
-    whose top is z = 0, around `table_middle`."""
+    `joints_low`, `joints_high`: the bounds of all robots' joints, one after the other; `payloads`: what robots carry; `table`:
+    length and breadth [m] of a table whose top is z = 0, around `table_middle`."""
 
     motion: Motion
     shoulder: Vector3
     joints_low: tuple[float, ...] = ()
     joints_high: tuple[float, ...] = ()
+    payloads: dict[Name, Payload] = {}
     table: tuple[float, float] | None = None
     table_middle: tuple[float, float] = (0.0, 0.0)
 
@@ -332,12 +343,28 @@ class Cell(_Model):
                 raise ValueError(
                     f"targets.{name}.mesh: no file {self.folder / target.mesh}: give body:forearm or a mesh beside the cell file"
                 )
-        for name, robot_model in self.robots.items():
-            if not robot_model.urdf.startswith("pybullet:") and not is_file(self.folder / robot_model.urdf):
-                raise ValueError(
-                    f"robots.{name}.urdf: no file {self.folder / robot_model.urdf}: give pybullet:PATH or a file beside this one"
-                )
+        self._check_robots()
         return self
+
+    def _check_robots(self) -> None:
+        """Raises ValueError for a URDF that cannot be read, and for joints, links of pads and payloads that its robot has not."""
+        links: dict[str, tuple[str, ...]] = {}
+        for name, robot in self.robots.items():
+            try:
+                description = urdf.read(urdf_path(robot, self.folder))
+            except (CellError, urdf.UrdfError) as error:
+                raise ValueError(f"robots.{name}.urdf: {error}") from None
+            if fault := description.fault(robot.joints):
+                raise ValueError(f"robots.{name}.joints: {fault}")
+            links[name] = tuple(link.name for link in description.links)
+        places = {f"pads.{name}.link": pad.link.partition("/") for name, pad in self.pads.items() if pad.link != "world"}
+        for name, payload in (self.sim.payloads if self.sim else {}).items():
+            if name not in self.robots:
+                raise ValueError(f"sim.payloads.{name}: expected one of {sorted(self.robots)}, got {name!r}")
+            places[f"sim.payloads.{name}.link"] = (name, "/", payload.link)
+        for place, (robot, _, link) in places.items():
+            if link not in links[robot]:
+                raise ValueError(f"{place}: robot {robot} has no link {link!r}: it has {', '.join(links[robot])}")
 
     def one(self, kind: Literal["cameras", "robots", "pads", "targets"], name: str | None) -> str:
         """The name of a camera, robot, pad or target, checked; None means the first one. Raises CellError."""
@@ -428,6 +455,14 @@ def _short(value: str | int | float) -> str:
     if isinstance(value, int) and value.bit_length() > 64:
         return f"an integer of {value.bit_length()} bits"
     return f"{value!r:.100}"
+
+
+def urdf_path(robot: Robot, folder: Path) -> Path:
+    """The URDF of a robot of a cell in a folder. Raises CellError where there is none."""
+    for path in (folder / robot.urdf, BUILT_IN / robot.urdf):
+        if is_file(path):
+            return path
+    raise CellError(f"no file {folder / robot.urdf}: give a URDF beside the cell file, or the built-in panda/panda.urdf")
 
 
 def is_file(path: Path) -> bool:

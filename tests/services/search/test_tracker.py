@@ -335,7 +335,7 @@ def test_a_robot_covers_what_is_behind_it_and_is_background_behind_the_target():
 
 
 def test_a_robot_is_drawn_where_its_joints_put_it():
-    panda = description.Robot(urdf="pybullet:franka_panda/panda.urdf", joints=tuple(f"panda_joint{i}" for i in range(1, 8)))
+    panda = description.Robot(urdf="panda/panda.urdf", joints=tuple(f"panda_joint{i}" for i in range(1, 8)))
     with_robot = CELL.model_copy(update={"robots": {"panda": panda}})
     robots = RobotDepth(with_robot, T_CAMERA_WORLD)
     k = evidence.Intrinsics.of_window(CAMERA, 0, 0, 2)

@@ -1,97 +1,25 @@
-"""The robot's kinematics and hull agree with pybullet, the reference that it was read from."""
+"""The robot that a URDF describes, and what is reported of a URDF that cannot be used. tests/sim/test_pybullet.py has the
+numbers."""
 
 import dataclasses
+import re
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
-import pybullet
-import pybullet_data
 import pytest
 
 from shared.body.robot import RobotModel, robot_models
 from shared.cell import description as cells
 from shared.geometry import rigid
-
-PANDA = cells.Robot(
-    urdf="pybullet:franka_panda/panda.urdf",
-    base=cells.Placement(position=(0.5, 0.1, 0.2), rpy=(0.1, 0.2, 3.0)),
-    joints=tuple(f"panda_joint{i}" for i in range(1, 8)),
-)
-# Everything that the Panda has not: tilted inertial frames, a prismatic and a continuous joint, primitives, a held joint.
-ODD = """<robot name="odd">
- <link name="base"><inertial><origin xyz="0.1 0.2 0.3" rpy="0.3 0.2 0.1"/><mass value="1"/>
-   <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-  <collision><origin xyz="0 0 0.1" rpy="0 0 0.5"/><geometry><box size="0.2 0.1 0.4"/></geometry></collision>
-  <collision><origin xyz="0 0 0.5"/><geometry><sphere radius="0.1"/></geometry></collision></link>
- <joint name="turn" type="revolute"><parent link="base"/><child link="one"/><origin xyz="0 0.1 0.4" rpy="0.4 0.1 0.2"/>
-  <axis xyz="0.6 0 0.8"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
- <link name="one"><inertial><origin xyz="0.3 0.2 0.3" rpy="0.9 0.2 0.4"/><mass value="1"/>
-   <inertia ixx="1" iyy="2" izz="1" ixy="0.1" ixz="0" iyz="0"/></inertial>
-  <collision><origin xyz="0 0.2 0.1" rpy="0.5 0 0.5"/><geometry><cylinder radius="0.1" length="0.4"/></geometry>
-  </collision></link>
- <joint name="slide" type="prismatic"><parent link="one"/><child link="two"/><origin xyz="0 0.1 0.4" rpy="0.4 0.1 0.2"/>
-  <axis xyz="0 1 0"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint>
- <link name="two"><inertial><mass value="1"/><inertia ixx="1" iyy="2" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
- <joint name="spin" type="continuous"><parent link="two"/><child link="three"/><origin xyz="0 0.1 0.4" rpy="0.4 0.1 0.2"/>
-  <axis xyz="0 0 1"/></joint>
- <link name="three"><inertial><mass value="1"/><inertia ixx="1" iyy="2" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
- <joint name="held" type="revolute"><parent link="three"/><child link="four"/><axis xyz="0 0 1"/>
-  <limit lower="0.3" upper="2" effort="1" velocity="1"/></joint>
- <link name="four"><inertial><mass value="1"/><inertia ixx="1" iyy="2" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-</robot>"""
+from tests.support.robots import ODD, ODD_JOINTS, PANDA, odd_robot
 
 
 @pytest.fixture(scope="module")
 def panda():
     return RobotModel(PANDA)
-
-
-@pytest.fixture(scope="module")
-def odd(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("robot")
-    (folder / "odd.urdf").write_text(ODD)
-    robot = cells.Robot(
-        urdf="odd.urdf", joints=("spin", "turn", "slide"), base=cells.Placement(position=(1, 2, 3), rpy=(0.1, 0.2, 0.3))
-    )
-    return RobotModel(robot, folder), folder / "odd.urdf"
-
-
-@pytest.fixture
-def client():
-    client = pybullet.connect(pybullet.DIRECT)
-    yield client
-    pybullet.disconnect(client)
-
-
-def reference(client: int, urdf: Path, model: RobotModel, q: np.ndarray, held: dict[str, float]) -> dict[str, np.ndarray]:
-    """T_world_link of every link but the base, by pybullet."""
-    body = pybullet.loadURDF(str(urdf), useFixedBase=True, flags=pybullet.URDF_USE_IMPLICIT_CYLINDER, physicsClientId=client)
-    infos = [pybullet.getJointInfo(body, i, client) for i in range(pybullet.getNumJoints(body, client))]
-    for name, value in {**dict(zip(model.joints, q, strict=True)), **held}.items():
-        joint = next(info[0] for info in infos if info[1].decode() == name)
-        pybullet.resetJointState(body, joint, value, physicsClientId=client)
-    T = model.T_world_base @ rigid.transform(*pybullet.getDynamicsInfo(body, -1, client)[3:5])
-    pybullet.resetBasePositionAndOrientation(body, *rigid.position_orientation(T), physicsClientId=client)
-    states = [pybullet.getLinkState(body, info[0], computeForwardKinematics=True, physicsClientId=client) for info in infos]
-    return {info[12].decode(): rigid.transform(*state[4:6]) for info, state in zip(infos, states, strict=True)}
-
-
-def test_forward_kinematics_of_the_panda_is_pybullets(panda, client):
-    urdf = Path(pybullet_data.getDataPath()) / "franka_panda/panda.urdf"
-    q = np.random.default_rng(0).uniform(panda.lower, panda.upper)
-    expected, links = reference(client, urdf, panda, q, {}), panda.link_transforms(q)
-    assert set(links) == {"panda_link0", *expected}
-    for link, T in expected.items():  # pybullet reports single precision
-        np.testing.assert_allclose(links[link], T, atol=1e-6, err_msg=link)
-
-
-def test_forward_kinematics_knows_slides_free_turns_held_joints_and_tilted_inertias(odd, client):
-    model, urdf = odd
-    q = np.array([2.9, -1.1, 0.37])
-    for link, T in reference(client, urdf, model, q, {"held": 0.3}).items():
-        np.testing.assert_allclose(model.link_transforms(q)[link], T, atol=1e-6, err_msg=link)
-    assert np.isinf(model.lower[0]) and model.lower[1:].tolist() == [-2.0, 0.0] and model.upper[1:].tolist() == [2.0, 1.0]
 
 
 def test_forward_kinematics_of_many_poses_is_that_of_each(panda):
@@ -100,21 +28,6 @@ def test_forward_kinematics_of_many_poses_is_that_of_each(panda):
     for i in range(4):
         for link, T in panda.link_transforms(q[i]).items():
             np.testing.assert_allclose(together[link][i], T, atol=1e-12)
-
-
-def test_collision_meshes_are_where_pybullets_rays_hit(odd, client):
-    model, urdf = odd
-    q = np.array([0.3, 0.8, 0.1])
-    reference(client, urdf, model, q, {"held": 0.3})
-    links, rng = model.link_transforms(q), np.random.default_rng(2)
-    for link in ("base", "one"):
-        vertices = rigid.apply(links[link], model.meshes[link].vertices)
-        middle = vertices.mean(axis=0)
-        for vertex in rng.permutation(vertices)[:20]:
-            outside = middle + 3.0 * (vertex - middle)
-            hit = pybullet.rayTest(outside, middle, physicsClientId=client)[0]
-            inward = np.linalg.norm(np.array(hit[3]) - outside) - np.linalg.norm(vertex - outside)
-            assert hit[0] >= 0 and inward < 2e-3, (link, inward)  # no vertex outside of pybullet's shape: facets are inside
 
 
 def test_meshes_are_the_files_of_the_urdf(panda):
@@ -139,20 +52,126 @@ def test_a_wrong_number_of_joint_angles_is_told(panda):
 
 
 def test_an_unknown_joint_is_told_with_the_joints_that_there_are():
-    with pytest.raises(cells.CellError, match="no moving joint elbow: it has panda_joint1, panda_joint2"):
+    with pytest.raises(cells.CellError, match=r"no moving joint elbow in .*panda.urdf: it has panda_joint1, panda_joint2"):
         RobotModel(PANDA.model_copy(update={"joints": ("panda_joint1", "elbow")}))
 
 
 def test_a_missing_urdf_is_told():
-    with pytest.raises(cells.CellError, match=r"no file .*panda/none.urdf: give pybullet:PATH"):
-        RobotModel(PANDA.model_copy(update={"urdf": "pybullet:panda/none.urdf"}))
+    with pytest.raises(cells.CellError, match=r"no file .*panda/none.urdf: give a URDF beside the cell file, or the built-in"):
+        RobotModel(PANDA.model_copy(update={"urdf": "panda/none.urdf"}))
 
 
-@pytest.mark.parametrize("text", ["<robot><link", ODD.replace('box size="0.2 0.1 0.4"', 'mesh filename="none.stl"')])
-def test_a_broken_urdf_or_a_missing_mesh_is_told(tmp_path, text):
-    (tmp_path / "broken.urdf").write_text(text)
-    with pytest.raises(cells.CellError, match=r"broken.urdf: a URDF expected that pybullet can load, and all its meshes"):
-        RobotModel(cells.Robot(urdf="broken.urdf", joints=()), tmp_path)
+@pytest.mark.parametrize(
+    ("old", "new", "line", "reason"),
+    [
+        ("</robot>", "<robot>", 21, "expected XML, got"),
+        ('<link name="base">', "<link>", 2, "expected name=... in <link>, got none"),
+        ('box size="0.2 0.1 0.4"', 'mesh filename="none.stl"', 4, "no file .*none.stl of a mesh: put it there, or correct"),
+        ('box size="0.2 0.1 0.4"', 'mesh filename="package://no/none.stl"', 4, "no file .*no/none.stl of a mesh"),
+        ('box size="0.2 0.1 0.4"', 'box size="0.2 0.1"', 4, r"expected size=3 numbers in <box>, got '0.2 0.1'"),
+        ('box size="0.2 0.1 0.4"', 'box size="0.2 nan 0.4"', 4, "expected size=3 numbers in <box>, got '0.2 nan 0.4'"),
+        ('box size="0.2 0.1 0.4"', 'box size="0.2 -1 0.4"', 4, "expected a box with sizes above 0 m"),
+        ('box size="0.2 0.1 0.4"', "cone", 4, "expected one of mesh, box, sphere, cylinder, capsule as geometry, got cone"),
+        ('<mass value="1"/>\n   <inertia ixx="1" iyy="1"', '<mass value="-1"/>\n   <inertia ixx="1" iyy="1"', 2, "a mass of at"),
+        ('<parent link="three"/>', '<parent link="four"/>', 18, "expected a tree of links, got a cycle: four -> four"),
+        ('<parent link="base"/>', '<parent link="four"/>', 6, "got a cycle: one -> two -> three -> four -> one"),
+        ('<child link="two"/>', '<child link="one"/>', 12, "expected another child link for each joint, got 'one' again"),
+        ('<link name="two">', '<link name="one">', 14, "expected another name for each link, got 'one' again"),
+        ('<child link="two"/>', '<child link="thumb"/>', 12, "joint slide: no link 'thumb': it has base, one, two"),
+        ('<axis xyz="0.6 0 0.8"/>', '<axis xyz="0 0 0"/>', 6, "expected an axis that is not zero"),
+        ('type="prismatic"', 'type="floating"', 12, "a joint of type fixed, revolute, continuous, prismatic, got 'floating'"),
+        ('<link name="base">', '<link name="loose"/><link name="base">', 1, "the base, got loose, base: join them"),
+    ],
+)  # fmt: skip
+def test_a_urdf_that_cannot_be_used_is_reported_with_its_line(tmp_path, old, new, line, reason):
+    with pytest.raises(cells.CellError, match=rf"robot: .*odd.urdf:{line}: .*{reason}"):
+        RobotModel(odd_robot(tmp_path, edited(old, new)), tmp_path)
+
+
+def edited(old: str, new: str) -> str:
+    assert old in ODD
+    return ODD.replace(old, new, 1)
+
+
+def test_a_part_that_hangs_on_itself_is_reported_though_the_rest_is_a_tree(tmp_path):
+    loop = """<link name="a"/><link name="b"/>
+      <joint name="ab" type="fixed"><parent link="a"/><child link="b"/></joint>
+      <joint name="ba" type="fixed"><parent link="b"/><child link="a"/></joint></robot>"""
+    with pytest.raises(cells.CellError, match=r"odd.urdf:2[23]: expected a tree of links, got a cycle: "):
+        RobotModel(odd_robot(tmp_path, edited("</robot>", loop)), tmp_path)
+
+
+def test_a_mesh_that_is_none_is_reported_when_it_is_asked_for(tmp_path):
+    (tmp_path / "bad.stl").write_text("no mesh")
+    model = RobotModel(odd_robot(tmp_path, edited('box size="0.2 0.1 0.4"', 'mesh filename="bad.stl"')), tmp_path)
+    with pytest.raises(cells.CellError, match=r"odd.urdf:4: expected a mesh .*bad.stl"):
+        _ = model.meshes
+
+
+@pytest.mark.parametrize(
+    "name", ["package://hand/parts/tip.obj", "package://parts/tip.obj", "file://parts/tip.obj", "parts/tip.obj"]
+)
+def test_meshes_are_found_beside_the_urdf_and_in_the_package_around_it(tmp_path, name):
+    folder = tmp_path / "hand"
+    (folder / "parts").mkdir(parents=True)
+    (folder / "parts" / "tip.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    model = RobotModel(odd_robot(folder, edited('box size="0.2 0.1 0.4"', f'mesh filename="{name}" scale="2 2 2"')), folder)
+    assert model.meshes["base"].vertices[:3].max() == pytest.approx(2.0 * np.cos(0.5), abs=1e-12)  # turned by 0.5 rad
+
+
+def test_an_obj_with_more_than_triangles_is_the_same_mesh(tmp_path):
+    plain = cells.BUILT_IN / "panda" / "meshes" / "hand.obj"
+    (tmp_path / "rich.obj").write_text(
+        "vn 0 0 1\n" + re.sub(r"(?m)^f (\d+) (\d+) (\d+)", r"f \1//1 \2//1 \3//1", plain.read_text())
+    )
+    (tmp_path / "plain.obj").write_bytes(plain.read_bytes())
+    box = 'box size="0.2 0.1 0.4"'
+    rich, same = (
+        RobotModel(odd_robot(tmp_path, edited(box, f'mesh filename="{file}"')), tmp_path).meshes["base"]
+        for file in ("rich.obj", "plain.obj")
+    )
+    np.testing.assert_array_equal(rich.vertices[rich.faces], same.vertices[same.faces])
+
+
+def test_a_joint_named_twice_is_reported(tmp_path):
+    with pytest.raises(cells.CellError, match="every joint once, got spin several times"):
+        RobotModel(odd_robot(tmp_path).model_copy(update={"joints": (*ODD_JOINTS, "spin")}), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("panda_joint7]", "elbow]", r"robots.panda.joints: no moving joint elbow in .*panda.urdf: it has panda_joint1"),
+        ("panda/panda.urdf", "none.urdf", r"robots.panda.urdf: no file .*none.urdf: give a URDF beside the cell file"),
+        ("panda/panda_hand", "panda/thumb", r"pads.p0.link: robot panda has no link 'thumb': it has panda_link0"),
+        ("  table: [0.9", "  payloads: {panda: {mass: 1, link: tip}}\n  table: [0.9", r"sim.payloads.panda.link: robot panda"),
+        ("  table: [0.9", "  payloads: {ur5: {mass: 1, link: tip}}\n  table: [0.9", r"sim.payloads.ur5: expected one of \['pan"),
+    ],
+)  # fmt: skip
+def test_a_cell_whose_robot_lacks_what_it_names_is_refused_with_the_line(tmp_path, old, new, place):
+    text = (cells.BUILT_IN / "arm.yaml").read_text()
+    assert old in text
+    (tmp_path / "mine.yaml").write_text(text.replace(old, new, 1))
+    line = text[: text.index(old)].count("\n") + 1
+    with pytest.raises(cells.CellError, match=rf"mine.yaml:{line}: {place}"):
+        cells.load(tmp_path / "mine.yaml")
+
+
+def test_a_robot_costs_little_to_read():
+    """Half a second with pybullet; CPU time of a process of its own, which has nothing else to do."""
+    code = """import resource
+from shared import cell
+from shared.body.robot import RobotModel
+arm = cell.load("arm")
+begin = resource.getrusage(resource.RUSAGE_SELF)
+RobotModel(arm.robots["panda"], arm.folder).meshes
+end = resource.getrusage(resource.RUSAGE_SELF)
+import sys
+print(end.ru_utime + end.ru_stime - begin.ru_utime - begin.ru_stime)
+print([name for name in ("trimesh", "scipy", "pybullet", "lxml") if name in sys.modules])"""
+    out = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[3], capture_output=True, text=True, check=True)
+    cpu_s, loaded = out.stdout.splitlines()
+    assert float(cpu_s) < 0.15 and loaded == "[]"  # 0.01 s on the machine where it was written
 
 
 def test_a_pad_on_a_link_that_the_robot_has_not_is_told():

@@ -1,9 +1,6 @@
-"""The rasteriser against geometry that can be worked out by hand, and against pybullet's."""
+"""The rasteriser against geometry that can be worked out by hand."""
 
 import numpy as np
-import pybullet
-import pybullet_data
-import pytest
 
 from shared.body import anatomy
 from shared.cell import description
@@ -70,30 +67,3 @@ def test_a_window_shows_the_same_pixels_as_the_whole_image():
     whole = raster.silhouette(vertices, mesh.faces, k, (0, 0, 640, 480))
     np.testing.assert_array_equal(raster.silhouette(vertices, mesh.faces, k, (200, 130, 160, 120)), whole[130:250, 200:360])
     assert whole.sum() > 3000
-
-
-@pytest.fixture
-def bullet():
-    client = pybullet.connect(pybullet.DIRECT)
-    yield client
-    pybullet.disconnect(client)
-
-
-def test_the_picture_agrees_with_pybullet_s_renderer(bullet):
-    path = f"{pybullet_data.getDataPath()}/duck.obj"
-    shape = pybullet.createVisualShape(pybullet.GEOM_MESH, fileName=path, meshScale=[0.1] * 3, physicsClientId=bullet)
-    pybullet.createMultiBody(baseVisualShapeIndex=shape, basePosition=(0, 0, 0), physicsClientId=bullet)
-    size, f = 320, 300.0
-    eye = (0.35, -0.45, 0.3)
-    view = pybullet.computeViewMatrix(eye, (0, 0, 0.08), (0, 0, 1))
-    projection = pybullet.computeProjectionMatrixFOV(2 * np.degrees(np.arctan(size / 2 / f)), 1.0, 0.01, 10)
-    renderer = pybullet.ER_TINY_RENDERER
-    ids = pybullet.getCameraImage(size, size, view, projection, renderer=renderer, physicsClientId=bullet)[4]
-    theirs = (np.asarray(ids).reshape(size, size) & 0xFFFFFF) == 0
-    table = description.load("table")
-    mesh = anatomy.target_mesh(table.targets["forearm"].model_copy(update={"mesh": path}), table)  # an absolute path
-    vertices = rigid.apply(rigid.inverse(rigid.look_at(eye, (0, 0, 0.08))), mesh.vertices * 0.1)
-    # TinyRenderer samples half a pixel to the left of and above the centre of the image plane's own pixels
-    ours = raster.silhouette(vertices, mesh.faces, (f, f, size / 2, size / 2 - 1), (0, 0, size, size))
-    assert theirs.sum() > 2000
-    assert (ours & theirs).sum() / (ours | theirs).sum() > 0.99

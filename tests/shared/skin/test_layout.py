@@ -76,7 +76,7 @@ def test_a_law_that_an_electrode_does_not_have_is_refused_with_its_name(table: c
 
 def test_electrodes_follow_the_link_that_carries_their_pad(table: cells.Cell) -> None:
     pads = {"a": cells.Pad(type="five", link="panda/hand", position=(0, 0, 0.1), rpy=(0, 0, np.pi / 2))}
-    robots = {"panda": cells.Robot(urdf="pybullet:franka_panda/panda.urdf", joints=("panda_joint1",))}
+    robots = {"panda": cells.Robot(urdf="panda/panda.urdf", joints=("panda_joint1",))}
     moving = layout.Skin(table.model_copy(update={"pads": pads, "robots": robots}))
     T = rigid.from_rpy((1, 2, 3), (0, 0, 0))
     electrodes = moving.positions(moving.T_world_pads(layout.link_names({"panda": {"hand": T}})))
