@@ -1,23 +1,25 @@
 """Every message that crosses the bus, and its wire format.
 
 A message is a frozen dataclass; on the wire it is a MessagePack map of its fields, an array being `[dtype, shape, bytes]`, led by
-the `version` of this format. `decode` believes nothing: it checks size, version, type, shape, dtype, finiteness and stamp, and
-says what it expected and what came.
+the `version` of this format: any MessagePack library reads it. `decode` checks size, version, types, shapes, dtypes, ranges,
+finiteness and stamp. msgspec checks types, ranges and lengths in C, from the declarations below, and stops at the first wrong
+byte, so that no payload fills the memory. The bytes of an array are copied once where they are encoded, and not at all where
+they are decoded: the array is a read-only view of the payload.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
-import struct
+import re
+import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
-import msgpack
+import msgspec
 import numpy as np
 
 VERSION = 1
@@ -44,28 +46,35 @@ UNIT_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from one."""
 ROUNDING = 1e-6
 """What shares and matrices may be off by rounding, relative."""
-LARGE = 65_536
-"""Bytes of an array from which it is worth while not to copy it twice."""
-HEAD = 1024
-"""Bytes within which the large array of a message begins."""
-BIN32 = 0xC6
-"""MessagePack's head of bytes with their number in 32 bits."""
-_STRUCTURE = {"max_array_len": 16, "max_map_len": 32, "max_str_len": 256, "max_ext_len": 0}
-"""What MessagePack may hold: more than any message needs, less than fills a memory."""
+LONGEST_TEXT, MOST_SOURCES = 256, 32
+"""Characters of a name, and senses of a pose: more than any message needs, less than fills a memory."""
 
 
 @dataclass(frozen=True)
 class _ArraySpec:
     dtype: str
     shape: tuple[int | None, ...]  # None: any positive length
-    check: Callable[[np.ndarray], str | None] | None = None  # what else is wrong with the values
+    check: Callable[[np.ndarray, float], str | None] | None = None  # what else is wrong with the values, by their sum of squares
 
     @functools.cached_property
     def numpy(self) -> np.dtype:
         return np.dtype(self.dtype)
 
+    @functools.cached_property
+    def _fixed(self) -> tuple[tuple[int, int], ...]:
+        return tuple((axis, length) for axis, length in enumerate(self.shape) if length is not None)
 
-def _array(dtype: str, *shape: int | None, check: Callable[[np.ndarray], str | None] | None = None) -> Any:
+    def fits(self, shape: tuple[int, ...]) -> bool:
+        """Whether an array may have this shape."""
+        if len(shape) != len(self.shape) or 0 in shape:
+            return False
+        for axis, length in self._fixed:  # noqa: SIM110 (a generator for `all` takes longer than the rest)
+            if shape[axis] != length:
+                return False
+        return True
+
+
+def _array(dtype: str, *shape: int | None, check: Callable[[np.ndarray, float], str | None] | None = None) -> Any:
     return field(metadata={"array": _ArraySpec(dtype, shape, check)})
 
 
@@ -78,16 +87,19 @@ def _covariance() -> Any:
     return _array("float64", 6, 6, check=_not_semidefinite)
 
 
-def _not_unit(value: np.ndarray) -> str | None:
-    norm = float(np.sqrt(value @ value))
+def _not_unit(value: np.ndarray, squares: float) -> str | None:
+    norm = math.sqrt(squares)
     return None if abs(norm - 1) <= UNIT_TOLERANCE else f"a unit quaternion expected, one of norm {norm:.4g} came"
 
 
-def _not_semidefinite(value: np.ndarray) -> str | None:
+def _not_semidefinite(value: np.ndarray, squares: float) -> str | None:
+    is_symmetric = value.tobytes() == value.T.tobytes()  # to the last bit: the usual case, and quickly seen
+    lowest = float(np.linalg.eigvalsh(value)[0])
+    if is_symmetric and lowest >= 0.0:
+        return None
     tolerance = ROUNDING * float(np.abs(value).max())
     if np.abs(value - value.T).max() > tolerance:
         return "a symmetric matrix expected, one with different halves came"
-    lowest = float(np.linalg.eigvalsh(value)[0])
     return None if lowest >= -tolerance else f"a matrix without negative eigenvalues expected, one with {lowest:.4g} came"
 
 
@@ -177,12 +189,15 @@ class HapticPose(Message):
     state: str = _choice("in_range", "out_of_range")
 
 
-@dataclass(frozen=True)
-class Source:
+_Quantity = Annotated[float, msgspec.Meta(ge=-LARGEST, le=LARGEST)]
+_Name = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
+
+
+class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One sense as the observer sees it: age of its last accepted measurement [s] and its share of the information in use."""
 
-    age_s: float
-    weight: float
+    age_s: _Quantity
+    weight: _Quantity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,62 +230,107 @@ class Truth(Message):
 
 
 M = typing.TypeVar("M", bound=Message)
-Convert = Callable[[Any], Any]
 
 
-class _Plan:
-    """How the fields of a message class go onto the wire and come from it, worked out once: a bus that carries thousands of
-    messages a second has no time to look at declarations. write, read: functions by field; read raises BadMessage."""
+class _Codec(typing.Generic[M]):
+    """What a message class is on the wire, worked out once from its declarations.
 
-    def __init__(self, kind: type[Message]):
-        hints = typing.get_type_hints(kind)
-        self.write: dict[str, Convert] = {}
-        self.read: dict[str, Convert] = {}
+    wire: the typed map that msgspec reads and writes, in which an array is a tuple (dtype, shape, bytes). arrays: the fields that
+    hold one. faults: by field, the `kind` of BadMessage for a value that msgspec refuses.
+    """
+
+    def __init__(self, kind: type[M]):
+        self.kind = kind
+        self.arrays: dict[str, _ArraySpec] = {}
+        self.faults: dict[str, str] = {}
+        hints, wire = typing.get_type_hints(kind), []
         for declared in dataclasses.fields(kind):
-            name, hint, spec = declared.name, hints[declared.name], declared.metadata.get("array")
-            where = f"{kind.__name__}.{name}"
-            if spec is not None:
-                self.write[name], self.read[name] = _array_writer(name, spec), _array_reader(where, spec)
-            elif hint is float or hint is int:
-                within = declared.metadata.get("within", (-LARGEST, LARGEST) if hint is float else (-math.inf, math.inf))
-                self.write[name], self.read[name] = _plain, _number_reader(where, hint, within)
+            name, hint, metadata = declared.name, hints[declared.name], declared.metadata
+            if (spec := metadata.get("array")) is not None:
+                self.arrays[name] = spec
+                wire.append((name, _array_on_the_wire(spec)))
+                self.faults[name] = "array"
+            elif hint in (int, float):
+                low, high = metadata.get("within", (None, None) if hint is int else (-LARGEST, LARGEST))
+                wire.append((name, Annotated[hint, msgspec.Meta(ge=low, le=high)]))
+                self.faults[name] = "number"
             elif hint is str:
-                self.write[name], self.read[name] = _plain, _text_reader(where, declared.metadata.get("choice"))
+                wire.append((name, Literal[metadata["choice"]] if "choice" in metadata else _Name))
+                self.faults[name] = "text"
             else:
-                self.write[name], self.read[name] = _write_sources, _sources_reader(where)
+                wire.append((name, Annotated[dict[_Name, Source], msgspec.Meta(max_length=MOST_SOURCES)]))
+                self.faults[name] = "sources"
+        self.wire = msgspec.defstruct(
+            kind.__name__, [("version", Literal[VERSION]), *wire], forbid_unknown_fields=True, gc=False, frozen=True
+        )
+        self.decoder = msgspec.msgpack.Decoder(self.wire)
+
+    def encode(self, message: M) -> bytes:
+        fields = dict(vars(message))
+        for name, spec in self.arrays.items():
+            fields[name] = _packed(name, spec, fields[name])
+        return _ENCODER.encode(self.wire(VERSION, **fields))
+
+    def decode(self, payload: bytes) -> M:
+        try:
+            fields = msgspec.structs.asdict(self.decoder.decode(payload))
+        except MemoryError:  # the reader's fault
+            raise
+        except Exception as error:
+            raise self._refusal(payload, error) from None
+        del fields["version"]
+        for name, spec in self.arrays.items():
+            fields[name] = self._unpacked(name, spec, *fields[name])
+        message = object.__new__(self.kind)
+        vars(message).update(fields)  # at once: the __init__ of a frozen dataclass sets field by field
+        return message
+
+    def _refusal(self, payload: bytes, error: Exception) -> BadMessage:
+        """Why msgspec did not take a payload. Another release may send other fields: its version is the reason, then."""
+        where = self.kind.__name__
+        if not isinstance(error, msgspec.ValidationError):
+            return BadMessage("msgpack", f"{where}: MessagePack expected, came {payload[:16]!r}… ({error!s:.100})")
+        try:
+            version = _version(payload)
+        except msgspec.ValidationError:
+            return BadMessage("map", f"{where}: a map of fields expected ({error!s:.300})")
+        except (msgspec.DecodeError, RecursionError) as worse:
+            return BadMessage("msgpack", f"{where}: MessagePack expected, came {payload[:16]!r}… ({worse!s:.100})")
+        if version != VERSION:
+            why = f"wire version {VERSION} expected, {_short(version)} came: run one release of Penumbra everywhere"
+            return BadMessage("version", f"{where}: {why}")
+        found = re.search(r"\$\.(\w+)", str(error))
+        kind = self.faults.get(found[1], "fields") if found else "fields"
+        if kind == "number" and re.search(r"`(int|float)` [<>]=", str(error)):
+            kind = "range"
+        return BadMessage(kind, f"{where}: {error!s:.300}")
+
+    def _unpacked(self, name: str, spec: _ArraySpec, dtype: str, shape: tuple[int, ...], data: memoryview) -> np.ndarray:
+        """A view of the bytes of an array, when its values have been looked at."""
+        expected = spec.numpy.itemsize * math.prod(shape)
+        if len(data) != expected:
+            came = f"{expected} bytes for {dtype} {list(shape)} expected, {len(data)} came"
+            raise BadMessage("array", f"{self.kind.__name__}.{name}: {came}")
+        array: np.ndarray = np.ndarray(shape, spec.numpy, data)
+        if spec.numpy.kind != "f":
+            return array
+        # the sum of squares is soon made, and small where all is well; else each number is looked at, also where it is NaN
+        squares = float(np.vdot(array, array))
+        if not squares <= LARGEST and not np.abs(array).max() <= LARGEST:
+            count = int((~(np.abs(array) <= LARGEST)).sum())
+            wanted = f"finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not"
+            raise BadMessage("finite", f"{self.kind.__name__}.{name}: {wanted}")
+        if spec.check is not None and (fault := spec.check(array, squares)):
+            raise BadMessage("values", f"{self.kind.__name__}.{name}: {fault}")
+        return array
 
 
-_plan = typing.cast(Callable[[type[Message]], _Plan], functools.cache(_Plan))
+_codec = typing.cast(Callable[[type[M]], _Codec[M]], functools.cache(_Codec))
 
 
 def encode(message: Message) -> bytes:
     """The MessagePack bytes of a message. Raises BadMessage where an array has not the declared dtype and shape."""
-    out: dict[str, Any] = {"version": VERSION}
-    large = None
-    for name, write in _plan(type(message)).write.items():
-        value = write(getattr(message, name))
-        if type(value) is list and len(value[2]) >= LARGE:
-            large = name
-        out[name] = value
-    if large is None:
-        return msgpack.packb(out)
-    out[large] = out.pop(large)  # to the end, where a reader finds it without a copy
-    return b"".join(_pieces(out))
-
-
-def _pieces(fields: dict[str, Any]) -> Iterator[bytes | memoryview]:
-    """What MessagePack makes of a message's fields, with the bytes of arrays as they are: `packb` would copy them twice."""
-    packer = msgpack.Packer()
-    yield packer.pack_map_header(len(fields))
-    for name, value in fields.items():
-        yield packer.pack(name)
-        if isinstance(value, list):
-            dtype, shape, view = value
-            yield packer.pack_array_header(3) + packer.pack(dtype) + packer.pack(shape)
-            yield struct.pack(">BI", BIN32, len(view))
-            yield view
-        else:
-            yield packer.pack(value)
+    return _codec(type(message)).encode(message)
 
 
 def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: float = MAX_PAST_S) -> M:
@@ -280,63 +340,10 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: f
     """
     if len(payload) > kind.MAX_BYTES:
         raise BadMessage("size", f"{kind.__name__}: at most {kind.MAX_BYTES} bytes expected, {len(payload)} came")
-    try:
-        raw = _unpack(payload)
-    except MemoryError:  # the reader's fault
-        raise
-    except Exception as error:
-        raise BadMessage("msgpack", f"{kind.__name__}: MessagePack expected, came {payload[:16]!r}… ({error!s:.100})") from None
-    if not isinstance(raw, dict):
-        raise BadMessage("map", f"{kind.__name__}: a map of fields expected, a {type(raw).__name__} came")
-    version = raw.pop("version", None)
-    if version != VERSION:
-        raise BadMessage(
-            "version",
-            f"{kind.__name__}: wire version {VERSION} expected, {_short(version)} came: run one release of Penumbra everywhere",
-        )
-    read = _plan(kind).read
-    if raw.keys() != read.keys():
-        raise BadMessage("fields", f"{kind.__name__}: fields {list(read)} expected, {sorted(map(_short, raw))} came")
-    message = kind(**{name: convert(raw[name]) for name, convert in read.items()})
+    message = _codec(kind).decode(payload)
     if now_ns is not None:
         check_stamp(message, now_ns, oldest_s)
     return message
-
-
-def _unpack(payload: bytes) -> Any:
-    """The objects in a payload."""
-    if len(payload) <= Message.MAX_BYTES:
-        return msgpack.unpackb(payload, **_STRUCTURE)
-    found = _without_a_copy(payload)
-    return _counted(payload) if found is None else found
-
-
-def _counted(payload: bytes) -> Any:
-    """A large payload may be full of tiny lists, each many times its size in memory: they are counted."""
-    count = itertools.count(1)
-
-    def limited(container: Any) -> Any:
-        if next(count) > 64:
-            raise ValueError("too many lists and maps")
-        return container
-
-    return msgpack.unpackb(payload, list_hook=limited, object_hook=limited, **_STRUCTURE)
-
-
-def _without_a_copy(payload: bytes) -> Any:
-    """The objects of a payload that ends with the bytes of a large array, as `encode` writes it: these bytes stay where they are.
-    None for any other payload."""
-    at = payload.find(BIN32, 0, HEAD)
-    while at >= 0 and at + 5 + int.from_bytes(payload[at + 1 : at + 5], "big") != len(payload):
-        at = payload.find(BIN32, at + 1, HEAD)
-    if at < 0:
-        return None
-    found = msgpack.unpackb(payload[:at] + b"\xc4\x00", **_STRUCTURE)  # as if there were none of them
-    array = next(reversed(found.values()), None) if isinstance(found, dict) else None
-    if not isinstance(array, list) or array[-1:] != [b""]:
-        return None
-    array[-1] = memoryview(payload)[at + 5 :]
-    return found
 
 
 def check_stamp(message: Message, now_ns: int, oldest_s: float) -> None:
@@ -351,106 +358,45 @@ def check_stamp(message: Message, now_ns: int, oldest_s: float) -> None:
         )
 
 
-def _check_array(where: str, spec: _ArraySpec, dtype: str, shape: tuple[int, ...]) -> None:
-    fits = len(shape) == len(spec.shape) and all(n > 0 and m in (None, n) for n, m in zip(shape, spec.shape, strict=True))
-    if dtype != spec.dtype or not fits:
+def _array_on_the_wire(spec: _ArraySpec) -> Any:
+    """The type of [dtype, shape, bytes], of which msgspec lets nothing else through."""
+    literal: Any = Literal  # of values that are known only here
+    lengths = tuple(Annotated[int, msgspec.Meta(ge=1)] if n is None else literal[n] for n in spec.shape)
+    return types.GenericAlias(tuple, (literal[spec.dtype], types.GenericAlias(tuple, lengths), memoryview))
+
+
+def _packed(name: str, spec: _ArraySpec, value: Any) -> tuple[str, tuple[int, ...], memoryview]:
+    value = np.ascontiguousarray(value)
+    if value.dtype != spec.numpy or not spec.fits(value.shape):
         wanted = "x".join("n" if n is None else str(n) for n in spec.shape)
-        raise BadMessage("array", f"{where}: {spec.dtype} of shape {wanted} expected, {dtype} of shape {tuple(shape)} came")
+        raise BadMessage(
+            "array", f"{name}: {spec.dtype} of shape {wanted} expected, {value.dtype.name} of shape {value.shape} came"
+        )
+    return spec.dtype, value.shape, value.data
 
 
 def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
+    """A NumPy scalar as a Python number, for msgspec, which does not know it."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise NotImplementedError
 
 
-def _write_sources(value: dict[str, Source]) -> dict[str, Any]:
-    return {key: dict(vars(item)) for key, item in value.items()}
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
 
 
-def _array_writer(name: str, spec: _ArraySpec) -> Convert:
-    def write(value: Any) -> list[Any]:
-        value = np.ascontiguousarray(value)
-        if value.dtype != spec.numpy or value.shape != spec.shape:
-            _check_array(name, spec, value.dtype.name, value.shape)
-        return [spec.dtype, value.shape, value.data.cast("B") if value.nbytes >= LARGE else value.tobytes()]
+class _Version(msgspec.Struct):
+    """The version of a message of any release; what else is in it is skipped and not made into objects."""
 
-    return write
+    version: msgspec.Raw = msgspec.Raw(msgspec.msgpack.encode(None))
 
 
-def _array_reader(where: str, spec: _ArraySpec) -> Convert:
-    numpy, check, is_float = spec.numpy, spec.check, spec.numpy.kind == "f"
-
-    def read(value: Any) -> np.ndarray:
-        well_formed = (
-            type(value) is list
-            and len(value) == 3
-            and type(value[0]) is str
-            and type(value[1]) is list
-            and all(type(n) is int for n in value[1])
-            and isinstance(value[2], bytes | memoryview)
-        )
-        if not well_formed:
-            raise BadMessage("array", f"{where}: [dtype, shape, bytes] expected, {_short(value)} came")
-        dtype, shape, data = value
-        _check_array(where, spec, dtype, tuple(shape))
-        if len(data) != numpy.itemsize * math.prod(shape):
-            expected = numpy.itemsize * math.prod(shape)
-            raise BadMessage("array", f"{where}: {expected} bytes for {dtype} {shape} expected, {len(data)} came")
-        array = np.frombuffer(data, numpy).reshape(shape)
-        # the sum of squares is soon made, and small where all is well; else each number is looked at, also where it is NaN
-        if is_float and not np.vdot(array, array) <= LARGEST and not np.abs(array).max() <= LARGEST:
-            count = int((~(np.abs(array) <= LARGEST)).sum())
-            raise BadMessage("finite", f"{where}: finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not")
-        if check is not None and (fault := check(array)):
-            raise BadMessage("values", f"{where}: {fault}")
-        return array
-
-    return read
-
-
-def _number_reader(where: str, hint: type, within: tuple[float, float]) -> Convert:
-    low, high = within
-    kinds = (int,) if hint is int else (int, float)
-    wanted = "an integer" if hint is int else "a finite number"
-
-    def read(value: Any) -> Any:
-        if type(value) in kinds and low <= value <= high:
-            return hint(value)
-        if type(value) not in kinds or not math.isfinite(value):
-            raise BadMessage("number", f"{where}: {wanted} expected, {_short(value)} came")
-        raise BadMessage("range", f"{where}: {wanted} from {low:g} to {high:g} expected, {_short(value)} came")
-
-    return read
-
-
-def _text_reader(where: str, choice: tuple[str, ...] | None) -> Convert:
-    def read(value: Any) -> str:
-        if type(value) is str and (choice is None or value in choice):
-            return value
-        raise BadMessage("text", f"{where}: {' | '.join(choice) if choice else 'a text'} expected, {_short(value)} came")
-
-    return read
-
-
-def _sources_reader(where: str) -> Convert:
-    number = _number_reader(where, float, (-LARGEST, LARGEST))
-
-    def read(value: Any) -> dict[str, Source]:
-        if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-            raise BadMessage("sources", f"{where}: a map of sources expected, {_short(value)} came")
-        return {key: source(key, item) for key, item in value.items()}
-
-    def source(key: str, item: Any) -> Source:
-        if not isinstance(item, dict) or item.keys() != {"age_s", "weight"}:
-            raise BadMessage("sources", f"{where}.{key}: age_s and weight expected, {_short(item)} came")
-        return Source(number(item["age_s"]), number(item["weight"]))
-
-    return read
+def _version(payload: bytes) -> Any:
+    """The version that a payload carries, None where it carries none. Raises msgspec.DecodeError where it is no map of names."""
+    raw = msgspec.msgpack.decode(payload, type=_Version).version
+    return msgspec.msgpack.decode(raw) if len(raw) <= LONGEST_TEXT else f"something of {len(raw)} bytes"
 
 
 def _short(value: Any) -> str:
-    """A value in a log line: never more of it than a line holds, however large it is."""
-    if isinstance(value, bytes | str):
-        return repr(value[:40]) + ("…" if len(value) > 40 else "")
-    if isinstance(value, list | dict):
-        return f"a {'list' if isinstance(value, list) else 'map'} of {len(value)}"
+    """A value in a log line, and never more of it than a line holds."""
     return f"{value!r:.60}"

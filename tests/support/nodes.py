@@ -48,7 +48,7 @@ def pose_json(target: str = "forearm") -> bytes:
             "velocity": now.velocity.tolist(),
             "covariance": now.covariance.tolist(),
             "state": now.state,
-            "sources": {name: vars(source) for name, source in now.sources.items()},
+            "sources": {name: {"age_s": source.age_s, "weight": source.weight} for name, source in now.sources.items()},
         }
     ).encode()
 

@@ -117,7 +117,11 @@ def test_a_message_without_a_version_is_refused_as_one_of_before_there_were_vers
 
 
 def test_a_thousand_levels_of_nesting_are_refused():
-    assert refused(messages.Joints, b"\x91" * 60_000).kind == "msgpack"
+    deep = b"\x91" * 60_000
+    assert refused(messages.Joints, deep).kind == "map"
+    version = msgpack.packb({"version": messages.VERSION})[1:]
+    for before in (b"\x82" + version + b"\xa8position", b"\x82" + version + b"\xa5field", b"\x81\xa7version"):
+        assert refused(messages.Joints, before + deep).kind == "msgpack"
 
 
 @pytest.mark.parametrize("shape", [[2**62, 2**62, 3], [2**31, 2**31, 3], [0, 0, 3], [1, 1, 3, 1], [], [True, 1, 3], [-1, 1, 3]])
@@ -160,7 +164,9 @@ def test_a_number_outside_its_range_is_refused_with_the_range(kind, field, value
         messages.Mask: messages.Mask(stamp_ns=1, labels=np.zeros((2, 2), np.uint8), x0=0, y0=0, scale=1),
         messages.Voltages: messages.Voltages(stamp_ns=1, period_ns=1, volts=np.zeros((1, 1), np.float32)),
     }[kind]
-    assert "integer" in str(refused(kind, changed(good, **{field: value})))
+    error = refused(kind, changed(good, **{field: value}))
+    assert f"`$.{field}`" in str(error) and "Expected `int`" in str(error)
+    assert error.kind == ("range" if type(value) is int else "number")
 
 
 def test_a_share_that_is_off_by_rounding_is_taken():
@@ -195,21 +201,26 @@ def test_encoding_an_array_of_the_wrong_shape_says_what_was_expected():
         encode(dataclasses.replace(pose(), position=np.zeros(2, np.float32)))
 
 
-def test_a_large_array_is_packed_last_as_plain_message_pack_and_read_where_it_lies(monkeypatch):
+def test_an_array_is_plain_message_pack_and_is_read_where_it_lies():
     rng = np.random.default_rng(0)
     sent = [
         messages.Frame(stamp_ns=5, image=rng.integers(0, 255, (300, 400, 3), np.uint8)),
         messages.Mask(stamp_ns=5, labels=rng.integers(0, 6, (300, 400), np.uint8), x0=-3, y0=700, scale=2),
     ]
-    large = [messages.encode(message) for message in sent]
-    monkeypatch.setattr(messages, "LARGE", 1 << 40)
-    for message, payload, name in zip(sent, large, ("image", "labels"), strict=True):
-        plain = messages.encode(message)
-        assert msgpack.unpackb(payload) == msgpack.unpackb(plain)
-        array, copied = (getattr(messages.decode(type(message), data), name) for data in (payload, plain))
-        assert (array == getattr(message, name)).all() and (copied == array).all()
+    for message, name in zip(sent, ("image", "labels"), strict=True):
+        payload, expected = encode(message), getattr(message, name)
+        dtype, shape, data = msgpack.unpackb(payload)[name]
+        assert (np.frombuffer(data, dtype).reshape(shape) == expected).all()
+        array = getattr(decode(type(message), payload), name)
+        assert (array == expected).all()
         assert np.shares_memory(array, np.frombuffer(payload, np.uint8))
         assert not array.flags.writeable
+
+
+def test_the_fields_of_a_map_may_come_in_any_order_as_other_libraries_write_them():
+    sent = pose()
+    fields = msgpack.unpackb(encode(sent))
+    same(decode(messages.FusedPose, msgpack.packb(dict(reversed(fields.items())))), sent)
 
 
 @pytest.mark.parametrize("change", ["shorter", "longer", "head", "nested"])
