@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         return _run(command, rest)
     except ImportError as error:
-        return _explain_import(command, error)
+        return _explain_import(command, error, rest)
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # `penumbra topics | head`
@@ -166,7 +166,7 @@ def _is_ours(error: Exception) -> bool:
     return isinstance(error, BusError | Refused | CellError | FileNotFoundError)
 
 
-def _explain_import(command: str, error: ImportError) -> int:
+def _explain_import(command: str, error: ImportError, argv: Sequence[str] = ()) -> int:
     """Names the extra that installs what is missing; an error in our own code is not explained away."""
     name = (error.name or "").partition(".")[0]
     if not name or (name in ("services", "shared", "sim") and error.name != f"services.{command}"):
@@ -175,6 +175,8 @@ def _explain_import(command: str, error: ImportError) -> int:
         print(f"penumbra {command}: not part of this installation", file=sys.stderr)
         return 2
     extra = command if command in (*SERVICES, "certs") else ("test" if command == "bench" else "all")
+    if argv and ".train:" in TOOLS.get((command, argv[0]), ""):
+        extra = "train"
     print(f"penumbra {command}: {name} is not installed: pip install -e '.[{extra}]'", file=sys.stderr)
     return 2
 

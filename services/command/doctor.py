@@ -27,7 +27,7 @@ SHM_BYTES = 128 << 20
 """Frames cross between processes in shared memory; Docker's default of 64 MB is too little for two cameras."""
 CORE = ("eclipse-zenoh", "msgpack", "numpy", "scipy", "pydantic", "pyyaml", "prometheus_client", "psutil", "rich")
 EXTRAS = {
-    "torch": "segmentation",
+    "torch": "train",
     "openvino": "segmentation",
     "numba": "search",
     "opencv-python-headless": "search",

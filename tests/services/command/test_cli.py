@@ -101,6 +101,14 @@ def test_a_missing_package_is_one_line_with_the_extra_that_installs_it():
     assert (result.returncode, result.stderr) == (2, "penumbra fusion: msgpack is not installed: pip install -e '.[fusion]'\n")
 
 
+@pytest.mark.parametrize("command", ["segmentation train", "posecnn train", "haptics train", "skin model"])
+def test_training_without_torch_names_the_extra_for_training(command):
+    code = "import sys; sys.modules['torch'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    result = run(*command.split(), code=code)
+    service = command.split()[0]
+    assert (result.returncode, result.stderr) == (2, f"penumbra {service}: torch is not installed: pip install -e '.[train]'\n")
+
+
 def test_an_import_error_in_our_own_code_is_not_explained_away():
     with pytest.raises(ImportError):
         cli._explain_import("fusion", ImportError("cannot import name 'x' from 'shared.runtime.bus'", name="shared.runtime.bus"))
