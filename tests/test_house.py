@@ -35,7 +35,7 @@ def test_only_the_emulator_train_py_and_characterise_py_know_the_simulated_world
         ("fusion", {"torch", "cv2", "pybullet", "trimesh", *SCIPY}),
         ("haptics", {"torch", "cv2", "trimesh", *SCIPY}),
         ("search", {"torch", *SCIPY}),
-        ("segmentation", {"numba", "pybullet", "trimesh", *SCIPY}),
+        ("segmentation", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
         ("posecnn", {"openvino", "pybullet", "trimesh", *SCIPY}),
         ("emulator", {"torch"}),
         ("skin", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),

@@ -18,6 +18,7 @@ from shared.cell.description import Camera, Cell
 from shared.contract.labels import Label
 from shared.geometry import raster, rigid
 from shared.geometry.rigid import Array
+from shared.native import processor
 from shared.perception.lookout import Window
 from shared.perception.vision import State, VisionEstimate
 
@@ -80,8 +81,7 @@ class PoseCNN:
         if net is None or uncertainty is None:
             net, uncertainty = load()
         self._net, self._uncertainty = net, uncertainty
-        able = torch.cpu.get_capabilities()
-        self._half = bool(able.get("avx512_bf16") or able.get("amx_bf16"))
+        self._half = processor.has_bfloat16()
         self._T_camera_world = rigid.inverse(self._camera.T_world_camera)
         self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])
 

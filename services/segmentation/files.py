@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
@@ -63,7 +62,6 @@ def arguments() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Write the masks; returns 2 where a file cannot be read."""
     options = arguments().parse_args(argv)
-    torch.set_num_threads(1)
     try:
         names = [path.stem for path in options.files]
         if len(set(names)) < len(names):

@@ -16,44 +16,19 @@ References: Lotter, Kreiman, Cox 2017 (arXiv:1605.08104); Linsley, Kim, Veerabad
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from services.segmentation import model
+from services.segmentation.model import FOLD, Model, Settings
 from shared.contract.labels import Label
 
 State = tuple[Tensor, ...]
 """What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""
-
-FOLD = 2
-"""Pixels a side that one position of the first layer sees."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Size of the network. channels, kernels: of the cell of each layer. The authors have 64-128-256-512 and kernels of 5;
-    kernels of 5 in the two coarse layers alone cost a tenth of the time of 5 everywhere and reach as far. `delay`: axonal
-    delays. `cell`: one of CELLS, all of nearly the same number of parameters."""
-
-    channels: tuple[int, ...] = (16, 16, 32, 64)
-    kernels: tuple[int, ...] = (3, 3, 5, 5)
-    decoder_channels: int = 16
-    delay: bool = False
-    cell: str = "hgru"
-
-    def __post_init__(self) -> None:
-        if self.cell not in CELLS:
-            raise ValueError(f"cell: one of {', '.join(CELLS)} expected, {self.cell!r} came")
-        if self.cell == "convlstm" and any(n % 2 for n in self.channels):
-            raise ValueError(f"even channels expected, a ConvLSTM halves them, {self.channels} came")
-        if len(self.channels) != len(self.kernels) or len(self.channels) < 2:
-            raise ValueError(f"one kernel for each of at least 2 layers expected, got {self.channels} and {self.kernels}")
 
 
 class HGRU(nn.Module):
@@ -84,10 +59,7 @@ class HGRU(nn.Module):
 
 def _scale(x: Tensor, gain: Tensor, offset: Tensor | None = None) -> Tensor:
     """gain * x + offset per channel. As a 1 x 1 convolution: with channels innermost in memory torch's broadcasting is 4 times
-    slower. OpenVINO, for which the network is traced, has it the other way round."""
-    if torch.jit.is_tracing():
-        scaled = x * gain[:, None, None]
-        return scaled if offset is None else scaled + offset[:, None, None]
+    slower."""
     return F.conv2d(x, torch.diag(gain)[:, :, None, None], offset)
 
 
@@ -129,9 +101,9 @@ CELLS: dict[str, type[nn.Module]] = {"hgru": HGRU, "convlstm": ConvLSTM, "conv":
 class PredNet(nn.Module):
     """The network of the module's description. Images are (batch, 3, h, w) in [0, 1], h and w multiples of `multiple`."""
 
-    def __init__(self, settings: Settings = Settings()):
+    def __init__(self, settings: Settings | None = None):
         super().__init__()
-        self.settings = settings
+        self.settings = settings = settings or Settings()
         c, n = settings.channels, len(settings.channels)
         self._inputs = inputs = [3 * FOLD * FOLD, *c[1:]]  # channels of A_l
         self.predict = nn.ModuleList(nn.Conv2d(c[i], inputs[i], 3, padding=1) for i in range(n))
@@ -145,34 +117,15 @@ class PredNet(nn.Module):
             if isinstance(module, nn.Conv2d):
                 module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)
 
-    @property
-    def layer_strides(self) -> tuple[int, ...]:
-        """Image pixels a side of one position of each layer."""
-        return tuple(FOLD * 2 ** max(i - 1, 0) for i in range(len(self.settings.channels)))
-
-    @property
-    def strides(self) -> tuple[int, ...]:
-        """The same for each tensor of the state."""
-        return self.layer_strides * (2 if self.settings.delay else 1)
-
-    @property
-    def multiple(self) -> int:
-        """Images have a multiple of this many pixels a side, and the state can be shifted by multiples of it."""
-        return self.layer_strides[-1]
-
     def initial_state(self, batch: int, height: int, width: int) -> State:
         """The state that has seen nothing, for images of this size. Raises ValueError where the size does not fit."""
-        if height % self.multiple or width % self.multiple or min(height, width) <= 0:
-            raise ValueError(f"image size: positive multiples of {self.multiple} expected, {width} x {height} came")
         channels = list(self.settings.channels)
         if self.settings.delay:
             channels += [2 * n for n in self._inputs]
         weight = self.head.weight
         return tuple(
-            torch.zeros(batch, c, height // s, width // s, dtype=weight.dtype, device=weight.device).to(
-                memory_format=torch.channels_last
-            )
-            for c, s in zip(channels, self.strides, strict=True)
+            torch.zeros(batch, c, *size, dtype=weight.dtype, device=weight.device).to(memory_format=torch.channels_last)
+            for c, size in zip(channels, self.settings.state_sizes(height, width), strict=True)
         )
 
     def forward(self, image: Tensor, state: State) -> tuple[Tensor, list[Tensor], State]:
@@ -209,22 +162,22 @@ class PredNet(nn.Module):
         return F.pixel_shuffle(self.head(F.relu(total)), FOLD)
 
 
+def stored(net: PredNet) -> Model:
+    """The network as it is stored and run."""
+    return Model(net.settings, {name: value.detach().float().numpy().copy() for name, value in net.state_dict().items()})
+
+
 def save(path: Path, net: PredNet, card: dict[str, Any]) -> None:
-    """Write weights (npz, half precision: a third of the mask's noise floor, half the size) and their card beside them."""
-    np.savez(path, **{name: value.detach().float().numpy().astype(np.float16) for name, value in net.state_dict().items()})
-    text = json.dumps({**card, "settings": {**card.get("settings", {}), "network": asdict(net.settings)}}, indent=2)
-    path.with_suffix(".json").write_text(text + "\n")
+    """Write weights and their card beside them."""
+    model.save(path, stored(net), card)
 
 
 def load(path: Path) -> tuple[PredNet, dict[str, Any]]:
     """The network of a weights file and its card. Raises ValueError where the two do not fit together."""
-    card = json.loads(path.with_suffix(".json").read_text())
-    network = {key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"]["network"].items()}
-    net = PredNet(Settings(**network))  # type: ignore[arg-type]
-    with np.load(path, allow_pickle=False) as stored:
-        weights = {name: torch.from_numpy(stored[name].astype(np.float32)) for name in stored.files}
+    network, card = model.load(path)
+    net = PredNet(network.settings)
     try:
-        net.load_state_dict(weights)
+        net.load_state_dict({name: torch.from_numpy(value) for name, value in network.weights.items()})
     except RuntimeError as error:
-        raise ValueError(f"{path}: weights of {network} expected as its card says: {error}") from None
+        raise ValueError(f"{path}: weights of {network.settings} expected as its card says: {error}") from None
     return net.eval(), card

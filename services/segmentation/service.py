@@ -6,8 +6,6 @@ import argparse
 from collections.abc import Iterable
 from pathlib import Path
 
-import torch
-
 from services.segmentation.inference import WEIGHTS, Segmenter, load_segmenter
 from shared.cell.description import Camera
 from shared.contract.messages import Frame, FusedPose, Mask
@@ -17,7 +15,9 @@ from shared.runtime.node import Node
 
 NAME = "segmentation"
 FOLLOW_S = 0.2
-"""How often a replica looks where it would have to look in the frames that are another one's."""
+"""How often it looks where the next frames will be looked at, also those that are another replica's."""
+AHEAD_S = 0.4
+"""How far ahead: where targets go on as they move, what the network needs for a window is compiled by then."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,12 +28,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def start(node: Node, options: argparse.Namespace) -> None:
     """Segment the frames of the cell's cameras that this replica owns."""
-    torch.set_num_threads(1)
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
 
     lookouts = {name: Lookout(cell, name) for name in cameras}
     segmenters = {name: load_segmenter(options.weights) for name in cameras}
+    for name, segmenter in segmenters.items():
+        segmenter.prepare(lookouts[name].window)  # while the process joins the others
 
     heard: set[str] = set()
 
@@ -47,14 +48,18 @@ def start(node: Node, options: argparse.Namespace) -> None:
         look."""
         if not heard:
             return False
-        windows = {name: lookouts[name].look(node.now_ns()) for name in names}
+        now_ns = node.now_ns()
+        windows = {name: lookouts[name].foresee(now_ns) for name in names}
         for name, window in windows.items():
-            segmenters[name].prepare(window)
+            segmenters[name].prepare(window, lookouts[name].foresee(now_ns + round(AHEAD_S * 1e9)))
         return all(segmenters[name].is_prepared(window) for name, window in windows.items())
 
     def follow() -> None:
-        """What another replica works on may be this one's next."""
-        is_ready([name for name in lookouts if not node.owns(f"camera/{name}")])
+        """What another replica works on may be this one's next, and the other replica does not say how it looks at it."""
+        for name, lookout in lookouts.items():
+            if not node.owns(f"camera/{name}"):
+                lookout.look(node.now_ns())
+        is_ready(lookouts)
 
     def watch(name: str, camera: Camera, lookout: Lookout, segmenter: Segmenter) -> None:
         def on_frame(frame: Frame, _: dict[str, str]) -> None:
@@ -64,7 +69,6 @@ def start(node: Node, options: argparse.Namespace) -> None:
                     f"camera {name}: frames of {camera.width} x {camera.height} expected (the cell file), {came} came"
                 )
             window = lookout.look(frame.stamp_ns)
-            segmenter.prepare(window)
             labels = segmenter(frame.image, window, frame.stamp_ns)
             mask = Mask(stamp_ns=frame.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=window.scale)
             node.publish(MASK, mask, camera=name)

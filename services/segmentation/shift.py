@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
+import numpy as np
 
-from services.segmentation.prednet import State
+from services.segmentation.openvino_step import State
 from shared.perception.lookout import Window
 
 
@@ -22,9 +22,9 @@ def shift_state(state: State, strides: Sequence[int], old: Window, new: Window) 
     for tensor, stride in zip(state, strides, strict=True):
         dx, dy = ((new.x0 - old.x0) // (old.scale * stride), (new.y0 - old.y0) // (old.scale * stride))
         height, width = new.height // stride, new.width // stride
-        moved = torch.zeros(*tensor.shape[:2], height, width, dtype=tensor.dtype).to(memory_format=torch.channels_last)
-        rows = slice(max(0, dy), max(max(0, dy), min(tensor.shape[2], height + dy)))
-        columns = slice(max(0, dx), max(max(0, dx), min(tensor.shape[3], width + dx)))
-        moved[:, :, rows.start - dy : rows.stop - dy, columns.start - dx : columns.stop - dx] = tensor[:, :, rows, columns]
+        moved = np.zeros((1, height, width, tensor.shape[-1]), tensor.dtype)
+        rows = slice(max(0, dy), max(max(0, dy), min(tensor.shape[1], height + dy)))
+        columns = slice(max(0, dx), max(max(0, dx), min(tensor.shape[2], width + dx)))
+        moved[:, rows.start - dy : rows.stop - dy, columns.start - dx : columns.stop - dx] = tensor[:, rows, columns]
         out.append(moved)
     return tuple(out)

@@ -109,11 +109,15 @@ class Lookout:
 
     def look(self, stamp_ns: int) -> Window:
         """The window for a frame exposed at a stamp: kept where it was while it does (`window_around`)."""
+        self._window = self.foresee(stamp_ns)
+        return self._window
+
+    def foresee(self, stamp_ns: int) -> Window:
+        """The window that `look` would give next, for a frame of this stamp."""
         known = {name: predict(self._poses.get(name), stamp_ns)[0] for name in self._boxes}
         sure = [(T, self._boxes[name]) for name, T in known.items() if T is not None]
         found = window_around(self._camera, sure, self._window) if len(sure) == len(known) else None
-        self._window = found or self._wide([name for name, T in known.items() if T is None], sure)
-        return self._window
+        return found or self._wide([name for name, T in known.items() if T is None], sure)
 
     def _wide(self, lost: Iterable[str] = (), sure: Iterable[tuple[Array, Array]] = ()) -> Window:
         homes = [self._homes[name] for name in lost or self._homes]

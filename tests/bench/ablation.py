@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from services.flags import Parser, above_zero, positive
-from services.segmentation import inference
+from services.segmentation import inference, prednet
 from services.segmentation.prednet import Settings
 from services.segmentation.training import evaluate, train
 from shared import training
@@ -65,7 +65,7 @@ def learn(name: str, data: train.Data, seed: int, minutes: float, steps: int | N
 def score(trainer: train.Trainer, data: train.Data, seed: int) -> dict[str, Any]:
     """The averaged weights on held-out sequences, calibrated on others."""
     offset, _ = evaluate.calibrate(trainer.average, data.calibration)
-    segmenter = inference.Segmenter(trainer.average, offset)
+    segmenter = inference.Segmenter(prednet.stored(trainer.average), offset)
     ms = inference.speed(segmenter, segmentation.VARIETY.size, segmentation.VARIETY.size)
     found = segmentation.result(seed, segmentation.rows(segmenter, data.held_out), [], ms)
     return {"rows": found["rows"], "ms_per_frame": found["ms_per_frame"]}

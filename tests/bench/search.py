@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -464,7 +463,6 @@ def judged(seed: int, plan: Plan) -> dict[str, Any]:
 
 def measure(seed: int, plan: Plan, parts: tuple[str, ...]) -> dict[str, Any]:
     """The whole benchmark; `parts` of exact, network, judged."""
-    torch.set_num_threads(1)
     masks = tuple(part for part in parts if part != "judged")
     exact_results(seed + 1, VIEWS[0], 0.3, 1)  # compiles and warms up
     if "network" in masks:

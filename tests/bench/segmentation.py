@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -129,7 +128,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--weights", type=Path, default=inference.WEIGHTS, help="the network (default: the committed one)")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)
-    torch.set_num_threads(1)
     segmenter = inference.load_segmenter(options.weights)
     ms = inference.speed(segmenter, VARIETY.size, VARIETY.size, 200)
     count = -(-options.frames // (VARIETY.frames - WARM_UP))

@@ -35,6 +35,7 @@ from shared.cell import description as cells
 from shared.contract.labels import Label
 from shared.geometry import rigid
 from shared.geometry.rigid import Array
+from shared.native import processor
 from sim.sets import sequences, shots
 
 VALIDATION_SEED = 2_000_000
@@ -243,8 +244,7 @@ class Trainer(training.Trainer[Network, Simulated]):
         hand = np.unique(mesh.faces[mesh.labels == Label.HAND])
         self._hand = torch.from_numpy(hand)
         self._forearm = torch.from_numpy(np.setdiff1d(np.arange(len(mesh.vertices)), hand))
-        able = torch.cpu.get_capabilities()
-        self._half = bool(able.get("avx512_bf16") or able.get("amx_bf16"))
+        self._half = processor.has_bfloat16()
 
     def train_step(self, data: Simulated, progress: float) -> dict[str, float]:
         """One step of gradient descent; returns the parts of the loss."""

@@ -89,7 +89,7 @@ def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str,
     scores: list[FrameScore] = []
     both, either = np.zeros(len(Label)), np.zeros(len(Label))
     for sequence in data:
-        found = np.stack([classes(logits + bias) for logits in run(net, sequence.images)])[WARM_UP:]
+        found = np.stack([classes((logits + bias).numpy()) for logits in run(net, sequence.images)])[WARM_UP:]
         labels = sequence.labels[WARM_UP:]
         for label in Label:
             both[label] += np.sum((found == label) & (labels == label))

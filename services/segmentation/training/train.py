@@ -28,6 +28,7 @@ from services.segmentation.prednet import PredNet, Settings
 from services.segmentation.training import loss, recordings
 from services.segmentation.training.evaluate import Labelled, calibrate, held_out
 from shared import training
+from shared.native import processor
 from sim.sets import sequences
 
 VALIDATION_SEED = 1_000_000
@@ -165,7 +166,7 @@ class Trainer(training.Trainer[PredNet, Data]):
         torch.manual_seed(seed)
         net = PredNet(settings)
         super().__init__(settings, schedule, seed, net, torch.optim.Adam(net.parameters(), betas=(0.9, 0.98)))
-        self._half = inference.fastest_dtype() is torch.bfloat16
+        self._half = processor.has_bfloat16()
 
     def train_step(self, data: Data, progress: float) -> dict[str, float]:
         """One step of gradient descent; returns the parts of the loss."""

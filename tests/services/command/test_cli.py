@@ -13,7 +13,7 @@ import pytest
 
 from services.command import cli, doctor
 from shared.cell import description as cells
-from shared.contract import topics
+from shared.contract import processes, topics
 from shared.runtime import bus
 from shared.runtime.node import Node
 from tests.support import injected
@@ -96,9 +96,18 @@ def test_no_router_is_one_line_that_says_how_to_start_one(capsys):
 
 
 def test_a_missing_package_is_one_line_with_the_extra_that_installs_it():
-    code = "import sys; sys.modules['msgpack'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; sys.modules['msgspec'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
     result = run("fusion", code=code)
-    assert (result.returncode, result.stderr) == (2, "penumbra fusion: msgpack is not installed: pip install -e '.[fusion]'\n")
+    assert (result.returncode, result.stderr) == (2, "penumbra fusion: msgspec is not installed: pip install -e '.[fusion]'\n")
+
+
+@pytest.mark.parametrize("command", ["segmentation train", "posecnn train", "haptics train", "skin model"])
+def test_training_without_torch_names_the_extra_for_training(command):
+    code = "import sys; sys.modules['torch'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    result = run(*command.split(), code=code)
+    extra = processes.tool(*command.split()).extra
+    assert "training" in extra.split(",")
+    assert (result.returncode, result.stderr) == (2, f"penumbra {command}: torch is not installed: pip install -e '.[{extra}]'\n")
 
 
 def test_an_import_error_in_our_own_code_is_not_explained_away():

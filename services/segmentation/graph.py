@@ -1,0 +1,121 @@
+"""PredNet in OpenVINO's operations, from stored weights: one time step, line by line that of `prednet.PredNet.forward`.
+
+Tensors are (1, channels, h, w), as in torch. Only the image, which comes in, and the state, which comes in and goes out, have
+their channels innermost: so they lie in memory, and the convolutions on a CPU want them so too, hence nothing is reordered.
+
+It is built without torch, in some milliseconds. OpenVINO starts a thread when it is imported, so a process that will be forked
+imports this module only afterwards.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import openvino
+from openvino import opset13 as op
+
+from services.segmentation.model import FOLD, Model
+
+CHANNELS_FIRST, CHANNELS_LAST = np.array([0, 3, 1, 2]), np.array([0, 2, 3, 1])
+
+
+def step(model: Model, height: int, width: int, precision: str) -> Any:
+    """OpenVINO's model of a time step for images of one size. precision: OpenVINO's name of the state's type, f32 or bf16.
+
+    Inputs: the image (1, h, w, channels) float32 in [0, 1], then the tensors of the state (1, h / stride, w / stride, channels).
+    Outputs: the class logits (1, classes, h, w) float32, then the new state. Raises ValueError where the size does not fit.
+    """
+    inputs, sizes = model.inputs, model.settings.state_sizes(height, width)
+    state_type = getattr(openvino.Type, precision)
+    image = op.parameter([1, height, width, inputs[0] // FOLD**2], np.float32, "image")
+    state = [op.parameter([1, *size, channels], state_type) for size, channels in zip(sizes, model.state_channels, strict=True)]
+    logits, new = _Step(model).forward(_channels_first(image), [_channels_first(tensor) for tensor in state])
+    outputs = [op.convert(logits, "f32"), *(op.convert(op.transpose(r, CHANNELS_LAST), state_type) for r in new)]
+    return openvino.Model(outputs, [image, *state], "prednet")
+
+
+def _channels_first(parameter: Any) -> Any:
+    return op.transpose(op.convert(parameter, "f32"), CHANNELS_FIRST)
+
+
+class _Step:
+    """The operations of a time step; names of layers are those of the weights."""
+
+    def __init__(self, model: Model):
+        self._settings, self._weights = model.settings, model.weights
+
+    def forward(self, image: Any, state: list[Any]) -> tuple[Any, list[Any]]:
+        """(class logits, new state) of an image and the old state."""
+        n = len(self._settings.channels)
+        old, heard = state[:n], state[n:]  # with delays: E_l of the step before
+        errors: list[Any] = []
+        arriving = op.space_to_depth(image, "depth_first", FOLD)
+        for i in range(n):
+            difference = op.subtract(arriving, self._convolution(f"predict.{i}", old[i]))
+            errors.append(op.relu(op.concat([difference, op.negative(difference)], 1)))
+            if i + 1 < n:
+                up = self._convolution(f"ascend.{i}", heard[i] if heard else errors[i])
+                arriving = op.relu(_pooled(up) if i > 0 else up)
+        new: list[Any] = []
+        for i in reversed(range(n)):
+            drive = self._convolution(f"drive.{i}", errors[i])
+            if i + 1 < n:
+                down = self._convolution(f"descend.{i}", old[i + 1] if heard else new[0])
+                drive = op.add(drive, _enlarged(down, 2, "nearest") if i > 0 else down)
+            new.insert(0, getattr(self, f"_{self._settings.cell}")(f"cells.{i}", drive, old[i]))
+        return self._decoded(new), [*new, *(errors if heard else ())]
+
+    def _decoded(self, representations: list[Any]) -> Any:
+        total = self._convolution("decode.0", representations[1])
+        for i in range(2, len(representations)):
+            part = self._convolution(f"decode.{i - 1}", representations[i])
+            total = op.add(total, _enlarged(part, 2 ** (i - 1), "linear_onnx"))
+        return op.depth_to_space(self._convolution("head", op.relu(total)), "depth_first", FOLD)
+
+    def _hgru(self, name: str, drive: Any, state: Any) -> Any:
+        inhibition = self._convolution(
+            f"{name}.horizontal", op.multiply(op.sigmoid(self._convolution(f"{name}.gain_gate", state)), state)
+        )
+        first = op.tanh(op.subtract(drive, op.multiply(inhibition, self._scaled(name, state, "alpha", "mu"))))
+        excitation = self._convolution(f"{name}.horizontal", first)
+        mixed = op.add(self._scaled(name, first, "kappa"), op.multiply(excitation, self._scaled(name, first, "omega", "beta")))
+        gate = op.sigmoid(self._convolution(f"{name}.mix_gate", first))
+        return op.add(state, op.multiply(op.subtract(op.tanh(mixed), state), gate))
+
+    def _convlstm(self, name: str, drive: Any, state: Any) -> Any:
+        output, memory = op.split(state, 1, 2).outputs()
+        gates = op.add(self._convolution(f"{name}.recurrent", output), self._convolution(f"{name}.input", drive))
+        enter, keep, leave, new = op.split(gates, 1, 4).outputs()
+        memory = op.add(op.multiply(op.sigmoid(keep), memory), op.multiply(op.sigmoid(enter), op.tanh(new)))
+        return op.concat([op.multiply(op.sigmoid(leave), op.tanh(memory)), memory], 1)
+
+    def _conv(self, name: str, drive: Any, state: Any) -> Any:
+        return op.tanh(op.add(self._convolution(f"{name}.recurrent", state), self._convolution(f"{name}.input", drive)))
+
+    def _convolution(self, name: str, x: Any) -> Any:
+        """A convolution of stride 1 that keeps the size."""
+        kernel, bias = self._weights[f"{name}.weight"], self._weights.get(f"{name}.bias")
+        room = [kernel.shape[-1] // 2] * 2
+        found = op.convolution(x, op.constant(kernel), [1, 1], room, room, [1, 1])
+        return found if bias is None else op.add(found, op.constant(bias.reshape(1, -1, 1, 1)))
+
+    def _scaled(self, name: str, x: Any, gain: str, offset: str | None = None) -> Any:
+        """gain * x + offset per channel."""
+        scaled = op.multiply(x, self._per_channel(f"{name}.{gain}"))
+        return scaled if offset is None else op.add(scaled, self._per_channel(f"{name}.{offset}"))
+
+    def _per_channel(self, name: str) -> Any:
+        return op.constant(self._weights[name].reshape(1, -1, 1, 1))
+
+
+def _pooled(x: Any) -> Any:
+    """The greatest of each 2 x 2 positions."""
+    return op.max_pool(x, [2, 2], [1, 1], [0, 0], [0, 0], [2, 2]).output(0)
+
+
+def _enlarged(x: Any, factor: int, mode: str) -> Any:
+    """torch's `interpolate` with corners not aligned."""
+    scales, axes = np.array([factor, factor], np.float32), np.array([2, 3])
+    where = "asymmetric" if mode == "nearest" else "half_pixel"
+    return op.interpolate(x, scales, mode, "scales", axes=axes, coordinate_transformation_mode=where, nearest_mode="floor")

@@ -1,0 +1,97 @@
+"""The network's shape and weights, as they are stored: what the running service, which knows no torch, has of it.
+
+`prednet.py` is the same network in torch, to be trained; `compiled.py` the same in OpenVINO, to be run.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FOLD = 2
+"""Pixels a side that one position of the first layer sees."""
+CELLS = ("hgru", "convlstm", "conv")
+"""What may update a layer's representation; `prednet.py` describes them."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Size of the network. channels, kernels: of the cell of each layer. The authors have 64-128-256-512 and kernels of 5;
+    kernels of 5 in the two coarse layers alone cost a tenth of the time of 5 everywhere and reach as far. `delay`: axonal
+    delays. `cell`: one of CELLS, all of nearly the same number of parameters."""
+
+    channels: tuple[int, ...] = (16, 16, 32, 64)
+    kernels: tuple[int, ...] = (3, 3, 5, 5)
+    decoder_channels: int = 16
+    delay: bool = False
+    cell: str = "hgru"
+
+    def __post_init__(self) -> None:
+        if self.cell not in CELLS:
+            raise ValueError(f"cell: one of {', '.join(CELLS)} expected, {self.cell!r} came")
+        if self.cell == "convlstm" and any(n % 2 for n in self.channels):
+            raise ValueError(f"even channels expected, a ConvLSTM halves them, {self.channels} came")
+        if len(self.channels) != len(self.kernels) or len(self.channels) < 2:
+            raise ValueError(f"one kernel for each of at least 2 layers expected, got {self.channels} and {self.kernels}")
+
+    @property
+    def layer_strides(self) -> tuple[int, ...]:
+        """Image pixels a side of one position of each layer."""
+        return tuple(FOLD * 2 ** max(i - 1, 0) for i in range(len(self.channels)))
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """The same for each tensor of the state."""
+        return self.layer_strides * (2 if self.delay else 1)
+
+    @property
+    def multiple(self) -> int:
+        """Images have a multiple of this many pixels a side, and the state can be shifted by multiples of it."""
+        return self.layer_strides[-1]
+
+    def state_sizes(self, height: int, width: int) -> tuple[tuple[int, int], ...]:
+        """(height, width) of each tensor of the state for images of this size. Raises ValueError where the size does not fit."""
+        if height % self.multiple or width % self.multiple or min(height, width) <= 0:
+            raise ValueError(f"image size: positive multiples of {self.multiple} expected, {width} x {height} came")
+        return tuple((height // stride, width // stride) for stride in self.strides)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A network: its settings, and its parameters (float32) by the names that they have in `prednet.PredNet`."""
+
+    settings: Settings
+    weights: dict[str, NDArray[np.float32]]
+
+    @property
+    def inputs(self) -> tuple[int, ...]:
+        """Channels of the input A_l of each layer, which layer l predicts."""
+        return tuple(len(self.weights[f"predict.{i}.bias"]) for i in range(len(self.settings.channels)))
+
+    @property
+    def state_channels(self) -> tuple[int, ...]:
+        """Channels of each tensor of the state: R_l of every layer and, with axonal delays, E_l after them."""
+        errors = tuple(2 * n for n in self.inputs) if self.settings.delay else ()
+        return self.settings.channels + errors
+
+
+def save(path: Path, model: Model, card: dict[str, Any]) -> None:
+    """Write weights (npz, half precision: a third of the mask's noise floor, half the size) and their card beside them."""
+    halves: dict[str, Any] = {name: value.astype(np.float16) for name, value in model.weights.items()}
+    np.savez(path, **halves)
+    text = json.dumps({**card, "settings": {**card.get("settings", {}), "network": asdict(model.settings)}}, indent=2)
+    path.with_suffix(".json").write_text(text + "\n")
+
+
+def load(path: Path) -> tuple[Model, dict[str, Any]]:
+    """The network of a weights file and its card."""
+    card = json.loads(path.with_suffix(".json").read_text())
+    network = {key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"]["network"].items()}
+    with np.load(path, allow_pickle=False) as stored:
+        weights = {name: stored[name].astype(np.float32) for name in stored.files}
+    return Model(Settings(**network), weights), card  # type: ignore[arg-type]
