@@ -7,7 +7,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -82,8 +82,8 @@ def _row(values: list[float], scale: float, spec: str, unit: str, spread: float 
     return f"{text} {unit}" + ("" if spread is None else f"  +- {spread * scale:.2g} {unit}")
 
 
-def list_topics(argv: list[str]) -> int:
-    """`penumbra topics [--hz]`"""
+def list_topics(argv: list[str], known: Sequence[topics.Topic] = topics.TOPICS) -> int:
+    """`penumbra topics [--hz]` of the topics that are known."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -97,17 +97,17 @@ def list_topics(argv: list[str]) -> int:
     if not options.hz:
         table = Table("topic", "key", "message", "Hz", "slow link", "quality of service", "priority", "stale after", "from",
                       "what", box=None)  # fmt: skip
-        for topic in topics.TOPICS:
+        for topic in known:
             key = topic.key.replace("{cell}", cell.name)
             table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", f"{topic.slow_hz:g}",
                           topic.qos.name.lower().replace("_", " "), topic.priority.name.lower(), f"{topic.stale_s:g} s",
                           " or ".join(topic.publishers), escape(topic.about))  # fmt: skip
         console.print(table)
         return 0
-    report, instances = listen(cell, bus.connection(options), options.seconds)
+    report, instances = listen(cell, bus.connection(options), options.seconds, known)
     table = Table("key", "Hz", "expected", "delay ms", "dropped", "bad", box=None)
     for key, row in report.items():
-        expected = bus.topic_of(key)
+        expected = bus.topic_of(key, known)
         if row["count"] or row["bad"] or "*" not in key:
             delay = "-" if row["delay_s"] is None else f"{1e3 * row['delay_s']:.1f}"
             bad = ", ".join(f"{n} {kind}" for kind, n in row["bad"].items()) or "0"
@@ -124,13 +124,13 @@ def list_topics(argv: list[str]) -> int:
 
 
 def listen(
-    cell: cells.Cell, connection: bus.Connection, seconds: float
+    cell: cells.Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic] = topics.TOPICS
 ) -> tuple[dict[str, dict[str, Any]], list[health.Instance]]:
-    """The counters of every key of the cell after listening for a while, and how its processes fare."""
+    """The counters of every key of the topics that are known after listening for a while, and how the cell's processes fare."""
     from shared.runtime.node import Node
 
     node = Node("topics", cell, connection)
-    for topic in topics.TOPICS:
+    for topic in known:
         node.subscribe(topic, lambda message, names: None)
     with node.open(PATIENCE_S):
         assert node.session is not None

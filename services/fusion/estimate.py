@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from services.fusion import so3
-from shared.contract.messages import FusedPose, Source
+from shared.contract.messages import MAX_FUTURE_S, FusedPose, Message, Source
+from shared.contract.senses import Measures
 from shared.geometry import rigid
+from shared.native import kernel
 
 Array = NDArray[np.floating[Any]]
 
-SOURCES = ("vision", "haptic")
 STATES = ("tracking", "coasting", "lost")
 TRACKING, COASTING, LOST = range(len(STATES))
 FATES = ("accepted", "gated", "late", "duplicate", "nothing", "future", "pose", "information")
 """What may become of a measurement: taken; too far from the prediction; older than the history; known already; observing nothing.
 The others are faults of its own, for which it is refused."""
 ACCEPTED, GATED, LATE, DUPLICATE, NOTHING, FUTURE, POSE_FAULT, INFORMATION_FAULT = range(len(FATES))
-AHEAD_S = 0.05
-"""How far ahead of the reader's clock a stamp may be: the clocks of one cell differ by less. One measurement from the future
-would make late whatever comes until then."""
 NO_CLOCK = (1 << 63) - 1
 """The latest stamp where nobody looks at a clock."""
 ROUNDING = 1e-6
@@ -53,12 +51,13 @@ class Estimate:
 
     def message(self, stamp_ns: int, target: str, frame: str) -> FusedPose:
         """The estimate at a stamp, as it is published."""
+        position, orientation = rigid.position_orientation(self.T)
         return FusedPose(
             stamp_ns=stamp_ns,
             target=target,
             frame=frame,
-            position=self.T[:3, 3],
-            orientation=np.array(so3.quaternion(self.T[:3, :3])),
+            position=position,
+            orientation=orientation,
             velocity=self.velocity,
             covariance=self.covariance,
             state=self.state,
@@ -83,14 +82,16 @@ class Limits:
 
     def state(self, age_s: float, covariance: Array) -> str:
         """tracking, coasting or lost, from the age of the newest measurement in use and the pose's covariance (6, 6)."""
-        return STATES[state_of(age_s, np.ascontiguousarray(covariance), np.array(astuple(self)))]
+        return STATES[int(state_of(age_s, np.ascontiguousarray(covariance), np.array(astuple(self))))]
 
 
-@njit(cache=True)
+@kernel("f8, f8[n, n], f8[4] -> i8")
 def state_of(age_s, covariance, limits):  # type: ignore[no-untyped-def]
-    """Which of STATES, by the Limits (4,) in the order of their fields."""
-    eigenvalues, _ = so3.eigen(covariance[:3, :3].copy())
-    sigma = math.sqrt(eigenvalues[2])
+    """Which of STATES, by the covariance of at least the position and the Limits in the order of their fields."""
+    position, vectors = np.empty((3, 3)), np.empty((3, 3))
+    so3.copy(covariance, position)
+    so3.eigen(position, 3, vectors)
+    sigma = math.sqrt(position[2, 2])
     if sigma > limits[2] or age_s > limits[3]:
         return LOST
     return TRACKING if age_s <= limits[0] and sigma <= limits[1] else COASTING
@@ -108,16 +109,16 @@ class Counts:
 
 
 class Log:
-    """Counts per source, and since when each was heard [ns]."""
+    """Counts per source, and since when each was heard [ns]. names: of the senses."""
 
-    def __init__(self) -> None:
-        self.counts = {source: Counts() for source in SOURCES}
+    def __init__(self, names: Iterable[str]) -> None:
+        self.counts = {name: Counts() for name in names}
         self.heard_ns: dict[str, int] = {}
 
     def check(self, source: str) -> None:
         """Raises ValueError for a source that is not known."""
         if source not in self.counts:
-            raise ValueError(f"source: one of {', '.join(self.counts)} expected, {source!r} came")
+            raise ValueError(f"source: expected one of {', '.join(self.counts)}, got {source!r}")
 
     def heard(self, source: str, stamp_ns: int) -> None:
         """Notes that a sense is there."""
@@ -161,11 +162,12 @@ def shaped(values: Array, shape: tuple[int, ...]) -> Array:
 
 
 def latest(now_ns: int | None) -> int:
-    """The latest stamp [ns] that is believed at a time, None: without a clock."""
-    return NO_CLOCK if now_ns is None else now_ns + int(AHEAD_S * 1e9)
+    """The latest stamp [ns] that is believed at a time: clocks of one cell differ by MAX_FUTURE_S at most. None: without a
+    clock."""
+    return NO_CLOCK if now_ns is None else now_ns + int(MAX_FUTURE_S * 1e9)
 
 
-@njit(cache=True)
+@kernel("i8, f8[4, 4], f8[6, 6], i8 -> i8")
 def fault(stamp_ns, T, information, latest_ns):  # type: ignore[no-untyped-def]
     """FUTURE, POSE_FAULT or INFORMATION_FAULT of a measurement, 0 where it has none: what `refusal` puts in words."""
     if stamp_ns > latest_ns:
@@ -179,7 +181,9 @@ def fault(stamp_ns, T, information, latest_ns):  # type: ignore[no-untyped-def]
                 off = max(off, abs(T[i, j] - (1.0 if j == 3 else 0.0)))
             elif j < 3:
                 off = max(off, abs(so3.dot(T[i, :3], T[j, :3]) - (1.0 if i == j else 0.0)))
-    if off > ROUNDING or so3.dot(so3.cross(T[0, :3], T[1, :3]), T[2, :3]) < 0.0:
+    third = np.empty(3)
+    so3.cross(T[0, :3], T[1, :3], third)
+    if off > ROUNDING or so3.dot(third, T[2, :3]) < 0.0:
         return POSE_FAULT
     largest = off = 0.0
     for i in range(6):
@@ -190,34 +194,50 @@ def fault(stamp_ns, T, information, latest_ns):  # type: ignore[no-untyped-def]
             off = max(off, abs(information[i, j] - information[j, i]))
     if off > ROUNDING * largest:
         return INFORMATION_FAULT
-    eigenvalues, _ = so3.eigen(information)
-    return INFORMATION_FAULT if eigenvalues[5] < 0.0 or eigenvalues[0] < -ROUNDING * eigenvalues[5] else 0
+    eigenvalues, vectors = np.empty((6, 6)), np.empty((6, 6))
+    so3.copy(information, eigenvalues)
+    so3.eigen(eigenvalues, 6, vectors)
+    low, high = eigenvalues[0, 0], eigenvalues[5, 5]
+    return INFORMATION_FAULT if high < 0.0 or low < -ROUNDING * high else 0
 
 
 def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int | None) -> Refused:
     """What is wrong with a measurement that has a `fault`, in words."""
     if fate == FUTURE:
-        ahead = f"{1e-9 * (stamp_ns - (now_ns or 0)):.3f} s came: check the clocks of its publisher and of fusion (chrony, ptp4l)"
-        text = f"stamp: at most {AHEAD_S} s ahead of the clock expected, {ahead}"
+        ahead = f"{1e-9 * (stamp_ns - (now_ns or 0)):.3f} s; check the clocks of its publisher and of fusion (chrony, ptp4l)"
+        text = f"stamp: expected at most {MAX_FUTURE_S} s ahead of the clock, got {ahead}"
     elif fate == POSE_FAULT:
-        text = (
-            "pose: a finite rigid transform (4, 4) with a rotation expected, what came is none: is its quaternion of length one?"
-        )
+        text = "pose: expected a finite rigid transform (4, 4) with a rotation, got none: is its quaternion of length one?"
     elif not np.isfinite(information).all():
-        text = "information: a finite (6, 6) matrix expected, what came is none"
+        text = "information: expected a finite (6, 6) matrix, got none"
     elif np.abs(information - information.T).max() > ROUNDING * np.abs(information).max():
-        text = "information: a symmetric matrix expected, one with different halves came"
+        text = "information: expected a symmetric matrix, got one with different halves"
     else:
         low, high = np.linalg.eigvalsh(information)[[0, -1]]
-        text = f"information: no negative eigenvalue expected, {low:.3g} beside {high:.3g} came"
+        text = f"information: expected no negative eigenvalue, got {low:.3g} beside {high:.3g}"
     return Refused(FATES[fate], text)
 
 
+def measured(message: Message, measures: Measures) -> tuple[Array, Array]:
+    """The pose (4, 4) that a message of a sense reports, and its information (6, 6), zero along what is not observed. Raises
+    Refused where its covariance is not symmetric and positive definite."""
+    of: Any = message
+    match measures:
+        case Measures.POSE:
+            return rigid.transform(of.position, of.orientation), information(of.covariance)
+        case Measures.POSE_INFORMATION:
+            return rigid.transform(of.position, of.orientation), of.information
+        case Measures.POSITION:
+            seen = np.zeros((6, 6))
+            seen[:3, :3] = information(of.covariance)
+            return rigid.transform(of.position), seen
+
+
 def information(covariance: Array) -> Array:
-    """The inverse (6, 6) of a covariance. Raises Refused where it is not symmetric and positive definite."""
+    """The inverse (n, n) of a covariance. Raises Refused where it is not symmetric and positive definite."""
     eigenvalues, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     low, high = eigenvalues[[0, -1]]
     if np.abs(covariance - covariance.T).max() > ROUNDING * high or low <= 1e-14 * high:
-        text = f"covariance: symmetric and positive definite expected, eigenvalues {low:.3g} to {high:.3g} came"
+        text = f"covariance: expected symmetric and positive definite, got eigenvalues {low:.3g} to {high:.3g}"
         raise Refused("covariance", text)
     return (vectors / eigenvalues) @ vectors.T

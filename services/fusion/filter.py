@@ -21,9 +21,8 @@ filter, what it refused included, is a function of the state before and the meas
 the order of stamp, source and position, each with the state after it. Its first entry is the newest one that is older than the
 horizon: nothing is inserted before it. `ring` (2,) holds the slot of the first entry and the number of entries.
 
-Everything works in place on the records of `records.py`; `measure_all` and `estimate_all` are called from outside,
-for as many targets as there are. It is one file because numba keeps what it compiled until the file of the function called from
-outside changes: after a change of `so3.py`, or of what is compiled in `estimate.py`, delete services/fusion/__pycache__.
+Everything works in place on the records of `records.py`; `measure_all`, `adopt` and `estimate_all` are called from outside, for
+as many targets as there are. The number of senses is that of the records. Functions write what they find to their last arguments.
 
 Sources: error-state filter on SO(3): Sola, "Quaternion kinematics for the error-state Kalman filter" (2017), arXiv:1711.02508;
 coloured measurement noise by state augmentation: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
@@ -34,13 +33,26 @@ noise: Mehra, "On the identification of variances and adaptive Kalman filtering"
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from services.fusion import so3
 from services.fusion.estimate import ACCEPTED, DUPLICATE, GATED, LATE, LOST, NOTHING, fault, state_of
-from services.fusion.records import MEASUREMENT, MOTION, NEVER, POSE, SENSES, SIZE, UNITS
+from services.fusion.records import (
+    ESTIMATE,
+    MEASUREMENT,
+    MODEL,
+    MOTION,
+    NEVER,
+    POSE,
+    SENSE_ESTIMATE,
+    SENSE_MODEL,
+    SENSE_STATE,
+    STATE,
+    UNITS,
+)
+from shared.native import inner, kernel
 
 HASTE = 4.0
 """So many times as fast a measurement that is refused teaches that the limb is faster: while it is, all are refused."""
@@ -49,24 +61,51 @@ ODD = 2.0
 another sense is less surprising: a sense that is wrong by little drags the state along."""
 
 
-@njit(cache=True)
+class State(NamedTuple):
+    """One entry of a history. now : STATE. senses (n,) : SENSE_STATE. P (size, size) : covariance of all errors."""
+
+    now: Any
+    senses: Any
+    P: Any
+
+
+class Entries(NamedTuple):
+    """The history of one target: as `records.History`, without the first dimension."""
+
+    measurements: Any
+    states: Any
+    senses: Any
+    P: Any
+    ring: Any
+
+
+class Model(NamedTuple):
+    """one : MODEL of the target. senses (n,) : SENSE_MODEL."""
+
+    one: Any
+    senses: Any
+
+
+@inner
 def forget(state):  # type: ignore[no-untyped-def]
     """Makes a state that knows nothing."""
-    state.stamp_ns = state.accepted_ns = NEVER
-    state.passed = state.rank = 0
-    state.distance = 0.0
-    state.agility[0] = state.agility[1] = 1.0
+    now = state.now
+    now.stamp_ns = now.accepted_ns = NEVER
+    now.passed = now.rank = 0
+    now.distance = 0.0
+    now.agility[0] = now.agility[1] = 1.0
     for i in range(POSE):
-        state.velocity[i] = 0.0
-    for i in range(POSE * SENSES):
-        state.bias[i] = 0.0
-    for s in range(SENSES):
-        state.came_ns[s] = state.heard_ns[s] = state.believed_ns[s] = state.refused_ns[s] = NEVER
-        state.refused[s] = state.has_innovation[s] = 0
-        state.gain[s], state.doubt[s] = 0.0, 1.0
+        now.velocity[i] = 0.0
+    for s in range(len(state.senses)):
+        sense = state.senses[s]
+        sense.came_ns = sense.heard_ns = sense.believed_ns = sense.refused_ns = NEVER
+        sense.refused = sense.has_innovation = 0
+        sense.gain, sense.doubt = 0.0, 1.0
+        for i in range(POSE):
+            sense.bias[i] = 0.0
 
 
-@njit(cache=True)
+@inner
 def reduce(model, source, stamp_ns, T, information, m):  # type: ignore[no-untyped-def]
     """Writes a pose (4, 4) with its information (6, 6) as the MEASUREMENT m."""
     m.stamp_ns, m.source = stamp_ns, source
@@ -74,74 +113,76 @@ def reduce(model, source, stamp_ns, T, information, m):  # type: ignore[no-untyp
         m.p[i] = T[i, 3]
         for j in range(3):
             m.R[i, j] = T[i, j]
-    scaled = np.empty((POSE, POSE))
+    scaled, vectors = np.empty((POSE, POSE)), np.empty((POSE, POSE))
     for i in range(POSE):
         for j in range(POSE):
             scaled[i, j] = 0.5 * (information[i, j] + information[j, i]) * UNITS[i] * UNITS[j]
-    eigenvalues, vectors = so3.eigen(scaled)
+    so3.eigen(scaled, POSE, vectors)
     k = 0
     for e in range(POSE):
-        if eigenvalues[e] > max(model.unobserved**-2, 1e-9 * eigenvalues[POSE - 1]):
+        if scaled[e, e] > max(model.one.unobserved**-2, 1e-9 * scaled[POSE - 1, POSE - 1]):
             for i in range(POSE):
                 m.directions[k, i] = vectors[i, e]
                 m.basis[k, i] = vectors[i, e] / UNITS[i]
-            m.sigma[k] = math.sqrt(1.0 / eigenvalues[e])
+            m.sigma[k] = math.sqrt(1.0 / scaled[e, e])
             k += 1
     m.rank, m.has_axis, m.slides = k, 0, 0
     if 0 < k < POSE:
-        weakest, axes = so3.eigen(_seen(m, 3))
-        m.has_axis = weakest[0] < 1e-3
+        m.has_axis = _weakest(m, 3, vectors) < 1e-3
         for i in range(3):
-            m.axis[i] = axes[i, 0]
-        weakest, axes = so3.eigen(_seen(m, 0))
-        m.slides = weakest[0] < 1e-3
+            m.axis[i] = vectors[i, 0]
+        m.slides = _weakest(m, 0, vectors) < 1e-3
 
 
-@njit(cache=True)
-def _seen(m, first):  # type: ignore[no-untyped-def]
-    """The sum (3, 3) of the outer products of the directions' translations (first 0) or rotations (first 3)."""
-    out = np.zeros((3, 3))
+@inner
+def _weakest(m, first, vectors):  # type: ignore[no-untyped-def]
+    """The smallest eigenvalue of the sum (3, 3) of the outer products of the directions' translations (first 0) or rotations
+    (first 3); writes the eigenvectors."""
+    seen = np.zeros((3, 3))
     for k in range(m.rank):
         for i in range(3):
             for j in range(3):
-                out[i, j] += m.directions[k, first + i] * m.directions[k, first + j]
-    return out
+                seen[i, j] += m.directions[k, first + i] * m.directions[k, first + j]
+    so3.eigen(seen, 3, vectors)
+    return seen[0, 0]
 
 
-@njit(cache=True)
-def step(model, state, m):  # type: ignore[no-untyped-def]
-    """Takes a state on to a measurement: predicted to its stamp, and updated unless the gate refuses it."""
-    fresh = m.stamp_ns - state.accepted_ns > model.lost_age * 1e9
+@inner
+def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
+    """Takes a state on to a measurement: predicted to its stamp, and updated unless the gate refuses it. PHt (size, 6): room."""
+    one, now, sense = model.one, state.now, state.senses[m.source]
+    fresh = m.stamp_ns - now.accepted_ns > one.lost_age * 1e9
     if fresh:
-        start(model, state, m, model.home[:3, 3].copy(), model.home[:3, :3].copy(), model.home_covariance.copy())
+        _start_at_home(one, state, m)
     else:
         predict(model, state, m.stamp_ns)
+    z, H, S_inverse, innovation = np.empty(POSE), np.empty((POSE, 2 * POSE)), np.empty((POSE, POSE)), np.empty(POSE)
     while True:
-        z, H = linearised(model, state, m)
-        PHt, S_inverse, innovation = innovated(model, state, m, z, H)
+        linearised(model, state, m, z, H)
+        innovated(model, state, m, z, H, PHt, S_inverse, innovation)
         if fresh:
             break
         distance = so3.dot(innovation, innovation)
-        state.distance, state.rank = distance, m.rank
-        state.surprise[m.source], state.came_ns[m.source] = distance / m.rank, m.stamp_ns
-        contradicted = _is_contradicted(model, state, m)
-        passes = distance <= model.threshold[1 if contradicted else 0, m.rank]
+        now.distance, now.rank = distance, m.rank
+        sense.surprise, sense.came_ns = distance / m.rank, m.stamp_ns
+        contradicted = _is_contradicted(one, state, m)
+        passes = distance <= model.senses[m.source].threshold[1 if contradicted else 0, m.rank]
         if not passes and not contradicted:
             learn(model, state, m, innovation, HASTE)
         elif passes:
             learn(model, state, m, innovation, 0.0 if contradicted and distance > ODD * m.rank else 1.0)
         if passes:
             break
-        if state.refused[m.source] == 0:
-            state.refused_ns[m.source] = m.stamp_ns
-        state.refused[m.source] += 1
-        state.passed = 0
-        if _is_blind(model, state) and not contradicted:
-            start(model, state, m, state.p.copy(), state.R.copy(), state.P[:POSE, :POSE] + model.home_covariance)
-        elif _is_persistent(model, state, m):
+        if sense.refused == 0:
+            sense.refused_ns = m.stamp_ns
+        sense.refused += 1
+        now.passed = 0
+        if _is_blind(one, state) and not contradicted:
+            _start_where_it_is(one, state, m)
+        elif _is_persistent(one, state, m):
             # So long a disagreement is no outlier: one of the senses is biased beyond its covariance, nobody knows which.
-            for i in range(SIZE):
-                for j in range(SIZE):
+            for i in range(len(state.P)):
+                for j in range(len(state.P)):
                     state.P[i, j] *= distance / m.rank
         else:
             return
@@ -149,264 +190,327 @@ def step(model, state, m):  # type: ignore[no-untyped-def]
     update(state, m, z, PHt, S_inverse)
 
 
-@njit(cache=True)
-def _is_contradicted(model, state, m):  # type: ignore[no-untyped-def]
+@inner
+def _is_contradicted(one, state, m):  # type: ignore[no-untyped-def]
     """Whether another sense, heard lately, is less surprising, believed or not: then a surprising measurement is wrong rather
     than the state. What it would teach is that the limb is faster, until it passes the gate."""
-    for s in range(SENSES):
-        if m.stamp_ns - state.came_ns[s] < model.witness * 1e9 and state.surprise[s] < state.surprise[m.source]:
+    surprise = state.senses[m.source].surprise
+    for s in range(len(state.senses)):
+        other = state.senses[s]
+        if m.stamp_ns - other.came_ns < one.witness * 1e9 and other.surprise < surprise:
             return True
     return False
 
 
-@njit(cache=True)
-def _is_blind(model, state):  # type: ignore[no-untyped-def]
+@inner
+def _is_blind(one, state):  # type: ignore[no-untyped-def]
     """Whether everything of all senses has been refused for so long that the state must be wrong."""
-    first_ns, refused = state.stamp_ns, 0
-    for s in range(SENSES):
-        if state.refused[s]:
-            first_ns = min(first_ns, state.refused_ns[s])
-            refused += state.refused[s]
-    return state.stamp_ns - max(state.accepted_ns, first_ns) >= model.patience * 1e9 and refused >= model.refusals
+    now = state.now
+    first_ns, refused = now.stamp_ns, 0
+    for s in range(len(state.senses)):
+        sense = state.senses[s]
+        if sense.refused:
+            first_ns = min(first_ns, sense.refused_ns)
+            refused += sense.refused
+    return now.stamp_ns - max(now.accepted_ns, first_ns) >= one.patience * 1e9 and refused >= one.refusals
 
 
-@njit(cache=True)
-def _is_persistent(model, state, m):  # type: ignore[no-untyped-def]
+@inner
+def _is_persistent(one, state, m):  # type: ignore[no-untyped-def]
     """Whether everything of the measurement's sense has been refused for so long that one of the senses must be wrong."""
-    lasts_ns = m.stamp_ns - state.refused_ns[m.source]
-    return state.refused[m.source] >= model.refusals and lasts_ns >= model.source_patience * 1e9
+    sense = state.senses[m.source]
+    lasts_ns = m.stamp_ns - sense.refused_ns
+    return sense.refused >= one.refusals and lasts_ns >= one.source_patience * 1e9
 
 
-@njit(cache=True)
-def start(model, state, m, p, R, covariance):  # type: ignore[no-untyped-def]
+@inner
+def _start_at_home(one, state, m):  # type: ignore[no-untyped-def]
+    """Begins where the target is expected before anything is known."""
+    p, R, covariance = np.empty(3), np.empty((3, 3)), np.empty((POSE, POSE))
+    for i in range(3):
+        p[i] = one.home[i, 3]
+    so3.copy(one.home, R)
+    so3.copy(one.home_covariance, covariance)
+    start(one, state, m, p, R, covariance)
+
+
+@inner
+def _start_where_it_is(one, state, m):  # type: ignore[no-untyped-def]
+    """Begins anew at the state's own pose, which may be wrong by as much as one that is only expected."""
+    p, R, covariance = np.empty(3), np.empty((3, 3)), np.empty((POSE, POSE))
+    for i in range(3):
+        p[i] = state.now.p[i]
+    so3.copy(state.now.R, R)
+    for i in range(POSE):
+        for j in range(POSE):
+            covariance[i, j] = state.P[i, j] + one.home_covariance[i, j]
+    start(one, state, m, p, R, covariance)
+
+
+@inner
+def start(one, state, m, p, R, covariance):  # type: ignore[no-untyped-def]
     """Makes a new state for one measurement to update; along what it does not observe, from a pose p (3,), R (3, 3) with its
-    covariance (6, 6)."""
+    covariance (6, 6), which are changed."""
+    value, derivative, correction = np.empty(POSE), np.empty((POSE, POSE)), np.empty(POSE)
+    turn, turned = np.empty((3, 3)), np.empty((3, 3))
     for _ in range(5):  # Gauss-Newton on the observed directions; one step does where all are observed
-        value, _ = error(p, R, m)
-        correction = np.zeros(POSE)
-        for i in range(m.rank):
-            for j in range(POSE):
+        error(p, R, m, value, derivative)
+        for j in range(POSE):
+            correction[j] = 0.0
+            for i in range(m.rank):
                 correction[j] -= value[i] * UNITS[j] * m.directions[i, j]
         for i in range(3):
             p[i] += correction[i]
-        R = so3.product(so3.exp(correction[3:]), R)
-    wide = np.eye(POSE)  # where it observes, the measurement decides
-    for k in range(m.rank):
-        for i in range(POSE):
-            for j in range(POSE):
+        so3.exp(correction[3:], turn)
+        so3.product(turn, R, turned)
+        so3.copy(turned, R)
+    wide, product = np.empty((POSE, POSE)), np.empty((POSE, POSE))
+    for i in range(POSE):
+        for j in range(POSE):
+            wide[i, j] = 1.0 if i == j else 0.0
+            for k in range(m.rank):  # where it observes, the measurement decides
                 wide[i, j] += 9.0 * UNITS[i] * m.directions[k, i] * m.basis[k, j]
+    so3.product(wide, covariance, product)
+    so3.product_transposed(product, wide, covariance)
     forget(state)
-    state.stamp_ns = state.accepted_ns = state.heard_ns[m.source] = m.stamp_ns
+    now = state.now
+    now.stamp_ns = now.accepted_ns = state.senses[m.source].heard_ns = m.stamp_ns
     for i in range(3):
-        state.p[i] = p[i]
-        for j in range(3):
-            state.R[i, j] = R[i, j]
-    covariance = so3.product_transposed(so3.product(wide, covariance), wide)
-    for i in range(SIZE):
-        for j in range(SIZE):
-            state.P[i, j] = covariance[i, j] if i < POSE and j < POSE else 0.0
+        now.p[i] = p[i]
+    so3.copy(R, now.R)
+    _spread(one, state, covariance)
+
+
+@inner
+def _spread(one, state, covariance):  # type: ignore[no-untyped-def]
+    """Sets the covariance of all errors where only the pose's (6, 6) is known."""
+    P = state.P
+    for i in range(len(P)):
+        for j in range(len(P)):
+            P[i, j] = 0.5 * (covariance[i, j] + covariance[j, i]) if i < POSE and j < POSE else 0.0
         if i >= POSE:
-            state.P[i, i] = model.velocity_spread[(i - POSE) // 3] ** 2 if i < MOTION else 1.0
+            P[i, i] = one.velocity_spread[(i - POSE) // 3] ** 2 if i < MOTION else 1.0
 
 
-@njit(cache=True)
-def move(model, dt, p, R, velocity, P, agility):  # type: ignore[no-untyped-def]
+@inner
+def move(one, dt, p, R, velocity, P, agility):  # type: ignore[no-untyped-def]
     """Takes a pose, its velocity (6,) and the covariance P (n, n), n >= 12, on by dt [s]: an integrated Ornstein-Uhlenbeck
     velocity; agility (2,). F and Q are its transition and process noise, P = F P F' + Q; entries beyond the 12th stay."""
-    tau = model.velocity_time
+    tau = one.velocity_time
     decay, reach, twice = math.exp(-dt / tau), -tau * math.expm1(-dt / tau), -0.5 * tau * math.expm1(-2.0 * dt / tau)
-    rotation = reach * velocity[3:]
-    turn, lever = so3.exp(rotation), so3.hat(0.5 * reach * rotation)
+    rotation, turn = np.empty(3), np.empty((3, 3))
     for i in range(3):
-        lever[i, i] += reach  # left Jacobian to first order
+        rotation[i] = reach * velocity[3 + i]
+    so3.exp(rotation, turn)
     for _ in range(2):  # F times P, then, P being transposed on the way, F times (F P)'
-        _transit(P, turn, lever, reach, decay)
+        _transit(P, turn, rotation, reach, decay)
         for i in range(len(P)):
             for j in range(i):
                 P[i, j], P[j, i] = P[j, i], P[i, j]
     for i in range(POSE):
-        density = agility[i // 3] * model.acceleration[i // 3]
+        density = agility[i // 3] * one.acceleration[i // 3]
         P[i, i] += density * max(0.0, tau**2 * (dt - 2.0 * reach + twice))
         P[i, i + 6] += density * 0.5 * reach**2
         P[i + 6, i] += density * 0.5 * reach**2
         P[i + 6, i + 6] += density * twice
     for i in range(3):
         p[i] += reach * velocity[i]
-    so3.turn(turn, R)
+    so3.turn(turn, R, 0)
     for i in range(POSE):
         velocity[i] *= decay
 
 
-@njit(cache=True)
-def _transit(P, turn, lever, reach, decay):  # type: ignore[no-untyped-def]
-    """F times P (n, n), in place."""
+@inner
+def _transit(P, turn, rotation, reach, decay):  # type: ignore[no-untyped-def]
+    """F times P (n, n), in place. What an angular velocity adds to the rotation is the left Jacobian of `rotation` times `reach`,
+    to first order."""
+    a, b, c = 0.5 * reach * rotation[0], 0.5 * reach * rotation[1], 0.5 * reach * rotation[2]
     for j in range(len(P)):
         for i in range(3):
             P[i, j] += reach * P[6 + i, j]
         x, y, z, u, v, w = P[3, j], P[4, j], P[5, j], P[9, j], P[10, j], P[11, j]
-        for i in range(3):
-            P[3 + i, j] = turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z + lever[i, 0] * u + lever[i, 1] * v + lever[i, 2] * w
+        P[3, j] = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + reach * u - c * v + b * w
+        P[4, j] = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + c * u + reach * v - a * w
+        P[5, j] = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z - b * u + a * v + reach * w
         for i in range(6, MOTION):
             P[i, j] *= decay
 
 
-@njit(cache=True)
+@inner
 def predict(model, state, stamp_ns):  # type: ignore[no-untyped-def]
     """Takes a state on to a later stamp."""
-    dt = (stamp_ns - state.stamp_ns) * 1e-9
-    move(model, dt, state.p, state.R, state.velocity, state.P, state.agility)
-    for s in range(SENSES):
-        keep = math.exp(-dt / model.time_constant[s])
-        for i in range(MOTION + POSE * s, MOTION + POSE * (s + 1)):
-            state.bias[i - MOTION] *= keep
-            for j in range(SIZE):
-                state.P[i, j] *= keep
-            for j in range(SIZE):
-                state.P[j, i] *= keep
-            state.P[i, i] += 1.0 - keep**2
-        state.gain[s] *= math.exp(-dt / model.weight_time)
-    state.stamp_ns = stamp_ns
+    one, now, P = model.one, state.now, state.P
+    dt = (stamp_ns - now.stamp_ns) * 1e-9
+    move(one, dt, now.p, now.R, now.velocity, P, now.agility)
+    for s in range(len(state.senses)):
+        sense, first = state.senses[s], MOTION + POSE * s
+        keep = math.exp(-dt / model.senses[s].time_constant)
+        for i in range(POSE):
+            sense.bias[i] *= keep
+            for j in range(len(P)):
+                P[first + i, j] *= keep
+            for j in range(len(P)):
+                P[j, first + i] *= keep
+            P[first + i, first + i] += 1.0 - keep**2
+        sense.gain *= math.exp(-dt / one.weight_time)
+    now.stamp_ns = stamp_ns
 
 
-@njit(cache=True)
-def error(p, R, m):  # type: ignore[no-untyped-def]
+@inner
+def error(p, R, m, value, derivative):  # type: ignore[no-untyped-def]
     """The error of a pose p (3,), R (3, 3) along the directions of a measurement (k,), and its derivative (k, 6) by the pose.
 
     What is not observed belongs to the limb and turns with it: the roll about its axis, the way along it. Were the directions
     those at the measured pose, their noise would let information leak into what nobody observes; so they are turned to the
     pose in question. A roll that is made up, however large, says nothing (swing-twist decomposition).
     """
-    turn = so3.product_transposed(R, m.R)
+    turn, rotation, jacobian, slide = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    back = np.empty(3)
+    so3.product_transposed(R, m.R, turn)
     if m.has_axis:
-        rotation = so3.swing(m.axis, so3.turned(turn, m.axis))
-        jacobian = so3.exp(-rotation)
+        so3.turned(turn, m.axis, back)
+        so3.swing(m.axis, back, rotation)
     else:
-        rotation = so3.log(turn)
-        jacobian = so3.left_jacobian_inverse(rotation)
-    slide = so3.exp(-rotation) if m.slides else np.eye(3)
-    value, derivative = np.zeros(m.rank), np.zeros((m.rank, POSE))
+        so3.log(turn, rotation)
+    for i in range(3):
+        back[i] = -rotation[i]
+    if m.has_axis:
+        so3.exp(back, jacobian)
+    else:
+        so3.left_jacobian_inverse(rotation, jacobian)
+    if m.slides:
+        so3.exp(back, slide)
     for k in range(m.rank):
+        value[k] = 0.0
         for i in range(3):
+            derivative[k, i] = 0.0 if m.slides else m.basis[k, i]
+            derivative[k, 3 + i] = 0.0
             for j in range(3):
-                derivative[k, i] += m.basis[k, j] * slide[j, i]
+                if m.slides:
+                    derivative[k, i] += m.basis[k, j] * slide[j, i]
                 derivative[k, 3 + i] += m.basis[k, 3 + j] * jacobian[j, i]
             value[k] += derivative[k, i] * (p[i] - m.p[i]) + m.basis[k, 3 + i] * rotation[i]
-    return value, derivative
 
 
-@njit(cache=True)
-def linearised(model, state, m):  # type: ignore[no-untyped-def]
+@inner
+def linearised(model, state, m, z, H):  # type: ignore[no-untyped-def]
     """Innovation z (k,) and its derivative H (k, 12) by the pose and the sense's bias, the white noise left out.
 
     A measurement says: the error e with `perturb(T_measured, e) == T_true` is noise along its directions.
     """
-    s, first = m.source, POSE * m.source
-    value, derivative = error(state.p.copy(), state.R.copy(), m)
-    z, H = np.empty(m.rank), np.empty((m.rank, 2 * POSE))
+    of, sense = model.senses[m.source], state.senses[m.source]
+    derivative = np.empty((POSE, POSE))
+    error(state.now.p, state.now.R, m, z, derivative)
     for i in range(m.rank):
         # what no covariance tells, the floor, is a calibration: all of it lasts
-        lasting = math.sqrt(state.doubt[s] * (model.lasting[s] * m.sigma[i] ** 2 + model.floor[s] ** 2))
-        z[i] = -value[i]
+        lasting = math.sqrt(sense.doubt * (of.lasting * m.sigma[i] ** 2 + of.floor**2))
+        z[i] = -z[i]
         for j in range(POSE):
             H[i, j] = derivative[i, j]
             H[i, POSE + j] = lasting * m.directions[i, j]
-            z[i] -= H[i, POSE + j] * state.bias[first + j]
-    return z, H
+            z[i] -= H[i, POSE + j] * sense.bias[j]
 
 
-@njit(cache=True)
-def innovated(model, state, m, z, H):  # type: ignore[no-untyped-def]
-    """P H' (n, k), the inverse of the innovation's covariance (k, k), and the innovation (6,) in units of its standard
+@inner
+def innovated(model, state, m, z, H, PHt, S_inverse, innovation):  # type: ignore[no-untyped-def]
+    """P H' (size, k), the inverse of the innovation's covariance (k, k), and the innovation (6,) in units of its standard
     deviation, zero where the measurement sees nothing; its square is the squared Mahalanobis distance."""
-    k, first = m.rank, MOTION + POSE * m.source
-    PHt = np.zeros((SIZE, k))
-    for i in range(SIZE):
+    k, first, P = m.rank, MOTION + POSE * m.source, state.P
+    for i in range(len(P)):
         for j in range(k):
+            PHt[i, j] = 0.0
             for c in range(POSE):
-                PHt[i, j] += state.P[i, c] * H[j, c] + state.P[i, first + c] * H[j, POSE + c]
-    S = np.zeros((k, k))
+                PHt[i, j] += P[i, c] * H[j, c] + P[i, first + c] * H[j, POSE + c]
+    S, vectors = np.empty((POSE, POSE)), np.empty((POSE, POSE))
     for i in range(k):
         for j in range(k):
+            S[i, j] = S_inverse[i, j] = 0.0
             for c in range(POSE):
                 S[i, j] += H[i, c] * PHt[c, j] + H[i, POSE + c] * PHt[first + c, j]
-        S[i, i] += state.doubt[m.source] * (1.0 - model.lasting[m.source]) * m.sigma[i] ** 2
-    eigenvalues, vectors = so3.eigen(S)
-    innovation, S_inverse = np.zeros(POSE), np.zeros((k, k))
+        S[i, i] += state.senses[m.source].doubt * (1.0 - model.senses[m.source].lasting) * m.sigma[i] ** 2
+    so3.eigen(S, k, vectors)
+    for j in range(POSE):
+        innovation[j] = 0.0
     for e in range(k):  # S^-1/2 is symmetric, so that innovations of different directions compare
         along = 0.0
         for i in range(k):
             along += vectors[i, e] * z[i]
             for j in range(k):
-                S_inverse[i, j] += vectors[i, e] * vectors[j, e] / eigenvalues[e]
+                S_inverse[i, j] += vectors[i, e] * vectors[j, e] / S[e, e]
         for i in range(k):
             for j in range(POSE):
-                innovation[j] += along / math.sqrt(eigenvalues[e]) * vectors[i, e] * m.directions[i, j]
-    return PHt, S_inverse, innovation
+                innovation[j] += along / math.sqrt(S[e, e]) * vectors[i, e] * m.directions[i, j]
 
 
-@njit(cache=True)
+@inner
 def learn(model, state, m, innovation, haste):  # type: ignore[no-untyped-def]
     """Adapts the agilities, `haste` times as fast as usual, and the doubt to an innovation (6,)."""
-    s = m.source
+    now, sense, bounds = state.now, state.senses[m.source], model.one.agility
     length = math.sqrt(so3.dot(innovation, innovation) / m.rank)
-    innovation = min(1.0, 2.0 / max(length, 1e-9)) * innovation  # an outlier teaches no more than two sigma do
-    if state.has_innovation[s]:
-        step = min(model.learning[0], model.learning[1] * (m.stamp_ns - state.heard_ns[s]) * 1e-9)
-        alike = so3.dot(innovation, state.innovation[s]) / m.rank  # 0 expected
-        unlike = so3.dot(innovation, innovation) / m.rank - alike  # 1 expected
+    scale = min(1.0, 2.0 / max(length, 1e-9))  # an outlier teaches no more than two sigma do
+    if sense.has_innovation:
+        rate = min(model.one.learning[0], model.one.learning[1] * (m.stamp_ns - sense.heard_ns) * 1e-9)
+        alike = scale * so3.dot(innovation, sense.innovation) / m.rank  # 0 expected
+        unlike = scale * scale * so3.dot(innovation, innovation) / m.rank - alike  # 1 expected
         for half in range(2):
             share, along = 0.0, 0.0
             for i in range(3 * half, 3 * half + 3):
-                along += innovation[i] * state.innovation[s, i]
+                along += scale * innovation[i] * sense.innovation[i]
                 for k in range(m.rank):
                     share += m.directions[k, i] ** 2
             if share > 1e-3:
-                faster = state.agility[half] * math.exp(haste * step * along / share)
-                state.agility[half] = min(max(faster, model.agility[0]), model.agility[1])
-        state.doubt[s] = min(max(state.doubt[s] * math.exp(0.5 * step * (unlike - 1.25)), 1.0), model.doubt)
-    state.heard_ns[s], state.has_innovation[s] = m.stamp_ns, 1
+                faster = now.agility[half] * math.exp(haste * rate * along / share)
+                now.agility[half] = min(max(faster, bounds[0]), bounds[1])
+        sense.doubt = min(max(sense.doubt * math.exp(0.5 * rate * (unlike - 1.25)), 1.0), model.one.doubt)
+    sense.heard_ns, sense.has_innovation = m.stamp_ns, 1
     for i in range(POSE):
-        state.innovation[s, i] = innovation[i]
+        sense.innovation[i] = scale * innovation[i]
 
 
-@njit(cache=True)
+@inner
 def update(state, m, z, PHt, S_inverse):  # type: ignore[no-untyped-def]
     """Updates a state with an accepted measurement."""
-    s, P = m.source, state.P
+    now, sense, P = state.now, state.senses[m.source], state.P
     before = _log_volume(P)
-    K = so3.product(PHt, S_inverse)
-    dx = np.zeros(SIZE)
-    for i in range(SIZE):
+    K, rotation, turn = np.empty(POSE), np.empty(3), np.empty((3, 3))
+    for i in range(len(P)):
+        correction = 0.0
+        for k in range(m.rank):  # a row of the gain
+            K[k] = 0.0
+            for j in range(m.rank):
+                K[k] += PHt[i, j] * S_inverse[j, k]
+            correction += K[k] * z[k]
         for k in range(m.rank):
-            dx[i] += K[i, k] * z[k]
-            for j in range(SIZE):
-                P[i, j] -= K[i, k] * PHt[j, k]
-    turn = so3.exp(dx[3:6])
+            for j in range(len(P)):
+                P[i, j] -= K[k] * PHt[j, k]
+        if i < 3:
+            now.p[i] += correction
+        elif i < POSE:
+            rotation[i - 3] = correction
+        elif i < MOTION:
+            now.velocity[i - POSE] += correction
+        else:
+            state.senses[(i - MOTION) // POSE].bias[(i - MOTION) % POSE] += correction
+    so3.exp(rotation, turn)
     if m.rank < POSE:  # what is not observed turns with the limb: see `error`
         for first in (3, 9):
-            so3.turn(turn, P[first : first + 3])
-            so3.turn(turn, P[:, first : first + 3].T)
-    for i in range(SIZE):
+            so3.turn(turn, P, first)
+            so3.turn_columns(turn, P, first)
+    for i in range(len(P)):
         for j in range(i):
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
-    so3.turn(turn, state.R)
-    so3.orthonormalise(state.R)
-    for i in range(3):
-        state.p[i] += dx[i]
-    for i in range(POSE):
-        state.velocity[i] += dx[POSE + i]
-    for i in range(POSE * SENSES):
-        state.bias[i] += dx[MOTION + i]
-    state.gain[s] += 0.5 * (before - _log_volume(P))
-    state.accepted_ns = state.believed_ns[s] = m.stamp_ns
-    state.refused[s], state.refused_ns[s] = 0, NEVER
-    state.passed = 1
+    so3.turn(turn, now.R, 0)
+    so3.orthonormalise(now.R)
+    sense.gain += 0.5 * (before - _log_volume(P))
+    now.accepted_ns = sense.believed_ns = m.stamp_ns
+    sense.refused, sense.refused_ns = 0, NEVER
+    now.passed = 1
 
 
-@njit(cache=True)
+@inner
 def _log_volume(P):  # type: ignore[no-untyped-def]
     """The logarithm of the determinant of the pose's covariance, from its Cholesky factor."""
-    L = np.zeros((POSE, POSE))
+    L = np.empty((POSE, POSE))
     volume = 0.0
     for i in range(POSE):
         for j in range(i + 1):
@@ -418,43 +522,21 @@ def _log_volume(P):  # type: ignore[no-untyped-def]
     return volume
 
 
-@njit(cache=True)
-def clear(states, measurements, ring):  # type: ignore[no-untyped-def]
+@inner
+def clear(history):  # type: ignore[no-untyped-def]
     """Makes a history of one entry, which is older than all and knows nothing."""
-    ring[0], ring[1] = 0, 1
-    measurements[0].stamp_ns, measurements[0].source = NEVER, -1
-    forget(states[0])
+    history.ring[0], history.ring[1] = 0, 1
+    first = history.measurements[0]
+    first.stamp_ns, first.source = NEVER, -1
+    forget(State(history.states[0], history.senses[0], history.P[0]))
 
 
-@njit(cache=True)
-def adopt(model, states, measurements, rings, target, stamp_ns, T, velocity, covariance, believed_ns, weight):  # type: ignore[no-untyped-def]
-    """Makes a history of one entry: a pose T (4, 4) at a stamp, with velocity (6,), the pose's covariance (6, 6), stamps (n,) of
-    what was last believed of each sense, and the weights (n,). The velocity may be off by as much as one that is unknown."""
-    clear(states[target], measurements[target], rings[target])
-    state = states[target, 0]
-    measurements[target, 0].stamp_ns = state.stamp_ns = stamp_ns
-    for i in range(3):
-        state.p[i] = T[i, 3]
-        for j in range(3):
-            state.R[i, j] = T[i, j]
-    so3.orthonormalise(state.R)
-    for i in range(SIZE):
-        for j in range(SIZE):
-            state.P[i, j] = 0.5 * (covariance[i, j] + covariance[j, i]) if i < POSE and j < POSE else 0.0
-        if i >= POSE:
-            state.P[i, i] = model.velocity_spread[(i - POSE) // 3] ** 2 if i < MOTION else 1.0
-    for i in range(POSE):
-        state.velocity[i] = velocity[i]
-    for s in range(SENSES):
-        state.believed_ns[s], state.gain[s] = believed_ns[s], weight[s]
-        state.accepted_ns = max(state.accepted_ns, believed_ns[s])
-
-
-@njit(cache=True)
-def insert(model, states, measurements, ring, m):  # type: ignore[no-untyped-def]
+@inner
+def insert(model, history, m, PHt):  # type: ignore[no-untyped-def]
     """Takes a measurement: ACCEPTED or GATED, LATE (older than the history: not applied) or DUPLICATE (not applied). A full ring
     gives up its oldest entry before the horizon does."""
-    size, horizon_ns = len(states), np.int64(model.horizon * 1e9)
+    measurements, ring = history.measurements, history.ring
+    size, horizon_ns = len(measurements), np.int64(model.one.horizon * 1e9)
     at = ring[1]  # where it belongs: seldom far from the end
     while at > 0 and _is_after(measurements[(ring[0] + at - 1) % size], m):
         at -= 1
@@ -474,19 +556,28 @@ def insert(model, states, measurements, ring, m):  # type: ignore[no-untyped-def
     ring[1] += 1
     for j in range(at, ring[1]):
         slot = (ring[0] + j) % size
-        states[slot] = states[(ring[0] + j - 1) % size]
-        step(model, states[slot], measurements[slot])
-    passed = states[(ring[0] + at) % size].passed
+        _copy_state(history, (ring[0] + j - 1) % size, slot)
+        step(model, State(history.states[slot], history.senses[slot], history.P[slot]), measurements[slot], PHt)
+    passed = history.states[(ring[0] + at) % size].passed
     newest_ns = max(newest_ns, m.stamp_ns)
     while ring[1] > 1 and measurements[(ring[0] + 1) % size].stamp_ns < newest_ns - horizon_ns:
         _drop_first(ring, size)
     return ACCEPTED if passed else GATED
 
 
-@njit(cache=True)
-def find(states, ring, stamp_ns):  # type: ignore[no-untyped-def]
+@inner
+def _copy_state(history, source, slot):  # type: ignore[no-untyped-def]
+    history.states[slot] = history.states[source]
+    for s in range(history.senses.shape[1]):
+        history.senses[slot, s] = history.senses[source, s]
+    so3.copy(history.P[source], history.P[slot])
+
+
+@inner
+def find(history, stamp_ns):  # type: ignore[no-untyped-def]
     """The slot of the state after the newest measurement not after `stamp_ns`; of the oldest one that knows something, if all are
     later."""
+    states, ring = history.states, history.ring
     size, at = len(states), ring[1] - 1
     while at > 0 and states[(ring[0] + at) % size].stamp_ns > stamp_ns:
         at -= 1
@@ -495,7 +586,7 @@ def find(states, ring, stamp_ns):  # type: ignore[no-untyped-def]
     return (ring[0] + at) % size
 
 
-@njit(cache=True)
+@inner
 def _is_after(a, b):  # type: ignore[no-untyped-def]
     """Whether a measurement comes after another: by stamp, source, and position, as of two cameras that expose together."""
     if a.stamp_ns != b.stamp_ns:
@@ -508,55 +599,127 @@ def _is_after(a, b):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True)
+@inner
 def _drop_first(ring, size):  # type: ignore[no-untyped-def]
     ring[0] = (ring[0] + 1) % size
     ring[1] -= 1
 
 
-@njit(cache=True)
-def clear_all(states, measurements, rings):  # type: ignore[no-untyped-def]
+@kernel(
+    "out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], out i8[t, 2]",
+    MEASUREMENT=MEASUREMENT,
+    STATE=STATE,
+    SENSE_STATE=SENSE_STATE,
+)
+def clear_all(measurements, states, senses, P, rings):  # type: ignore[no-untyped-def]
+    """Clears the histories of all targets."""
     for i in range(len(rings)):
-        clear(states[i], measurements[i], rings[i])
+        clear(Entries(measurements[i], states[i], senses[i], P[i], rings[i]))
 
 
-@njit(cache=True)
-def measure_all(models, states, measurements, rings, targets, sources, stamps_ns, T, information, latest_ns, fates):  # type: ignore[no-untyped-def]
-    """`Bank.measure`, one after the other."""
+@kernel(
+    "MODEL[t], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], out i8[t, 2], "
+    "i8, i8, f8[4, 4], f8[6], f8[6, 6], SENSE_ESTIMATE[n]",
+    MODEL=MODEL,
+    MEASUREMENT=MEASUREMENT,
+    STATE=STATE,
+    SENSE_STATE=SENSE_STATE,
+    SENSE_ESTIMATE=SENSE_ESTIMATE,
+)
+def adopt(models, measurements, states, senses, P, rings, target, stamp_ns, T, velocity, covariance, known):  # type: ignore[no-untyped-def]
+    """Makes a history of one entry: a pose T (4, 4) at a stamp, with velocity (6,), the pose's covariance (6, 6), and what is
+    known of the senses. The velocity may be off by as much as one that is unknown."""
+    history = Entries(measurements[target], states[target], senses[target], P[target], rings[target])
+    clear(history)
+    state = State(history.states[0], history.senses[0], history.P[0])
+    now, first = state.now, history.measurements[0]
+    first.stamp_ns = now.stamp_ns = stamp_ns
+    for i in range(3):
+        now.p[i] = T[i, 3]
+    so3.copy(T, now.R)
+    so3.orthonormalise(now.R)
+    _spread(models[target], state, covariance)
+    for i in range(POSE):
+        now.velocity[i] = velocity[i]
+    for s in range(len(known)):
+        sense = state.senses[s]
+        sense.believed_ns, sense.gain = known[s].believed_ns, known[s].weight
+        now.accepted_ns = max(now.accepted_ns, known[s].believed_ns)
+
+
+@kernel(
+    "MODEL[t], SENSE_MODEL[n], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], "
+    "out i8[t, 2], i8[m], i8[m], i8[m], f8[m, 4, 4], f8[m, 6, 6], i8, out i8[m], out f8[size, 6]",
+    MODEL=MODEL,
+    SENSE_MODEL=SENSE_MODEL,
+    MEASUREMENT=MEASUREMENT,
+    STATE=STATE,
+    SENSE_STATE=SENSE_STATE,
+)
+def measure_all(
+    models, sense_models, measurements, states, senses, P, rings,
+    targets, sources, stamps_ns, T, information, latest_ns, fates, room,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """`Bank.measure`, one after the other. room (size, 6) is written to."""
     m = np.empty(1, MEASUREMENT)[0]
     for r in range(len(targets)):
         i = targets[r]
         fates[r] = fault(stamps_ns[r], T[r], information[r], latest_ns)
         if fates[r] == 0:
-            reduce(models[i], sources[r], stamps_ns[r], T[r], information[r], m)
-            fates[r] = insert(models[i], states[i], measurements[i], rings[i], m) if m.rank else NOTHING
+            model = Model(models[i], sense_models)
+            reduce(model, sources[r], stamps_ns[r], T[r], information[r], m)
+            history = Entries(measurements[i], states[i], senses[i], P[i], rings[i])
+            fates[r] = insert(model, history, m, room) if m.rank else NOTHING
 
 
-@njit(cache=True)
-def estimate_all(models, states, rings, stamp_ns, out):  # type: ignore[no-untyped-def]
+@kernel(
+    "MODEL[t], MEASUREMENT[t, c], STATE[t, c], SENSE_STATE[t, c, n], f8[t, c, size, size], i8[t, 2], i8, "
+    "out ESTIMATE[t], out SENSE_ESTIMATE[t, n]",
+    MODEL=MODEL,
+    MEASUREMENT=MEASUREMENT,
+    STATE=STATE,
+    SENSE_STATE=SENSE_STATE,
+    ESTIMATE=ESTIMATE,
+    SENSE_ESTIMATE=SENSE_ESTIMATE,
+)
+def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, shares):  # type: ignore[no-untyped-def]
     """`Bank.estimate`, one after the other."""
+    p, R, velocity, covariance = np.empty(3), np.empty((3, 3)), np.empty(POSE), np.empty((MOTION, MOTION))
     for n in range(len(out)):
-        model, state, found = models[n], states[n, find(states[n], rings[n], stamp_ns)], out[n]
-        if state.stamp_ns == NEVER:
-            p, R, P = model.home[:3, 3].copy(), model.home[:3, :3].copy(), model.home_covariance.copy()
-            velocity, found.state = np.zeros(POSE), LOST
+        history = Entries(measurements[n], states[n], senses[n], P[n], rings[n])
+        one, slot, found = models[n], find(history, stamp_ns), out[n]
+        now, of_senses = states[n, slot], senses[n, slot]
+        if now.stamp_ns == NEVER:
+            for i in range(3):
+                p[i] = one.home[i, 3]
+            so3.copy(one.home, R)
+            for i in range(POSE):
+                velocity[i] = 0.0
+                for j in range(POSE):
+                    covariance[i, j] = one.home_covariance[i, j]
+            found.state = LOST
         else:
-            p, R, P = state.p.copy(), state.R.copy(), state.P[:MOTION, :MOTION].copy()
-            velocity = state.velocity.copy()
-            move(model, max(0.0, (stamp_ns - state.stamp_ns) * 1e-9), p, R, velocity, P, state.agility)
-            found.state = state_of((stamp_ns - state.accepted_ns) * 1e-9, P, model.limits)
+            for i in range(3):
+                p[i] = now.p[i]
+            so3.copy(now.R, R)
+            so3.copy(P[n, slot], covariance)
+            for i in range(POSE):
+                velocity[i] = now.velocity[i]
+            dt = max(0.0, (stamp_ns - now.stamp_ns) * 1e-9)
+            move(one, dt, p, R, velocity, covariance, now.agility)
+            found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)
         for i in range(3):
             for j in range(3):
                 found.T[i, j] = R[i, j]
             found.T[i, 3], found.T[3, i] = p[i], 0.0
         found.T[3, 3] = 1.0
+        so3.copy(covariance, found.covariance)
+        total = 0.0
         for i in range(POSE):
             found.velocity[i] = velocity[i]
-            for j in range(POSE):
-                found.covariance[i, j] = P[i, j]
-        total = 0.0
-        for s in range(SENSES):
-            total += state.gain[s]
-        for s in range(SENSES):
-            found.believed_ns[s] = state.believed_ns[s]
-            found.weight[s] = state.gain[s] / total if total > 0.0 else 0.0
+        for s in range(len(of_senses)):
+            total += of_senses[s].gain
+        for s in range(len(of_senses)):
+            share = shares[n, s]
+            share.believed_ns = of_senses[s].believed_ns
+            share.weight = of_senses[s].gain / total if total > 0.0 else 0.0

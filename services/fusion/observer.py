@@ -11,21 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fusion import filter
-from services.fusion.estimate import (
-    ACCEPTED,
-    FUTURE,
-    SOURCES,
-    STATES,
-    Array,
-    Estimate,
-    Log,
-    latest,
-    refusal,
-    shaped,
-)
-from services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, STATE
-from services.fusion.settings import Settings, model
+from services.fusion.estimate import ACCEPTED, FUTURE, STATES, Array, Estimate, Log, latest, refusal, shaped
+from services.fusion.records import ESTIMATE, MODEL, NEVER, POSE, SENSE_ESTIMATE, History, size
+from services.fusion.settings import Settings, model, sense_models
 from shared.contract.messages import FusedPose, Source
+from shared.contract.senses import SENSES, Sense
 from shared.geometry import rigid
 
 
@@ -33,25 +23,31 @@ class Bank:
     """The observers of n targets, which share nothing but the calls.
 
     homes : expected poses (n, 4, 4) before anything is known, with standard deviations `spreads` (n, 2), of position [m] and
-    rotation [rad].
+    rotation [rad]. senses : whose measurements are taken.
     """
 
-    def __init__(self, homes: Array, spreads: Sequence[tuple[float, float]], settings: Settings | None = None):
+    def __init__(
+        self,
+        homes: Array,
+        spreads: Sequence[tuple[float, float]],
+        settings: Settings | None = None,
+        senses: Sequence[Sense] = SENSES,
+    ):
         self.settings = settings or Settings()
-        n = len(homes)
-        self.logs = [Log() for _ in range(n)]
+        self.names = tuple(sense.name for sense in senses)
+        self.logs = [Log(self.names) for _ in homes]
         self._models = np.array([model(self.settings, *given) for given in zip(homes, spreads, strict=True)], MODEL)
-        self._states = np.zeros((n, self.settings.capacity), STATE)
-        self._measurements = np.zeros((n, self.settings.capacity), MEASUREMENT)
-        self._rings = np.zeros((n, 2), np.int64)
-        filter.clear_all(self._states, self._measurements, self._rings)
+        self._sense_models = sense_models(senses)
+        self._history = History.empty(len(homes), self.settings.capacity * len(senses), len(senses))
+        self._room = np.empty((size(len(senses)), POSE))
+        filter.clear_all(*self._history)
 
     def __len__(self) -> int:
         return len(self.logs)
 
     def forget(self, targets: slice = slice(None)) -> None:
         """Begins anew with every target, or with some of them; their counts go on."""
-        filter.clear_all(self._states[targets], self._measurements[targets], self._rings[targets])
+        filter.clear_all(*self._history.of(targets))
         for log in self.logs[targets]:
             log.heard_ns.clear()
 
@@ -66,63 +62,88 @@ class Bank:
     ) -> NDArray[np.int64]:
         """Takes m poses T (m, 4, 4) with their information (m, 6, 6), one after the other; their fates (m,), of FATES.
 
-        targets, sources (m,) : which target each belongs to, and which of SOURCES it comes from; otherwise as
+        targets, sources (m,) : which target each belongs to, and which of `names` it comes from; otherwise as
         `ErrorStateObserver.measure`. What is refused is counted, and the others are taken.
         """
         fates = np.empty(len(targets), np.int64)
         filter.measure_all(
-            *(self._models, self._states, self._measurements, self._rings),
-            *(targets, sources, stamps_ns, T, information, latest(now_ns), fates),
+            *(self._models, self._sense_models, *self._history),
+            *(targets, sources, stamps_ns, T, information, latest(now_ns), fates, self._room),
         )
         columns = (each.tolist() for each in (targets, sources, stamps_ns, fates))
         for target, source, stamp_ns, fate in zip(*columns, strict=True):
-            self.logs[target].took(SOURCES[source], stamp_ns, fate)
+            self.logs[target].took(self.names[source], stamp_ns, fate)
         return fates
 
     def adopt(self, target: int, message: FusedPose) -> None:
         """As `ErrorStateObserver.adopt`, of one target."""
-        believed_ns, weight = np.full(len(SOURCES), NEVER), np.zeros(len(SOURCES))
-        for s, name in enumerate(SOURCES):
+        known = np.array([(NEVER, 0.0)] * len(self.names), SENSE_ESTIMATE)
+        for record, name in zip(known, self.names, strict=True):
             if (source := message.sources.get(name)) is not None:
-                believed_ns[s], weight[s] = message.stamp_ns - int(1e9 * source.age_s), source.weight
-                self.logs[target].heard(name, int(believed_ns[s]))
+                record["believed_ns"], record["weight"] = message.stamp_ns - int(1e9 * source.age_s), source.weight
+                self.logs[target].heard(name, int(record["believed_ns"]))
         T = rigid.transform(message.position, message.orientation)
         filter.adopt(
-            *(self._models[target], self._states, self._measurements, self._rings, target),
-            *(message.stamp_ns, T, message.velocity, message.covariance, believed_ns, weight),
+            *(self._models, *self._history, target),
+            *(message.stamp_ns, T, message.velocity, message.covariance, known),
         )
 
-    def estimate(self, stamp_ns: int, targets: slice = slice(None)) -> NDArray[np.void]:
-        """The ESTIMATE of every target (n,) at a stamp, or of some of them; otherwise as `ErrorStateObserver.estimate`."""
+    def estimate(self, stamp_ns: int, targets: slice = slice(None)) -> tuple[NDArray[np.void], NDArray[np.void]]:
+        """The ESTIMATE of every target (n,) at a stamp, or of some of them, and the SENSE_ESTIMATE of every target and sense;
+        otherwise as `ErrorStateObserver.estimate`."""
         models = self._models[targets]
-        out = np.empty(len(models), ESTIMATE)
-        filter.estimate_all(models, self._states[targets], self._rings[targets], stamp_ns, out)
-        return out
+        out, senses = np.empty(len(models), ESTIMATE), np.empty((len(models), len(self.names)), SENSE_ESTIMATE)
+        filter.estimate_all(models, *self._history.of(targets), stamp_ns, out, senses)
+        return out, senses
 
     def earliest_ns(self, target: int) -> int:
         """As `ErrorStateObserver.earliest_ns`, of one target."""
-        first, count = self._rings[target]
-        return int(self._states[target, first]["stamp_ns"]) if count else 0
+        first, count = self._history.rings[target]
+        return int(self._history.states[target, first]["stamp_ns"]) if count else 0
 
     def innovation(self, target: int) -> tuple[float, int]:
         """As `ErrorStateObserver.innovation`, of one target."""
-        first, count = self._rings[target]
-        newest = self._states[target, (first + count - 1) % self._states.shape[1]]
+        first, count = self._history.rings[target]
+        newest = self._history.states[target, (first + count - 1) % self._history.states.shape[1]]
         return float(newest["distance"]), int(newest["rank"])
 
     def estimates(self, stamp_ns: int) -> list[Estimate]:
-        """The same, each with its sources, to be told to others."""
-        return _told(self.estimate(stamp_ns), self.logs, stamp_ns)
+        """The same, each with its sources, to be published."""
+        return self._described(slice(None), stamp_ns)
+
+    def one(self, stamp_ns: int, target: int) -> Estimate:
+        """The same of one target."""
+        return self._described(slice(target, target + 1), stamp_ns)[0]
+
+    def _described(self, targets: slice, stamp_ns: int) -> list[Estimate]:
+        found, senses = self.estimate(stamp_ns, targets)
+        out = []
+        columns = (found["T"], found["velocity"], found["covariance"], found["state"].tolist(), senses.tolist())
+        for T, velocity, covariance, state, known, log in zip(*columns, self.logs[targets], strict=True):
+            sources = {}
+            for name, (believed_ns, weight) in zip(self.names, known, strict=True):
+                if name in log.heard_ns:
+                    newest_ns = believed_ns if believed_ns != NEVER else log.heard_ns[name]
+                    sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), weight)
+            out.append(Estimate(T, velocity, covariance, STATES[state], sources))
+        return out
 
 
 class ErrorStateObserver:
     """Fuses the poses of the senses by how much each can be trusted now.
 
     home : expected pose (4, 4) before anything is known, with standard deviations `spread` (position [m], rotation [rad]).
+    senses : whose measurements are taken.
     """
 
-    def __init__(self, home: rigid.Array, spread: tuple[float, float], settings: Settings | None = None):
-        self._join(Bank(np.asarray(home)[None], [spread], settings), 0)
+    def __init__(
+        self,
+        home: rigid.Array,
+        spread: tuple[float, float],
+        settings: Settings | None = None,
+        senses: Sequence[Sense] = SENSES,
+    ):
+        self._join(Bank(np.asarray(home)[None], [spread], settings, senses), 0)
 
     @classmethod
     def of(cls, bank: Bank, target: int) -> ErrorStateObserver:
@@ -147,7 +168,7 @@ class ErrorStateObserver:
         """
         self.log.check(source)
         T, information = shaped(T, (4, 4)), shaped(information, (POSE, POSE))
-        target, which, stamp = np.array([[self._target], [SOURCES.index(source)], [stamp_ns]])
+        target, which, stamp = np.array([[self._target], [self._bank.names.index(source)], [stamp_ns]])
         fate = int(self._bank.measure(target, which, stamp, T[None], information[None], now_ns)[0])
         if fate >= FUTURE:
             raise refusal(fate, stamp_ns, T, information, now_ns)
@@ -176,22 +197,6 @@ class ErrorStateObserver:
         """The pose at a stamp, from the measurements up to it. Disturbs nothing.
 
         A stamp before the history reads its oldest state. A source's weight is its share of the information that the senses
-        brought in the last `weight_time`, fading exponentially; information in nats, as `records.STATE` defines its gain.
+        brought in the last `weight_time`, fading exponentially; information in nats, as `records.SENSE_STATE` defines its gain.
         """
-        found = self._bank.estimate(stamp_ns, slice(self._target, self._target + 1))
-        return _told(found, [self.log], stamp_ns)[0]
-
-
-def _told(found: NDArray[np.void], logs: Sequence[Log], stamp_ns: int) -> list[Estimate]:
-    """The ESTIMATE of n targets (n,) for others to read."""
-    names = ("state", "believed_ns", "weight")
-    arrays, lists = (found["T"], found["velocity"], found["covariance"]), (found[name].tolist() for name in names)
-    out = []
-    for T, velocity, covariance, state, believed_ns, weight, log in zip(*arrays, *lists, logs, strict=True):
-        sources = {}
-        for name, since_ns in log.heard_ns.items():
-            s = SOURCES.index(name)
-            newest_ns = believed_ns[s] if believed_ns[s] != NEVER else since_ns
-            sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), weight[s])
-        out.append(Estimate(T, velocity, covariance, STATES[state], sources))
-    return out
+        return self._bank.one(stamp_ns, self._target)

@@ -34,14 +34,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.fusion import so3
 from services.fusion.estimate import Array, Estimate, Limits, Log
 from shared.contract.messages import FusedPose, Source
 from shared.geometry import rigid
 
 STEP_S = 0.01
 SENSES = {"vision": slice(0, 6), "haptic": slice(6, 12)}
-"""Rows of y, g, z and C, and blocks of R."""
+"""Rows of y, g, z and C, and blocks of R: the paper's two senses. This observer takes no others, whatever the table of senses
+has."""
 C = np.vstack([np.eye(6), np.eye(6)])
 """C = dg/dx (section "Modified Luenberger-type Observer"), (12, 6)."""
 
@@ -107,7 +107,7 @@ class PaperObserver:
 
     def __init__(self, home: rigid.Array, spread: tuple[float, float], settings: PaperSettings | None = None):
         self.settings = settings or PaperSettings()
-        self.log = Log()
+        self.log = Log(SENSES)
         self._home = home
         self._home_covariance = np.diag(np.repeat(np.square(spread), 3))
         self._W_v = np.diag(self.settings.W_v)
@@ -288,7 +288,7 @@ def _wrapped(x: Array) -> Array:
 
 def _rates(x: Array) -> Array:
     """B (6, 6): a small change of x as a pose error (translation, rotation vector about fixed axes)."""
-    about_y, about_z = so3.exp(np.array([0.0, x[4], 0.0])), so3.exp(np.array([0.0, 0.0, x[5]]))
+    about_y, about_z = rigid.rotation((0.0, x[4], 0.0)), rigid.rotation((0.0, 0.0, x[5]))
     B = np.eye(6)
     B[3:, 3] = about_z @ about_y[:, 0]
     B[3:, 4] = about_z[:, 1]

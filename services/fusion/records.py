@@ -1,38 +1,53 @@
-"""The records that the default observer's filter, `kernel.py`, works on: settings, a measurement, a state, an estimate."""
+"""The records that the default observer's filter, `kernel.py`, works on: settings, a measurement, a state, an estimate.
+
+What there is of every sense is a record in an array (n,) of its own, in the order of the table of senses, so that the compiled
+filter serves any number of them.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
-from services.fusion.estimate import SOURCES
+import numpy as np
+from numpy.typing import NDArray
 
 POSE, MOTION = 6, 12  # sizes of the pose, and of the pose with its velocities, within the state
-UNITS = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+UNITS = (0.1, 0.1, 0.1, 1.0, 1.0, 1.0)
 """Units [m, rad] in which translations and rotations compare: a turn by 1 rad moves the ends of a forearm by about 10 cm."""
-SENSES = len(SOURCES)
-SIZE = MOTION + POSE * SENSES
 NEVER = -(1 << 62)
 """The stamp of what has not happened."""
 
+
+def size(senses: int) -> int:
+    """Number of the state's errors: position, rotation, their velocities, and the bias of each sense."""
+    return MOTION + POSE * senses
+
+
 MODEL = np.dtype(
     [
-        *((name, "f8", SENSES) for name in ("lasting", "time_constant", "floor")),  # as in Sense
         *((name, "f8", 2) for name in ("acceleration", "velocity_spread", "agility", "learning")),  # as in Settings
         *((name, "f8") for name in ("velocity_time", "doubt", "patience", "source_patience", "refusals", "unobserved")),
         ("witness", "f8"),
         *((name, "f8") for name in ("horizon", "weight_time", "lost_age")),
         ("limits", "f8", 4),  # as in Limits
-        ("threshold", "f8", (2, POSE + 1)),  # squared Mahalanobis distances that `gate` lets pass, by rank
         ("home", "f8", (4, 4)),
         ("home_covariance", "f8", (POSE, POSE)),
     ]
 )
 """The settings, with the home of one target, as compiled code reads them."""
 
+SENSE_MODEL = np.dtype(
+    [
+        *((name, "f8") for name in ("lasting", "time_constant", "floor")),  # as in `senses.Errors`
+        ("threshold", "f8", (2, POSE + 1)),  # squared Mahalanobis distances that its `gate` lets pass, by rank
+    ]
+)
+"""The same of one sense."""
+
 MEASUREMENT = np.dtype(
     [
         ("stamp_ns", "i8"),
-        ("source", "i8"),  # which of SOURCES
+        ("source", "i8"),  # row of the table of senses
         ("rank", "i8"),  # k, how many directions it observes; what follows has k rows in use
         ("p", "f8", 3),
         ("R", "f8", (3, 3)),
@@ -56,25 +71,29 @@ STATE = np.dtype(
         ("p", "f8", 3),
         ("R", "f8", (3, 3)),
         ("velocity", "f8", POSE),
-        ("bias", "f8", SIZE - MOTION),
-        ("P", "f8", (SIZE, SIZE)),  # covariance of the errors of position, rotation, velocities, and the bias of each sense
         ("agility", "f8", 2),  # learned factors on the process noise, linear and angular
-        # by sense
-        ("came_ns", "i8", SENSES),  # stamp of the last measurement
-        ("surprise", "f8", SENSES),  # its squared Mahalanobis distance a direction
-        ("heard_ns", "i8", SENSES),  # stamp of the last measurement that taught something
-        ("believed_ns", "i8", SENSES),  # and of the last accepted one
-        ("refused", "i8", SENSES),  # how many were refused since
-        ("refused_ns", "i8", SENSES),  # stamp of the first of them
-        # information that it brought [nats], fading: by how much it made the logarithm of the volume of the pose's uncertainty
-        # smaller. It counts what was new: the hundredth measurement with the same error brings next to nothing
-        ("gain", "f8", SENSES),
-        ("doubt", "f8", SENSES),  # learned factor on its covariance
-        ("has_innovation", "i8", SENSES),
-        ("innovation", "f8", (SENSES, POSE)),  # the last one, in units of its standard deviation
     ]
 )
-"""The filter after one measurement."""
+"""The filter after one measurement, without the covariance (size, size) of all errors, which is an array of its own."""
+
+SENSE_STATE = np.dtype(
+    [
+        ("came_ns", "i8"),  # stamp of the last measurement
+        ("surprise", "f8"),  # its squared Mahalanobis distance a direction
+        ("heard_ns", "i8"),  # stamp of the last measurement that taught something
+        ("believed_ns", "i8"),  # and of the last accepted one
+        ("refused", "i8"),  # how many were refused since
+        ("refused_ns", "i8"),  # stamp of the first of them
+        # information that it brought [nats], fading: by how much it made the logarithm of the volume of the pose's uncertainty
+        # smaller. It counts what was new: the hundredth measurement with the same error brings next to nothing
+        ("gain", "f8"),
+        ("doubt", "f8"),  # learned factor on its covariance
+        ("has_innovation", "i8"),
+        ("innovation", "f8", POSE),  # the last one, in units of its standard deviation
+        ("bias", "f8", POSE),
+    ]
+)
+"""What the filter knows of one sense after a measurement of any."""
 
 ESTIMATE = np.dtype(
     [
@@ -82,8 +101,39 @@ ESTIMATE = np.dtype(
         ("velocity", "f8", POSE),
         ("covariance", "f8", (POSE, POSE)),
         ("state", "i8"),  # which of STATES
-        ("believed_ns", "i8", SENSES),  # stamp of the last accepted measurement of each sense, NEVER where there is none
-        ("weight", "f8", SENSES),
     ]
 )
 """What is answered for one target: `estimate.Estimate` in arrays."""
+
+SENSE_ESTIMATE = np.dtype([("believed_ns", "i8"), ("weight", "f8")])
+"""The same of one sense; its stamp is that of its last accepted measurement, NEVER where there is none."""
+
+
+class History(NamedTuple):
+    """The histories of targets (t,), each a ring of c entries, with n senses; see `kernel.py`.
+
+    measurements (t, c) : MEASUREMENT. states (t, c) : STATE. senses (t, c, n) : SENSE_STATE. P (t, c, size, size) : covariances
+    of the errors of position, rotation, their velocities, and the bias of each sense. rings (t, 2) : see `kernel.py`.
+    """
+
+    measurements: NDArray[np.void]
+    states: NDArray[np.void]
+    senses: NDArray[np.void]
+    P: NDArray[np.float64]
+    rings: NDArray[np.int64]
+
+    @classmethod
+    def empty(cls, targets: int, capacity: int, senses: int) -> History:
+        """Room for histories, not yet cleared."""
+        n, shape = size(senses), (targets, capacity)
+        return cls(
+            np.zeros(shape, MEASUREMENT),
+            np.zeros(shape, STATE),
+            np.zeros((*shape, senses), SENSE_STATE),
+            np.zeros((*shape, n, n)),
+            np.zeros((targets, 2), np.int64),
+        )
+
+    def of(self, targets: slice) -> History:
+        """The histories of some of the targets, without a copy."""
+        return History(*(part[targets] for part in self))

@@ -1,4 +1,4 @@
-"""Wiring of the fusion service: poses of the senses in, the fused pose out at 200 Hz and to whoever asks."""
+"""Wiring of the fusion service: measurements of the senses in, the fused pose out at 200 Hz and to whoever asks."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from services.fusion import so3
-from services.fusion.estimate import AHEAD_S, Array, Estimate, Refused, information, latest
+from services.fusion import paper
+from services.fusion.estimate import Estimate, Refused, latest, measured
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
+from shared import native
 from shared.cell import description
 from shared.contract import messages, topics
+from shared.contract.senses import SENSES, Sense
 from shared.geometry import rigid
 from shared.runtime.node import Node
 
@@ -26,6 +29,8 @@ OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
 PERIOD_S = 1.0 / topics.FUSED.rate_hz
 SILENCE_S = 0.025
 """A replica speaks for the one before it in rank after so long a silence: a frozen process counts as alive for another second."""
+SET_BACK_S = 0.05
+"""A clock that goes back by more was set, by less it is kept together with others."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,12 +41,15 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--target", metavar="NAME", help="fuse this target only (default: all of the cell)")
 
 
-def start(node: Node, options: argparse.Namespace) -> None:
-    """Wires one observer per target, and one timer for all. Raises CellError for a target that the cell does not have."""
+def start(node: Node, options: argparse.Namespace, senses: Sequence[Sense] = SENSES) -> None:
+    """Wires one observer per target, and one timer for all. senses: whose measurements are taken; the paper's observer takes its
+    two alone. Raises CellError for a target that the cell does not have."""
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
-    warm_up(OBSERVERS[options.observer])
-    group = Group(options.observer, [node.cell.targets[name] for name in names], node.now_ns)
-    fusions = [Fusion(node, name, group, observer) for name, observer in zip(names, group.observers, strict=True)]
+    if options.observer == "paper":
+        senses = [sense for sense in senses if sense.name in paper.SENSES]
+    native.prepare()
+    group = Group(options.observer, [node.cell.targets[name] for name in names], node.now_ns, senses)
+    fusions = [Fusion(node, name, group, observer, senses) for name, observer in zip(names, group.observers, strict=True)]
 
     def publish() -> None:
         stamp_ns, estimates = group.estimates()
@@ -53,18 +61,10 @@ def start(node: Node, options: argparse.Namespace) -> None:
     node.is_warm = lambda: all(fusion.state != "lost" for fusion in fusions)
 
 
-def warm_up(kind: type[ErrorStateObserver | PaperObserver]) -> None:
-    """Compiles everything, or loads what an earlier start has compiled, so that the first measurement takes no longer than the
-    others."""
-    observer = kind(np.eye(4), (1.0, 1.0))
-    observer.measure("vision", 1, np.eye(4), np.eye(6))
-    so3.quaternion(observer.estimate(1).T[:3, :3])
-
-
 class Group:
     """The observers of the cell's targets, of which all can be asked at once, and their clock now_ns()."""
 
-    def __init__(self, kind: str, targets: list[description.Target], now_ns: Callable[[], int]):
+    def __init__(self, kind: str, targets: list[description.Target], now_ns: Callable[[], int], senses: Sequence[Sense] = SENSES):
         homes = [target.home.transform for target in targets]
         spreads = [(target.home_spread.position, target.home_spread.rotation) for target in targets]
         self.lock = threading.Lock()
@@ -74,14 +74,14 @@ class Group:
             self.observers = [PaperObserver(home, spread) for home, spread in zip(homes, spreads, strict=True)]
             self._bank = None
         else:
-            self._bank = Bank(np.array(homes), spreads)
+            self._bank = Bank(np.array(homes), spreads, senses=senses)
             self.observers = [ErrorStateObserver.of(self._bank, i) for i in range(len(targets))]
 
     def now_ns(self) -> int:
         """The time, asked with the lock held. Where the clock was set back, all that is known is of a time to come, of which
         nothing can be told now: it is forgotten. Where it was set forward, it is too old."""
         stamp_ns = self._now_ns()
-        if stamp_ns < self._last_ns - AHEAD_S * 1e9:
+        if stamp_ns < self._last_ns - SET_BACK_S * 1e9:
             for observer in self.observers:
                 observer.forget()
         self._last_ns = stamp_ns
@@ -110,7 +110,7 @@ class Publishers:
         if speaker != publisher and now_s - heard_s < silence_s:
             raise Refused(
                 "publisher",
-                f"{stream}: one publisher expected, {publisher} came beside {speaker}: two processes publish the same poses; "
+                f"{stream}: expected one publisher, got {publisher} beside {speaker}: two processes publish the same poses; "
                 "end one of them",
             )
         self._speaks[stream] = publisher, now_s
@@ -120,25 +120,61 @@ class Fusion:
     """One target: its observer, what it hears and what it says. Every replica listens, the stream's owner publishes, and the next
     in rank where it is silent. One that knows nothing yet goes on from what the others publish."""
 
-    def __init__(self, node: Node, target: str, group: Group, observer: ErrorStateObserver | PaperObserver):
+    def __init__(
+        self,
+        node: Node,
+        target: str,
+        group: Group,
+        observer: ErrorStateObserver | PaperObserver,
+        senses: Sequence[Sense] = SENSES,
+    ):
         self.node, self.target, self.group, self.observer = node, target, group, observer
         self._publishers = Publishers()
         self._told: set[tuple[str, str]] = set()
         self.state = "lost"
         self._heard_s = time.monotonic()  # another replica
-        node.subscribe(topics.VISION, self.on_vision, target=target)
-        node.subscribe(topics.HAPTIC, self.on_haptic, target=target)
+        for sense in senses:
+            node.subscribe(sense.topic, partial(self.on_measurement, sense), target=target)
         node.subscribe(topics.FUSED, self.on_fused, from_others=True, target=target)
         node.answer(topics.current_pose(node.cell.name, target), self.answer)
         node.report[target] = self.describe
 
-    def on_vision(self, message: messages.VisionPose, names: dict[str, str]) -> None:
-        """A camera's pose; each camera of the cell is a stream of its own."""
-        self._take("vision", message, lambda: self._seen(message, names["publisher"]), message.hidden)
+    def on_measurement(self, sense: Sense, message: Any, names: dict[str, str]) -> None:
+        """Hands a measurement on to the observer, or the news that a sense is there but has nothing to say; what is refused is
+        counted, and the first of each kind is logged."""
+        log = self.observer.log
+        try:
+            self._check_origin(sense, message, names["publisher"])
+            is_usable = sense.usable is None or message.state == sense.usable
+            found = measured(message, sense.measures) if is_usable else None
+        except Refused as error:
+            log.refused(sense.name, error.kind)
+            self._tell(sense.name, error)
+            return
+        with self.group.lock:
+            now_ns = self.group.now_ns()
+            if found is None:
+                log.heard(sense.name, message.stamp_ns)
+                return
+            hidden = getattr(message, "hidden", None)  # the share by which the paper's observer weighs the camera
+            try:
+                self.observer.measure(sense.name, message.stamp_ns, *found, hidden, now_ns)
+            except Refused as error:
+                self._tell(sense.name, error)
 
-    def on_haptic(self, message: messages.HapticPose, names: dict[str, str]) -> None:
-        """The skin's pose."""
-        self._take("haptic", message, lambda: self._felt(message, names["publisher"]), None)
+    def _check_origin(self, sense: Sense, message: Any, publisher: str) -> None:
+        """Raises Refused for a message of another target, frame or part of the cell, and for a second publisher."""
+        expected, got = (self.target, self.node.cell.frame), (message.target, message.frame)
+        if got != expected:
+            raise Refused("frame", f"{sense.name}: expected target and frame {expected}, got {got!r:.120}")
+        stream = sense.name
+        if sense.part is not None:
+            part, known = getattr(message, sense.part), getattr(self.node.cell, f"{sense.part}s")
+            if part not in known:
+                text = f"{sense.name}: expected a {sense.part} of the cell ({', '.join(known)}), got {part!r:.60}"
+                raise Refused(sense.part, text)
+            stream = f"{sense.name} of {sense.part} {part}"
+        self._publishers.check(stream, publisher, time.monotonic(), sense.topic.stale_s)
 
     def on_fused(self, message: messages.FusedPose, names: dict[str, str]) -> None:
         """The pose as another replica knows it."""
@@ -147,46 +183,6 @@ class Fusion:
             with self.group.lock:
                 if message.stamp_ns <= latest(self.group.now_ns()):
                     self.observer.adopt(message)
-
-    def _seen(self, message: messages.VisionPose, publisher: str) -> Array | None:
-        """The information (6, 6) of a camera's pose, None where it is not to be used. Raises Refused."""
-        if message.camera not in self.node.cell.cameras:
-            known = ", ".join(self.node.cell.cameras)
-            raise Refused("camera", f"vision: a camera of the cell ({known}) expected, {message.camera!r:.60} came")
-        self._publishers.check(f"vision of camera {message.camera}", publisher, time.monotonic(), topics.VISION.stale_s)
-        return information(message.covariance) if message.state == "tracking" else None
-
-    def _felt(self, message: messages.HapticPose, publisher: str) -> Array | None:
-        """The information (6, 6) of the skin's pose, None where it is not to be used. Raises Refused."""
-        self._publishers.check("haptic", publisher, time.monotonic(), topics.HAPTIC.stale_s)
-        return message.information if message.state == "in_range" else None
-
-    def _take(self, source: str, message: Any, read: Callable[[], Array | None], hidden: float | None) -> None:
-        """Hands a measurement on to the observer, or the news that a sense is there but has nothing to say; what is refused is
-        counted, and told once of each kind."""
-        log = self.observer.log
-        try:
-            self._check_place(source, message)
-            information = read()
-        except Refused as error:
-            log.refused(source, error.kind)
-            self._tell(source, error)
-            return
-        with self.group.lock:
-            now_ns = self.group.now_ns()
-            if information is None:
-                log.heard(source, message.stamp_ns)
-                return
-            T = rigid.transform(message.position, message.orientation)
-            try:
-                self.observer.measure(source, message.stamp_ns, T, information, hidden, now_ns)
-            except Refused as error:
-                self._tell(source, error)
-
-    def _check_place(self, source: str, message: Any) -> None:
-        expected, came = (self.target, self.node.cell.frame), (message.target, message.frame)
-        if came != expected:
-            raise Refused("frame", f"{source}: target and frame {expected} expected, {came!r:.120} came")
 
     def _tell(self, source: str, error: Refused) -> None:
         if (source, error.kind) not in self._told:
@@ -209,11 +205,12 @@ class Fusion:
             self.node.log.info("lost" if estimate.state == "lost" else "found", target=self.target, **counts)
 
     def answer(self, parameters: dict[str, str], payload: bytes) -> tuple[bytes, str]:
-        """The current pose, or with `stamp_ns=` that at the stamp of a picture, say, by all that is known by now: MessagePack of
-        FusedPose, or JSON with `format=json`. Raises ValueError on another format, and a stamp that is none or out of reach."""
+        """The current pose, or with `stamp_ns=` that at the stamp of a picture, say, using all measurements received so far:
+        MessagePack of FusedPose, or JSON with `format=json`. Raises ValueError on another format, and on a stamp that is none or
+        out of reach."""
         form = parameters.get("format", "msgpack")
         if form not in ("msgpack", "json"):
-            raise ValueError(f"format: msgpack or json expected, {form!r} came")
+            raise ValueError(f"format: expected msgpack or json, got {form!r}")
         with self.group.lock:
             stamp_ns = self.group.now_ns()
             if "stamp_ns" in parameters:
@@ -228,7 +225,7 @@ class Fusion:
 def _within(text: str, earliest_ns: int, now_ns: int) -> int:
     """The stamp [ns] that is asked for. Raises ValueError where none is known there."""
     if not text.isdecimal() or not earliest_ns <= int(text) <= now_ns:
-        raise ValueError(f"stamp_ns: nanoseconds from {earliest_ns} to {now_ns} expected, {text!r} came: ask within the history")
+        raise ValueError(f"stamp_ns: expected nanoseconds from {earliest_ns} to {now_ns}, got {text!r}; ask within the history")
     return int(text)
 
 

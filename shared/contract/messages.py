@@ -202,8 +202,8 @@ class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, kw_only=True)
 class FusedPose(Message):
-    """The one pose. `velocity`: linear [m/s] and angular [rad/s] along the frame's axes. `sources` by name (vision, haptic);
-    a sense that was never heard is absent."""
+    """The one pose. `velocity`: linear [m/s] and angular [rad/s] along the frame's axes. `sources` by name (of the
+    table of senses); a sense that was never heard is absent."""
 
     target: str
     frame: str

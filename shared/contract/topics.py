@@ -27,7 +27,8 @@ class Priority(Enum):
 class Topic:
     """`key` with its {names} to fill in; nominal `rate_hz`; `depth`: samples that a reader keeps while busy;
     `stale_s`: the age after which a reader calls the topic stale; `publishers`: the processes (`shared.contract.processes`) that
-    may publish it; `slow_hz`: how often a slow link carries a key's messages, 0 for never (`penumbra router --slow`)."""
+    may publish it; `slow_hz`: how often a slow link carries a key's messages, 0 for never (`penumbra router --slow`);
+    `by_camera`: whether all cameras' messages go by one key, each at the rate of its camera."""
 
     name: str
     key: str
@@ -40,6 +41,7 @@ class Topic:
     priority: Priority
     slow_hz: float
     qos: QoS = QoS.LATEST_WINS
+    by_camera: bool = False
 
     @property
     def oldest_s(self) -> float:
@@ -63,7 +65,7 @@ TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 
 MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, ("segmentation",),
              "class indices of a window of a frame", Priority.IMAGE, 0)  # fmt: skip
 VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, ("search", "posecnn"),
-               "the camera's pose and covariance", Priority.POSE, 20)  # fmt: skip
+               "the camera's pose and covariance", Priority.POSE, 20, by_camera=True)  # fmt: skip
 HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 50, 16, 0.1, ("haptics",),
                "the skin's pose and information", Priority.POSE, 20)  # fmt: skip
 FUSED = Topic("fused", "penumbra/{cell}/target/{target}/pose/fused", messages.FusedPose, 200, 4, 0.1, ("fusion",), "the one pose",

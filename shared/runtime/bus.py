@@ -14,7 +14,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -266,9 +266,9 @@ def ask(
     return answers
 
 
-def topic_of(key: str) -> Topic | None:
-    """The topic that a key (or a key expression) belongs to."""
-    return next((topic for topic in TOPICS if zenoh.KeyExpr(topic.at()).includes(key)), None)
+def topic_of(key: str, known: Iterable[Topic] = TOPICS) -> Topic | None:
+    """The topic that a key (or a key expression) belongs to, of those that are known."""
+    return next((topic for topic in known if zenoh.KeyExpr(topic.at()).includes(key)), None)
 
 
 class Rate:

@@ -286,7 +286,7 @@ class Node:
     def _rate_hz(self, topic: Topic, names: dict[str, str]) -> float:
         """How often a key's publisher sends: as the table says, but for what follows the cameras' own rates."""
         rates = {name: camera.rate_hz for name, camera in self.cell.cameras.items()}
-        if topic is topics.VISION:
+        if topic.by_camera:
             return max(topic.rate_hz, sum(rates.values()))
         return max(topic.rate_hz, rates.get(names.get("camera", ""), 0.0))
 

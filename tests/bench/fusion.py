@@ -38,10 +38,11 @@ from rich.table import Table
 from scipy.stats import chi2
 
 from services.flags import Parser, above_zero, positive
-from services.fusion.estimate import SOURCES, Estimate
+from services.fusion.estimate import Estimate
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
 from shared.contract import messages
+from shared.contract.senses import SENSES
 from shared.geometry import rigid
 from shared.geometry.rigid import Array
 from tests.bench.lib import fusion_runs as runs
@@ -59,6 +60,7 @@ WIDTH = 130
 BASELINES = ("oracle", "average", "gtsam", "paper")
 SLOW, SLOW_EVERY = ("gtsam", "paper"), 4
 """Baselines that take most of the time, and are played in every fourth run only."""
+SOURCES = tuple(sense.name for sense in SENSES)
 
 
 @dataclass(frozen=True)

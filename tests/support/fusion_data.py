@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from services.fusion.records import UNITS
-from services.fusion.settings import Sense
+from shared.contract import senses
 from shared.geometry import rigid
 from shared.geometry.rigid import Array
 
@@ -27,9 +27,9 @@ def ns(seconds: float) -> int:
 class Errors:
     """A sense's pose errors, a lasting and a white part, none where nothing is observed."""
 
-    def __init__(self, sense: Sense, period: float, rng: np.random.Generator):
-        self._sense, self._rng = sense, rng
-        self._keep = np.exp(-period / sense.time_constant)
+    def __init__(self, errors: senses.Errors, period: float, rng: np.random.Generator):
+        self._errors, self._rng = errors, rng
+        self._keep = np.exp(-period / errors.time_constant)
         self._bias = rng.normal(size=6)
 
     def draw(self, seen: Array) -> Array:
@@ -38,7 +38,8 @@ class Errors:
         w, V = np.linalg.eigh(seen * np.outer(UNITS, UNITS))
         root = (V * np.where(w > 1e-6, np.abs(w), np.inf) ** -0.5) @ V.T
         white = self._rng.normal(size=6)
-        return UNITS * (root @ (np.sqrt(self._sense.lasting) * self._bias + np.sqrt(1 - self._sense.lasting) * white))
+        lasting = self._errors.lasting
+        return UNITS * (root @ (np.sqrt(lasting) * self._bias + np.sqrt(1 - lasting) * white))
 
 
 def without_roll(T: Array, sigma: list[float]) -> Array:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from services.fusion import so3
 from shared.geometry import rigid
 from shared.geometry.rigid import Array
 from tests.bench.lib.fusion_runs import PERIOD_S, Message
@@ -127,7 +126,10 @@ class FixedLagSmoother:
         T, information = message.T, self._weight[message.source] * message.information
         axis = T[:3, 0]
         if axis @ information[3:, 3:] @ axis < 1e-6 * information[3:, 3:].trace():  # the roll is made up
-            swing = so3.exp(so3.swing(known.attitude().matrix()[:, 0], axis))
+            before = known.attitude().matrix()[:, 0]
+            across = np.cross(before, axis)
+            angle = np.arctan2(np.linalg.norm(across), before @ axis)
+            swing = rigid.rotation(angle * across / max(float(np.linalg.norm(across)), 1e-12))
             T = rigid.transform(T[:3, 3])
             T[:3, :3] = swing @ known.attitude().matrix()
         A = np.kron(np.eye(2), T[:3, :3])  # gtsam's errors are along the body's axes, rotation first

@@ -9,33 +9,36 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from services.fusion import chi_square
 from services.fusion.observer import ErrorStateObserver
-from services.fusion.settings import Sense, Settings, _quantile
+from services.fusion.settings import Settings
+from shared.contract import senses
 from shared.geometry import rigid
 from shared.geometry.rigid import Array, perturb, pose_error
 from tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, Errors, ns, without_roll
 
-SENSES = {"vision": Sense(0.8, 1.0, 1e-4), "haptic": Sense(0.8, 1.0, 1e-4)}
-MATCHED = Settings(senses=SENSES, velocity_spread=(0.4, 0.5), acceleration=(0.3, 0.5), learning=(0.0, 0.0))
+ERRORS = senses.Errors(0.8, 1.0, 1e-4)
+SENSES = tuple(dataclasses.replace(sense, errors=ERRORS) for sense in senses.SENSES)
+MATCHED = Settings(velocity_spread=(0.4, 0.5), acceleration=(0.3, 0.5), learning=(0.0, 0.0))
 PERIOD = {"vision": 0.05, "haptic": 0.01}
 
 
 # ---- consistency: the truth moves and the senses err as the filter assumes
 
 
-def normalised_error(senses: dict[str, tuple[float, float]], settings: Settings, seed: int, seconds: float = 1.0) -> float:
-    """Squared error in units of the covariance (6 degrees of freedom) after a run; senses: name -> from and until when [s]."""
+def normalised_error(there: dict[str, tuple[float, float]], settings: Settings, seed: int, seconds: float = 1.0) -> float:
+    """Squared error in units of the covariance (6 degrees of freedom) after a run; there: sense -> from and until when [s]."""
     rng = np.random.default_rng(seed)
     spread = (0.05, 0.15)
     T = perturb(HOME, rng.normal(size=6) * np.repeat(spread, 3))
     velocity = rng.normal(size=6) * np.repeat(settings.velocity_spread, 3)
-    observer = ErrorStateObserver(HOME, spread, settings)
+    observer = ErrorStateObserver(HOME, spread, settings, SENSES)
     h = 0.01
     decay = np.exp(-h / settings.velocity_time)
     kick = np.sqrt(np.repeat(settings.acceleration, 3) * 0.5 * settings.velocity_time * (1 - decay**2))
-    errors = {name: Errors(settings.senses[name], PERIOD[name], rng) for name in senses}
+    errors = {name: Errors(ERRORS, PERIOD[name], rng) for name in there}
     for k in range(round(seconds / h) + 1):
-        for name, (begin, end) in senses.items():
+        for name, (begin, end) in there.items():
             if not begin <= k * h <= end or k % round(PERIOD[name] / h):
                 continue
             seen = np.diag(1.0 / np.square([0.01, 0.01, 0.02, 0.03, 0.03, 0.03]))
@@ -55,7 +58,7 @@ def normalised_error(senses: dict[str, tuple[float, float]], settings: Settings,
 
 
 @pytest.mark.parametrize(
-    ("senses", "settings"),
+    ("there", "settings"),
     [
         pytest.param({"vision": (0.0, 9.0)}, MATCHED, id="visible"),
         pytest.param({"haptic": (0.0, 9.0)}, MATCHED, id="haptic only"),
@@ -67,9 +70,9 @@ def normalised_error(senses: dict[str, tuple[float, float]], settings: Settings,
         ),
     ],
 )
-def test_errors_are_as_large_as_the_covariance_says(senses: dict[str, tuple[float, float]], settings: Settings) -> None:
+def test_errors_are_as_large_as_the_covariance_says(there: dict[str, tuple[float, float]], settings: Settings) -> None:
     runs = 30
-    total = sum(normalised_error(senses, settings, seed) for seed in range(runs))
+    total = sum(normalised_error(there, settings, seed) for seed in range(runs))
     # fixed seeds: the band catches a wrong filter, not bad luck
     low, high = chi2.ppf([0.001, 0.999], 6 * runs)
     assert low < total < high
@@ -118,7 +121,7 @@ def test_fused_is_never_much_worse_than_the_better_sense_although_their_errors_l
         rng = np.random.default_rng(seed)
         at = reaches(rng)
         observer = ErrorStateObserver(HOME, SPREAD)
-        draw = {"vision": Errors(Sense(0.95, 4.0), 0.05, rng), "haptic": Errors(Sense(0.6, 0.7), 0.01, rng)}
+        draw = {"vision": Errors(senses.Errors(0.95, 4.0), 0.05, rng), "haptic": Errors(senses.Errors(0.6, 0.7), 0.01, rng)}
         waiting: list[tuple[float, float, str, Array, Array]] = []
         newest: dict[str, tuple[float, float]] = {}
         for k in range(1200):
@@ -184,7 +187,13 @@ def test_a_sense_that_is_noisier_than_it_says_is_doubted_and_not_refused() -> No
     assert np.sqrt(estimate.covariance[0, 0]) > 0.004
 
 
-@pytest.mark.parametrize("share", [0.5, 0.95, 0.999, 0.9999])
+@pytest.mark.parametrize("share", chi_square.QUANTILES)
 @pytest.mark.parametrize("rank", range(1, 7))
 def test_gates_are_quantiles_of_chi_square(rank: int, share: float) -> None:
-    assert _quantile(rank, share) == pytest.approx(chi2.ppf(share, rank), rel=1e-9)
+    # ppf loses digits where the share is close to one
+    assert chi_square.quantile(share, rank) == pytest.approx(chi2.ppf(share, rank), rel=1e-11)
+
+
+def test_a_gate_that_is_in_no_table_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"share of a gate: expected one of 0.99, 0.999, 0.9999, got 0.5"):
+        chi_square.quantile(0.5, 3)
