@@ -17,7 +17,7 @@ from services.segmentation import prednet
 from services.segmentation.openvino_step import Compiled
 from services.segmentation.prednet import PredNet, State
 from services.segmentation.shift import shift_state
-from shared.contract.labels import Label
+from shared.contract.labels import TARGET_LABELS, Label
 from shared.perception.lookout import MAX_PIXELS, SIZE_STEP, Window
 
 log = logging.getLogger("penumbra.segmentation")
@@ -25,7 +25,6 @@ log = logging.getLogger("penumbra.segmentation")
 WEIGHTS = Path(__file__).parent / "weights" / "prednet.npz"
 MAX_GAP_S = 0.5
 """After a longer silence the picture has little to do with what the state remembers."""
-TARGET_LABELS = (Label.FOREARM, Label.HAND)
 
 
 class Segmenter:
