@@ -1,6 +1,6 @@
 """Makes weights/ again: `penumbra posecnn train`.
 
-RenderedPictures pictures, those that PredNet's sequences begin with, are rendered by a second process into a growing data set on disk
+Simulated pictures, those that PredNet's sequences begin with, are rendered by a second process into a growing data set on disk
 while the network learns from those there. Step n takes its pictures, patches and colours from a generator seeded by (seed, n),
 and the schedule is a function of the progress, so that a run of --steps interrupted and resumed ends with the same weights as one
 that was not.

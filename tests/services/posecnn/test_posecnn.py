@@ -163,7 +163,7 @@ def test_sequences_say_where_their_target_is():
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    data = train.Simulated(tmp_path_factory.mktemp("posecnn"), 1, 32, chunk=16)
+    data = train.RenderedPictures(tmp_path_factory.mktemp("posecnn"), 1, 32, chunk=16)
     yield data
     data.close()
 
@@ -356,8 +356,8 @@ def test_up_starts_one_way_to_see(vision, there):
 
 
 def test_the_command_s_train_writes_weights_that_the_service_reads(tmp_path, monkeypatch):
-    few = functools.partial(train.Simulated, most=16, chunk=16)
-    monkeypatch.setattr(train, "Simulated", lambda folder, seed, most: few(folder, seed))
+    few = functools.partial(train.RenderedPictures, most=16, chunk=16)
+    monkeypatch.setattr(train, "RenderedPictures", lambda folder, seed, most: few(folder, seed))
     monkeypatch.setattr(train, "PoseCnnSettings", lambda: SMALL)
     out = tmp_path / "weights" / "mine.npz"
     places = ["--cache", str(tmp_path / "data"), "--checkpoint", str(tmp_path / "checkpoint"), "--out", str(out)]
