@@ -12,7 +12,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 
@@ -96,6 +98,16 @@ def one_cycle(progress: float, rise: float) -> float:
         return 0.05 + 0.95 * progress / rise
     fall = min((progress - rise) / (1.0 - rise), 1.0)
     return 0.005 + 0.995 * 0.5 * (1.0 + math.cos(math.pi * fall))
+
+
+def recoloured(picture: NDArray[np.float32], rng: np.random.Generator, amount: float) -> NDArray[np.float32]:
+    """A picture (..., 3) in [0, 1] with brightness, contrast, saturation and tint changed at random by up to `amount`."""
+    brightness, contrast, saturation = 1.0 + amount * rng.uniform(-1.0, 1.0, 3)
+    gain = (brightness * (1.0 + 0.25 * amount * rng.uniform(-1.0, 1.0, 3))).astype(np.float32)
+    grey = picture.mean(axis=-1, keepdims=True)
+    picture = grey + np.float32(saturation) * (picture - grey)
+    mean = picture.mean()
+    return np.clip((mean + np.float32(contrast) * (picture - mean)) * gain, 0.0, 1.0, dtype=np.float32)
 
 
 def add_arguments(parser: argparse.ArgumentParser, name: str, minutes: float) -> None:

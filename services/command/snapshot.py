@@ -21,7 +21,7 @@ from shared.body import anatomy
 from shared.body.robot import robot_models
 from shared.cell import description as cells
 from shared.contract import messages, topics
-from shared.contract.labels import Label
+from shared.contract.labels import COLOURS, Label
 from shared.geometry import raster, rigid
 from shared.runtime import bus
 from shared.skin.layout import Skin, link_names
@@ -29,14 +29,6 @@ from shared.skin.layout import Skin, link_names
 PATIENCE_S = 5.0
 """How long to wait until every topic has been heard."""
 
-TINTS = {
-    Label.ROBOT: (90, 140, 255),
-    Label.TORSO: (170, 120, 200),
-    Label.UPPER_ARM: (240, 150, 60),
-    Label.FOREARM: (40, 220, 120),
-    Label.HAND: (40, 220, 220),
-    Label.OCCLUDER: (230, 60, 60),
-}
 LINES = {"tracking": (30, 230, 60), "coasting": (255, 190, 30), "lost": (240, 40, 40)}
 PAD_HALF = (0.0305, 0.03)
 FULL_SIGNAL = 0.6
@@ -140,7 +132,7 @@ def draw(
 def _tint(picture: NDArray[np.uint8], mask: messages.Mask) -> None:
     """Blends the classes of the mask's window into the picture, in place."""
     colours = np.zeros((256, 3), np.float32)
-    for label, colour in TINTS.items():
+    for label, colour in COLOURS.items():
         colours[label] = colour
     labels = np.kron(mask.labels, np.ones((mask.scale, mask.scale), np.uint8))
     top, left = max(mask.y0, 0), max(mask.x0, 0)

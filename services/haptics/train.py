@@ -3,17 +3,17 @@
 Scenes are drawn from a Gaussian somewhat wider than the region of the cell's motion (which the published estimate subtracts
 again), robots anywhere between the joint limits of the cell's `sim` section, limbs of all sizes; voltages come from the fitted
 field model with noise, a model error and now and then a dead pad. R_c is regressed on scenes that the network was not trained on.
+An interrupted run goes on with --resume, from a new pool of scenes.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
 import itertools
 import json
-import math
-import time
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,13 @@ import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from scipy.spatial.transform import Rotation
 
-from services.flags import Parser, above_zero, positive
+from services.flags import Parser, positive
 from services.haptics.estimator import Estimator
 from services.haptics.paper_network import PoseNetwork, Regression, Relative, features, fingerprint
 from services.haptics.size_and_rest import SIZE, SIZE_SPREAD
+from shared import training
 from shared.body.anatomy import target_mesh
 from shared.body.robot import robot_models
 from shared.cell import description as cells
@@ -37,7 +37,10 @@ from shared.skin.layout import Skin, link_names
 from shared.skin.response import Response
 
 WEIGHTS = Path(__file__).parent / "weights"
+VALIDATION_SEED, REGRESSION_SEED = 1_000_000, 2_000_000
+"""Added to the seed for the scenes of the card's score, and for those of R_c: the network was trained on neither."""
 HIDDEN = (256, 256, 256, 256)
+"""Widths of the hidden layers: the paper's."""
 SAMPLES = 10
 """Voltage samples in the mean of one window (10 ms at 1 kHz)."""
 CLOSEST = 0.005
@@ -45,18 +48,20 @@ CLOSEST = 0.005
 ENLARGED = 1.5
 """Spread of the training's poses, in standard deviations of a pose uniform in the region of the cell's motion."""
 OUTPUTS = 6 + 21
-"""The pose, and while it is trained the Cholesky factor of its precision: what cannot be known then does not count."""
+"""Outputs while it is trained: the pose and the Cholesky factor of its precision, so that what cannot be known does not count."""
 LOG_LIMIT = 8.0
 """Largest log of a precision factor in units of the prior: 3000 times better than beforehand."""
-REGRESSED, KERNELS = 3000, 500
-"""Scenes for R_c, and means of neighbouring ones among them that the Gaussian processes keep."""
+REGRESSED = 3000
+"""Number of scenes for R_c."""
+KERNELS = 500
+"""Number of means of neighbouring ones among these scenes that the Gaussian processes keep."""
 LOG_CHI2 = -1.2704
-"""Mean of the log of a squared standard normal number: a log squared error is so far below the log variance."""
+"""Mean of the log of a squared standard normal number: a log squared error is so far below the log variance. Derived:
+-(Euler's constant + log 2)."""
 DEAD = 0.02
 """Share of pads that are dead in training."""
-BATCH, FRESH, START, POOL = 1024, 128, 2000, 400_000
-"""Scenes in a step; of these, drawn anew (the others come from a pool that they join); in the pool at first and at most."""
-CHECKPOINT_S = 20.0
+START, POOL = 2000, 400_000
+"""Number of scenes in the pool at first and at most."""
 BANDS = (0.0, 0.04, 0.075, 0.125, 0.175)
 """Limits of the gap bands [m] of the held-out errors."""
 
@@ -296,107 +301,136 @@ def save(network: PoseNetwork, path: Path, key: str) -> None:
     np.savez_compressed(path, **arrays)
 
 
-def main(argv: list[str] | None = None) -> None:
-    parser = Parser(prog="penumbra haptics train", description="Train the skin's pose network for a cell.")
-    parser.add_argument("--cell", default="table", help="built-in cell or YAML file (default: %(default)s)")
-    parser.add_argument("--target", help="the target's name (default: the first)")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--steps", type=positive, default=12_000, help="training steps (default: %(default)s)")
-    parser.add_argument("--minutes", type=above_zero, help="stop the schedule after this time instead of --steps")
-    parser.add_argument("--scenes", type=positive, default=4000, help="held-out scenes for the card (default: %(default)s)")
-    parser.add_argument("--out", type=Path, help="weights file (default: the one that the service loads)")
-    parser.add_argument("--checkpoint", type=Path, help="resume here and save here (default: runs/haptics-CELL-TARGET.pt)")
-    options = parser.parse_args(argv)
-    torch.set_num_threads(1)
-    cell = cells.load(options.cell)
-    target = cell.one("targets", options.target)
-    scenes = Scenes(cell, target)
-    out = options.out or WEIGHTS / f"{cell.name}-{target}.npz"
-    checkpoint = options.checkpoint or Path("runs") / f"haptics-{cell.name}-{target}.pt"
-    model, mean, scale, steps, seconds = _train(scenes, fingerprint(cell, target), options, checkpoint)
-    network = to_numpy(model, mean, scale, scenes, NOTHING_KNOWN)
-    network = replace(network, regression=regress(scenes, network, options.seed + 2_000_000))
-    save(network, out, fingerprint(cell, target))
-    schedule = f"--minutes {options.minutes:g}" if options.minutes else f"--steps {options.steps}"
+class Pool:
+    """What is learned from: a pool of scenes that every step adds new ones to, for drawing a whole batch would take longer than
+    learning from it. mean, scale (f,): of the inputs of its first scenes, which normalise all others."""
+
+    def __init__(self, scenes: Scenes, seed: int):
+        self.scenes = scenes
+        first = scenes.draw(np.random.default_rng(seed), START)
+        x, y = scenes.inputs(first), scenes.labels(first)
+        self.mean, self.scale = x.mean(axis=0).astype(np.float64), x.std(axis=0).astype(np.float64) + 1e-3
+        self._x, self._y = np.empty((POOL, x.shape[1]), np.float32), np.empty((POOL, 6), np.float32)
+        self._x[:START], self._y[:START], self._drawn = x, y, START
+
+    def batch(self, rng: np.random.Generator, schedule: Schedule) -> tuple[torch.Tensor, torch.Tensor]:
+        """Normalised inputs (b, f) and labels (b, 6) of scenes of the pool, after new ones have joined it."""
+        new = self.scenes.draw(rng, schedule.fresh)
+        place = np.arange(self._drawn, self._drawn + schedule.fresh) % POOL
+        self._x[place], self._y[place] = self.scenes.inputs(new), self.scenes.labels(new)
+        self._drawn += schedule.fresh
+        rows = rng.integers(min(self._drawn, POOL), size=schedule.batch)
+        x = ((self._x[rows] - self.mean) / self.scale).astype(np.float32)
+        return torch.from_numpy(x), torch.from_numpy(self._y[rows])
+
+    def close(self) -> None:
+        """Nothing to end: scenes are drawn when they are asked for."""
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """inputs: how many numbers the network reads; trained_for: the fingerprint of the cell and target."""
+
+    inputs: int
+    trained_for: str
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How training goes."""
+
+    peak_rate: float = 1e-3
+    """Adam's largest learning rate, of one cycle. Adam's usual value (Kingma and Ba 2015, arXiv:1412.6980)."""
+    rise: float = 0.02
+    """Share of the training in which the rate rises to its peak. Chosen."""
+    batch: int = 1024
+    """Scenes in a step. Chosen."""
+    fresh: int = 128
+    """Scenes that each step draws anew; they join the pool. Chosen for time: an eighth of a batch."""
+    clip: float = 20.0
+    """Largest norm of a gradient. Chosen."""
+    averaging: float = 0.998
+    """Share of the averaged weights, which are exported, that a step keeps. Chosen: five hundred steps are averaged."""
+
+
+class Trainer(training.Trainer[torch.nn.Sequential, Pool]):
+    """The network being trained."""
+
+    SETTINGS = NetworkSettings
+    schedule: Schedule
+
+    def __init__(self, settings: NetworkSettings, schedule: Schedule, seed: int):
+        torch.manual_seed(seed)
+        net = build(settings.inputs)
+        super().__init__(settings, schedule, seed, net, torch.optim.Adam(net.parameters()))
+
+    def train_step(self, data: Pool, progress: float) -> dict[str, float]:
+        """One step of gradient descent; returns the loss."""
+        schedule = self.schedule
+        x, y = data.batch(np.random.default_rng([self.seed, 1, self.step]), schedule)
+        value = loss(self.net(x), y)
+        self.descend(value, schedule.peak_rate * training.one_cycle(progress, schedule.rise), schedule.clip, schedule.averaging)
+        return {"loss": value.item()}
+
+
+def export(trainer: Trainer, pool: Pool, out: Path, held_out: int) -> dict[str, Any]:
+    """Regresses R_c, scores the averaged weights on held-out scenes, and writes them with their card; returns the card."""
+    scenes, seed = pool.scenes, trainer.seed
+    network = to_numpy(trainer.average, pool.mean, pool.scale, scenes, NOTHING_KNOWN)
+    network = replace(network, regression=regress(scenes, network, seed + REGRESSION_SEED))
+    save(network, out, trainer.settings.trained_for)
     card = {
-        "made_by": f"penumbra haptics train --cell {options.cell} --target {target} --seed {options.seed} {schedule}",
-        "date": time.strftime("%Y-%m-%d"),
-        "seed": options.seed,
+        "seed": seed,
+        "date": datetime.date.today().isoformat(),
         "settings": {
-            "network": {"hidden": HIDDEN, "steps": steps, "batch": BATCH, "minutes": round(seconds / 60, 1)},
+            "network": {"hidden": HIDDEN, "steps": trainer.step, "minutes": round(trainer.minutes, 1)},
+            "schedule": asdict(trainer.schedule),
             "data": {"samples_per_window": SAMPLES, "model_error": "of the response", "dead_pads": DEAD, "closest_m": CLOSEST},
             "prior": {"home": scenes.home.round(6).tolist(), "spread": scenes.spread.round(6).tolist()},
-            "fingerprint": fingerprint(cell, target),
+            "fingerprint": trainer.settings.trained_for,
         },
-        "held_out_seed": options.seed + 1_000_000,
-        "held_out": evaluate(scenes, network, options.seed + 1_000_000, options.scenes),
+        "held_out_seed": seed + VALIDATION_SEED,
+        "held_out": evaluate(scenes, network, seed + VALIDATION_SEED, held_out),
     }
     out.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n")
+    return card
+
+
+def arguments() -> argparse.ArgumentParser:
+    """The flags of `penumbra haptics train`."""
+    parser = Parser(prog="penumbra haptics train", description="Train the skin's pose network for a cell.")
+    training.add_arguments(parser, "haptics", 15.0)
+    parser.add_argument("--cell", default="table", help="built-in cell or YAML file (default: %(default)s)")
+    parser.add_argument("--target", help="the target's name (default: the first)")
+    parser.add_argument("--out", type=Path, help="weights file (default: the one that the service loads)")
+    parser.add_argument("--held-out", type=positive, default=4000, help="scenes for the card's score (default: %(default)s)")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Train, then write weights and card."""
+    options = arguments().parse_args(argv)
+    cell = cells.load(options.cell)
+    target = cell.one("targets", options.target)
+    out = options.out or WEIGHTS / f"{cell.name}-{target}.npz"
+    scenes, trained_for = Scenes(cell, target), fingerprint(cell, target)
+    if options.resume and options.checkpoint.is_file():
+        trainer = Trainer.restore(options.checkpoint, Schedule())
+        if trainer.settings.trained_for != trained_for:
+            raise SystemExit(
+                f"{options.checkpoint}: expected a checkpoint for target {target} of cell {cell.name} ({trained_for}), got one "
+                f"for another cell ({trainer.settings.trained_for}): give its --cell, another --checkpoint, or leave --resume out"
+            )
+        pool = Pool(scenes, trainer.seed)
+    else:
+        pool = Pool(scenes, options.seed)
+        trainer = Trainer(NetworkSettings(len(pool.mean), trained_for), Schedule(), options.seed)
+    if not training.complete(trainer, pool, options):
+        return 130
+    card = export(trainer, pool, out, options.held_out)
     print(f"{out} and its card: {json.dumps(card['held_out'], indent=1)}")
-    checkpoint.unlink(missing_ok=True)
-
-
-def _train(
-    scenes: Scenes, key: str, options: argparse.Namespace, checkpoint: Path
-) -> tuple[torch.nn.Sequential, Array, Array, int, float]:
-    """The trained model, mean and scale of its inputs, steps and seconds; goes on from the checkpoint of an interrupted run."""
-    torch.manual_seed(options.seed)
-    rng = np.random.default_rng(options.seed)
-    first = scenes.draw(rng, START)
-    x, y = scenes.inputs(first), scenes.labels(first)
-    mean, scale = x.mean(axis=0).astype(np.float64), x.std(axis=0).astype(np.float64) + 1e-3
-    pool_x, pool_y = np.empty((POOL, x.shape[1]), np.float32), np.empty((POOL, 6), np.float32)
-    pool_x[:START], pool_y[:START], filled = x, y, START
-    model = build(x.shape[1])
-    optimizer = torch.optim.Adam(model.parameters(), lr=1e-3)
-    step, before = 0, 0.0
-    if checkpoint.is_file():
-        state = torch.load(checkpoint, weights_only=True)
-        if state["key"] == key and state["seed"] == options.seed:
-            model.load_state_dict(state["model"])
-            optimizer.load_state_dict(state["optimizer"])
-            step, before = state["step"], state["seconds"]
-            rng = np.random.default_rng([options.seed, step])
-            print(f"resumed {checkpoint} at step {step}")
-    began = saved = time.monotonic()
-
-    def save_checkpoint() -> None:
-        checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        state = {"key": key, "seed": options.seed, "step": step, "seconds": before + time.monotonic() - began}
-        torch.save({**state, "model": model.state_dict(), "optimizer": optimizer.state_dict()}, checkpoint)
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns) as progress:
-        total = int(60 * options.minutes) if options.minutes else options.steps
-        bar = progress.add_task("training", total=total)
-        try:
-            while True:
-                seconds = before + time.monotonic() - began
-                done = seconds / (60 * options.minutes) if options.minutes else step / options.steps
-                if done >= 1.0:
-                    return model, mean, scale, step, seconds
-                fresh = scenes.draw(rng, FRESH)
-                place = np.arange(filled, filled + FRESH) % POOL
-                pool_x[place], pool_y[place], filled = scenes.inputs(fresh), scenes.labels(fresh), filled + FRESH
-                rows = rng.integers(min(filled, POOL), size=BATCH)
-                x_batch = torch.from_numpy(((pool_x[rows] - mean) / scale).astype(np.float32))
-                for group in optimizer.param_groups:
-                    group["lr"] = 1e-3 * min(1.0, (step + 1) / 200) * (0.5 * (1 + math.cos(math.pi * done)) + 0.002)
-                value = loss(model(x_batch), torch.from_numpy(pool_y[rows]))
-                optimizer.zero_grad()
-                value.backward()
-                torch.nn.utils.clip_grad_norm_(model.parameters(), 20.0)
-                optimizer.step()
-                step += 1
-                if step % 20 == 0:
-                    progress.update(bar, completed=int(done * total), description=f"training, loss {value.item():.2f}")
-                if time.monotonic() - saved > CHECKPOINT_S:
-                    saved = time.monotonic()
-                    save_checkpoint()
-        except KeyboardInterrupt:
-            save_checkpoint()
-            raise SystemExit(f"interrupted at step {step}; run the same command again to go on from {checkpoint}") from None
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

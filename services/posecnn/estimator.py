@@ -46,7 +46,7 @@ UNKNOWN = np.diag([1.0**2] * 3 + [1.5**2] * 3)
 
 
 @dataclass(frozen=True)
-class Estimate(VisionEstimate):
+class PoseCnnEstimate(VisionEstimate):
     """signs: what the covariance was read from, None where nothing was found."""
 
     signs: Signs | None = None
@@ -94,7 +94,7 @@ class PoseCNN:
         ahead = rigid.apply(rigid.from_rpy((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)), self._mesh.vertices)
         raster.silhouette(ahead, self._mesh.faces, (50.0, 50.0, 32.0, 32.0), (0, 0, 64, 64))
 
-    def update(self, image: NDArray[np.uint8], window: Window, T_prior: Array | None = None) -> Estimate:
+    def update(self, image: NDArray[np.uint8], window: Window, T_prior: Array | None = None) -> PoseCnnEstimate:
         """What an image (h, w, 3) uint8 RGB says about the target's pose, looked for in a window; T_prior (4 x 4): the predicted
         T_world_target, None where nothing is known: it decides only whether a target that is not seen counts as occluded.
 
@@ -189,7 +189,9 @@ class PoseCNN:
         covered = raster.silhouette(vertices, self._mesh.faces, (focal, focal, *centre), window)
         return int(covered.sum()), covered[side : 2 * side, side : 2 * side]
 
-    def _judge(self, square: patch.Patch, labels: NDArray[np.int64], found: Found | None, T_prior: Array | None) -> Estimate:
+    def _judge(
+        self, square: patch.Patch, labels: NDArray[np.int64], found: Found | None, T_prior: Array | None
+    ) -> PoseCnnEstimate:
         T_world_camera = self._camera.T_world_camera
         if found is not None and found.hidden <= HIDDEN and found.vote.share >= AGREEING and found.overlap >= FITS:
             own = self._camera.fx * self._length / found.T[2, 3]
@@ -197,11 +199,11 @@ class PoseCNN:
                 found.hidden, min(own, square.focal * self._length / found.T[2, 3]), found.vote.spread, found.vote.share
             )
             covariance = self._axes @ self._uncertainty.covariance(found.T, self._length, signs) @ self._axes.T
-            return Estimate(T_world_camera @ found.T, covariance, found.overlap, found.hidden, "tracking", signs)
+            return PoseCnnEstimate(T_world_camera @ found.T, covariance, found.overlap, found.hidden, "tracking", signs)
         T = self._target.home.transform if T_prior is None else T_prior
         state: State = "occluded" if T_prior is not None and self._is_covered(labels, square, T_prior) else "lost"
         overlap, hidden = (found.overlap, found.hidden) if found is not None else (0.0, 1.0)
-        return Estimate(T, UNKNOWN, overlap, hidden, state)
+        return PoseCnnEstimate(T, UNKNOWN, overlap, hidden, state)
 
     def _is_covered(self, labels: NDArray[np.int64], square: patch.Patch, T_world_target: Array) -> bool:
         """Whether most of the target's picture at a pose shows things that can stand before it."""

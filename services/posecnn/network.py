@@ -38,7 +38,7 @@ PROPORTIONS = (-0.29, -0.11, 0.186, -0.1, 0.1)
 
 
 @dataclass(frozen=True)
-class Settings:
+class PoseCnnSettings:
     """channels: at strides 2, 4, 8 and 16; pooled: of the features that are pooled; hidden: of the layer before the rotation."""
 
     channels: tuple[int, int, int, int] = (32, 64, 96, 128)
@@ -86,7 +86,7 @@ def conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequ
 class Network(nn.Module):
     """The network of the module's description. Images are (batch, 3, side, side) in [0, 1], side a multiple of 16."""
 
-    def __init__(self, settings: Settings = Settings()):
+    def __init__(self, settings: PoseCnnSettings = PoseCnnSettings()):
         super().__init__()
         self.settings = settings
         a, b, c, d = settings.channels
@@ -158,7 +158,7 @@ def load(path: Path) -> tuple[Network, dict[str, Any]]:
         raise FileNotFoundError(f"no weights {path}: make them with `penumbra posecnn train --out {path}`")
     card = json.loads(path.with_suffix(".json").read_text())
     network = {key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"]["network"].items()}
-    net = Network(Settings(**network))  # type: ignore[arg-type]
+    net = Network(PoseCnnSettings(**network))  # type: ignore[arg-type]
     with np.load(path, allow_pickle=False) as stored:
         weights = {name: torch.from_numpy(stored[name]) for name in stored.files}
     try:

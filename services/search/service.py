@@ -21,8 +21,8 @@ NAME = "search"
 FRAMES_KEPT = 4
 """Number of frames of a camera that are kept until their masks come."""
 JOINTS_NEAR_NS = 200_000_000
-"""Largest distance [ns] of a frame from the joint angles with which robots are drawn into it. Chosen: a mask without any
-knowledge of the robot is worse than one with a robot that has moved a little."""
+"""Largest distance [ns] of a frame from the joint angles with which robots are drawn into it. Chosen: a mask of which nothing is
+known of the robot is worse than one with a robot that has moved a little."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -18,20 +18,11 @@ from rich.progress import track
 
 from services.flags import Parser
 from services.segmentation import inference
-from shared.contract.labels import Label
+from shared.contract.labels import COLOURS, TARGET_LABELS, Label
 from shared.perception.lookout import STEP, Window, whole_frame
 
 SETTLE = 4
 PERIOD_NS = 50_000_000
-COLOURS: dict[Label, tuple[int, int, int]] = {
-    Label.ROBOT: (90, 120, 200),
-    Label.TORSO: (150, 110, 170),
-    Label.UPPER_ARM: (230, 170, 60),
-    Label.FOREARM: (60, 190, 90),
-    Label.HAND: (20, 230, 200),
-    Label.OCCLUDER: (200, 60, 60),
-}
-"""RGB of the overlay; background stays as it is."""
 
 
 class FileError(ValueError):
@@ -162,7 +153,7 @@ def overlay(image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.uin
         colours[mask == label] = colour
     blended = (image // 2 + colours // 2).astype(np.uint8)
     blended[mask == Label.BACKGROUND] = image[mask == Label.BACKGROUND]
-    target = np.isin(mask, inference.TARGET_LABELS).astype(np.uint8)
+    target = np.isin(mask, TARGET_LABELS).astype(np.uint8)
     contours, _ = cv2.findContours(target, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return np.asarray(cv2.drawContours(blended, contours, -1, (255, 255, 255), 1), np.uint8)
 

@@ -14,14 +14,13 @@ from services.segmentation import model
 from services.segmentation.model import Model
 from services.segmentation.openvino_step import Compiled, Precision, State
 from services.segmentation.shift import shift_state
-from shared.contract.labels import Label
+from shared.contract.labels import TARGET_LABELS, Label
 from shared.native import processor
 from shared.perception.lookout import Window
 
 WEIGHTS = Path(__file__).parent / "weights" / "prednet.npz"
 MAX_GAP_S = 0.5
 """After a longer silence the picture has little to do with what the state remembers."""
-TARGET_LABELS = (Label.FOREARM, Label.HAND)
 
 
 class Segmenter:

@@ -47,7 +47,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
         node.every(BACKOFF_S[0], partial(Session.run, session), math.inf)
 
 
-def pads(cell: cells.Cell, ports: list[str] | None, pad: str | None) -> dict[str, tuple[cells.Reader, ...]]:
+def pads(cell: cells.Cell, ports: list[str] | None, pad: str | None) -> dict[str, tuple[cells.SensingBoard, ...]]:
     """The pads to be read, each with its boards on their ports. Raises CellError where the two do not fit."""
     if ports is None:
         named = {name: found for name, found in cell.pads.items() if pad in (None, name) and found.boards}
@@ -77,7 +77,7 @@ def pads(cell: cells.Cell, ports: list[str] | None, pad: str | None) -> dict[str
 class Session:
     """One pad from opening its boards to losing them, again and again."""
 
-    def __init__(self, node: Node, pad: str, readers: tuple[cells.Reader, ...], cycles: int):
+    def __init__(self, node: Node, pad: str, readers: tuple[cells.SensingBoard, ...], cycles: int):
         self._node, self._pad, self._readers, self._cycles = node, pad, readers, cycles
         self._kind = node.cell.pad_types[node.cell.pads[pad].type]
         self._lsb = self._kind.chain.adc_reference / board.FULL_SCALE

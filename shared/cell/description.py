@@ -199,7 +199,7 @@ class PadType(_Model):
         return Law(a1=nominal.a1, a2=nominal.a2, a3=self.rest.a3, polarity=self.rest.polarity, noise=self.rest.noise)
 
 
-class Reader(_Model):
+class SensingBoard(_Model):
     """A sensing board of a pad: the serial port that it is on, and which of its six channels measure which electrode."""
 
     port: str | None = None
@@ -216,7 +216,7 @@ class Pad(_Model):
     rpy: Vector3 = (0.0, 0.0, 0.0)
     backed: bool = False
     calibration: dict[Name, Law] = {}
-    boards: tuple[Reader, ...] = ()
+    boards: tuple[SensingBoard, ...] = ()
 
     @cached_property
     def T_link_pad(self) -> rigid.Array:

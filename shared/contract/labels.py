@@ -13,3 +13,17 @@ class Label(IntEnum):
     FOREARM = 4
     HAND = 5
     OCCLUDER = 6
+
+
+TARGET_LABELS = (Label.FOREARM, Label.HAND)
+"""The classes of a forearm with its hand. Networks are trained for them, and their logits calibrated for them; at run time the
+classes of a target are those of the cell file (`labels`)."""
+COLOURS: dict[Label, tuple[int, int, int]] = {
+    Label.ROBOT: (90, 120, 200),
+    Label.TORSO: (150, 110, 170),
+    Label.UPPER_ARM: (230, 170, 60),
+    Label.FOREARM: (60, 190, 90),
+    Label.HAND: (20, 230, 200),
+    Label.OCCLUDER: (200, 60, 60),
+}
+"""The colour [RGB, of 255] of each class where a mask is shown over its picture; the background stays as it is."""

@@ -205,14 +205,16 @@ def decode(data: bytes) -> Reply:
     raise PacketError(f"a reply of {listed} bytes (16 + 24 for each of 2 to 9 samples a cycle) expected{fit}, {came} came")
 
 
-def readers(pad: cells.Pad, pad_type: cells.PadType) -> tuple[cells.Reader, ...]:
+def readers(pad: cells.Pad, pad_type: cells.PadType) -> tuple[cells.SensingBoard, ...]:
     """The boards of a pad as the cell file has them, or where it has none: two electrodes a board in the order of the pad type,
     the first on channels 0 to 2, the second on 3 to 5. Five electrodes c, r, l, t, b take three boards."""
     if pad.boards:
         return pad.boards
     names = list(pad_type.electrodes)
     pairs = [names[k : k + 2] for k in range(0, len(names), 2)]
-    return tuple(cells.Reader(channels={name: (3 * k, 3 * k + 1, 3 * k + 2) for k, name in enumerate(pair)}) for pair in pairs)
+    return tuple(
+        cells.SensingBoard(channels={name: (3 * k, 3 * k + 1, 3 * k + 2) for k, name in enumerate(pair)}) for pair in pairs
+    )
 
 
 FILLER = b"\xff"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from services.posecnn.estimator import Estimate, PoseCNN
+from services.posecnn.estimator import PoseCNN, PoseCnnEstimate
 from services.posecnn.network import Network
 from services.posecnn.uncertainty import KINDS, Uncertainty, errors, fitted
 from shared.body.anatomy import Mesh
@@ -50,7 +50,7 @@ class Shown(Protocol):
 class Result:
     """An estimate, and what it is an estimate of."""
 
-    estimate: Estimate
+    estimate: PoseCnnEstimate
     T_camera_target: Array
     T_world_camera: Array
     length: float

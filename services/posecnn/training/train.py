@@ -27,12 +27,12 @@ from torch import Tensor
 from services.flags import Parser, positive
 from services.posecnn import network, patch
 from services.posecnn.estimator import WEIGHTS
-from services.posecnn.network import REFERENCE_PX, STRIDE, Network, Settings, proportions
+from services.posecnn.network import REFERENCE_PX, STRIDE, Network, PoseCnnSettings, proportions
 from services.posecnn.training import evaluate, loss
 from shared import training
 from shared.body import anatomy
 from shared.cell import description as cells
-from shared.contract.labels import Label
+from shared.contract.labels import TARGET_LABELS, Label
 from shared.geometry import rigid
 from shared.geometry.rigid import Array
 from shared.native import processor
@@ -116,7 +116,7 @@ class Truth:
         return cls(row[:16].reshape(4, 4), row[16:20], float(row[20]), row[21:].reshape(-1, 3))
 
 
-class Simulated:
+class RenderedPictures:
     """Pictures rendered in order by a process of low priority, kept on disk in files of `chunk`."""
 
     def __init__(self, folder: Path, seed: int, most: int, chunk: int = CHUNK):
@@ -206,7 +206,8 @@ def draw_batch(chosen: list[tuple[NDArray[np.uint8], Truth]], schedule: Schedule
         size = float(np.ptp(truth.vertices[:, 0]))
         halved = np.column_stack([M[:, :2], M[:, 2] - (STRIDE - 1) / 2.0]) / STRIDE
         side_out = patch.SIDE // STRIDE
-        columns["images"].append(colour(patch.warp(pixels[..., :3], M), rng, schedule.jitter))
+        warped = patch.warp(pixels[..., :3], M).astype(np.float32) / np.float32(255.0)
+        columns["images"].append(training.recoloured(warped, rng, schedule.jitter))
         columns["labels"].append(cv2.warpAffine(pixels[..., 3], halved, (side_out, side_out), flags=cv2.INTER_NEAREST))
         columns["centre"].append(focal * T[:2, 3] / T[2, 3] + principal)
         columns["length"].append(focal * size / T[2, 3])
@@ -218,24 +219,13 @@ def draw_batch(chosen: list[tuple[NDArray[np.uint8], Truth]], schedule: Schedule
     return Batch(stacked["images"].movedim(-1, 1), stacked["labels"].long(), **as_float)
 
 
-def colour(pixels: NDArray[np.uint8], rng: np.random.Generator, amount: float) -> NDArray[np.float32]:
-    """A picture (..., 3) in [0, 1] with brightness, contrast, saturation and tint changed at random by up to `amount`."""
-    picture = pixels.astype(np.float32) / np.float32(255.0)
-    brightness, contrast, saturation = 1.0 + amount * rng.uniform(-1.0, 1.0, 3)
-    gain = (brightness * (1.0 + 0.25 * amount * rng.uniform(-1.0, 1.0, 3))).astype(np.float32)
-    grey = picture.mean(axis=-1, keepdims=True)
-    picture = grey + np.float32(saturation) * (picture - grey)
-    mean = picture.mean()
-    return np.clip((mean + np.float32(contrast) * (picture - mean)) * gain, 0.0, 1.0)
-
-
-class Trainer(training.Trainer[Network, Simulated]):
+class Trainer(training.Trainer[Network, RenderedPictures]):
     """PoseCNN being trained."""
 
-    SETTINGS = Settings
+    SETTINGS = PoseCnnSettings
     schedule: Schedule
 
-    def __init__(self, settings: Settings, schedule: Schedule, seed: int):
+    def __init__(self, settings: PoseCnnSettings, schedule: Schedule, seed: int):
         torch.manual_seed(seed)
         net = Network(settings)
         super().__init__(settings, schedule, seed, net, torch.optim.AdamW(net.parameters(), weight_decay=schedule.decay))
@@ -246,7 +236,7 @@ class Trainer(training.Trainer[Network, Simulated]):
         self._forearm = torch.from_numpy(np.setdiff1d(np.arange(len(mesh.vertices)), hand))
         self._half = processor.has_bfloat16()
 
-    def train_step(self, data: Simulated, progress: float) -> dict[str, float]:
+    def train_step(self, data: RenderedPictures, progress: float) -> dict[str, float]:
         """One step of gradient descent; returns the parts of the loss."""
         schedule = self.schedule
         rng = np.random.default_rng([self.seed, 1, self.step])
@@ -272,7 +262,7 @@ class Trainer(training.Trainer[Network, Simulated]):
         missed = loss.rotation(
             loss.matrices(quaternions), batch.rotation, batch.points[:, self._forearm], batch.points[:, self._hand]
         )
-        seen = torch.isin(batch.labels, torch.tensor(loss.TARGET_LABELS)).sum((1, 2)) >= 8
+        seen = torch.isin(batch.labels, torch.tensor(TARGET_LABELS)).sum((1, 2)) >= 8
         return parts | {"rotation": (missed * seen).sum() / seen.sum().clamp_min(1)}
 
 
@@ -325,8 +315,8 @@ def main(argv: list[str] | None = None) -> int:
     if options.resume and options.checkpoint.is_file():
         trainer = Trainer.restore(options.checkpoint, schedule)
     else:
-        trainer = Trainer(Settings(), schedule, options.seed)
-    data = Simulated(options.cache, trainer.seed, schedule.most)
+        trainer = Trainer(PoseCnnSettings(), schedule, options.seed)
+    data = RenderedPictures(options.cache, trainer.seed, schedule.most)
     if not training.complete(trainer, data, options):
         return 130
     card = export(trainer, options.out, options.held_out)

@@ -29,30 +29,31 @@ SIMPLIFIED = 1000.0
 """Largest side of a mesh while it is thinned out: the order in which edges go depends on an absolute distance."""
 
 
-class FileError(ValueError):
+class ObjectFileError(ValueError):
     """What a user gave cannot be used; the text says what was expected, what came and what to do."""
 
 
 def load(path: Path, unit: str) -> Mesh:
-    """The triangle mesh of a file (PLY, STL, OBJ, GLB, OFF) in metres, as it is; `unit` is one of UNITS. Raises FileError."""
+    """The triangle mesh of a file (PLY, STL, OBJ, GLB, OFF) in metres, as it is; `unit` is one of UNITS. Raises
+    ObjectFileError."""
     import trimesh
 
     if not path.is_file():
-        raise FileError(f"{path}: a mesh file expected, there is none")
+        raise ObjectFileError(f"{path}: a mesh file expected, there is none")
     try:
         mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh's readers raise anything
-        raise FileError(f"{path}: a triangle mesh that trimesh reads expected (PLY, STL, OBJ, GLB, OFF): {error}") from None
+        raise ObjectFileError(f"{path}: a triangle mesh that trimesh reads expected (PLY, STL, OBJ, GLB, OFF): {error}") from None
     vertices, faces = np.asarray(getattr(mesh, "vertices", ())), np.asarray(getattr(mesh, "faces", ()))
     if not len(faces):
-        raise FileError(f"{path}: a triangle mesh expected, {len(vertices)} points without triangles came")
+        raise ObjectFileError(f"{path}: a triangle mesh expected, {len(vertices)} points without triangles came")
     if not np.isfinite(vertices[faces]).all():
-        raise FileError(f"{path}: finite coordinates expected, some of the mesh's vertices are not: mend the file")
+        raise ObjectFileError(f"{path}: finite coordinates expected, some of the mesh's vertices are not: mend the file")
     extent = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
     if not EXTENT[0] <= extent * UNITS[unit] <= EXTENT[1]:
         fitting = [name for name, metres in UNITS.items() if 0.02 <= extent * metres <= 3.0]
         hint = f"if its unit is {' or '.join(fitting)}, give it with --mesh-unit" if fitting else "scale it"
-        raise FileError(
+        raise ObjectFileError(
             f"{path}: an object of {EXTENT[0]} to {EXTENT[1]:g} m expected, with --mesh-unit {unit} this one is "
             f"{extent * UNITS[unit]:.3g} m long: {hint}"
         )
@@ -61,10 +62,10 @@ def load(path: Path, unit: str) -> Mesh:
 
 def mend(mesh: Mesh, most: int) -> Mesh:
     """The same surface with at most about `most` triangles: coinciding vertices are one, triangles without area and twins are
-    gone, and neighbours turn the same side outwards. Holes stay. Raises FileError where nothing is left."""
+    gone, and neighbours turn the same side outwards. Holes stay. Raises ObjectFileError where nothing is left."""
     vertices, faces = _merged(mesh.vertices, mesh.faces)
     if not len(faces):
-        raise FileError("mesh: triangles with an area expected, there are none")
+        raise ObjectFileError("mesh: triangles with an area expected, there are none")
     if len(faces) > DENSE * most:
         vertices, faces = _clustered(vertices, faces)
     faces = _oriented(vertices, faces)

@@ -47,7 +47,7 @@ the boundary errs: fitted to the masks of `penumbra bench objects`."""
 
 
 class RigidObject:
-    """A mesh prepared for contours, about its own middle. Raises FileError for a mesh without a surface."""
+    """A mesh prepared for contours, about its own middle. Raises ObjectFileError for a mesh without a surface."""
 
     def __init__(self, mesh: Mesh):
         mesh = meshes.mend(mesh, FACES[1])

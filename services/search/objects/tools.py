@@ -20,7 +20,7 @@ from services.flags import Parser
 from services.search.contour import NEAR
 from services.search.evidence import Intrinsics
 from services.search.objects import meshes, pose
-from services.search.objects.meshes import FileError
+from services.search.objects.meshes import ObjectFileError
 from services.search.objects.pose import ObjectEstimate, RigidObject, Tracker
 from shared.geometry import rigid as geometry
 from shared.geometry.rigid import Array
@@ -67,7 +67,7 @@ def track(argv: list[str]) -> int:
 def _told(name: str, run: Callable[[list[str]], None], argv: list[str]) -> int:
     try:
         run(argv)
-    except FileError as error:
+    except ObjectFileError as error:
         print(f"penumbra search {name}: {error}", file=sys.stderr)
         return 2
     return 0
@@ -84,7 +84,7 @@ def _refine(argv: list[str]) -> None:
     mask = read_mask(options.mask, shape)
     occluder = None if options.occluder is None else read_mask(options.occluder, shape)
     if not mask.any():
-        raise FileError(f"{options.mask}: pixels that show the object expected (not black), all are black")
+        raise ObjectFileError(f"{options.mask}: pixels that show the object expected (not black), all are black")
     check_mask(mask, options.mask)
     check_start(rigid, T, k, mask, occluder, options.init)
     picture = None if options.image is None else read_picture(options.image, shape)
@@ -105,7 +105,7 @@ def _track(argv: list[str]) -> None:
     )
     options = parser.parse_args(argv)
     if not options.fps > 0:
-        raise FileError(f"--fps: a number above 0 expected, {options.fps:g} came")
+        raise ObjectFileError(f"--fps: a number above 0 expected, {options.fps:g} came")
     rigid, (k, shape), T = _given(options)
     names = frames(options.masks)
     images = None if options.images is None else beside(names, options.images)
@@ -152,13 +152,13 @@ def _given(options: argparse.Namespace) -> tuple[RigidObject, tuple[Intrinsics, 
     """What both commands need: object, camera with the image's shape, start."""
     metres, degrees = options.init_sigma
     if not (0 < metres < 10 and 0 < degrees < 360):
-        raise FileError(f"--init-sigma: metres and degrees above 0 expected, {metres:g} and {degrees:g} came")
+        raise ObjectFileError(f"--init-sigma: metres and degrees above 0 expected, {metres:g} and {degrees:g} came")
     options.spread = metres, math.radians(degrees)
     camera, T = read_camera(options.camera), read_pose(options.init)
     try:
         return RigidObject(meshes.load(options.mesh, options.mesh_unit)), camera, T
-    except FileError as error:
-        raise FileError(str(error) if str(options.mesh) in str(error) else f"{options.mesh}: {error}") from None
+    except ObjectFileError as error:
+        raise ObjectFileError(str(error) if str(options.mesh) in str(error) else f"{options.mesh}: {error}") from None
 
 
 # --- files ------------------------------------------------------------------------------------------------------------------
@@ -168,38 +168,38 @@ def _json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text())
     except OSError as error:
-        raise FileError(f"{path}: a readable JSON file expected: {error.strerror}") from None
+        raise ObjectFileError(f"{path}: a readable JSON file expected: {error.strerror}") from None
     except ValueError as error:
-        raise FileError(f"{path}: JSON expected: {error}") from None
+        raise ObjectFileError(f"{path}: JSON expected: {error}") from None
     if not isinstance(value, dict):
-        raise FileError(f"{path}: a JSON object expected, {type(value).__name__} came")
+        raise ObjectFileError(f"{path}: a JSON object expected, {type(value).__name__} came")
     return value
 
 
 def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int]]:
-    """Intrinsics and (height, width) of a camera file. Raises FileError."""
+    """Intrinsics and (height, width) of a camera file. Raises ObjectFileError."""
     value = _json(path)
     missing = [name for name in CAMERA if name not in value]
     if missing:
-        raise FileError(f"{path}: the keys {', '.join(CAMERA)} expected, {', '.join(missing)} missing")
+        raise ObjectFileError(f"{path}: the keys {', '.join(CAMERA)} expected, {', '.join(missing)} missing")
     for name in CAMERA:
         number = value[name]
         if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
-            raise FileError(f"{path}: {name}: a finite number expected, {number!r} came")
+            raise ObjectFileError(f"{path}: {name}: a finite number expected, {number!r} came")
     w, h = value["width"], value["height"]
     if w != int(w) or h != int(h) or not (16 <= w <= 16384 and 16 <= h <= 16384):
-        raise FileError(f"{path}: width and height of 16 to 16384 whole pixels expected, {w} x {h} came")
+        raise ObjectFileError(f"{path}: width and height of 16 to 16384 whole pixels expected, {w} x {h} came")
     for name in ("fx", "fy"):
         if not VIEW[0] * w <= value[name] <= VIEW[1] * w:
-            raise FileError(
+            raise ObjectFileError(
                 f"{path}: {name}: a focal length of {VIEW[0] * w:.0f} to {VIEW[1] * w:.0f} pixels expected for an image "
                 f"{w} wide, {value[name]:g} came: is it in millimetres, or of another image size?"
             )
     if not 0.5 < value["fx"] / value["fy"] < 2.0:
-        raise FileError(f"{path}: fx and fy of nearly the same size expected, {value['fx']:g} and {value['fy']:g} came")
+        raise ObjectFileError(f"{path}: fx and fy of nearly the same size expected, {value['fx']:g} and {value['fy']:g} came")
     for name, size in (("cx", w), ("cy", h)):
         if not -0.25 * size <= value[name] <= 1.25 * size:
-            raise FileError(
+            raise ObjectFileError(
                 f"{path}: {name}: a principal point in or near the image ({size} pixels) expected, {value[name]:g} came: "
                 "do width and height belong to these intrinsics?"
             )
@@ -207,21 +207,21 @@ def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int]]:
 
 
 def read_pose(path: Path) -> Array:
-    """T_camera_object of a pose file. Raises FileError."""
+    """T_camera_object of a pose file. Raises ObjectFileError."""
     value = _json(path)
     if "camera_from_object" not in value:
-        raise FileError(f"{path}: the key camera_from_object expected, {', '.join(value) or 'no key'} came")
+        raise ObjectFileError(f"{path}: the key camera_from_object expected, {', '.join(value) or 'no key'} came")
     try:
         T = np.array(value["camera_from_object"], dtype=np.float64)
     except (ValueError, TypeError):
         T = np.empty(0)
     if T.shape != (4, 4):
-        raise FileError(f"{path}: camera_from_object: 4 rows of 4 numbers expected, a shape of {T.shape} came")
+        raise ObjectFileError(f"{path}: camera_from_object: 4 rows of 4 numbers expected, a shape of {T.shape} came")
     if not np.isfinite(T).all():
-        raise FileError(f"{path}: camera_from_object: finite numbers expected, some are not")
+        raise ObjectFileError(f"{path}: camera_from_object: finite numbers expected, some are not")
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > RIGID or np.linalg.det(R) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise FileError(
+        raise ObjectFileError(
             f"{path}: camera_from_object: a rotation without scale or mirror image, a translation and the last row 0 0 0 1 "
             f"expected, a determinant of {np.linalg.det(R):.3g} and the last row {' '.join(f'{v:g}' for v in T[3])} came"
         )
@@ -229,7 +229,7 @@ def read_pose(path: Path) -> Array:
     T[:3, :3] = u @ vt
     distance = float(np.linalg.norm(T[:3, 3]))
     if distance > FURTHEST:
-        raise FileError(
+        raise ObjectFileError(
             f"{path}: camera_from_object in metres expected, this object is {distance:.4g} m away: is it in millimetres?"
         )
     return T
@@ -237,12 +237,12 @@ def read_pose(path: Path) -> Array:
 
 def _image(path: Path, shape: tuple[int, int], flags: int) -> NDArray[np.uint8]:
     if not path.is_file():
-        raise FileError(f"{path}: an image file expected, there is none")
+        raise ObjectFileError(f"{path}: an image file expected, there is none")
     image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), flags)
     if image is None:
-        raise FileError(f"{path}: an image that OpenCV reads expected (PNG, JPEG ...), this is none")
+        raise ObjectFileError(f"{path}: an image that OpenCV reads expected (PNG, JPEG ...), this is none")
     if image.shape[:2] != shape:
-        raise FileError(
+        raise ObjectFileError(
             f"{path}: an image of {shape[1]} x {shape[0]} expected, as the camera's file says, "
             f"{image.shape[1]} x {image.shape[0]} came"
         )
@@ -250,7 +250,8 @@ def _image(path: Path, shape: tuple[int, int], flags: int) -> NDArray[np.uint8]:
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> Bool:
-    """The pixels (h, w) of a mask file that are brighter than half of its brightest; none where all are 0. Raises FileError."""
+    """The pixels (h, w) of a mask file that are brighter than half of its brightest; none where all are 0. Raises
+    ObjectFileError."""
     image = _image(path, shape, cv2.IMREAD_UNCHANGED)
     if image.ndim == 3:
         alpha = image[..., 3:]
@@ -261,17 +262,17 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool:
 
 
 def read_picture(path: Path, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """An image (h, w, 3) uint8 RGB. Raises FileError."""
+    """An image (h, w, 3) uint8 RGB. Raises ObjectFileError."""
     return np.ascontiguousarray(_image(path, shape, cv2.IMREAD_COLOR)[..., ::-1])
 
 
 def frames(folder: Path) -> list[Path]:
-    """The image files of a folder in the order of their names, numbers in names by their value. Raises FileError."""
+    """The image files of a folder in the order of their names, numbers in names by their value. Raises ObjectFileError."""
     if not folder.is_dir():
-        raise FileError(f"{folder}: a folder of masks expected, there is none")
+        raise ObjectFileError(f"{folder}: a folder of masks expected, there is none")
     found = sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES), key=lambda p: _order(p.stem))
     if not found:
-        raise FileError(f"{folder}: a folder of images expected ({', '.join(sorted(PICTURES))}), it has none")
+        raise ObjectFileError(f"{folder}: a folder of images expected ({', '.join(sorted(PICTURES))}), it has none")
     return found
 
 
@@ -289,11 +290,11 @@ def _order(name: str) -> tuple[tuple[int, str], ...]:
 
 
 def beside(names: list[Path], folder: Path) -> list[Path]:
-    """The files of a folder that have the same names as these, whatever their suffix. Raises FileError."""
+    """The files of a folder that have the same names as these, whatever their suffix. Raises ObjectFileError."""
     by_stem = {path.stem: path for path in frames(folder)}
     missing = [path.stem for path in names if path.stem not in by_stem]
     if missing:
-        raise FileError(
+        raise ObjectFileError(
             f"{folder}: an image for every mask expected, by name, {len(missing)} of {len(names)} are missing, first {missing[0]}"
         )
     return [by_stem[path.stem] for path in names]
@@ -303,18 +304,20 @@ def beside(names: list[Path], folder: Path) -> list[Path]:
 
 
 def check_mask(mask: Bool, path: Path) -> None:
-    """Raises FileError for a mask (h, w) that cannot be one object's."""
+    """Raises ObjectFileError for a mask (h, w) that cannot be one object's."""
     share = float(mask.mean())
     if share > 0.95:
-        raise FileError(f"{path}: the object and its surroundings expected, {share:.0%} of the mask is set: is it inverted?")
+        raise ObjectFileError(
+            f"{path}: the object and its surroundings expected, {share:.0%} of the mask is set: is it inverted?"
+        )
 
 
 def check_start(rigid: RigidObject, T: Array, k: Intrinsics, mask: Bool, occluder: Bool | None, path: Path) -> None:
-    """Raises FileError for a start T_camera_object from which the mask cannot be reached."""
+    """Raises ObjectFileError for a start T_camera_object from which the mask cannot be reached."""
     V = rigid.shape.fine.in_camera(T @ rigid.T_object_middle)
     if V[:, 2].min() < NEAR:
         z = (T @ rigid.T_object_middle)[2, 3]
-        raise FileError(
+        raise ObjectFileError(
             f"{path}: camera_from_object: the whole object at least {NEAR} m in front of the camera expected (z > 0), its "
             f"middle is at z = {z:.3g} m and it is {rigid.diameter:.3g} m long: is this object_from_camera, or the mesh's unit "
             "another?"
@@ -322,7 +325,7 @@ def check_start(rigid: RigidObject, T: Array, k: Intrinsics, mask: Bool, occlude
     u, v = k.fx * V[:, 0] / V[:, 2] + k.cx, k.fy * V[:, 1] / V[:, 2] + k.cy
     h, w = mask.shape
     if u.max() < -w or u.min() > 2 * w or v.max() < -h or v.min() > 2 * h:
-        raise FileError(
+        raise ObjectFileError(
             f"{path}: camera_from_object: an object in or near the image ({w} x {h}) expected, this one is at pixel "
             f"({u.mean():.0f}, {v.mean():.0f}): do pose and camera belong together?"
         )
@@ -331,7 +334,7 @@ def check_start(rigid: RigidObject, T: Array, k: Intrinsics, mask: Bool, occlude
     expected = math.hypot(float(np.ptp(u)), float(np.ptp(v)))
     hidden = occluder is not None or rows[0] == 0 or columns[0] == 0 or rows[-1] == h - 1 or columns[-1] == w - 1
     if seen > TIMES * expected or (expected > TIMES * seen and not hidden):
-        raise FileError(
+        raise ObjectFileError(
             f"{path}: a start whose silhouette is about as large as the mask ({seen:.0f} pixels) expected, it is {expected:.0f} "
             f"pixels large, for a mesh of {rigid.diameter:.3g} m: check --mesh-unit, the focal length and the start's distance"
         )

@@ -244,20 +244,10 @@ def draw_batch(
             patch = patch[:, :, ::-1]
         if rng.random() < 0.5:
             patch = patch[::-1]
-        picture = jitter(patch[..., :3].astype(np.float32) / 255.0, rng, amount)
+        picture = training.recoloured(patch[..., :3].astype(np.float32) / 255.0, rng, amount)
         images.append(torch.from_numpy(picture).movedim(-1, 1))
         labels.append(torch.from_numpy(patch[..., 3].astype(np.int64)))
     return torch.stack(images), torch.stack(labels)
-
-
-def jitter(picture: NDArray[np.float32], rng: np.random.Generator, amount: float) -> NDArray[np.float32]:
-    """Brightness, contrast, saturation and tint of a picture (..., 3) in [0, 1], changed at random by up to `amount`."""
-    brightness, contrast, saturation = 1.0 + amount * rng.uniform(-1.0, 1.0, 3)
-    tint = 1.0 + 0.25 * amount * rng.uniform(-1.0, 1.0, 3)
-    grey = picture.mean(axis=-1, keepdims=True)
-    picture = grey + saturation * (picture - grey)
-    mean = picture.mean()
-    return np.clip((mean + contrast * (picture - mean)) * brightness * tint, 0.0, 1.0, dtype=np.float32)
 
 
 def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:

@@ -453,7 +453,7 @@ def test_training_can_be_interrupted_goes_on_and_writes_weights_with_a_card(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(train, "REGRESSED", 200)
-    flags = ["--cell", "table", "--out", str(tmp_path / "w.npz"), "--checkpoint", str(tmp_path / "c.pt"), "--scenes", "40"]
+    flags = ["--out", str(tmp_path / "w.npz"), "--checkpoint", str(tmp_path / "c"), "--held-out", "40", "--steps", "6"]
     steps = []
 
     def interrupted(out: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
@@ -464,11 +464,12 @@ def test_training_can_be_interrupted_goes_on_and_writes_weights_with_a_card(
 
     loss = train.loss
     monkeypatch.setattr(train, "loss", interrupted)
-    with pytest.raises(SystemExit, match="run the same command again"):
-        train.main([*flags, "--steps", "6"])
-    train.main([*flags, "--steps", "6"])
-    assert "resumed" in capsys.readouterr().out and len(steps) == 4 + 3
+    assert train.main([*flags, "--cell", "table"]) == 130
+    assert "stopped at step 3: go on with --resume" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="expected a checkpoint for target forearm of cell arm"):
+        train.main([*flags, "--cell", "arm", "--resume"])
+    assert train.main([*flags, "--cell", "table", "--resume"]) == 0
+    assert len(steps) == 4 + 3
     card = json.loads((tmp_path / "w.json").read_text())
-    assert card["settings"]["network"]["steps"] == 6 and card["seed"] == 1
+    assert card["settings"]["network"]["steps"] == 6 and card["seed"] == 0
     assert networks.load(tmp_path / "w.npz", cells.load("table"), "forearm").weights[0].shape[1] == 256
-    assert not (tmp_path / "c.pt").exists()

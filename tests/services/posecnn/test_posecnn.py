@@ -20,7 +20,7 @@ from shared import training
 from shared.body import anatomy
 from shared.cell import description as cells
 from shared.contract import topics
-from shared.contract.labels import Label
+from shared.contract.labels import TARGET_LABELS, Label
 from shared.contract.messages import Frame
 from shared.geometry import raster, rigid
 from shared.perception.lookout import Window, whole_frame
@@ -29,7 +29,7 @@ from sim.world.world import record
 from tests.support.replay import Replay
 
 TABLE = cells.load("table")
-SMALL = network.Settings(channels=(8, 8, 16, 16), pooled=4, hidden=16)
+SMALL = network.PoseCnnSettings(channels=(8, 8, 16, 16), pooled=4, hidden=16)
 
 
 @pytest.fixture(autouse=True)
@@ -155,7 +155,7 @@ def test_sequences_say_where_their_target_is():
                 continue
             vertices = rigid.apply(sequence.poses.T_camera_target[t], sequence.poses.vertices)
             expected = raster.silhouette(vertices, faces, tuple(sequence.poses.intrinsics), (0, 0, 192, 192))
-            shown = np.isin(sequence.labels[t], loss.TARGET_LABELS)
+            shown = np.isin(sequence.labels[t], TARGET_LABELS)
             overlaps.append((expected & shown).sum() / (expected | shown).sum())
     assert len(overlaps) > 3
     assert min(overlaps) > 0.9
@@ -163,7 +163,7 @@ def test_sequences_say_where_their_target_is():
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    data = train.Simulated(tmp_path_factory.mktemp("posecnn"), 1, 32, chunk=16)
+    data = train.RenderedPictures(tmp_path_factory.mktemp("posecnn"), 1, 32, chunk=16)
     yield data
     data.close()
 
@@ -202,7 +202,7 @@ def test_a_batch_tells_the_target_s_place_in_every_patch(data):
     batch = train.draw_batch(chosen, train.Schedule(), rng)
     assert batch.images.shape == (len(chosen), 3, patch.SIDE, patch.SIDE)
     for labels, centre, length in zip(batch.labels, batch.centre, batch.length, strict=True):
-        rows, columns = np.nonzero(np.isin(labels, loss.TARGET_LABELS))
+        rows, columns = np.nonzero(np.isin(labels, TARGET_LABELS))
         if len(rows) > 50:
             away = np.hypot(columns * network.STRIDE - float(centre[0]), rows * network.STRIDE - float(centre[1]))
             assert away.min() < 0.5 * float(length)
@@ -356,9 +356,9 @@ def test_up_starts_one_way_to_see(vision, there):
 
 
 def test_the_command_s_train_writes_weights_that_the_service_reads(tmp_path, monkeypatch):
-    few = functools.partial(train.Simulated, most=16, chunk=16)
-    monkeypatch.setattr(train, "Simulated", lambda folder, seed, most: few(folder, seed))
-    monkeypatch.setattr(train, "Settings", lambda: SMALL)
+    few = functools.partial(train.RenderedPictures, most=16, chunk=16)
+    monkeypatch.setattr(train, "RenderedPictures", lambda folder, seed, most: few(folder, seed))
+    monkeypatch.setattr(train, "PoseCnnSettings", lambda: SMALL)
     out = tmp_path / "weights" / "mine.npz"
     places = ["--cache", str(tmp_path / "data"), "--checkpoint", str(tmp_path / "checkpoint"), "--out", str(out)]
     assert cli.main(["posecnn", "train", "--steps", "2", "--held-out", "2", *places]) == 0

@@ -388,8 +388,8 @@ def test_ports_that_do_not_fit_the_pad_are_refused_in_one_line(argv, text, capsy
 
 def test_the_cell_file_can_name_ports_and_channels():
     boards = [
-        cells.Reader(port="/dev/x", channels={"t": (0, 1), "b": (2, 3), "l": (4, 5)}),
-        cells.Reader(port="/dev/y", channels={"c": (0,), "r": (5,)}),
+        cells.SensingBoard(port="/dev/x", channels={"t": (0, 1), "b": (2, 3), "l": (4, 5)}),
+        cells.SensingBoard(port="/dev/y", channels={"c": (0,), "r": (5,)}),
     ]
     cell = CELL.model_copy(update={"pads": {**CELL.pads, "p2": CELL.pads["p2"].model_copy(update={"boards": tuple(boards)})}})
     assert service.pads(cell, None, None) == {"p2": tuple(boards)}
