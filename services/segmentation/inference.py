@@ -14,7 +14,7 @@ from services.segmentation import model
 from services.segmentation.model import Model
 from services.segmentation.openvino_step import Compiled, Precision, State
 from services.segmentation.shift import shift_state
-from shared.contract.labels import TARGET_LABELS, Label
+from shared.contract.labels import TARGET_LABELS
 from shared.native import processor
 from shared.perception.lookout import Window
 
