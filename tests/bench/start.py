@@ -235,8 +235,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)
     found = {}
-    for cell in options.cell or ["table", "arm"]:
-        found[cells.load(cell).name] = measure(cell, options.seed, options.runs)
+    try:
+        for cell in options.cell or ["table", "arm"]:
+            found[cells.load(cell).name] = measure(cell, options.seed, options.runs)
+    except Failed as error:
+        print(f"penumbra bench start: {error}", file=sys.stderr)
+        return 1
     _show(found, Console())
     if options.json:
         options.json.write_text(json.dumps({"cells": found}, indent=1) + "\n")
