@@ -281,6 +281,8 @@ def test_a_long_command_whose_output_is_piped_tells_how_far_it_is(capsys):
     assert capsys.readouterr().err == "letters: 0 of 3\nletters: 3 of 3\n"
 
 
-def test_doctor_asks_no_weights_of_a_service_that_is_not_trained(capsys):
-    cli.main(["doctor", "--connect", f"tcp/127.0.0.1:{free_port()}"])
-    assert "has no weights" not in capsys.readouterr().out
+def test_doctor_finds_nothing_to_mend_on_a_healthy_installation(endpoint, capsys):
+    assert cli.main(["doctor", "--connect", endpoint]) == 0
+    out = capsys.readouterr().out
+    assert "has no weights" not in out and "fail" not in out
+    assert f"ok   router at {endpoint}" in out
