@@ -36,8 +36,7 @@ def serve(name: str, argv: list[str]) -> int:
     module.arguments(parser)
     options = parser.parse_args(argv)
     options.mode = options.mode or getattr(module, "MODE", None)
-    logs.configure(options.log_level, options.log_format, name)
-    _die_with_thread()
+    logs.configure(options.log_level, options.log_format, name, ends_with_thread=True)
     node = Node(module.NAME, description.load(options.cell), bus.connection(options))
     with flags.metrics(parser, options.metrics_port, lambda: [node.health()]):
         module.start(node, options)
@@ -71,27 +70,6 @@ def die_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != int(parent):  # it died before we asked
         sys.exit(1)
-
-
-def _die_with_thread() -> None:
-    """Ends the process with the first of its threads that fails: it would look alive and do a part of its work only. Whoever
-    started it starts it again. A thread without the memory to begin is one, for which its starter would wait for ever."""
-    tell, tell_unraisable = threading.excepthook, sys.unraisablehook
-
-    def end(failed: threading.ExceptHookArgs) -> None:
-        try:
-            tell(failed)
-        finally:  # also without memory for words
-            os._exit(1)
-
-    def end_without_memory(failed: sys.UnraisableHookArgs) -> None:
-        try:
-            tell_unraisable(failed)
-        finally:
-            if failed.exc_type is MemoryError:
-                os._exit(1)
-
-    threading.excepthook, sys.unraisablehook = end, end_without_memory
 
 
 def _compile_on_full_disk() -> None:

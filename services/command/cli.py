@@ -52,15 +52,13 @@ COMMANDS: dict[str, Command | Process] = {
 def main(argv: list[str] | None = None) -> int:
     """Runs `penumbra ARGV...` and returns the exit code: 0 well, 1 failed, 2 asked for something that is not there."""
     argv = sys.argv[1:] if argv is None else argv
-    if not argv or argv[0] in ("-h", "--help", "help"):
-        print(_usage())
-        return 0 if argv else 2
-    command, rest = argv[0], argv[1:]
-    if command not in COMMANDS:
+    is_help = not argv or argv[0] in ("-h", "--help", "help")
+    command, rest = ("help", []) if is_help else (argv[0], argv[1:])
+    if not is_help and command not in COMMANDS:
         print(f"penumbra: no command {command!r}: one of {', '.join(COMMANDS)} expected", file=sys.stderr)
         return 2
     try:
-        code = _run(command, rest)
+        code = _help(bool(argv)) if is_help else _run(command, rest)
         sys.stdout.flush()
         return code
     except ImportError as error:
@@ -107,6 +105,11 @@ def bench(argv: list[str]) -> int:
         print(f"penumbra bench: one of {', '.join(names) or '(none installed)'} expected", file=sys.stderr)
         return 2
     return importlib.import_module(f"tests.bench.{argv[0]}").main(argv[1:]) or 0
+
+
+def _help(is_asked: bool) -> int:
+    print(_usage())
+    return 0 if is_asked else 2
 
 
 def _usage() -> str:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from services.emulator.serial_boards import SerialBoards
 from sim.world.world import World
+
+if TYPE_CHECKING:
+    from services.emulator.serial_boards import SerialBoards
 
 COMMANDS = {
     "occlude": "a share of the target's pixels to hide from 0 to 1, or auto",

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from services.emulator.control import control
 from services.emulator.pacing import Pacer, Time
-from services.emulator.serial_boards import SerialBoards
 from shared.contract import topics
 from shared.contract.topics import VOLTAGES
 from shared.runtime.node import Node
@@ -55,6 +54,8 @@ def start(node: Node, options: argparse.Namespace) -> None:
 
     serial = None
     if options.serial is not None:
+        from services.emulator.serial_boards import SerialBoards  # its boards' model takes as long to import as all else
+
         pads = options.serial or list(cell.pads)
         serial = SerialBoards(world, pads, options.serial_folder, world_time.began_ns, TICK_NS * 1e-9, AHEAD_S)
         for name, device in serial.devices.items():

@@ -42,7 +42,7 @@ ONE_THREAD = {
     "NUMBA_NUM_THREADS": "1",
 }
 """Every process is one worker: pools of threads that spin would take the cores from the others."""
-COMMON = ("shared.runtime.node", "services.flags", "services.run", "prometheus_client")
+COMMON = ("shared.runtime.node", "services.flags", "services.run")
 """Imported before the first service is forked. What only some services need they import themselves, side by side."""
 ANSWER_S = 2.0
 """A fork takes some milliseconds, on a machine that is far too busy a second. A fork server that takes longer is ended, and the

@@ -30,8 +30,9 @@ PORT = 7447
 POLL_S = 0.05
 REDRAW_S = 0.5
 PLAIN_S = 5.0
-FORKSERVER_S = 5.0
-"""How long the start waits for the fork server; after that, processes are started plainly."""
+FORKSERVER_S = 10.0
+"""How long the start waits for the fork server; after that, processes are started plainly. It imports what each of them would
+import itself, so that only a fork server that is broken takes longer than a plain start."""
 LISTEN_S = 0.005
 """How often it is looked whether the router listens."""
 SENSES = (topics.VISION, topics.HAPTIC)

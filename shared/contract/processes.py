@@ -116,7 +116,7 @@ PROCESSES = (
         needs="cameras",
         vision="procnet",
         tools=(
-            Tool("train", "services.segmentation.training.train:main", extra="segmentation,training"),
+            Tool("train", "services.segmentation.training.train:main", extra="segmentation,train"),
             Tool("infer", "services.segmentation.files:main", extra="segmentation"),
         ),
         trained_by="train",
@@ -139,7 +139,7 @@ PROCESSES = (
         extra="posecnn",
         needs="cameras",
         vision="posecnn",
-        tools=(Tool("train", "services.posecnn.training.train:main", extra="posecnn,training"),),
+        tools=(Tool("train", "services.posecnn.training.train:main", extra="posecnn,train"),),
         trained_by="train",
     ),
     Process(
@@ -153,7 +153,7 @@ PROCESSES = (
             Tool("decode", "services.skin.decode:main", extra="skin"),
             Tool("calibrate", "services.skin.calibration.calibrate:main", extra="skin"),
             Tool("characterise", "services.skin.calibration.characterise:main", extra="skin,emulator"),
-            Tool("model", "services.skin.model:main", extra="training"),
+            Tool("model", "services.skin.model:main", extra="train"),
         ),
         in_compose=False,
     ),
@@ -162,7 +162,7 @@ PROCESSES = (
         "voltages to the skin's pose (`haptics train`: learn the network again)",
         extra="haptics",
         needs="pads",
-        tools=(Tool("train", "services.haptics.train:main", extra="haptics,training"),),
+        tools=(Tool("train", "services.haptics.train:main", extra="haptics,train"),),
         trained_by="train",
     ),
     Process(

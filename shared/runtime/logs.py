@@ -9,10 +9,12 @@ import contextlib
 import errno
 import json
 import logging
+import os
 import sys
 import threading
 from collections.abc import Iterator, MutableMapping
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, TextIO
 
 LEVELS = ("debug", "info", "warning", "error")
@@ -36,9 +38,13 @@ def get(service: str, **fields: Any) -> Log:
     return Log(logging.getLogger(f"penumbra.{service}"), fields)
 
 
-def configure(level: str = "info", form: str = "text", service: str = "penumbra") -> None:
+def configure(level: str = "info", form: str = "text", service: str = "penumbra", ends_with_thread: bool = False) -> None:
     """Sends the logs of Penumbra to standard error, from `level` on. As JSON, whatever else the process of `service` says there
-    is a line of JSON too: warnings of libraries, and the exception that ends a thread or the process."""
+    is a line of JSON too: warnings of libraries, and the exception that ends a thread or the process.
+
+    ends_with_thread: the process ends with the first of its threads that fails, with exit code 1. It would look alive and do a
+    part of its work only; its supervisor starts it again. A thread that has no memory to begin with counts as failed.
+    """
     handler = _ToStandardError()
     handler.setFormatter(_Json() if form == "json" else _Text())
     logger = logging.getLogger("penumbra")
@@ -50,9 +56,31 @@ def configure(level: str = "info", form: str = "text", service: str = "penumbra"
         logging.captureWarnings(True)
         log = get(service)
         sys.excepthook = lambda kind, error, trace: log.error(f"{kind.__name__}: {error}", exc_info=(kind, error, trace))
-        threading.excepthook = lambda ended: log.error(
-            f"{ended.exc_type.__name__}: {ended.exc_value}", exc_info=ended.exc_value or True
-        )
+    threading.excepthook = partial(_on_thread, get(service) if form == "json" else None, ends_with_thread)
+    if ends_with_thread:
+        sys.unraisablehook = _on_unraisable
+
+
+def _on_thread(log: Log | None, ends_process: bool, failed: threading.ExceptHookArgs) -> None:
+    """The hook for an exception that ends a thread. log: where it is reported, None for Python's own way."""
+    try:
+        if log is None:
+            threading.__excepthook__(failed)
+        else:
+            log.error(f"{failed.exc_type.__name__}: {failed.exc_value}", exc_info=failed.exc_value or True)
+    finally:  # also without memory for words
+        if ends_process:
+            os._exit(1)
+
+
+def _on_unraisable(failed: sys.UnraisableHookArgs) -> None:
+    """The hook for an exception that nobody can catch, such as that of a thread without the memory to begin: its starter would
+    wait for ever."""
+    try:
+        sys.__unraisablehook__(failed)
+    finally:
+        if failed.exc_type is MemoryError:
+            os._exit(1)
 
 
 def is_json() -> bool:

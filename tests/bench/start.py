@@ -12,16 +12,17 @@ import contextlib
 import json
 import os
 import shutil
+import socket
 import statistics
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import psutil
 import zenoh
@@ -31,14 +32,14 @@ from rich.table import Table
 from services import flags
 from shared.cell import description as cells
 from shared.contract import messages, processes, topics
-from tests.support.live import free_port, service_of
+from tests.support.live import connect, free_port, service_of
 
 ROOT = Path(__file__).parents[2]
 LEFT_OUT = ("__pycache__", ".*", "build", "runs", "*.egg-info")
 """What a fresh clone does not hold: everything compiled or cached."""
 PATIENCE_S = 300.0
 """After which a start that is not complete counts as failed."""
-LOOK_S = 0.02
+LOOK_S = 0.01
 
 
 class Failed(RuntimeError):
@@ -58,20 +59,11 @@ class Start:
 
 
 class Listener:
-    """Receives the first message of every process of a cell, on a bus whose router is only about to come."""
+    """Receives the first message of every process of a cell, from the router at a port of loopback."""
 
     def __init__(self, cell: cells.Cell, port: int):
         self._cell, self.first_s = cell, dict[str, float]()
-        config = {
-            "mode": "client",
-            "connect": {
-                "endpoints": [f"tcp/127.0.0.1:{port}"],
-                "timeout_ms": -1,
-                "retry": {"period_init_ms": 20, "period_max_ms": 20, "period_increase_factor": 1},
-            },
-            "scouting": {"multicast": {"enabled": False}},
-        }
-        self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        self._session = connect(port)
         self._tokens = self._session.liveliness().declare_subscriber(topics.alive(cell.name), self._on_token, history=True)
         for topic in topics.TOPICS:
             subscriber = self._session.declare_subscriber(topic.at(cell=cell.name), zenoh.handlers.RingChannel(1))
@@ -125,6 +117,9 @@ def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
             command, env=environment, cwd=home, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
         )
         try:
+            _until(lambda: _listens(port) or launcher.poll() is not None, began_s + PATIENCE_S)
+            if launcher.poll() is not None:
+                raise Failed(f"the launcher of cell {cell} ended: {_words(log)}")
             listener = Listener(cells.load(cell), port)
             used_s = _until_done(listener, launcher)
         finally:
@@ -132,24 +127,42 @@ def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
             launcher.wait()
         listener.close()
         if not listener.is_done:
-            log.seek(0)
             missing = ", ".join(sorted(set(listener.names) - listener.first_s.keys()))
-            raise Failed(f"nothing of {missing} in cell {cell} within {PATIENCE_S:.0f} s: {log.read()[-2000:]}")
+            raise Failed(f"nothing of {missing} in cell {cell} within {PATIENCE_S:.0f} s: {_words(log)}")
     names = [name for name in (*listener.names, processes.LAUNCHER.name) if name in listener.first_s]
     return Start(
         {name: round(listener.first_s[name] - began_s, 2) for name in names}, {name: used_s.get(name, 0.0) for name in names}
     )
 
 
+def _until(is_done: Callable[[], bool], deadline_s: float) -> None:
+    """Returns when something is done, or at a time of the monotonic clock."""
+    while not is_done() and time.monotonic() < deadline_s:
+        time.sleep(LOOK_S)
+
+
+def _listens(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
+        return True
+    return False
+
+
+def _words(log: IO[str]) -> str:
+    """The last words of a launcher."""
+    log.seek(0)
+    return log.read()[-2000:]
+
+
 def _until_done(listener: Listener, launcher: subprocess.Popen[bytes]) -> dict[str, float]:
     """CPU [s] of each service's processes at its first message; returns when all have shown themselves."""
     used_s: dict[str, float] = {}
     known: dict[int, tuple[str, psutil.Process]] = {}
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not listener.is_done and launcher.poll() is None and time.monotonic() < deadline_s:
+
+    def is_over() -> bool:
         _measure(listener, launcher, known, used_s)
-        time.sleep(LOOK_S)
-    _measure(listener, launcher, known, used_s)
+        return listener.is_done or launcher.poll() is not None
+
+    _until(is_over, time.monotonic() + PATIENCE_S)
     return used_s
 
 
@@ -182,20 +195,24 @@ def fresh() -> Iterator[Path]:
 
 
 def measure(cell: str, seed: int, runs: int) -> dict[str, Any]:
-    """The medians of `runs` cold and as many warm starts of a cell, as JSON."""
+    """`runs` cold and as many warm starts of a cell, as JSON. Raises Failed."""
     cold, warm = [], []
     for k in range(runs):
         with fresh() as folder:
             cold.append(start(folder / "checkout", cell, seed + k, folder / "home"))
             warm.append(start(folder / "checkout", cell, seed + k, folder / "home"))
+    return summary(cold, warm)
+
+
+def summary(cold: list[Start], warm: list[Start]) -> dict[str, Any]:
+    """The medians of cold starts and of the warm ones that followed them, as JSON."""
     services = {}
     for name in cold[0].seconds:
-        pairs = [(c.cpu_s, w.cpu_s) for c, w in zip(cold, warm, strict=True)]
-        compiling_s = [c[name] - w[name] for c, w in pairs if name in c and name in w]
+        pairs = [(c.cpu_s[name], w.cpu_s[name]) for c, w in zip(cold, warm, strict=True) if name in c.cpu_s and name in w.cpu_s]
         services[name] = {
             "cold_s": _median([c.seconds[name] for c in cold if name in c.seconds]),
             "warm_s": _median([w.seconds[name] for w in warm if name in w.seconds]),
-            "compile_cpu_s": max(0.0, _median(compiling_s)),
+            "compile_cpu_s": max(0.0, _median([c - w for c, w in pairs])),
         }
     return {
         "cold_s": _median([c.tracking_s for c in cold]),
@@ -218,8 +235,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)
     found = {}
-    for cell in options.cell or ["table", "arm"]:
-        found[cells.load(cell).name] = measure(cell, options.seed, options.runs)
+    try:
+        for cell in options.cell or ["table", "arm"]:
+            found[cells.load(cell).name] = measure(cell, options.seed, options.runs)
+    except Failed as error:
+        print(f"penumbra bench start: {error}", file=sys.stderr)
+        return 1
     _show(found, Console())
     if options.json:
         options.json.write_text(json.dumps({"cells": found}, indent=1) + "\n")

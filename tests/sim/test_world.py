@@ -5,13 +5,14 @@ from collections import Counter
 
 import numpy as np
 import pytest
+import trimesh
 
 from shared.cell import description as cells
 from shared.contract.labels import Label
 from shared.contract.topics import TRUTH, VOLTAGES
 from shared.geometry import rigid
 from shared.geometry.surface import Surface
-from sim.picture.occluder import AWAY, OcclusionSchedule
+from sim.picture.occluder import AWAY, OcclusionSchedule, box
 from sim.world.clearance import hull_points
 from sim.world.motion import Clock
 from sim.world.world import BATCH, TICK_NS, Sensors, World, record
@@ -290,3 +291,12 @@ def test_recorded_voltages_are_the_fields_at_the_true_pose():
         signals.append(noise)
     assert np.var(signals) == pytest.approx(6.2e-6, rel=0.25)  # 1360 samples: 10 % at two sigma
     assert [b.stamp_ns - a.stamp_ns for a, b in itertools.pairwise(truth)] == [TICK_NS] * (len(truth) - 1)
+
+
+def test_a_box_is_closed_and_its_triangles_face_outwards():
+    shape = box((0.2, 0.4, 0.6), (1.0, 2.0, 3.0), Label.OCCLUDER)
+    solid = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+    assert solid.is_volume, "closed, and every triangle faces outwards"
+    assert solid.volume == pytest.approx(0.2 * 0.4 * 0.6)
+    np.testing.assert_allclose(solid.bounds, [[0.9, 1.8, 2.7], [1.1, 2.2, 3.3]])
+    np.testing.assert_array_equal(shape.faces, trimesh.creation.box().faces)

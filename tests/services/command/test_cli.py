@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from services import progress
 from services.command import cli, doctor
 from shared.cell import description as cells
 from shared.contract import processes, topics
@@ -106,7 +107,7 @@ def test_training_without_torch_names_the_extra_for_training(command):
     code = "import sys; sys.modules['torch'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
     result = run(*command.split(), code=code)
     extra = processes.tool(*command.split()).extra
-    assert "training" in extra.split(",")
+    assert "train" in extra.split(",")
     assert (result.returncode, result.stderr) == (2, f"penumbra {command}: torch is not installed: pip install -e '.[{extra}]'\n")
 
 
@@ -272,3 +273,25 @@ print(more(41))
         ]
     assert "No space left on device" in runs[0].stderr
     assert runs[1].stdout.strip() == "42"
+
+
+@pytest.mark.parametrize("argv", [["topics"], ["--help"], ["pose", "--json"]])
+def test_output_that_cannot_be_written_is_one_line_and_no_traceback(argv, endpoint):
+    argv = [*argv, "--connect", endpoint] if argv[0] == "pose" else argv
+    command = [sys.executable, "-m", "services.command.cli", *argv]
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
+    told = f"penumbra {argv[0].strip('-')}: the output cannot be written: No space left on device\n"
+    assert (result.returncode, result.stderr) == (1, told)
+
+
+def test_a_long_command_whose_output_is_piped_tells_how_far_it_is(capsys):
+    assert list(progress.track("abc", "letters")) == ["a", "b", "c"]
+    assert capsys.readouterr().err == "letters: 0 of 3\nletters: 3 of 3\n"
+
+
+def test_doctor_finds_nothing_to_mend_on_a_healthy_installation(endpoint, capsys):
+    assert cli.main(["doctor", "--connect", endpoint]) == 0
+    out = capsys.readouterr().out
+    assert "has no weights" not in out and "fail" not in out
+    assert f"ok   router at {endpoint}" in out

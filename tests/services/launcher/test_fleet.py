@@ -171,8 +171,9 @@ def test_a_hung_process_is_ended_by_force_when_it_is_replaced(launched):
     ("argv", "line"),
     [
         (["restart", "magic"], "penumbra restart: restart magic: one of worker expected: these run here"),
-        (["scale", "magic=2"], "penumbra scale: scale magic=2: NAME=NUMBER, NAME one of worker, sensor expected"),
+        (["scale", "magic=2"], "penumbra scale: scale magic=2: NAME=NUMBER, NAME one of worker, sensor, meeting expected"),
         (["scale", "worker=65"], "penumbra scale: worker=65: 0 to 64 of worker expected"),
+        (["scale", "meeting=0"], "penumbra scale: meeting: expected 1, got 0: all other processes meet there"),
         (
             ["scale", "sensor=2"],
             "penumbra scale: sensor=2: 0 to 1 of sensor expected, because it stands for what there is but once",
@@ -182,7 +183,12 @@ def test_a_hung_process_is_ended_by_force_when_it_is_replaced(launched):
 def test_what_cannot_be_changed_is_one_line_that_says_what_can(argv, line, capsys):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with Node("launcher", CELL, bus.Connection("router", listen=(endpoint,))) as node:
-        fleet = Fleet({"worker": Kind(ALWAYS_CRASHES), "sensor": Kind(ALWAYS_CRASHES, beside=False)}, {"worker": 1})
+        kinds = {
+            "worker": Kind(ALWAYS_CRASHES),
+            "sensor": Kind(ALWAYS_CRASHES, beside=False),
+            "meeting": Kind(ALWAYS_CRASHES, beside=False, is_required=True),
+        }
+        fleet = Fleet(kinds, {"worker": 1})
         launch.Launcher(node, fleet, Console(quiet=True))
         assert cli.main([*argv, "--connect", endpoint]) == 2
     assert capsys.readouterr().err == line + "\n"

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from services.launcher import display, launch, supervised
 from services.launcher.fleet import Fleet, Kind
+from services.launcher.forkserver import ForkServer
 from services.launcher.supervised import Supervised
 from shared.cell import description as cells
 from shared.contract import topics
@@ -26,6 +27,7 @@ from tests.support.live import connect, free_port, service_of, wait_for
 from tests.support.nodes import pose
 
 CELL = cells.load("table")
+ROOT = Path(launch.__file__).parents[1]
 ALWAYS_CRASHES = "import sys; sys.exit('out of luck')"
 REFUSES = "import sys; print('cell table has no camera: it has front', file=sys.stderr); sys.exit(2)"
 SLEEPS = "import time; print('up', flush=True); time.sleep(600)"
@@ -272,7 +274,7 @@ def test_a_router_that_dies_is_started_again_and_everybody_comes_back():
 
 
 def test_every_line_of_the_table_is_a_package_and_every_service_is_in_the_table():
-    services = Path(launch.__file__).parent
+    services = ROOT / "services"
     assert {process.name for process in PROCESSES} == {path.parent.name for path in services.glob("*/service.py")}
 
 
@@ -282,3 +284,110 @@ def test_every_line_of_the_table_is_a_package_and_every_service_is_in_the_table(
 def test_a_cell_without_cameras_needs_no_process_that_looks(name, needed):
     blind = CELL.model_copy(update={"cameras": {}})
     assert next(process for process in PROCESSES if process.name == name).is_needed(blind) is needed
+
+
+# ---- what `up` says by its exit code, and what it refuses
+
+
+def test_a_process_that_failed_is_told_by_the_exit_code(router):
+    fleet = Fleet({"wrong": Kind([sys.executable, "-c", REFUSES])}, {"wrong": 1})
+    (wrong,) = fleet.processes
+    with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
+        node.every(0.05, lambda: node.stopping.set() if wrong.state == "failed" else None)
+        assert launch.Launcher(node, fleet, Console(quiet=True)).run(60) == 1
+
+
+@pytest.mark.parametrize(("service", "code"), [("search", 1), ("skin", 0)])
+def test_a_sense_and_a_fusion_without_a_tracked_pose_are_told_by_the_exit_code(router, capsys, service, code):
+    idle = Kind([sys.executable, "-c", SLEEPS])
+    fleet = Fleet({service: idle, "fusion": idle}, {service: 1, "fusion": 1})
+    with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
+        assert launch.Launcher(node, fleet, Console(width=400)).run(0.5) == code
+    assert ("no pose was tracked within 0.5 s" in capsys.readouterr().out) == bool(code)
+
+
+def test_replicas_that_publish_a_stream_by_turns_are_shown_with_the_rate_of_both(router):
+    with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
+        watch = display.Watch(node)
+        key = topics.FUSED.at(cell="table", target="forearm")
+        watch.health = {name: {"topics": {}, "published": {key: {"rate_hz": 100.0}}} for name in ("a", "b")}
+        (row,) = (row for row in watch.topic_rows() if row.name == "fused")
+    assert row.rate_hz == 200.0
+
+
+def test_what_a_process_does_while_it_starts_is_shown():
+    process = Supervised("fusion", [])
+    process.state = "running"
+    row = process.row({"status": "starting", "reasons": ["compiling 12 of 40"]})
+    assert (row.state, row.note) == ("starting", "compiling 12 of 40")
+
+
+def test_a_second_emulator_of_a_cell_is_refused(router):
+    with Node("emulator", CELL, bus.Connection(connect=(router,))):
+        process = up("--connect", router)
+        _, err = process.communicate(timeout=30)
+    assert process.returncode == 2
+    told = f"penumbra up: cell table at {router} has a process emulator already, and two would contradict each other: "
+    assert err.splitlines()[-1] == f"{told}leave this one out with --replicas emulator=0"
+
+
+def test_up_uses_the_router_of_the_environment_unless_it_is_given_a_port(router):
+    environment = {**os.environ, "PENUMBRA_CONNECT": router}
+    for flags, starts_a_router in (([], False), (["--port", str(free_port())], True)):
+        process = up("--seconds", "1.5", *flags, *NOTHING, env=environment)
+        out, err = process.communicate(timeout=30)
+        assert (process.returncode, "router running" in out) == (0, starts_a_router), err
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--port", "99999"], "--port: expected a port from 1 to 65535, got '99999'"),
+        (["--port", "0"], "--port: expected a port from 1 to 65535, got '0'"),
+        (["--seconds", "nan"], "--seconds: expected a time above 0, in seconds, got 'nan'"),
+        (["--seconds", "-3"], "--seconds: expected a time above 0, in seconds, got '-3'"),
+        (["--method", "foo"], "--method: invalid choice: 'foo'"),
+        (["--observer", "foo"], "--observer: invalid choice: 'foo'"),
+        (["--cel", "table"], "unrecognized arguments: --cel table"),
+        (["--replicas", "router=0"], "--replicas router: expected 1, got 0: all other processes meet there"),
+    ],
+)
+def test_up_refuses_a_bad_flag_in_one_line(flags, words, capsys):
+    with pytest.raises((SystemExit, cells.CellError)) as ended:
+        launch.main(flags, ForkServer())
+    assert words in (capsys.readouterr().err or str(ended.value))
+
+
+def test_the_children_of_up_import_nothing_from_the_current_folder(tmp_path):
+    for name in ("shared", "services", "sim", "zenoh", "json"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(f"raise SystemExit('the {name} of the current folder')")
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    flags = ["up", "--port", str(free_port()), "--seconds", "3", *NOTHING, "--replicas", "fusion=1"]
+    for fork in (True, False):  # without a fork server every process is started plainly
+        broken = "" if fork else "from services import forkserver; forkserver.ForkServer.start = lambda self: None; "
+        command = [
+            sys.executable,
+            "-P",
+            "-c",
+            code.replace("from services.command.cli", f"{broken}from services.command.cli"),
+            *flags,
+        ]
+        out = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        assert "of the current folder" not in out.stderr
+        assert "fusion: on the bus" in out.stderr, out.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+def test_up_ends_in_order_and_without_noise_also_when_its_terminal_is_closed(number):
+    process = up("--port", str(free_port()), *NOTHING, "--replicas", "fusion=2")
+    lines = []
+    for line in process.stderr:
+        lines.append(line)
+        if sum("fusion: on the bus" in each for each in lines) == 2:
+            break
+    process.send_signal(number)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 0
+    assert "restarts: none" in out
+    assert "Traceback" not in err and "waiting for the router" not in err

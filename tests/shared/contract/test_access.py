@@ -146,9 +146,9 @@ def reaches(asker: zenoh.Session, key: str, queryable: zenoh.Queryable) -> bool:
 
 
 @pytest.mark.parametrize("who", WHO)
-@pytest.mark.parametrize("service", access.ANSWERS)
-def test_a_question_is_answered_only_by_whose_it_is(secured, who, service):
-    key = access.ANSWERS[service].replace("/*/", "/table/", 1).replace("*", "forearm")
+@pytest.mark.parametrize(("service", "key"), [(service, key) for service, keys in access.ANSWERS.items() for key in keys])
+def test_a_question_is_answered_only_by_whose_it_is(secured, who, service, key):
+    key = key.replace("/*/", "/table/", 1).replace("*", "forearm")
     queryable = secured.client(who).declare_queryable(key, zenoh.handlers.FifoChannel(8))
     secured.settle(who)
     is_asked = reaches(secured.router.session, key, queryable)
