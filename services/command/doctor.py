@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import shutil
+import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ EXTRAS = {
     "ruamel.yaml": "skin",
     "scikit-learn": "skin",
     "trimesh": "mesh",
-    "pybullet": "robot",
+    "pybullet": "emulator",
     "pyserial": "skin",
 }
 STYLES = {"ok": "green", "warn": "yellow", "fail": "red"}
@@ -98,7 +99,13 @@ def _packages() -> Iterator[Finding]:
         except importlib.metadata.PackageNotFoundError:
             extra = EXTRAS.get(name)
             status = "warn" if extra else "fail"
-            yield Finding(status, f"{name} is not installed", f"pip install -e '.[{extra}]'" if extra else "pip install -e .")
+            mend = f"pip install -e '.[{extra}]'" if extra else "pip install -e ."
+            if name == "pybullet" and sys.version_info >= (3, 12):
+                mend = (
+                    "only the emulator of a cell with a robot needs it; it has wheels up to CPython 3.11, "
+                    "and pip install 'pybullet>=3.2.6,<4' compiles it"
+                )
+            yield Finding(status, f"{name} is not installed", mend)
 
 
 def _cores() -> Finding:

@@ -254,12 +254,13 @@ class _Arm:
             effort = np.minimum(self._effort, self._load + YIELD * self._effort) if pushed else self._effort
             self._drive((self._hold - self.q) / TICK_S, effort)
             return
-        demanded, soon = np.clip(demanded, self._lower, self._upper), np.clip(soon, self._lower, self._upper)
+        demanded, soon = (np.minimum(np.maximum(q, self._lower), self._upper) for q in (demanded, soon))
         behind = demanded - self.q
         catch_up = np.minimum(np.minimum(np.abs(behind) / TICK_S, np.sqrt(ACCELERATION * np.abs(behind))), CATCH_UP)
-        wanted = (soon - demanded) / TICK_S + np.sign(behind) * catch_up
-        change = np.clip(wanted - self._velocity, -ACCELERATION * TICK_S, ACCELERATION * TICK_S)
-        self._drive(np.clip(self._velocity + change, -self._fastest, self._fastest), self._effort)
+        change = (soon - demanded) / TICK_S + np.sign(behind) * catch_up - self._velocity
+        most = ACCELERATION * TICK_S
+        velocity = self._velocity + np.minimum(np.maximum(change, -most), most)
+        self._drive(np.minimum(np.maximum(velocity, -self._fastest), self._fastest), self._effort)
 
     def read(self) -> None:
         """Reads the joints after a tick."""

@@ -245,7 +245,7 @@ def _bodies(world: World, scripts: Mapping[str, JointMotion]) -> Robots:
 
 
 def _parts(actor: Actor, clock: Clock, time_s: float) -> list[Array]:
-    return actor.person.poses(actor.at(clock.at(time_s), clock.rate(time_s)).T_world_target)
+    return actor.parts(clock.at(time_s))
 
 
 def _scripted(scripts: Mapping[str, JointMotion], clock: Clock, time_s: float) -> dict[str, Array]:
