@@ -29,15 +29,21 @@ def test_only_the_emulator_train_py_and_characterise_py_know_the_simulated_world
             assert path.parent.name == "emulator" or path.name in ("train.py", "characterise.py"), path
 
 
+def test_only_the_robots_bodies_know_pybullet():
+    """It prints when it is imported, and has wheels up to CPython 3.11 only: whatever imports it must be able to do without."""
+    knowing = {path.relative_to(ROOT).as_posix() for path in ROOT.glob("s*/**/*.py") if "import pybullet" in path.read_text()}
+    assert knowing == {"sim/world/dynamics.py"}
+
+
 @pytest.mark.parametrize(
     ("service", "heavy"),
     [
         ("fusion", {"torch", "cv2", "pybullet", "trimesh", *SCIPY}),
-        ("haptics", {"torch", "cv2", "trimesh", *SCIPY}),
-        ("search", {"torch", *SCIPY}),
+        ("haptics", {"torch", "cv2", "pybullet", "trimesh", *SCIPY}),
+        ("search", {"torch", "pybullet", "trimesh", *SCIPY}),
         ("segmentation", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
         ("posecnn", {"openvino", "pybullet", "trimesh", *SCIPY}),
-        ("emulator", {"torch", "trimesh", "scipy.special"}),
+        ("emulator", {"torch", "pybullet", "trimesh", "scipy.special"}),
         ("skin", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
         ("router", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
     ],

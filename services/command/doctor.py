@@ -9,11 +9,13 @@ import os
 import platform
 import re
 import shutil
+import sys
 import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from packaging.requirements import Requirement
 from rich.console import Console
 from rich.markup import escape
 
@@ -108,11 +110,12 @@ def requirements(lines: Iterable[str] | None = None) -> dict[str, list[str]]:
     """
     out: dict[str, list[str]] = {}
     for line in importlib.metadata.requires("penumbra") or () if lines is None else lines:
-        requirement, _, marker = line.partition(";")
-        extra = re.search(r"extra == ['\"]([\w-]+)", marker)
-        name = re.match(r"[\w.-]+(\[[\w,-]+\])?", requirement.strip())
-        assert name is not None, line
-        out.setdefault(extra[1] if extra else "", []).append(name[0])
+        requirement = Requirement(line)
+        extra = re.search(r"extra == ['\"]([\w-]+)", line)
+        name = extra[1] if extra else ""
+        if requirement.marker is None or requirement.marker.evaluate({"extra": name}):  # else: not for this Python
+            own = f"[{','.join(sorted(requirement.extras))}]" if requirement.extras else ""
+            out.setdefault(name, []).append(requirement.name + own)
     return out
 
 

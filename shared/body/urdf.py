@@ -6,11 +6,12 @@ the kinematics, and keeps no line numbers for errors. Visual shapes, materials, 
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, cast, get_args
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -50,6 +51,18 @@ class Link:
     mass: float | None
     centre: Array
 
+    def shapes(self) -> list[list[Any]]:
+        """Its collision shapes as JSON can hold them, for comparisons: the same wherever their files lie."""
+        return [
+            [
+                solid.kind,
+                solid.size,
+                (np.round(solid.T_link_solid, 6) + 0.0).tolist(),  # neither rounding errors nor a negative zero count
+                hashlib.sha256(solid.file.read_bytes()).hexdigest() if solid.file else "",
+            ]
+            for solid in self.solids
+        ]
+
 
 @dataclass(frozen=True)
 class Joint:
@@ -81,6 +94,10 @@ class Urdf:
     path: Path
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
+
+    def link(self, name: str) -> Link:
+        """A link by its name. Raises KeyError."""
+        return {link.name: link for link in self.links}[name]
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -230,7 +247,7 @@ class _Reader:
         (damping,) = self._numbers(dynamics, "damping", 1, "0")
         return Joint(
             name=element.attrib["name"],
-            kind=kind,
+            kind=cast(JointKind, kind),
             parent=self._attribute(self._child(element, "parent"), "link"),
             child=self._attribute(self._child(element, "child"), "link"),
             T_parent_child=self._origin(element),

@@ -84,8 +84,7 @@ class Camera(_Model):
 
 
 class Robot(_Model):
-    """A robot: its URDF (a path beside the cell file, or beside the built-in ones: `panda/panda.urdf`), base and moving
-    joints."""
+    """A robot: its URDF (a path beside the cell file, or the built-in `panda/panda.urdf`), base and moving joints."""
 
     urdf: str
     base: Placement = Placement()
@@ -362,9 +361,9 @@ class Cell(_Model):
             if name not in self.robots:
                 raise ValueError(f"sim.payloads.{name}: expected one of {sorted(self.robots)}, got {name!r}")
             places[f"sim.payloads.{name}.link"] = (name, "/", payload.link)
-        for place, (robot, _, link) in places.items():
-            if link not in links[robot]:
-                raise ValueError(f"{place}: robot {robot} has no link {link!r}: it has {', '.join(links[robot])}")
+        for place, (owner, _, link) in places.items():
+            if link not in links[owner]:
+                raise ValueError(f"{place}: robot {owner} has no link {link!r}: it has {', '.join(links[owner])}")
 
     def one(self, kind: Literal["cameras", "robots", "pads", "targets"], name: str | None) -> str:
         """The name of a camera, robot, pad or target, checked; None means the first one. Raises CellError."""

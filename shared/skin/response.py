@@ -22,6 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from shared.body import urdf
 from shared.cell import description as cells
 
 Array = NDArray[np.float64]
@@ -165,7 +166,8 @@ def fingerprint(cell: cells.Cell, pad: str, target: str, bare: bool = False) -> 
     }
     if own.backed and not bare:
         robot, _, link = own.link.partition("/")
-        parts["behind"] = {"urdf": cell.robots[robot].urdf, "link": link, "at": [own.position, own.rpy]}
+        shapes = urdf.read(cells.urdf_path(cell.robots[robot], cell.folder)).link(link).shapes()
+        parts["behind"] = {"shapes": shapes, "at": [own.position, own.rpy]}
     return _digest(json.dumps(parts, sort_keys=True).encode())
 
 

@@ -68,6 +68,11 @@ class Actor:
         velocity = speed * np.concatenate([rate[:3], angular_velocity(pose[3:], rate[3:])])
         return Placed(rigid.from_rpy(pose[:3], pose[3:]), pose, velocity)
 
+    def parts(self, scene_s: float) -> list[Array]:
+        """T_world_mesh of each of the person's meshes at a time of the scene."""
+        pose, _ = self._limb.at(scene_s)
+        return self.person.poses(rigid.from_rpy(pose[:3], pose[3:]))
+
     def plan(self, until_s: float) -> None:
         """Plans its motion up to a time of the scene."""
         self._limb.plan(until_s)

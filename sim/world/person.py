@@ -32,10 +32,11 @@ class Person:
         elbow = T_world_target[..., :3, 3] - T_world_target[..., :3, 0] * self._elbow
         x = elbow - self._shoulder
         x /= np.linalg.norm(x, axis=-1, keepdims=True)
-        y = np.cross((0.0, 0.0, 1.0), x)
-        y /= np.linalg.norm(y, axis=-1, keepdims=True)
+        x0, x1, x2 = x[..., 0], x[..., 1], x[..., 2]
+        y0, y1 = np.stack([-x1, x0]) / np.sqrt(x0**2 + x1**2)  # y lies across the vertical; np.cross costs five times as much
+        y, z = np.stack([y0, y1, np.zeros_like(y0)], axis=-1), np.stack([-x2 * y1, x2 * y0, x0 * y1 - x1 * y0], axis=-1)
         shoulder = elbow - self._upper_arm * x
-        upper_arm = frame(np.stack([x, y, np.cross(x, y)], axis=-1), shoulder)
+        upper_arm = frame(np.stack([x, y, z], axis=-1), shoulder)
         return [T_world_target, upper_arm, frame(self._R_world_torso, shoulder)]
 
 

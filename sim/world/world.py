@@ -2,15 +2,17 @@
 
 `World(cell, seed).state(t)` is a function of time, seed and the commands given (occlude, motion, pause, speed). Each target is a
 person's (`sim.world.actor`), who moves by reaches that never touch robot, pads or table. Persons do not make way for one another:
-their homes should be as far apart as people work.
+their homes should be as far apart as people work. Robots are bodies that follow a script (`sim.world.dynamics`): their motion is
+integrated up to the latest time that was asked for, and the last minutes of it are kept.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,8 +30,11 @@ from sim.picture.scene import Cameras, View, furniture
 from sim.skin.faults import SkinFaults
 from sim.skin.pads import SkinModel
 from sim.world.actor import Actor, Placed
-from sim.world.motion import Clock, joint_motions
+from sim.world.motion import Clock, JointMotion, joint_motions
 from sim.world.person import Person
+
+if TYPE_CHECKING:
+    from sim.world.dynamics import Robots
 
 FAR = 10.0
 """What the truth calls the gap [m] where the cell has no pads."""
@@ -77,18 +82,17 @@ class World:
             raise cells.CellError(f"cell {cell.name} has no `sim`: the emulator needs its motion, shoulder and joint bounds")
         self.cell, self.sim, self.seed = cell, cell.sim, seed
         self.robots = robot_models(cell)
-        self._joint_motions = joint_motions(cell, cell.sim, seed)
-        self.actors = {
-            name: Actor(cell, cell.sim, name, seed + i, self.robots, self._joint_motions) for i, name in enumerate(cell.targets)
-        }
+        scripts = joint_motions(cell, cell.sim, seed)
+        self.actors = {name: Actor(cell, cell.sim, name, seed + i, self.robots, scripts) for i, name in enumerate(cell.targets)}
         self.skin = SkinModel(cell, next(iter(cell.targets))) if cell.pads else None
         self.skin_faults = SkinFaults(self.skin.skin) if self.skin else None
-        self._furniture = furniture(cell, cell.sim)
+        self.furniture = furniture(cell, cell.sim)
         self._cameras = Cameras(cell, seed)
         self._shown = {camera: Lookout(cell, camera).targets for camera in cell.cameras}
         self.clock, self.occlusion_clock = Clock(), Clock()
         self.occlusion = OcclusionSchedule(seed)
         self.panel = Panel(seed)
+        self._bodies = _bodies(self, scripts) if self.robots else None
         self._motion, self._paused, self._speed = True, False, 1.0
 
     @property
@@ -103,7 +107,7 @@ class World:
     def state(self, time_s: float) -> WorldState:
         """Where everything is at a time."""
         scene_s = self.clock.at(time_s)
-        joints = {name: motion.at(scene_s) for name, motion in self._joint_motions.items()}
+        joints = self._bodies.at(time_s) if self._bodies else {}
         return WorldState(
             time_s=time_s,
             targets={name: actor.at(scene_s, self.clock.rate(time_s)) for name, actor in self.actors.items()},
@@ -158,7 +162,7 @@ class World:
             for robot, model in self.robots.items()
             for link, mesh in model.meshes.items()
         }
-        out |= {name: (mesh, links[link]) for name, (mesh, link) in self._furniture.items()}
+        out |= {name: (mesh, links[link]) for name, (mesh, link) in self.furniture.items()}
         T_world_panel = self.occluder(camera, state)
         return out if T_world_panel is None else {**out, "occluder": (self.panel.mesh, T_world_panel)}
 
@@ -210,6 +214,7 @@ class World:
             "paused": self._paused,
             "speed": self._speed,
             "scene_s": self.clock.at(time_s),
+            "stopped": self._bodies.stopped() if self._bodies else {},
             "skin": self.skin_faults.describe() if self.skin_faults else {},
             "seed": self.seed,
         }
@@ -217,6 +222,34 @@ class World:
     def _set_rates(self, time_s: float) -> None:
         self.clock.set_rate(time_s, self._speed if self._motion and not self._paused else 0.0)
         self.occlusion_clock.set_rate(time_s, 0.0 if self._paused else 1.0)
+
+
+def _bodies(world: World, scripts: Mapping[str, JointMotion]) -> Robots:
+    """The robots of a world as bodies. Raises CellError where pybullet is missing."""
+    try:
+        from sim.world import dynamics
+    except ModuleNotFoundError:
+        raise cells.CellError(
+            f"cell {world.cell.name} has a robot: the emulator moves it with pybullet, which is not installed: "
+            "pip install 'pybullet>=3.2.6,<4', or choose a cell without robots such as table "
+            "(pybullet has wheels up to CPython 3.11; on later ones pip compiles it, which takes a C++ compiler)"
+        ) from None
+    clock = world.clock  # not the world: it holds the bodies, and a cycle of the two would stay until garbage is collected
+    persons = [
+        dynamics.Bystander(actor.person.meshes, partial(_parts, actor, clock))
+        for name, actor in world.actors.items()
+        if dynamics.within_reach(world.robots.values(), world.cell.targets[name].home.position)
+    ]
+    tables = [mesh for name, (mesh, _) in world.furniture.items() if name == "table"]
+    return dynamics.Robots(world.robots, world.sim.payloads, partial(_scripted, scripts, clock), persons, tables)
+
+
+def _parts(actor: Actor, clock: Clock, time_s: float) -> list[Array]:
+    return actor.parts(clock.at(time_s))
+
+
+def _scripted(scripts: Mapping[str, JointMotion], clock: Clock, time_s: float) -> dict[str, Array]:
+    return {name: script.at(clock.at(time_s)) for name, script in scripts.items()}
 
 
 BATCH = 20

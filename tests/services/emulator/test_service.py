@@ -37,8 +37,8 @@ def ask(world, command, value=None, time_s=1.0):
 
 def test_every_command_answers_with_what_is_in_force(world):
     assert ask(world, "state") | {"scene_s": 0} == {
-        "occlusion": "auto", "occlusion_now": 0.0, "motion": "on", "paused": False, "speed": 1.0, "scene_s": 0, "skin": {},
-        "seed": 1,
+        "occlusion": "auto", "occlusion_now": 0.0, "motion": "on", "paused": False, "speed": 1.0, "scene_s": 0, "stopped": {},
+        "skin": {}, "seed": 1,
     }  # fmt: skip
     assert ask(world, "occlude", "0.8")["occlusion"] == 0.8
     assert ask(world, "occlude", 0)["occlusion"] == 0.0
