@@ -119,7 +119,7 @@ def serve(name: str, argv: list[str]) -> int:
     logs.configure(options.log_level, options.log_format, name)
     _die_with_thread()
     node = Node(module.NAME, description.load(options.cell), bus.connection(options))
-    with flags.metrics(parser, options.metrics_port, lambda: [node.health()]):
+    with flags.metrics(parser, options.metrics_port, lambda: [node.report()]):
         module.start(node, options)
         node.run()
     return leave()

@@ -39,7 +39,7 @@ EXTRAS = {
     "pyserial": "skin",
 }
 STYLES = {"ok": "green", "warn": "yellow", "fail": "red"}
-FOUND = {"ok": "ok", "degraded": "warn", "down": "fail"}
+FOUND = {"ok": "ok", "starting": "warn", "degraded": "warn", "down": "fail"}
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from services.fusion.paper import PaperObserver
 from shared.cell import description
 from shared.contract import messages, topics
 from shared.geometry import rigid
-from shared.runtime.node import Node
+from shared.runtime.node import ServiceNode
 
 NAME = "fusion"
 OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
@@ -36,7 +36,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--target", metavar="NAME", help="fuse this target only (default: all of the cell)")
 
 
-def start(node: Node, options: argparse.Namespace) -> None:
+def start(node: ServiceNode, options: argparse.Namespace) -> None:
     """Wires one observer per target, and one timer for all. Raises CellError for a target that the cell does not have."""
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
     warm_up(OBSERVERS[options.observer])
@@ -50,7 +50,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
 
     node.every(PERIOD_S, publish)
     # a replica that takes over goes on with the pose: it does not begin with "lost" while the other one knows it
-    node.is_warm = lambda: all(fusion.state != "lost" for fusion in fusions)
+    node.warm_when(lambda: all(fusion.state != "lost" for fusion in fusions))
 
 
 def warm_up(kind: type[ErrorStateObserver | PaperObserver]) -> None:
@@ -120,17 +120,17 @@ class Fusion:
     """One target: its observer, what it hears and what it says. Every replica listens, the stream's owner publishes, and the next
     in rank where it is silent. One that knows nothing yet goes on from what the others publish."""
 
-    def __init__(self, node: Node, target: str, group: Group, observer: ErrorStateObserver | PaperObserver):
+    def __init__(self, node: ServiceNode, target: str, group: Group, observer: ErrorStateObserver | PaperObserver):
         self.node, self.target, self.group, self.observer = node, target, group, observer
         self._publishers = Publishers()
         self._told: set[tuple[str, str]] = set()
         self.state = "lost"
-        self._heard_s = time.monotonic()  # another replica
+        self._others = node.latest(topics.FUSED, from_others=True, target=target)
+        self._others_count, self._heard_s = 0, time.monotonic()
         node.subscribe(topics.VISION, self.on_vision, target=target)
         node.subscribe(topics.HAPTIC, self.on_haptic, target=target)
-        node.subscribe(topics.FUSED, self.on_fused, from_others=True, target=target)
         node.answer(topics.current_pose(node.cell.name, target), self.answer)
-        node.report[target] = self.describe
+        node.tell(target, self.describe)
 
     def on_vision(self, message: messages.VisionPose, names: dict[str, str]) -> None:
         """A camera's pose; each camera of the cell is a stream of its own."""
@@ -140,10 +140,15 @@ class Fusion:
         """The skin's pose."""
         self._take("haptic", message, lambda: self._felt(message, names["publisher"]), None)
 
-    def on_fused(self, message: messages.FusedPose, names: dict[str, str]) -> None:
-        """The pose as another replica knows it."""
-        self._heard_s = time.monotonic()
-        if self.state == "lost" and message.state != "lost" and not self.node.owns(self.target):
+    def _hear_others(self) -> None:
+        """Notes when another replica spoke last, and takes over the pose that it knows where this one knows none."""
+        if (count := self._others.drain()) == self._others_count:
+            return
+        self._others_count, self._heard_s = count, time.monotonic()
+        if self.state != "lost" or self.node.owns(self.target):
+            return
+        message: messages.FusedPose | None = self._others.get(target=self.target)
+        if message is not None and message.state != "lost":
             with self.group.lock:
                 if message.stamp_ns <= latest(self.group.now_ns()):
                     self.observer.adopt(message)
@@ -200,6 +205,7 @@ class Fusion:
 
     def publish(self, stamp_ns: int, estimate: Estimate) -> None:
         """Publishes an estimate, where it is this replica's turn."""
+        self._hear_others()
         changed, self.state = (estimate.state == "lost") != (self.state == "lost"), estimate.state
         if time.monotonic() - self._heard_s < self.node.rank(self.target) * SILENCE_S:
             return

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TextIO, cast
+from typing import Any, Literal, TextIO, cast
 
 from rich.console import Console
 from rich.live import Live
@@ -75,11 +75,8 @@ class Launcher:
     def __init__(self, node: Node, fleet: Fleet, console: Console):
         self.node, self.fleet, self.console = node, fleet, console
         self.watch = display.Watch(node)
-        node.report["processes"] = lambda: {
-            process.name: {"state": process.state, "restarts": process.restarts, "note": process.note}
-            for process in fleet.processes
-        }
-        node.worries = self._worries
+        node.tell("processes", self._processes)
+        node.worry(self._worries)
         node.answer(topics.launcher(node.cell.name), fleet.answer)
         self._looping: set[str] = set()
 
@@ -120,7 +117,7 @@ class Launcher:
         for process in self.fleet.processes:
             process.measure()
             if (report := local.get(process.pid or 0)) is not None:
-                process.heard(report["ready"], report["hangs"])
+                process.heard(report.ready, report.hangs)
 
         self._tell_of_loops()
 
@@ -130,13 +127,20 @@ class Launcher:
             self.node.log.error("a process dies again and again; the others go on", process=name, why=looping[name])
         self._looping = set(looping)
 
+    def _processes(self) -> dict[str, dict[str, Any]]:
+        return {
+            process.name: {"state": process.state, "restarts": process.restarts, "note": process.note}
+            for process in self.fleet.processes
+        }
+
     def _worries(self) -> list[str]:
         return [f"{each.name} {each.state}: {each.note}" for each in self.fleet.processes if each.state in ("waiting", "failed")]
 
     def _rows(self) -> list[display.ProcessRow]:
         local = self.watch.local()
-        own = local.get(os.getpid(), {})
-        launcher = display.ProcessRow("launcher", "running", os.getpid(), own.get("cpu", 0.0), own.get("memory_mb", 0.0), 0)
+        own = local.get(os.getpid())
+        cpu, memory_mb = (own.cpu, own.memory_mb) if own else (0.0, 0.0)
+        launcher = display.ProcessRow("launcher", "running", os.getpid(), cpu, memory_mb, 0)
         return [launcher, *(process.row(local.get(process.pid or 0)) for process in self.fleet.processes)]
 
 

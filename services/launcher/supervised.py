@@ -12,12 +12,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable
-from typing import Any
 
 import psutil
 
 from services.launcher import display
 from services.launcher.forkserver import Forked, ForkServer
+from shared.contract.report import Report
 from shared.runtime import logs
 
 BACKOFF_S = (0.2, 10.0)
@@ -217,11 +217,11 @@ class Supervised:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.popen.pid, number)
 
-    def row(self, health: dict[str, Any] | None = None) -> display.ProcessRow:
+    def row(self, health: Report | None = None) -> display.ProcessRow:
         """For the table; health: its own report, where it gave one."""
         state, note = self.state, self.note
-        if state == "running" and health is not None and health["status"] != "ok":
-            state, note = health["status"], "; ".join([*([note] if note else []), *health["reasons"]])
+        if state == "running" and health is not None and health.status != "ok":
+            state, note = health.status, "; ".join([*([note] if note else []), *health.reasons])
         return display.ProcessRow(self.name, state, self.pid, self.cpu, self.memory_mb, self.restarts, note)
 
 

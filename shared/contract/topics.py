@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING, Literal
 
 from shared.contract import messages
+
+if TYPE_CHECKING:
+    from shared.cell.description import Cell
 
 
 class QoS(Enum):
@@ -27,7 +31,8 @@ class Priority(Enum):
 class Topic:
     """`key` with its {names} to fill in; nominal `rate_hz`; `depth`: samples that a reader keeps while busy;
     `stale_s`: the age after which a reader calls the topic stale; `publisher`: the service that may publish it, or
-    either of two; `slow_hz`: how often a slow link carries a key's messages, 0 for never (`penumbra router --slow`)."""
+    either of two; `slow_hz`: how often a slow link carries a key's messages, 0 for never (`penumbra router --slow`); `needs`: the
+    part of a cell without which nobody publishes it, where that is not in its key."""
 
     name: str
     key: str
@@ -40,6 +45,11 @@ class Topic:
     priority: Priority
     slow_hz: float
     qos: QoS = QoS.LATEST_WINS
+    needs: Literal["cameras", "pads"] | None = None
+
+    def is_expected(self, cell: Cell) -> bool:
+        """Whether a cell has what the publishers of this topic need: without it the topic is not missing."""
+        return self.needs is None or bool(getattr(cell, self.needs))
 
     @property
     def publishers(self) -> tuple[str, ...]:
@@ -68,9 +78,9 @@ TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 
 MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, "segmentation",
              "class indices of a window of a frame", Priority.IMAGE, 0)  # fmt: skip
 VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, "search or posecnn",
-               "the camera's pose and covariance", Priority.POSE, 20)  # fmt: skip
+               "the camera's pose and covariance", Priority.POSE, 20, needs="cameras")  # fmt: skip
 HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 50, 16, 0.1, "haptics",
-               "the skin's pose and information", Priority.POSE, 20)  # fmt: skip
+               "the skin's pose and information", Priority.POSE, 20, needs="pads")  # fmt: skip
 FUSED = Topic("fused", "penumbra/{cell}/target/{target}/pose/fused", messages.FusedPose, 200, 4, 0.1, "fusion", "the one pose",
               Priority.POSE, 20)  # fmt: skip
 

@@ -5,22 +5,22 @@ Counters are of the process that tells them and start anew with it, which is wha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
 from wsgiref.simple_server import WSGIServer
 
 from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from shared.contract.report import Report, TopicReport
 from shared.runtime import bus
+from shared.runtime.health import STATUSES
 
-STATUSES = ("ok", "degraded", "down")
 FUSED_STATES = ("tracking", "coasting", "lost")
 WHO = ("cell", "service", "instance", "host")
 """The labels of every metric."""
 
-Reports = Callable[[], Iterable[Mapping[str, Any]]]
+Reports = Callable[[], Iterable[Report]]
 
 
 def serve(address: str, port: int, reports: Reports) -> WSGIServer:
@@ -44,52 +44,52 @@ class _Collector(Collector):
         return metrics(self._reports())
 
 
-def metrics(reports: Iterable[Mapping[str, Any]]) -> Iterator[Metric]:
+def metrics(reports: Iterable[Report]) -> Iterator[Metric]:
     """The metrics of health reports. Times are in seconds, memory in bytes, CPU in cores."""
     families = _Families()
     for report in reports:
-        who = tuple(report[name] for name in WHO)
+        who = tuple(getattr(report, name) for name in WHO)
         for status in STATUSES:
-            families.gauge("status", "1 for the status that the process has", who, status == report["status"], status=status)
-        families.gauge("uptime_seconds", "since the process began", who, report["uptime_s"])
-        families.gauge("cpu_cores", "cores in use", who, report["cpu"])
-        families.gauge("memory_bytes", "resident memory", who, 1e6 * report["memory_mb"])
-        families.gauge("replicas", "living replicas of the service", who, report["replicas"])
-        for kind, count in report["faults"].items():
+            families.gauge("status", "1 for the status that the process has", who, status == report.status, status=status)
+        families.gauge("uptime_seconds", "since the process began", who, report.uptime_s)
+        families.gauge("cpu_cores", "cores in use", who, report.cpu)
+        families.gauge("memory_bytes", "resident memory", who, 1e6 * report.memory_mb)
+        families.gauge("replicas", "living replicas of the service", who, report.replicas)
+        for kind, count in report.faults.items():
             families.counter("faults", "exceptions by kind and place", who, count, kind=kind)
-        for key, traffic in report["topics"].items():
+        for key, traffic in report.topics.items():
             _traffic(families, "received", who, key, traffic)
-        for key, traffic in report["published"].items():
+        for key, traffic in report.published.items():
             _traffic(families, "published", who, key, traffic)
-        if report["service"] == "launcher":
-            for process, row in report.get("report", {}).get("processes", {}).items():
+        if report.service == "launcher":
+            for process, row in report.report.get("processes", {}).items():
                 families.counter("restarts", "times that a process was started again", who, row["restarts"], process=process)
                 families.gauge("running", "1 for a process that answers", who, row["state"] == "running", process=process)
-        if report["service"] == "fusion":
-            for target, row in report.get("report", {}).items():
+        if report.service == "fusion":
+            for target, row in report.report.items():
                 for state in FUSED_STATES:
                     is_it = row["state"] == state
                     families.gauge("fused_state", "1 for the state of the target's pose", who, is_it, target=target, state=state)
     return iter(families)
 
 
-def _traffic(families: _Families, way: str, who: tuple[str, ...], key: str, traffic: Mapping[str, Any]) -> None:
+def _traffic(families: _Families, way: str, who: tuple[str, ...], key: str, traffic: TopicReport) -> None:
     topic = bus.topic_of(key.partition(" #")[0])
     labels = {"topic": topic.name if topic else "", "key": key}
-    families.counter(f"{way}_messages", f"good messages {way}", who, traffic["count"], **labels)
-    families.gauge(f"{way}_hertz", f"messages {way} a second", who, traffic["rate_hz"], **labels)
-    if traffic["age_s"] is not None:
-        families.gauge(f"{way}_age_seconds", "since the newest measurement", who, traffic["age_s"], **labels)
+    families.counter(f"{way}_messages", f"good messages {way}", who, traffic.count, **labels)
+    families.gauge(f"{way}_hertz", f"messages {way} a second", who, traffic.rate_hz, **labels)
+    if traffic.age_s is not None:
+        families.gauge(f"{way}_age_seconds", "since the newest measurement", who, traffic.age_s, **labels)
     if way == "published":
         return
-    if traffic["delay_s"] is not None:
-        families.gauge("received_delay_seconds", "from the newest measurement to its arrival", who, traffic["delay_s"], **labels)
-    families.gauge("stale", "1 for an input that is missing", who, traffic["stale"], **labels)
-    if traffic["dropped"] is not None:
+    if traffic.delay_s is not None:
+        families.gauge("received_delay_seconds", "from the newest measurement to its arrival", who, traffic.delay_s, **labels)
+    families.gauge("stale", "1 for an input that is missing", who, traffic.stale, **labels)
+    if traffic.dropped is not None:
         families.counter(
-            "dropped_messages", "messages that the publisher sent and that never came", who, traffic["dropped"], **labels
+            "dropped_messages", "messages that the publisher sent and that never came", who, traffic.dropped, **labels
         )
-    for kind, count in traffic["bad"].items():
+    for kind, count in traffic.bad.items():
         families.counter("refused_messages", "messages refused by kind", who, count, **labels, kind=kind)
 
 

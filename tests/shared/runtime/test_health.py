@@ -19,6 +19,7 @@ from shared.cell import description as cells
 from shared.contract import topics
 from shared.runtime import bus, health
 from shared.runtime.node import Node
+from shared.runtime.traffic import Traffic
 from tests.support.live import free_port, wait_for
 from tests.support.nodes import pose
 
@@ -81,7 +82,7 @@ def test_a_process_with_nothing_to_say_is_ok_and_one_off_the_bus_is_down():
 
 
 def test_every_reason_names_what_is_missing_and_since_when():
-    never, old, fresh = (bus.Traffic(0.3) for _ in range(3))
+    never, old, fresh = (Traffic(0.3) for _ in range(3))
     now_ns = 10**12
     old.took(now_ns - 3_210_000_000, now_ns)
     fresh.took(now_ns, now_ns)
