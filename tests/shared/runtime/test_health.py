@@ -111,10 +111,8 @@ def test_missing_inputs_of_one_kind_are_one_reason():
     for k, traffic in enumerate(pads.values()):
         traffic.took(now_ns - (k + 1) * 100_000_000, now_ns)
     fused = {"penumbra/arm/target/forearm/pose/fused": Traffic(0.1)}
-    assert health.judge("", pads | fused, {}, [], now_ns)[1] == [
-        "no skin/*/voltages (7 of 8) for 0.8 s",
-        "nothing heard on target/forearm/pose/fused yet",
-    ]
+    expected = ["no skin/*/voltages (7 of 8) for 0.8 s", "nothing heard on target/forearm/pose/fused yet"]
+    assert health.judge("", pads | fused, {}, [], now_ns)[1] == expected
 
 
 def test_a_process_that_prepares_its_work_or_waits_for_one_that_does_is_starting():
