@@ -38,7 +38,7 @@ def serve(name: str, argv: list[str]) -> int:
     options.mode = options.mode or getattr(module, "MODE", None)
     logs.configure(options.log_level, options.log_format, name, ends_with_thread=True)
     node = Node(module.NAME, description.load(options.cell), bus.connection(options))
-    with flags.metrics(parser, options.metrics_port, lambda: [node.health()]):
+    with flags.metrics(parser, options.metrics_port, lambda: [node.report()]):
         module.start(node, options)
         node.run()
     return leave()

@@ -9,7 +9,6 @@ import os
 import platform
 import re
 import shutil
-import sys
 import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 SHM_BYTES = 128 << 20
 """Frames cross between processes in shared memory; Docker's default of 64 MB is too little for two cameras."""
 STYLES = {"ok": "green", "warn": "yellow", "fail": "red"}
-FOUND = {"ok": "ok", "starting": "ok", "degraded": "warn", "down": "fail"}
+FOUND = {"ok": "ok", "starting": "warn", "degraded": "warn", "down": "fail"}
 
 
 @dataclass(frozen=True)

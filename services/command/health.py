@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 import zenoh
 
-from shared.contract import topics
+from shared.contract import report, topics
 from shared.runtime import bus
 
 ANSWER_S = 1.0
@@ -15,7 +14,7 @@ ANSWER_S = 1.0
 
 @dataclass(frozen=True)
 class Instance:
-    """One running instance: its status (ok, degraded or down, as `shared.runtime.health` has them) and the reasons."""
+    """One running instance: its status (ok, starting, degraded or down, as `shared.runtime.health` has them) and the reasons."""
 
     service: str
     instance: str
@@ -33,7 +32,6 @@ def ask(session: zenoh.Session, cell: str) -> list[Instance]:
         if reply.ok is not None:
             service, instance = str(reply.ok.key_expr).split("/")[-2:]
             found[instance] = Instance(service, instance, "down", (f"it hangs: no answer within {ANSWER_S:g} s",))
-    for report in map(json.loads, bus.ask(session, topics.health(cell), timeout_s=ANSWER_S)):
-        instance = report["instance"]
-        found[instance] = Instance(report["service"], instance, report["status"], tuple(report["reasons"]))
+    for each in map(report.read, bus.ask(session, topics.health(cell), timeout_s=ANSWER_S)):
+        found[each.instance] = Instance(each.service, each.instance, each.status, tuple(each.reasons))
     return sorted(found.values(), key=lambda each: (each.service, each.instance))

@@ -17,6 +17,7 @@ from services import flags
 from services.command import health
 from shared.cell import description as cells
 from shared.contract import access, topics
+from shared.contract.report import TopicReport
 from shared.runtime import bus
 
 PATIENCE_S = 1.0
@@ -108,11 +109,11 @@ def list_topics(argv: list[str], known: Sequence[topics.Topic] = topics.TOPICS) 
     table = Table("key", "Hz", "expected", "delay ms", "dropped", "bad", box=None)
     for key, row in report.items():
         expected = bus.topic_of(key, known)
-        if row["count"] or row["bad"] or "*" not in key:
-            delay = "-" if row["delay_s"] is None else f"{1e3 * row['delay_s']:.1f}"
-            bad = ", ".join(f"{n} {kind}" for kind, n in row["bad"].items()) or "0"
+        if row.count or row.bad or "*" not in key:
+            delay = "-" if row.delay_s is None else f"{1e3 * row.delay_s:.1f}"
+            bad = ", ".join(f"{n} {kind}" for kind, n in row.bad.items()) or "0"
             table.add_row(
-                key, f"{row['rate_hz']:.1f}", f"{expected.rate_hz:g}" if expected else "", delay, str(row["dropped"] or 0), bad
+                key, f"{row.rate_hz:.1f}", f"{expected.rate_hz:g}" if expected else "", delay, str(row.dropped or 0), bad
             )
     console.print(table)
     table = Table("process", "instance", "status", "reasons", box=None)
@@ -125,7 +126,7 @@ def list_topics(argv: list[str], known: Sequence[topics.Topic] = topics.TOPICS) 
 
 def listen(
     cell: cells.Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic] = topics.TOPICS
-) -> tuple[dict[str, dict[str, Any]], list[health.Instance]]:
+) -> tuple[dict[str, TopicReport], list[health.Instance]]:
     """The counters of every key of the topics that are known after listening for a while, and how the cell's processes fare."""
     from shared.runtime.node import Node
 
@@ -136,7 +137,7 @@ def listen(
         assert node.session is not None
         node.stopping.wait(seconds)
         instances = [found for found in health.ask(node.session, cell.name) if found.instance != node.instance]
-        return node.health()["topics"], instances
+        return node.report().topics, instances
 
 
 def sim(argv: list[str]) -> int:

@@ -22,7 +22,7 @@ from shared.cell import description
 from shared.contract import messages, topics
 from shared.contract.senses import SENSES, Sense
 from shared.geometry import rigid
-from shared.runtime.node import Node
+from shared.runtime.node import ServiceNode
 
 NAME = "fusion"
 OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
@@ -41,7 +41,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--target", metavar="NAME", help="fuse this target only (default: all of the cell)")
 
 
-def start(node: Node, options: argparse.Namespace, senses: Sequence[Sense] = SENSES) -> None:
+def start(node: ServiceNode, options: argparse.Namespace, senses: Sequence[Sense] = SENSES) -> None:
     """Wires one observer per target, and one timer for all. senses: whose measurements are taken; the paper's observer takes its
     two alone. Raises CellError for a target that the cell does not have."""
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
@@ -58,7 +58,7 @@ def start(node: Node, options: argparse.Namespace, senses: Sequence[Sense] = SEN
 
     node.every(PERIOD_S, publish)
     # a replica that takes over goes on with the pose: it does not begin with "lost" while the other one knows it
-    node.is_warm = lambda: all(fusion.state != "lost" for fusion in fusions)
+    node.warm_when(lambda: all(fusion.state != "lost" for fusion in fusions))
 
 
 class Group:
@@ -122,7 +122,7 @@ class Fusion:
 
     def __init__(
         self,
-        node: Node,
+        node: ServiceNode,
         target: str,
         group: Group,
         observer: ErrorStateObserver | PaperObserver,
@@ -132,12 +132,12 @@ class Fusion:
         self._publishers = Publishers()
         self._told: set[tuple[str, str]] = set()
         self.state = "lost"
-        self._heard_s = time.monotonic()  # another replica
+        self._others = node.latest(topics.FUSED, from_others=True, target=target)
+        self._others_count, self._heard_s = 0, time.monotonic()
         for sense in senses:
             node.subscribe(sense.topic, partial(self.on_measurement, sense), target=target)
-        node.subscribe(topics.FUSED, self.on_fused, from_others=True, target=target)
         node.answer(topics.current_pose(node.cell.name, target), self.answer)
-        node.report[target] = self.describe
+        node.tell(target, self.describe)
 
     def on_measurement(self, sense: Sense, message: Any, names: dict[str, str]) -> None:
         """Hands a measurement on to the observer, or the news that a sense is there but has nothing to say; what is refused is
@@ -176,10 +176,15 @@ class Fusion:
             stream = f"{sense.name} of {sense.part} {part}"
         self._publishers.check(stream, publisher, time.monotonic(), sense.topic.stale_s)
 
-    def on_fused(self, message: messages.FusedPose, names: dict[str, str]) -> None:
-        """The pose as another replica knows it."""
-        self._heard_s = time.monotonic()
-        if self.state == "lost" and message.state != "lost" and not self.node.owns(self.target):
+    def _hear_others(self) -> None:
+        """Notes when another replica spoke last, and takes over the pose that it knows where this one knows none."""
+        if (count := self._others.drain()) == self._others_count:
+            return
+        self._others_count, self._heard_s = count, time.monotonic()
+        if self.state != "lost" or self.node.owns(self.target):
+            return
+        message: messages.FusedPose | None = self._others.get(target=self.target)
+        if message is not None and message.state != "lost":
             with self.group.lock:
                 if message.stamp_ns <= latest(self.group.now_ns()):
                     self.observer.adopt(message)
@@ -196,6 +201,7 @@ class Fusion:
 
     def publish(self, stamp_ns: int, estimate: Estimate) -> None:
         """Publishes an estimate, where it is this replica's turn."""
+        self._hear_others()
         changed, self.state = (estimate.state == "lost") != (self.state == "lost"), estimate.state
         if time.monotonic() - self._heard_s < self.node.rank(self.target) * SILENCE_S:
             return

@@ -21,7 +21,7 @@ from shared.contract.topics import FUSED, HAPTIC, JOINTS, VOLTAGES
 from shared.geometry.rigid import position_orientation
 from shared.geometry.surface import Surface
 from shared.perception.prediction import LONGEST_S, predict
-from shared.runtime.node import Node
+from shared.runtime.node import ServiceNode
 from shared.skin.layout import Near, Skin
 from shared.skin.response import Response
 
@@ -42,7 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--window-ms", type=float, default=20.0, help="voltages averaged for one pose (default: %(default)s)")
 
 
-def start(node: Node, options: argparse.Namespace) -> None:
+def start(node: ServiceNode, options: argparse.Namespace) -> None:
     cell = node.cell
     skin = Skin(cell)
     poses = PadPoses(cell, skin, robot_models(cell))
@@ -54,10 +54,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
     backlog = Backlog()
     told = Faults(node)
     misfits = Misfits(node)
-    fused: dict[str, FusedPose] = {}
-
-    def on_fused(message: FusedPose, names: dict[str, str]) -> None:
-        fused[names["target"]] = message
+    fused = {target: node.latest(FUSED, target=target) for target in estimators}
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
         poses.add(names["robot"], message.stamp_ns, message.position)
@@ -78,7 +75,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
             if found is None:
                 estimate = which.nothing(faults["joints"])
             else:
-                T, covariance = predict(seen(fused.get(target), window.stamp_ns), window.stamp_ns)
+                T, covariance = predict(seen(fused[target].get(target=target), window.stamp_ns), window.stamp_ns)
                 expected = None if T is None or covariance is None else (T, covariance)
                 (T_world_pads, joints), own = found, near[target]
                 amplitude, samples = window.amplitude[own.electrodes], window.samples[own.electrodes]
@@ -90,12 +87,11 @@ def start(node: Node, options: argparse.Namespace) -> None:
         told.update(faults, window.stamp_ns)
 
     streams = [f"haptic/{target}" for target in estimators]
-    node.subscribe(FUSED, on_fused)
     node.subscribe(JOINTS, on_joints, streams)
     node.subscribe(VOLTAGES, on_voltages, streams)
 
 
-def estimator(node: Node, options: argparse.Namespace, cell: Cell, target: str) -> Estimator:
+def estimator(node: ServiceNode, options: argparse.Namespace, cell: Cell, target: str) -> Estimator:
     """Ready to run on the pads of a cell: weights loaded where they fit it, code compiled."""
     path = options.weights / f"{cell.name}-{target}.npz"
     weights = None
@@ -123,7 +119,7 @@ class Misfits:
     """Per pad, what the limb leaves unexplained, in the health's report as misfit/PAD: mean squared residual in variances, of
     windows in which a limb is in range. A pad that is turned, or has another pad's calibration, stands out."""
 
-    def __init__(self, node: Node):
+    def __init__(self, node: ServiceNode):
         self._node = node
         self._means: dict[str, float] = {}
 
@@ -139,7 +135,7 @@ class Misfits:
                 now = float(squares[own][used].mean())
                 before = self._means.get(pad, now)
                 self._means[pad] = before + SHARE * (now - before)
-                self._node.report[f"misfit/{pad}"] = partial(self._told, pad)
+                self._node.tell(f"misfit/{pad}", partial(self._told, pad))
 
     def _told(self, pad: str) -> float:
         return round(self._means[pad], 2)
@@ -148,7 +144,7 @@ class Misfits:
 class Faults:
     """Tells what is left out and what is back: only what lasts, so that a hiccup of the machine does not fill the log."""
 
-    def __init__(self, node: Node):
+    def __init__(self, node: ServiceNode):
         self._node = node
         self._told: dict[str, str] = {}
         self._since_ns: dict[str, int] = {}

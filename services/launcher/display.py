@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import socket
 import time
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,8 +16,9 @@ from rich.table import Table
 from rich.text import Text
 
 from services.launcher.supervised import ProcessRow
-from shared.contract import topics
+from shared.contract import report, topics
 from shared.contract.messages import BadMessage, FusedPose, Truth, decode
+from shared.contract.report import Report
 from shared.geometry import rigid
 from shared.runtime import bus
 from shared.runtime.node import Node
@@ -35,7 +34,7 @@ class TopicRow:
     and refused."""
 
     name: str
-    rates: Counter[str] = field(default_factory=Counter)
+    rates: dict[str, float] = field(default_factory=dict)
     delays_s: list[float] = field(default_factory=list)
     dropped: int = 0
     bad: int = 0
@@ -69,21 +68,21 @@ class Watch:
         names = {"cell": node.cell.name, "target": self._target}
         self._fused = session.declare_subscriber(topics.FUSED.at(**names), zenoh.handlers.RingChannel(1))
         self._truth = session.declare_subscriber(topics.TRUTH.at(**names), zenoh.handlers.RingChannel(64))
-        self.health: dict[str, dict[str, Any]] = {}
+        self.health: dict[str, Report] = {}
         self.accuracy: Accuracy | None = None
         self.errors: list[tuple[float, float]] = []
         self.has_tracked = False  # whether a fused pose was `tracking` at some look
 
     def refresh(self) -> None:
         """Asks all instances how they are; `health` is then their answers by instance."""
-        found = [json.loads(answer) for answer in self._node.query(topics.health(self._node.cell.name), timeout_s=ANSWER_S)]
-        self.health = {report["instance"]: report for report in found}
+        found = [report.read(answer) for answer in self._node.query(topics.health(self._node.cell.name), timeout_s=ANSWER_S)]
+        self.health = {each.instance: each for each in found}
         self._look_at_pose()
 
-    def local(self) -> dict[int, dict[str, Any]]:
+    def local(self) -> dict[int, Report]:
         """The answers of this host's instances by pid."""
         host = socket.gethostname()
-        return {report["pid"]: report for report in self.health.values() if report["host"] == host}
+        return {each.pid: each for each in self.health.values() if each.host == host}
 
     def _look_at_pose(self) -> None:
         samples = list(_drain(self._fused))
@@ -104,16 +103,17 @@ class Watch:
     def topic_rows(self) -> list[TopicRow]:
         """The traffic of the cell: rates as published, delays and losses as received."""
         rows = {topic.name: TopicRow(topic.name) for topic in topics.TOPICS if self._node.keys(topic, {})}
-        for report in self.health.values():
-            for key, traffic in report["published"].items():
+        for found in self.health.values():
+            for key, traffic in found.published.items():
                 if (topic := bus.topic_of(key)) is not None and topic.name in rows:
-                    rows[topic.name].rates[key] += traffic["rate_hz"]
-            for key, traffic in report["topics"].items():
+                    rates = rows[topic.name].rates
+                    rates[key] = rates.get(key, 0.0) + traffic.rate_hz
+            for key, traffic in found.topics.items():
                 if (topic := bus.topic_of(key.partition(" #")[0])) is not None and topic.name in rows:
                     row = rows[topic.name]
-                    row.delays_s += [traffic["delay_s"]] if traffic["delay_s"] is not None else []
-                    row.dropped += traffic["dropped"] or 0
-                    row.bad += sum(traffic["bad"].values())
+                    row.delays_s += [traffic.delay_s] if traffic.delay_s is not None else []
+                    row.dropped += traffic.dropped or 0
+                    row.bad += sum(traffic.bad.values())
         return list(rows.values())
 
 

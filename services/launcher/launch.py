@@ -9,7 +9,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable
-from typing import TextIO, cast
+from typing import Any, TextIO, cast
 
 from rich.console import Console
 from rich.live import Live
@@ -45,16 +45,8 @@ class Launcher:
     def __init__(self, node: Node, fleet: Fleet, console: Console):
         self.node, self.fleet, self.console = node, fleet, console
         self.watch = display.Watch(node)
-        node.report["processes"] = lambda: {
-            process.name: {
-                "state": process.state,
-                "is_running": process.state == "running",
-                "restarts": process.restarts,
-                "note": process.note,
-            }
-            for process in fleet.processes
-        }
-        node.worries = self._worries
+        node.tell("processes", self._processes)
+        node.worry(self._worries)
         node.answer(topics.launcher(node.cell.name), fleet.answer)
         self._looping: set[str] = set()
 
@@ -108,7 +100,7 @@ class Launcher:
         for process in self.fleet.processes:
             process.measure()
             if (report := local.get(process.pid or 0)) is not None:
-                process.heard(report["ready"], report["hangs"])
+                process.heard(report.ready, report.hangs)
 
         self._tell_of_loops()
 
@@ -118,13 +110,25 @@ class Launcher:
             self.node.log.error("a process dies again and again; the others go on", process=name, why=looping[name])
         self._looping = set(looping)
 
+    def _processes(self) -> dict[str, dict[str, Any]]:
+        return {
+            process.name: {
+                "state": process.state,
+                "is_running": process.state == "running",
+                "restarts": process.restarts,
+                "note": process.note,
+            }
+            for process in self.fleet.processes
+        }
+
     def _worries(self) -> list[str]:
         return [f"{each.name} {each.state}: {each.note}" for each in self.fleet.processes if each.state in ("waiting", "failed")]
 
     def _rows(self) -> list[ProcessRow]:
         local = self.watch.local()
-        own = local.get(os.getpid(), {})
-        launcher = ProcessRow(LAUNCHER.name, "running", os.getpid(), own.get("cpu", 0.0), own.get("memory_mb", 0.0), 0)
+        own = local.get(os.getpid())
+        cpu, memory_mb = (own.cpu, own.memory_mb) if own else (0.0, 0.0)
+        launcher = ProcessRow(LAUNCHER.name, "running", os.getpid(), cpu, memory_mb, 0)
         return [launcher, *(process.row(local.get(process.pid or 0)) for process in self.fleet.processes)]
 
 

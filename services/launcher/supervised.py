@@ -13,11 +13,11 @@ import time
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import psutil
 
 from services.launcher.forkserver import Forked, ForkServer, environment
+from shared.contract.report import Report
 from shared.runtime import logs
 
 BACKOFF_S = (0.2, 10.0)
@@ -223,11 +223,11 @@ class Supervised:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.popen.pid, number)
 
-    def row(self, health: dict[str, Any] | None = None) -> ProcessRow:
+    def row(self, health: Report | None = None) -> ProcessRow:
         """For the table; health: its own report, where it gave one."""
         state, note = self.state, self.note
-        if state == "running" and health is not None and health["status"] != "ok":
-            state, note = health["status"], "; ".join([*([note] if note else []), *health["reasons"]])
+        if state == "running" and health is not None and health.status != "ok":
+            state, note = health.status, "; ".join([*([note] if note else []), *health.reasons])
         return ProcessRow(self.name, state, self.pid, self.cpu, self.memory_mb, self.restarts, note)
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 
 from services.posecnn.estimator import WEIGHTS, PoseCNN, load
-from shared.contract.messages import Frame, FusedPose
+from shared.contract.messages import Frame
 from shared.contract.topics import FRAME, FUSED, VISION
 from shared.perception.lookout import Lookout
 from shared.perception.prediction import predict
-from shared.runtime.node import Node
+from shared.runtime.node import ServiceNode
 
 NAME = "posecnn"
 
@@ -24,7 +24,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", type=Path, default=WEIGHTS, help="the network, made by `penumbra posecnn train`")
 
 
-def start(node: Node, options: argparse.Namespace) -> None:
+def start(node: ServiceNode, options: argparse.Namespace) -> None:
     """Subscribes; every frame is searched for every target that its camera can see and this replica owns."""
     torch.set_num_threads(1)
     cell = node.cell
@@ -40,23 +40,20 @@ def start(node: Node, options: argparse.Namespace) -> None:
     }
     for estimator in estimators.values():
         estimator.prepare()
-    fused: dict[str, FusedPose] = {}
-
-    def on_fused(message: FusedPose, names: dict[str, str]) -> None:
-        fused[names["target"]] = message
-        for lookout in lookouts.values():
-            lookout.hear(message)
+    fused = node.latest(FUSED)
 
     def on_frame(frame: Frame, names: dict[str, str]) -> None:
         camera = names["camera"]
+        for target in lookouts[camera].targets:
+            if (pose := fused.get(target=target)) is not None:
+                lookouts[camera].hear(pose)
         window = lookouts[camera].look(frame.stamp_ns)
         for (own, target), estimator in estimators.items():
             if own != camera or not node.owns(f"{camera}/{target}"):
                 continue
-            T_prior, _ = predict(fused.get(target), frame.stamp_ns)
+            T_prior, _ = predict(fused.get(target=target), frame.stamp_ns)
             estimate = estimator.update(frame.image, window, T_prior)
             node.publish(VISION, estimate.message(frame.stamp_ns, target, camera, cell.frame), target=target)
 
-    node.subscribe(FUSED, on_fused)
     for camera in cameras:
         node.subscribe(FRAME, on_frame, streams=[f"{camera}/{target}" for target in targets], camera=camera)

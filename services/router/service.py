@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import replace
 
 import psutil
 
@@ -51,7 +50,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
         raise bus.BusError(f"--slow-hz {options.slow_hz[0]}: say with --slow INTERFACE which link is slow")
     if options.slow:
         keys = {key: rates_hz[topic.name] for topic in topics.TOPICS for key in node.keys(topic, {})}
-        node.connection = replace(node.connection, slow=SlowLinks(tuple(options.slow), keys))
+        node.thin_out(SlowLinks(tuple(options.slow), keys))
 
 
 def _rate(text: str) -> tuple[str, float]:

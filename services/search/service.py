@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import threading
-from collections import deque
-
-import numpy as np
-from numpy.typing import NDArray
 
 from services.search.tracker import METHODS, Search
-from shared.contract.messages import Frame, FusedPose, Joints, Mask
+from shared.contract.messages import Frame, Joints, Mask
 from shared.contract.topics import FRAME, FUSED, JOINTS, MASK, VISION
 from shared.perception.joint_history import JointHistory
 from shared.perception.lookout import Lookout
 from shared.perception.prediction import predict
-from shared.runtime.node import Node
+from shared.runtime.node import ServiceNode
 
 NAME = "search"
 FRAMES_KEPT = 4
@@ -34,25 +29,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--target", help="search only this target (default: all)")
 
 
-class RecentFrames:
-    """The last frames of a camera. The bus calls the handlers of frames and of masks on different threads."""
-
-    def __init__(self) -> None:
-        self._frames: deque[Frame] = deque(maxlen=FRAMES_KEPT)
-        self._lock = threading.Lock()
-
-    def add(self, frame: Frame) -> None:
-        """Keeps a frame, the oldest one goes."""
-        with self._lock:
-            self._frames.append(frame)
-
-    def image_at(self, stamp_ns: int) -> NDArray[np.uint8] | None:
-        """The image (h, w, 3) of the frame with this stamp, None where it is not kept."""
-        with self._lock:
-            return next((frame.image for frame in self._frames if frame.stamp_ns == stamp_ns), None)
-
-
-def start(node: Node, options: argparse.Namespace) -> None:
+def start(node: ServiceNode, options: argparse.Namespace) -> None:
     """Subscribes; every mask is searched for every target that its camera can see and this replica owns."""
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
@@ -65,11 +42,12 @@ def start(node: Node, options: argparse.Namespace) -> None:
     for search in searches.values():
         search.prepare()
     history = {robot: JointHistory(JOINTS_NEAR_NS) for robot in cell.robots}
-    fused: dict[str, FusedPose] = {}
-    frames = {camera: RecentFrames() for camera in cameras}
+    fused = {target: node.latest(FUSED, target=target) for target in targets}
+    frames: dict[str, tuple[Frame, ...]] = dict.fromkeys(cameras, ())
 
     def on_frame(message: Frame, names: dict[str, str]) -> None:
-        frames[names["camera"]].add(message)
+        known = frames[names["camera"]]
+        frames[names["camera"]] = (*known, message)[-FRAMES_KEPT:]  # a new one each time: `on_mask` may be in the old one
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
         robot, expected = names["robot"], len(cell.robots[names["robot"]].joints)
@@ -77,24 +55,19 @@ def start(node: Node, options: argparse.Namespace) -> None:
             raise ValueError(f"joints of {robot}: {expected} values expected, {len(message.position)} came")
         history[robot].add(message.stamp_ns, message.position)
 
-    def on_fused(message: FusedPose, names: dict[str, str]) -> None:
-        fused[names["target"]] = message
-
     def on_mask(message: Mask, names: dict[str, str]) -> None:
-        image = frames[names["camera"]].image_at(message.stamp_ns)
+        image = next((frame.image for frame in frames[names["camera"]] if frame.stamp_ns == message.stamp_ns), None)
         joints = {robot: q for robot, h in history.items() if (q := h.at(message.stamp_ns)) is not None}
         for (camera, target), search in searches.items():
             if camera != names["camera"] or not node.owns(f"{camera}/{target}"):
                 continue
-            T_prior, covariance = predict(fused.get(target), message.stamp_ns)
+            T_prior, covariance = predict(fused[target].get(target=target), message.stamp_ns)
             estimate = search.update(message, T_prior, covariance, joints, image)
             pose = estimate.message(message.stamp_ns, target, camera, cell.frame)
             node.publish(VISION, pose, target=target)
 
     for robot in cell.robots:
         node.subscribe(JOINTS, on_joints, robot=robot)
-    for target in targets:
-        node.subscribe(FUSED, on_fused, target=target)
     for camera in cameras:
         streams = [f"{camera}/{target}" for target in targets]
         node.subscribe(FRAME, on_frame, streams, camera=camera)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 
 from services.segmentation.inference import WEIGHTS, Segmenter, load_segmenter
 from shared.cell.description import Camera
-from shared.contract.messages import Frame, FusedPose, Mask
+from shared.contract.messages import Frame, Mask
 from shared.contract.topics import FRAME, FUSED, MASK
 from shared.perception.lookout import Lookout
-from shared.runtime.node import Node
+from shared.runtime.node import ServiceNode
 
 NAME = "segmentation"
 FOLLOW_S = 0.2
@@ -26,58 +27,64 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", type=Path, default=WEIGHTS, help="the network, made by `penumbra segmentation train`")
 
 
-def start(node: Node, options: argparse.Namespace) -> None:
+def start(node: ServiceNode, options: argparse.Namespace) -> None:
     """Segment the frames of the cell's cameras that this replica owns."""
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
 
     lookouts = {name: Lookout(cell, name) for name in cameras}
+    looking = {name: threading.Lock() for name in cameras}  # a camera's frames and `follow` look by turns
     segmenters = {name: load_segmenter(options.weights) for name in cameras}
     for name, segmenter in segmenters.items():
         segmenter.prepare(lookouts[name].window)  # while the process joins the others
 
-    heard: set[str] = set()
+    fused = {target: node.latest(FUSED, target=target) for lookout in lookouts.values() for target in lookout.targets}
 
-    def on_pose(message: FusedPose, names: dict[str, str]) -> None:
-        heard.add(names["target"])
-        for lookout in lookouts.values():
-            lookout.hear(message)
+    def informed(name: str) -> Lookout:
+        """A camera's lookout that knows the newest poses; to be called with its lock held."""
+        for target in lookouts[name].targets:
+            if (pose := fused[target].get(target=target)) is not None:
+                lookouts[name].hear(pose)
+        return lookouts[name]
 
     def is_ready(names: Iterable[str]) -> bool:
         """Whether frames of these cameras would wait for nothing; compiles ahead where they would, once it is known where to
         look."""
-        if not heard:
+        if not any(each.drain() for each in fused.values()):
             return False
-        now_ns = node.now_ns()
-        windows = {name: lookouts[name].foresee(now_ns) for name in names}
-        for name, window in windows.items():
-            segmenters[name].prepare(window, lookouts[name].foresee(now_ns + round(AHEAD_S * 1e9)))
-        return all(segmenters[name].is_prepared(window) for name, window in windows.items())
+        now_ns, ready = node.now_ns(), True
+        for name in names:
+            with looking[name]:
+                lookout = informed(name)
+                window, later = lookout.foresee(now_ns), lookout.foresee(now_ns + round(AHEAD_S * 1e9))
+            segmenters[name].prepare(window, later)
+            ready &= segmenters[name].is_prepared(window)
+        return ready
 
     def follow() -> None:
         """What another replica works on may be this one's next, and the other replica does not say how it looks at it."""
-        for name, lookout in lookouts.items():
+        for name in lookouts:
             if not node.owns(f"camera/{name}"):
-                lookout.look(node.now_ns())
+                with looking[name]:
+                    informed(name).look(node.now_ns())
         is_ready(lookouts)
 
-    def watch(name: str, camera: Camera, lookout: Lookout, segmenter: Segmenter) -> None:
+    def watch(name: str, camera: Camera, segmenter: Segmenter) -> None:
         def on_frame(frame: Frame, _: dict[str, str]) -> None:
             if frame.image.shape[:2] != (camera.height, camera.width):
                 came = f"{frame.image.shape[1]} x {frame.image.shape[0]}"
                 raise ValueError(
                     f"camera {name}: frames of {camera.width} x {camera.height} expected (the cell file), {came} came"
                 )
-            window = lookout.look(frame.stamp_ns)
+            with looking[name]:
+                window = informed(name).look(frame.stamp_ns)
             labels = segmenter(frame.image, window, frame.stamp_ns)
             mask = Mask(stamp_ns=frame.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=window.scale)
             node.publish(MASK, mask, camera=name)
 
         node.subscribe(FRAME, on_frame, streams=[f"camera/{name}"], camera=name)
 
-    for target in dict.fromkeys(target for lookout in lookouts.values() for target in lookout.targets):
-        node.subscribe(FUSED, on_pose, target=target)
-    for name, lookout in lookouts.items():
-        watch(name, cell.cameras[name], lookout, segmenters[name])
+    for name in cameras:
+        watch(name, cell.cameras[name], segmenters[name])
     node.every(FOLLOW_S, follow)
-    node.is_warm = lambda: is_ready(lookouts)
+    node.warm_when(lambda: is_ready(lookouts))

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from shared.body.robot import robot_models
 from shared.cell import description as cells
-from shared.contract import topics
+from shared.contract import report, topics
 from shared.contract.messages import FusedPose, Joints, Voltages
 from shared.geometry.rigid import Array, inverse, transform
 from shared.runtime import bus
@@ -221,7 +221,7 @@ def _misfits(answers: list[bytes]) -> dict[str, float]:
     """Mean squared residuals [variances] by pad, as the haptics service tells them in its health."""
     out: dict[str, float] = {}
     for answer in answers:
-        for name, value in json.loads(answer).get("report", {}).items():
+        for name, value in report.read(answer).report.items():
             if name.startswith("misfit/") and value is not None:
                 out[name.removeprefix("misfit/")] = float(value)
     return out

@@ -43,7 +43,7 @@ def start(node: Node, options: argparse.Namespace) -> None:
         raise cells.CellError(f"--cycles: 1 to 60000 expected, {options.cycles} came")
     for pad, readers in pads(node.cell, options.port, options.pad).items():
         session = Session(node, pad, readers, options.cycles)
-        node.report[pad] = session.describe
+        node.tell(pad, session.describe)
         node.every(BACKOFF_S[0], partial(Session.run, session), math.inf)
 
 

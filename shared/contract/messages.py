@@ -277,7 +277,7 @@ class _Codec(typing.Generic[M]):
         except MemoryError:  # the reader's fault
             raise
         except Exception as error:
-            raise self._refusal(payload, error) from None
+            raise self.refusal(payload, error) from None
         del fields["version"]
         for name, spec in self.arrays.items():
             fields[name] = self._unpacked(name, spec, *fields[name])
@@ -285,7 +285,7 @@ class _Codec(typing.Generic[M]):
         vars(message).update(fields)  # at once: the __init__ of a frozen dataclass sets field by field
         return message
 
-    def _refusal(self, payload: bytes, error: Exception) -> BadMessage:
+    def refusal(self, payload: bytes, error: Exception) -> BadMessage:
         """Why msgspec did not take a payload. Another release may send other fields: its version is the reason, then."""
         where = self.kind.__name__
         if not isinstance(error, msgspec.ValidationError):
@@ -342,20 +342,40 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: f
         raise BadMessage("size", f"{kind.__name__}: at most {kind.MAX_BYTES} bytes expected, {len(payload)} came")
     message = _codec(kind).decode(payload)
     if now_ns is not None:
-        check_stamp(message, now_ns, oldest_s)
+        check_stamp(kind, message.stamp_ns, now_ns, oldest_s)
     return message
 
 
-def check_stamp(message: Message, now_ns: int, oldest_s: float) -> None:
-    """Raises BadMessage where the stamp is too far from the reader's clock."""
-    age_s = (now_ns - message.stamp_ns) * 1e-9
+def check_stamp(kind: type[Message], stamp_ns: int, now_ns: int, oldest_s: float) -> None:
+    """Raises BadMessage where the stamp of a message is too far from the reader's clock."""
+    age_s = (now_ns - stamp_ns) * 1e-9
     if age_s > oldest_s:
-        raise BadMessage("past", f"{type(message).__name__}: stamp at most {oldest_s:g} s old expected, {age_s:.3f} s came")
+        raise BadMessage("past", f"{kind.__name__}: stamp at most {oldest_s:g} s old expected, {age_s:.3f} s came")
     if age_s < -MAX_FUTURE_S:
         raise BadMessage(
-            "future",
-            f"{type(message).__name__}: stamp at most {MAX_FUTURE_S} s ahead expected, {-age_s:.3f} s came: check the clocks",
+            "future", f"{kind.__name__}: stamp at most {MAX_FUTURE_S} s ahead expected, {-age_s:.3f} s came: check the clocks"
         )
+
+
+class Head(msgspec.Struct, frozen=True, gc=False):
+    """What a reader must know of a message that it does not look at; its other fields are skipped."""
+
+    version: Literal[VERSION]  # type: ignore[valid-type]
+    stamp_ns: int
+    camera: _Name = ""
+
+
+_HEADS = msgspec.msgpack.Decoder(Head)
+
+
+def head(kind: type[Message], payload: bytes) -> Head:
+    """The head of a message of this kind. Raises BadMessage where it has none of this version."""
+    try:
+        return _HEADS.decode(payload)
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise _codec(kind).refusal(payload, error) from None
 
 
 def _array_on_the_wire(spec: _ArraySpec) -> Any:

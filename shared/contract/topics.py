@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING, Literal
 
 from shared.contract import messages
+
+if TYPE_CHECKING:
+    from shared.cell.description import Cell
 
 
 class QoS(Enum):
@@ -28,7 +32,8 @@ class Topic:
     """`key` with its {names} to fill in; nominal `rate_hz`; `depth`: samples that a reader keeps while busy;
     `stale_s`: the age after which a reader calls the topic stale; `publishers`: the processes (`shared.contract.processes`) that
     may publish it; `slow_hz`: how often a slow link carries a key's messages, 0 for never (`penumbra router --slow`);
-    `by_camera`: whether all cameras' messages go by one key, each at the rate of its camera."""
+    `by_camera`: whether all cameras' messages go by one key, each at the rate of its camera; `needs`: the part of a cell without
+    which nobody publishes it, where that is not in its key."""
 
     name: str
     key: str
@@ -42,6 +47,11 @@ class Topic:
     slow_hz: float
     qos: QoS = QoS.LATEST_WINS
     by_camera: bool = False
+    needs: Literal["cameras", "pads"] | None = None
+
+    def is_expected(self, cell: Cell) -> bool:
+        """Whether a cell has what the publishers of this topic need: without it the topic is not missing."""
+        return self.needs is None or bool(getattr(cell, self.needs))
 
     @property
     def oldest_s(self) -> float:
@@ -65,9 +75,9 @@ TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 
 MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, ("segmentation",),
              "class indices of a window of a frame", Priority.IMAGE, 0)  # fmt: skip
 VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, ("search", "posecnn"),
-               "the camera's pose and covariance", Priority.POSE, 20, by_camera=True)  # fmt: skip
+               "the camera's pose and covariance", Priority.POSE, 20, by_camera=True, needs="cameras")  # fmt: skip
 HAPTIC = Topic("haptic", "penumbra/{cell}/target/{target}/pose/haptic", messages.HapticPose, 50, 16, 0.1, ("haptics",),
-               "the skin's pose and information", Priority.POSE, 20)  # fmt: skip
+               "the skin's pose and information", Priority.POSE, 20, needs="pads")  # fmt: skip
 FUSED = Topic("fused", "penumbra/{cell}/target/{target}/pose/fused", messages.FusedPose, 200, 4, 0.1, ("fusion",), "the one pose",
               Priority.POSE, 20)  # fmt: skip
 

@@ -21,6 +21,8 @@ WINDOW = 64
 """Numbers that may arrive out of order."""
 MEASUREMENTS = 64
 """Measurements of a key that are remembered: of the slowest stream more than its oldest that is taken."""
+SEEN = (1 << WINDOW) - 1
+"""The window of a publisher of which every number was here."""
 NUMBERS = 1 << 32
 """Publishers count modulo this: at 200 Hz it comes around after eight months."""
 
@@ -30,19 +32,23 @@ class Window:
 
     def __init__(self, number: int):
         self._highest = number
-        self._seen = (1 << WINDOW) - 1  # what was before the first is not waited for
+        self._seen = SEEN  # what was before the first is not waited for
 
     def take(self, number: int) -> int:
         """How many more numbers are missing than before: those that were left out, or -1 for one that comes late. Raises
         BadMessage for one that was here, or may have been."""
         ahead = (number - self._highest) % NUMBERS
+        if ahead == 1:  # as almost always
+            self._seen = (self._seen << 1 | 1) & SEEN
+            self._highest = number
+            return 0
         if ahead == 0 or ahead >= NUMBERS // 2:
             behind = -ahead % NUMBERS
             if behind >= WINDOW or self._seen >> behind & 1:
                 raise BadMessage("replayed", f"a number after {self._highest} expected, {number} came: it was here before")
             self._seen |= 1 << behind
             return -1
-        self._seen = (self._seen << ahead | 1) & ((1 << WINDOW) - 1) if ahead < WINDOW else 1
+        self._seen = (self._seen << ahead | 1) & SEEN if ahead < WINDOW else 1
         self._highest = number
         return ahead - 1
 
@@ -52,17 +58,17 @@ class Bucket:
 
     def __init__(self, rate_hz: float, now_s: float):
         self._rate_hz = rate_hz
-        self._tokens = max(1.0, rate_hz)
+        self._tokens = self._full = max(1.0, rate_hz)
         self._last_s = now_s
 
     def take(self, now_s: float) -> bool:
         """Whether one more fits."""
-        self._tokens = min(max(1.0, self._rate_hz), self._tokens + (now_s - self._last_s) * self._rate_hz)
+        tokens = self._tokens + (now_s - self._last_s) * self._rate_hz
+        if tokens > self._full:
+            tokens = self._full
         self._last_s = now_s
-        if self._tokens < 1.0:
-            return False
-        self._tokens -= 1.0
-        return True
+        self._tokens = tokens - 1.0 if tokens >= 1.0 else tokens
+        return tokens >= 1.0
 
 
 @dataclass
@@ -80,6 +86,7 @@ class Guard:
         self._limit_hz = RATE_TIMES * rate_hz
         self._publishers: dict[str, _Publisher] = {}
         self._measurements: deque[tuple[int, str]] = deque(maxlen=MEASUREMENTS)
+        self._newest_ns: int | None = None  # of these: what is newer cannot be one of them
 
     def admit(self, publisher: str, number: int | None, now_s: float) -> int | None:
         """How many more numbers of this publisher are missing than before; None where it does not count. `now_s` must not run
@@ -106,7 +113,9 @@ class Guard:
             if found.stamp_ns is not None and stamp_ns <= found.stamp_ns:
                 raise BadMessage("replayed", f"without numbers, a stamp after {found.stamp_ns} expected, {stamp_ns} came")
             found.stamp_ns = stamp_ns
-        if (stamp_ns, camera) in self._measurements:
+        if self._newest_ns is None or stamp_ns > self._newest_ns:
+            self._newest_ns = stamp_ns
+        elif (stamp_ns, camera) in self._measurements:
             raise BadMessage("repeated", f"every measurement once expected, that of stamp {stamp_ns} came again")
         self._measurements.append((stamp_ns, camera))
         found.heard_s = now_s

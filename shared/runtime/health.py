@@ -1,14 +1,18 @@
-"""How a process fares, in one word and its reasons. ok: nothing to say; degraded: it works, but not as it should; down: it is cut
-off from the others."""
+"""How a process fares, in one word and its reasons.
+
+ok: nothing to say. starting: it prepares its work, or waits for a process that does. degraded: it works, but not as it should.
+down: it is cut off from the others.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Mapping, Sequence
 
-from shared.runtime.bus import Traffic
+from shared.runtime.traffic import Traffic
 
+STATUSES = ("ok", "starting", "degraded", "down")
 LATELY_S = 30.0
 """What happened longer ago than this says nothing about now."""
 
@@ -43,22 +47,57 @@ def counts(received: Mapping[str, Traffic], faults: Mapping[str, int]) -> dict[t
 
 
 def judge(
-    away: str, received: Mapping[str, Traffic], grown: Mapping[tuple[str, str], int], own: Sequence[str], now_ns: int
+    away: str,
+    received: Mapping[str, Traffic],
+    grown: Mapping[tuple[str, str], int],
+    own: Sequence[str],
+    now_ns: int,
+    progress: str = "",
+    waits: Callable[[Traffic], str] = lambda traffic: "",
 ) -> tuple[str, list[str]]:
-    """Status and reasons. away: why the others cannot be reached, empty where they can; received: what is read, by key; grown:
-    which of `counts` grew lately; own: what the service itself suffers from."""
-    reasons = [away] if away else []
+    """Status and reasons. away: why the others cannot be reached, empty where they can. received: what is read, by key. grown:
+    which of `counts` grew lately. own: what the service itself suffers from. progress: what it does before it can work. waits:
+    why an input that was never heard is not a fault yet, empty where it is one."""
+    missing: defaultdict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)  # by what is wrong, and pattern of keys
+    known: Counter[str] = Counter()
     for key, traffic in sorted(received.items()):
+        pattern = _pattern(key)
+        known[pattern] += 1
         if traffic.is_stale(now_ns):
             age_s = traffic.age_s(now_ns)
-            reasons.append(f"nothing heard on {_short(key)} yet" if age_s is None else f"no {_short(key)} for {age_s:.1f} s")
+            why = "late" if age_s is not None else waits(traffic)
+            missing[why, pattern].append((key, age_s or 0.0))
+    starting = [progress] if progress else []
+    degraded = [away] if away else []
+    for (why, pattern), found in missing.items():
+        which = _which([key for key, _ in found], pattern, known[pattern])
+        if why == "late":
+            degraded.append(f"no {which} for {max(age_s for _, age_s in found):.1f} s")
+        elif why:
+            starting.append(f"waiting for {which}: {why}")
+        else:
+            degraded.append(f"nothing heard on {which} yet")
     for key in sorted({key for key, _ in grown if key}):
         kinds = ", ".join(f"{n} {kind}" for (where, kind), n in sorted(grown.items()) if where == key)
-        reasons.append(f"refused on {_short(key)} in the last {LATELY_S:.0f} s: {kinds}")
+        degraded.append(f"refused on {_short(key)} in the last {LATELY_S:.0f} s: {kinds}")
     if faults := ", ".join(f"{n} {kind}" for (where, kind), n in sorted(grown.items()) if not where):
-        reasons.append(f"faults in the last {LATELY_S:.0f} s: {faults}")
-    reasons += own
-    return "down" if away else "degraded" if reasons else "ok", reasons
+        degraded.append(f"faults in the last {LATELY_S:.0f} s: {faults}")
+    degraded += own
+    status = "down" if away else "degraded" if degraded else "starting" if starting else "ok"
+    return status, degraded + starting
+
+
+def _pattern(key: str) -> str:
+    """The keys of a topic and kind of part with one pattern: `penumbra/{cell}/skin/*/voltages`."""
+    chunks = key.split("/")
+    return "/".join([*chunks[:3], "*", *chunks[4:]])
+
+
+def _which(keys: list[str], pattern: str, known: int) -> str:
+    """Keys of one pattern in words, of which so many are known in all."""
+    if len(keys) == 1:
+        return _short(keys[0])
+    return f"{_short(pattern)} ({len(keys)})" if len(keys) == known else f"{_short(pattern)} ({len(keys)} of {known})"
 
 
 def _short(key: str) -> str:

@@ -5,8 +5,7 @@ Counters are of the process that tells them and start anew with it, which is wha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
 from wsgiref.simple_server import WSGIServer
 
 from prometheus_client import CollectorRegistry, start_http_server
@@ -14,13 +13,14 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from shared.contract import processes
+from shared.contract.report import Report, TopicReport
 from shared.runtime import bus
+from shared.runtime.health import STATUSES
 
-STATUSES = ("ok", "degraded", "down")
 WHO = ("cell", "service", "instance", "host")
 """The labels of every metric."""
 
-Reports = Callable[[], Iterable[Mapping[str, Any]]]
+Reports = Callable[[], Iterable[Report]]
 
 
 def serve(address: str, port: int, reports: Reports) -> WSGIServer:
@@ -44,33 +44,32 @@ class _Collector(Collector):
         return metrics(self._reports())
 
 
-def metrics(reports: Iterable[Mapping[str, Any]]) -> Iterator[Metric]:
+def metrics(reports: Iterable[Report]) -> Iterator[Metric]:
     """The metrics of health reports. Times are in seconds, memory in bytes, CPU in cores."""
     families = _Families()
     for report in reports:
-        who = tuple(report[name] for name in WHO)
+        who = tuple(getattr(report, name) for name in WHO)
         for status in STATUSES:
-            families.gauge("status", "1 for the status that the process has", who, status == report["status"], status=status)
-        families.gauge("uptime_seconds", "since the process began", who, report["uptime_s"])
-        families.gauge("cpu_cores", "cores in use", who, report["cpu"])
-        families.gauge("memory_bytes", "resident memory", who, 1e6 * report["memory_mb"])
-        families.gauge("replicas", "living replicas of the service", who, report["replicas"])
-        for kind, count in report["faults"].items():
+            families.gauge("status", "1 for the status that the process has", who, status == report.status, status=status)
+        families.gauge("uptime_seconds", "since the process began", who, report.uptime_s)
+        families.gauge("cpu_cores", "cores in use", who, report.cpu)
+        families.gauge("memory_bytes", "resident memory", who, 1e6 * report.memory_mb)
+        families.gauge("replicas", "living replicas of the service", who, report.replicas)
+        for kind, count in report.faults.items():
             families.counter("faults", "exceptions by kind and place", who, count, kind=kind)
-        for key, traffic in report["topics"].items():
+        for key, traffic in report.topics.items():
             _traffic(families, "received", who, key, traffic)
-        for key, traffic in report["published"].items():
+        for key, traffic in report.published.items():
             _traffic(families, "published", who, key, traffic)
         _own(families, who, report)
     return iter(families)
 
 
-def _own(families: _Families, who: tuple[str, ...], report: Mapping[str, Any]) -> None:
+def _own(families: _Families, who: tuple[str, ...], report: Report) -> None:
     """The metrics of a service's own report that its row of the table of processes names."""
-    process = processes.find(report["service"])
-    told = report.get("report", {})
+    process = processes.find(report.service)
     for metric in process.metrics if process else ():
-        for entry, row in (told.get(metric.within, {}) if metric.within else told).items():
+        for entry, row in (report.report.get(metric.within, {}) if metric.within else report.report).items():
             label = {metric.each: entry}
             if metric.is_counter:
                 families.counter(metric.name, metric.about, who, row[metric.field], **label)
@@ -81,23 +80,23 @@ def _own(families: _Families, who: tuple[str, ...], report: Mapping[str, Any]) -
                 families.gauge(metric.name, metric.about, who, row[metric.field], **label)
 
 
-def _traffic(families: _Families, way: str, who: tuple[str, ...], key: str, traffic: Mapping[str, Any]) -> None:
+def _traffic(families: _Families, way: str, who: tuple[str, ...], key: str, traffic: TopicReport) -> None:
     topic = bus.topic_of(key.partition(" #")[0])
     labels = {"topic": topic.name if topic else "", "key": key}
-    families.counter(f"{way}_messages", f"good messages {way}", who, traffic["count"], **labels)
-    families.gauge(f"{way}_hertz", f"messages {way} a second", who, traffic["rate_hz"], **labels)
-    if traffic["age_s"] is not None:
-        families.gauge(f"{way}_age_seconds", "since the newest measurement", who, traffic["age_s"], **labels)
+    families.counter(f"{way}_messages", f"good messages {way}", who, traffic.count, **labels)
+    families.gauge(f"{way}_hertz", f"messages {way} a second", who, traffic.rate_hz, **labels)
+    if traffic.age_s is not None:
+        families.gauge(f"{way}_age_seconds", "since the newest measurement", who, traffic.age_s, **labels)
     if way == "published":
         return
-    if traffic["delay_s"] is not None:
-        families.gauge("received_delay_seconds", "from the newest measurement to its arrival", who, traffic["delay_s"], **labels)
-    families.gauge("stale", "1 for an input that is missing", who, traffic["stale"], **labels)
-    if traffic["dropped"] is not None:
+    if traffic.delay_s is not None:
+        families.gauge("received_delay_seconds", "from the newest measurement to its arrival", who, traffic.delay_s, **labels)
+    families.gauge("stale", "1 for an input that is missing", who, traffic.stale, **labels)
+    if traffic.dropped is not None:
         families.counter(
-            "dropped_messages", "messages that the publisher sent and that never came", who, traffic["dropped"], **labels
+            "dropped_messages", "messages that the publisher sent and that never came", who, traffic.dropped, **labels
         )
-    for kind, count in traffic["bad"].items():
+    for kind, count in traffic.bad.items():
         families.counter("refused_messages", "messages refused by kind", who, count, **labels, kind=kind)
 
 

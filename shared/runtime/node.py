@@ -5,19 +5,22 @@ def start(node, options):                     # wires; nothing is received befor
     node.every(0.005, publish_pose)
 
 node.run()                                    # until SIGINT or SIGTERM
+
+Threads. Each subscription calls its handler in a thread of its own, one message after another: two handlers of one service run
+at the same time, and so do timers (`every`), answers (`answer`) and whatever the health report calls (`tell`, `worry`). What two
+of them share is owned by one of them and only read by the others as a whole (an attribute or a dictionary's value that is
+replaced, never a container that changes while somebody iterates over it), or has a lock. `latest` may be looked at from any
+thread.
 """
 
 from __future__ import annotations
 
-import itertools
 import json
-import math
 import os
 import re
 import secrets
 import signal
 import socket
-import string
 import threading
 import time
 import traceback
@@ -27,36 +30,71 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, cast
+from typing import Any, Protocol
 
 import psutil
 import zenoh
 
 from shared.cell import description as cell
 from shared.contract import topics
-from shared.contract.messages import VERSION, BadMessage, Message, encode
-from shared.contract.topics import QoS, Topic
+from shared.contract.messages import VERSION, Message
+from shared.contract.report import Report
+from shared.contract.topics import Topic
 from shared.runtime import bus, health, logs
-from shared.runtime.guard import Guard
-from shared.runtime.hang import HANG_S, Turn
-from shared.runtime.replicas import Clock, Pace, Replicas, Share
+from shared.runtime.fitness import Fitness
+from shared.runtime.hang import HANG_S
+from shared.runtime.link import CLOSE_S, Link
+from shared.runtime.logs import Log
+from shared.runtime.progress import Progress, Waiting
+from shared.runtime.queries import Answer, Queries
+from shared.runtime.reader import Latest
+from shared.runtime.replicas import Replicas
+from shared.runtime.slow_links import SlowLinks
+from shared.runtime.streams import Handler, Streams
 
-CLOSE_S = 0.8
-"""Closing a session on a bad network may take much longer; a process that ends does not wait for that."""
+__all__ = ["CLOSE_S", "LatestMessages", "Node", "ServiceNode"]
+
 FRAMES_UNDER_WAY = 3
 """Of each camera, in shared memory: one that is written and two that are read."""
-QUERY_DEPTH = 32
 NEWS_S = 0.2
 """Within this a session has heard which replicas there are."""
-LOOK_S = 0.2
-"""How often it is looked whether this replica is fit for its part."""
-UNWATCHED_S = 5.0
-"""After so long without a look what looks hangs itself, as where it wants a thread that has no memory to begin."""
 WARM_UP_S = 2.0
 """How long a replica that joins others may listen before it takes its share."""
+ASK_S = 0.5
+"""How long the publishers of a missing input may take to say how far they are."""
 
 
-Answer = Callable[[dict[str, str], bytes], "bytes | tuple[bytes, str]"]
+class LatestMessages(Protocol):
+    """The newest message of each key of a topic."""
+
+    def get(self, **names: str) -> Any:
+        """The newest message of the key with these names, None where there was none."""
+
+    def drain(self) -> int:
+        """Takes in what has come; the number of good messages so far."""
+
+
+class ServiceNode(Protocol):
+    """What the `start` of a service may use: the node on the bus has it, and so has that of a replay."""
+
+    @property
+    def cell(self) -> cell.Cell: ...
+    @property
+    def log(self) -> Log: ...
+    def now_ns(self) -> int: ...
+    def publish(self, topic: Topic, message: Message, **names: str) -> None: ...
+    def subscribe(
+        self, topic: Topic, handler: Handler, streams: Sequence[str] = (), from_others: bool = False, **names: str
+    ) -> None: ...
+    def latest(self, topic: Topic, from_others: bool = False, **names: str) -> LatestMessages: ...
+    def answer(self, key: str, function: Answer) -> None: ...
+    def every(self, period_s: float, function: Callable[[], None], patience_s: float = HANG_S) -> None: ...
+    def owns(self, stream: str) -> bool: ...
+    def rank(self, stream: str) -> float: ...
+    def progress(self, what: str, done: int, total: int) -> None: ...
+    def tell(self, name: str, function: Callable[[], Any]) -> None: ...
+    def worry(self, function: Callable[[], Sequence[str]]) -> None: ...
+    def warm_when(self, function: Callable[[], bool]) -> None: ...
 
 
 class Node:
@@ -71,59 +109,79 @@ class Node:
     def __init__(self, service: str, cell: cell.Cell, connection: bus.Connection = bus.Connection()):  # noqa: B008 (frozen)
         frames = sum(3 * camera.width * camera.height for camera in cell.cameras.values())
         pool_bytes = max(bus.POOL_BYTES, FRAMES_UNDER_WAY * frames)
-        self.service, self.cell, self.connection = service, cell, replace(connection, service=service, pool_bytes=pool_bytes)
-        self._needs_router = bus.mode(self.connection) == "client"  # refuses a bad configuration before anything else is done
+        self.service, self.cell = service, cell
         self.instance = f"{_safe(socket.gethostname())}-{os.getpid()}-{secrets.token_hex(2)}"
         self.log = logs.get(service, instance=self.instance)
         self.stopping = threading.Event()
-        self.session: zenoh.Session | None = None
-        self._pending: list[Callable[[], None]] = []
-        self._threads: list[threading.Thread] = []
-        self._received: dict[str, bus.Traffic] = {}
-        self._published: dict[str, bus.Traffic] = {}
-        self._publishers: dict[tuple[str, ...], tuple[zenoh.Publisher, bus.Traffic, zenoh.EntityGlobalId, itertools.count]] = {}
+        self._link = Link(replace(connection, service=service, pool_bytes=pool_bytes), self.stopping, self.log)
+        self._is_open = False
+        self.replicas = Replicas(topics.alive(self.cell.name, service, self.instance))
+        self._fitness = Fitness(self.replicas, self.log)
+        self._streams = Streams(cell, self._link, self.replicas, lambda: self.now_ns(), self._fitness.turn, self.fault, self.log)
+        self._queries = Queries(service, self._link, self.fault)
+        self._progress = Progress(self.log)
+        self._is_announced = False
+        self._waiting = Waiting(lambda name: self.query(topics.health(cell.name, name), timeout_s=ASK_S))
         self._faults: dict[str, int] = {}
         self._lately = health.Lately()
-        self.report: dict[str, Callable[[], Any]] = {}
-        self.worries: Callable[[], Sequence[str]] = list  # what the service itself suffers from, in words
-        self._turns: list[Turn] = []
-        self._hang = ""  # the handler that hangs, in words
-        self._looked_s = math.inf  # when it was last looked whether this replica is fit
-        self._slowness = ""  # that this process does not get its time, in words
-        self._clock, self._pace = Clock(), Pace()
-        self.is_warm: Callable[[], bool] = lambda: True  # whether it could go on with what another replica does
-        self.replicas = Replicas(topics.alive(self.cell.name, service, self.instance))
+        self._tells: dict[str, Callable[[], Any]] = {}
+        self._worries: list[Callable[[], Sequence[str]]] = []
+        self._warm: list[Callable[[], bool]] = []
         self._process = psutil.Process()
         self._cpu = 0.0
         self._started = time.monotonic()
-        self._reachable = False
-        self._other_versions = itertools.count()
+
+    @property
+    def connection(self) -> bus.Connection:
+        """How the others are reached."""
+        return self._link.connection
+
+    @property
+    def session(self) -> zenoh.Session | None:
+        """The Zenoh session, None before it is open and after the node is closed."""
+        return self._link.session
 
     # ---- life
 
     def open(self, patience_s: float = float("inf")) -> Node:
         """Opens the session, waiting for the router, and declares what was asked for. Raises bus.BusError."""
-        self.session = bus.open_session(self.connection, self.stopping, self._tell_waiting, patience_s)
-        self._reachable = True
+        session = self._link.open(patience_s)
+        self._is_open = True
         if not self.is_warm():
             self.replicas.wait()
-        session = self.session
-        self._spawn(lambda: self.replicas.watch(session), "replicas")
-        self.answer(topics.health(self.cell.name, self.service, self.instance), self._answer_health)
-        for declare in self._pending:
-            declare()
-        self._pending.clear()
+        self._link.spawn(lambda: self.replicas.watch(session), "replicas")
+        self._announce(session)
+        self._link.declare_all()
         self._come_alive()
         self._process.cpu_percent()
-        self.every(1.0, self._keep_house)
-        self._spawn(self._watch_fitness, "watch fitness")
+        self.every(1.0, self._keep_house, HANG_S + len(topics.TOPICS) * ASK_S)
+        self._link.spawn(self._watch_fitness, "watch fitness")
         self.log.info("on the bus", at=", ".join(self.connection.listen) or self.connection.where)
         return self
+
+    def _announce(self, session: zenoh.Session) -> None:
+        """Answers the health query from now on."""
+        if not self._is_announced:
+            self._is_announced = True
+            self._queries.serve(session, topics.health(self.cell.name, self.service, self.instance), self._answer_health)
+
+    def _announce_early(self) -> None:
+        """Lets others see how far a process is that is not open yet."""
+        try:
+            self._announce(self._link.open(float("inf")))
+        except bus.BusError:  # `open` raises it again
+            return
+
+    def _watch_fitness(self) -> None:
+        received = self._streams.received
+        self._fitness.watch(self.stopping, lambda: list(received.values()), self._come_alive, self._streams.drain)
 
     def _come_alive(self) -> None:
         """The last step: who is alive can be asked, is listening, and owns streams. Beside living replicas a service warms up
         first, for at most WARM_UP_S; alone, a cold one is better than none."""
-        session = cast(zenoh.Session, self.session)
+        session = self.session
+        if session is None:
+            return
 
         def warm_up() -> None:
             began = time.monotonic()
@@ -133,7 +191,7 @@ class Node:
             self.replicas.join(session)
 
         if not self.is_warm():
-            self._spawn(warm_up, "warm up")
+            self._link.spawn(warm_up, "warm up")
         else:
             self.replicas.join(session)
 
@@ -164,19 +222,10 @@ class Node:
     def close(self) -> None:
         """Leaves the bus and ends the node's threads, within about CLOSE_S."""
         self.stopping.set()
-        if self.session is None:
-            return
-        readers = self.replicas.leave()
-        session, self.session = self.session, None
-        deadline = time.monotonic() + CLOSE_S
-        closing = threading.Thread(target=session.close, name="close", daemon=True)
-        closing.start()
-        for thread in (closing, *self._threads, *(reader.thread for reader in readers)):
-            if thread is not threading.current_thread():
-                thread.join(max(0.0, deadline - time.monotonic()))
+        self._link.close(reader.thread for reader in self.replicas.leave())
 
     def __enter__(self) -> Node:
-        return self if self.session else self.open()
+        return self if self._is_open else self.open()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
@@ -195,43 +244,10 @@ class Node:
     def publish(self, topic: Topic, message: Message, **names: str) -> None:
         """Sends a message. names: every {name} of the topic's key, e.g. camera="front". Raises CellError for a name that the cell
         does not have, BadMessage for an array of the wrong dtype or shape."""
-        session = self.session
-        if session is None:
-            return
-        identity = (topic.name, *names.values())
-        found = self._publishers.get(identity)
-        if found is None:
-            found = self._publishers.setdefault(identity, self._declare_publisher(session, topic, names))
-        publisher, traffic, source, numbers = found
-        payload = encode(message)
-        try:
-            publisher.put(payload, source_info=zenoh.SourceInfo(source, next(numbers) & 0xFFFFFFFF))
-        except zenoh.ZError:
-            if self.session is not None:  # else: closed meanwhile
-                raise
-            return
-        traffic.took(message.stamp_ns, self.now_ns())
-
-    def _declare_publisher(self, session: zenoh.Session, topic: Topic, names: dict[str, str]) -> Any:
-        missing = [name for name in _names(topic) if name not in names]
-        if missing:
-            raise ValueError(f"publishing {topic.name} needs {', '.join(f'{name}=' for name in missing)}")
-        (key,) = self.keys(topic, names)
-        publisher = session.declare_publisher(
-            key,
-            congestion_control=zenoh.CongestionControl.BLOCK if topic.qos is QoS.NEVER_DROP else zenoh.CongestionControl.DROP,
-            priority=getattr(zenoh.Priority, topic.priority.value),
-        )
-        traffic = self._published.setdefault(key, bus.Traffic(topic.stale_s))
-        return publisher, traffic, publisher.id, itertools.count()
+        self._streams.publish(topic, message, names)
 
     def subscribe(
-        self,
-        topic: Topic,
-        handler: Callable[[Any, dict[str, str]], None],
-        streams: Sequence[str] = (),
-        from_others: bool = False,
-        **names: str,
+        self, topic: Topic, handler: Handler, streams: Sequence[str] = (), from_others: bool = False, **names: str
     ) -> None:
         """Calls `handler(message, names)` for every good message, in a thread of this subscription.
 
@@ -244,71 +260,18 @@ class Node:
         service divide the messages, and none receives what another one works on. from_others: leaves out what this node
         publishes itself.
         """
-        keys = self.keys(topic, names)
-        if not keys:
-            self.log.info("nothing to read: the cell has no such part", topic=topic.name)
-            return
-        expression = next(iter(keys)) if len(keys) == 1 else topic.at(cell=self.cell.name, **names)
-        stale_s = math.inf if from_others else topic.stale_s  # there need not be others
-        table = {key: (found, self._count(key, stale_s), Guard(self._rate_hz(topic, found))) for key, found in keys.items()}
-        strangers = (
-            bus.Traffic(float("inf")) if len(keys) == 1 else self._received.setdefault(expression, bus.Traffic(float("inf")))
-        )
+        self._streams.subscribe(topic, handler, streams, from_others, names)
 
-        turn = self._turn(f"reader of {expression}")
-
-        def read() -> bus.Reader:
-            return bus.Reader(
-                cast(zenoh.Session, self.session),
-                expression,
-                topic.depth * len(keys),
-                topic,
-                table,
-                strangers,
-                handler,
-                self.now_ns,
-                self._refused,
-                self.fault,
-                from_others,
-                turn,
-            )
-
-        if streams:
-            share = Share(tuple(streams), [traffic for _, traffic, _ in table.values()], read)
-            self._declare(lambda: self.replicas.share(share))
-        else:
-            self._declare(lambda: self._threads.append(read().thread))
-
-    def _turn(self, what: str, patience_s: float = HANG_S) -> Turn:
-        self._turns.append(turn := Turn(what, patience_s))
-        return turn
-
-    def _rate_hz(self, topic: Topic, names: dict[str, str]) -> float:
-        """How often a key's publisher sends: as the table says, but for what follows the cameras' own rates."""
-        rates = {name: camera.rate_hz for name, camera in self.cell.cameras.items()}
-        if topic.by_camera:
-            return max(topic.rate_hz, sum(rates.values()))
-        return max(topic.rate_hz, rates.get(names.get("camera", ""), 0.0))
-
-    def _count(self, key: str, stale_s: float) -> bus.Traffic:
-        """Counters for one more reader of a key."""
-        readers = sum(1 for known in self._received if known.partition(" #")[0] == key)
-        traffic = bus.Traffic(stale_s)
-        self._received[key if not readers else f"{key} #{readers + 1}"] = traffic
-        return traffic
+    def latest(self, topic: Topic, from_others: bool = False, **names: str) -> Latest[Any]:
+        """The newest message of each key, for whoever looks less often than messages come: only those that are looked at are
+        decoded, and nothing wakes up when one comes. They are guarded, counted and missed like those of `subscribe`, except for
+        their delay, which nobody knows. names, from_others: as in `subscribe`."""
+        return self._streams.latest(topic, from_others, names)
 
     def keys(self, topic: Topic, names: dict[str, str]) -> dict[str, dict[str, str]]:
         """Every concrete key of a topic in this cell with its names, some of them fixed; none where the cell has no such part.
         Raises CellError for a name that the cell does not have."""
-        values: list[Sequence[str]] = []
-        for name in _names(topic):
-            kind = cast(Literal["cameras", "robots", "pads", "targets"], f"{name}s")
-            values.append([self.cell.one(kind, names[name])] if name in names else list(getattr(self.cell, kind)))
-        unknown = names.keys() - set(_names(topic))
-        if unknown:
-            raise ValueError(f"topic {topic.name} has the names {', '.join(_names(topic))}, not {', '.join(sorted(unknown))}")
-        combinations = (dict(zip(_names(topic), choice, strict=True)) for choice in itertools.product(*values))
-        return {topic.at(cell=self.cell.name, **found): found for found in combinations}
+        return self._streams.keys(topic, names)
 
     # ---- queries
 
@@ -316,47 +279,24 @@ class Node:
         """Answers queries on `key` with `function(parameters, payload)`: bytes, or bytes and their encoding. A ValueError becomes
         an error reply with its text. While it warms up, or is unfit, beside others, it leaves the answers to them."""
 
-        def serve(queryable: Any) -> None:
-            while True:
-                try:
-                    query = queryable.recv()
-                except zenoh.ZError:
-                    return
-                with query:
-                    self._reply(key, query, function)
-
-        def declare() -> None:
-            queryable = cast(zenoh.Session, self.session).declare_queryable(key, zenoh.handlers.RingChannel(QUERY_DEPTH))
-            self._spawn(lambda: serve(queryable), f"answer {key}")
-
-        self._declare(declare)
-
-    def _reply(self, key: str, query: zenoh.Query, function: Answer) -> None:
-        parameters = dict(cast(Any, query.parameters))
-        try:
-            if not self.replicas.has_joined and self.replicas.others and function != self._answer_health:
+        def answer(parameters: dict[str, str], payload: bytes) -> bytes | tuple[bytes, str]:
+            if not self.replicas.has_joined and self.replicas.others:
                 raise ValueError(f"{self.service} {self.instance} has no part now: ask the others")
-            result = function(parameters, query.payload.to_bytes() if query.payload is not None else b"")
-        except ValueError as error:
-            query.reply_err(str(error).encode())
-        except Exception as error:
-            self.fault(f"answer on {key}", error)
-            query.reply_err(f"{self.service} failed: {type(error).__name__}: {error}".encode())
-        else:
-            payload, encoding = result if isinstance(result, tuple) else (result, None)
-            query.reply(key, payload, encoding=encoding)
+            return function(parameters, payload)
+
+        self._queries.answer(key, answer)
 
     def query(self, key: str, parameters: str = "", payload: bytes | None = None, timeout_s: float = 1.0) -> list[bytes]:
         """The payloads of all answers; none where nobody answers. Raises bus.Refused where the only answers are errors."""
-        return bus.ask(self.session, key, parameters, payload, timeout_s) if self.session else []
+        return self._queries.ask(key, parameters, payload, timeout_s)
 
-    # ---- time, replicas, health
+    # ---- time and replicas
 
     def every(self, period_s: float, function: Callable[[], None], patience_s: float = HANG_S) -> None:
         """Calls `function` every `period_s` in a thread of its own; turns that are missed are left out, not made up for. A turn
         hangs that takes `patience_s` longer than usual: infinite for one that returns when the node stops."""
         what = f"timer {getattr(getattr(function, 'func', function), '__name__', '')} of {period_s} s"
-        turn = self._turn(what, patience_s)
+        turn = self._fitness.turn(what, patience_s)
 
         def loop() -> None:
             due = time.monotonic()
@@ -368,31 +308,7 @@ class Node:
                     self.fault(what, error)
                 due = max(due + period_s, time.monotonic() - period_s)
 
-        self._declare(lambda: self._spawn(loop, f"every {period_s} s"))
-
-    def _watch_fitness(self) -> None:
-        """While a handler hangs, this process stands still or its clock is off, it has no part where others live: its streams are
-        theirs until it is fit again."""
-        self._looked_s, has_withdrawn = time.monotonic(), False
-        while not self.stopping.wait(LOOK_S):
-            now_s = time.monotonic()
-            late_s, self._looked_s = now_s - self._looked_s - LOOK_S, now_s
-            self._slowness = self._pace.judge(late_s, LOOK_S)
-            if late_s < LOOK_S:  # else the whole process stood still
-                longest_s, what = max(((turn.hangs_s(now_s), turn.what) for turn in self._turns), default=(0.0, ""))
-                self._hang = f"{what} hangs for {longest_s:.0f} s" if longest_s else ""
-            unfit = self._hang or self._slowness or self._clock.judge(self._received.values(), now_s)
-            try:
-                if unfit and self.replicas.has_joined and self.replicas.others:
-                    self.log.warning("unfit: the other replicas take over", why=unfit)
-                    has_withdrawn = True
-                    self.replicas.withdraw()
-                elif has_withdrawn and not unfit:
-                    self.log.info("fit again")
-                    has_withdrawn = False
-                    self._come_alive()
-            except zenoh.ZError:  # the session was closed
-                return
+        self._link.declare(lambda _: self._link.spawn(loop, f"every {period_s} s"))
 
     def owns(self, stream: str) -> bool:
         """Whether this replica is the one of the living replicas of its service that handles `stream`. While the news of a
@@ -403,53 +319,68 @@ class Node:
         """How many living replicas are before this one to handle `stream`; infinity where this one has no part now."""
         return self.replicas.rank(stream)
 
+    # ---- what a service says of itself
+
+    def progress(self, what: str, done: int, total: int) -> None:
+        """Says how far the service is with what it must do before it can work, as in `progress("compiling", 12, 40)`; the last
+        step ends it. Until then its status is `starting` with the reason `compiling 12 of 40`, on the bus also before the node is
+        open, and so is that of whoever waits for it; the log has a line every 2 s."""
+        self._progress.set(what, done, total)
+        if not self._is_announced and not self.stopping.is_set():
+            self._link.spawn(self._announce_early, "announce")
+
+    def tell(self, name: str, function: Callable[[], Any]) -> None:
+        """Adds what `function` returns, as JSON, to the health report under `report` and this name."""
+        self._tells[name] = function
+
+    def worry(self, function: Callable[[], Sequence[str]]) -> None:
+        """Adds the reasons that `function` returns, in words: while there are any, the status is `degraded`."""
+        self._worries.append(function)
+
+    def warm_when(self, function: Callable[[], bool]) -> None:
+        """Has a replica join the others only when `function` says that it could go on with what another one does."""
+        self._warm.append(function)
+
+    def is_warm(self) -> bool:
+        """Whether this replica could go on with what another one does."""
+        return all(function() for function in self._warm)
+
+    def thin_out(self, slow: SlowLinks) -> None:
+        """Has a router send little over some of its links; before it is open."""
+        self._link.connection = replace(self.connection, slow=slow)
+
+    def report(self) -> Report:
+        """What this instance is and how it fares."""
+        self._streams.drain()
+        now_ns = self.now_ns()
+        status, reasons = self._judge(self._look(), now_ns)
+        received, published = self._streams.received, self._streams.published
+        return Report(
+            service=self.service,
+            instance=self.instance,
+            status=status,
+            reasons=reasons,
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            cell=self.cell.name,
+            wire_version=VERSION,
+            ready=self.replicas.has_joined,
+            hangs=self._fitness.hangs(),
+            progress=str(self._progress),
+            uptime_s=round(time.monotonic() - self._started, 1),
+            cpu=round(self._cpu, 3),
+            memory_mb=round(self._process.memory_info().rss / 1e6, 1),
+            replicas=len(self.replicas),
+            topics={key: traffic.report(now_ns) for key, traffic in sorted(received.items())},
+            published={key: traffic.report(now_ns) for key, traffic in sorted(published.items())},
+            stale=sorted(key for key, traffic in received.items() if traffic.is_stale(now_ns)),
+            faults=dict(self._faults),
+            report={name: function() for name, function in list(self._tells.items())},
+        )
+
     def health(self) -> dict[str, Any]:
-        """What this instance is and how it fares, as JSON: its status and the reasons for it (`shared.runtime.health`), CPU in
-        cores, memory in MB, counters of every topic, and what the service tells of itself in `report`: JSON by name, from a
-        function each."""
-        now = self.now_ns()
-        status, reasons = health.judge(self._away(), self._received, self._look(), self._suffers(), now)
-        return {
-            "service": self.service,
-            "instance": self.instance,
-            "status": status,
-            "reasons": reasons,
-            "host": socket.gethostname(),
-            "pid": os.getpid(),
-            "cell": self.cell.name,
-            "wire_version": VERSION,
-            "ready": self.replicas.has_joined,
-            "hangs": self._hangs(),
-            "uptime_s": round(time.monotonic() - self._started, 1),
-            "cpu": round(self._cpu, 3),
-            "memory_mb": round(self._process.memory_info().rss / 1e6, 1),
-            "replicas": len(self.replicas),
-            "topics": {key: traffic.report(now) for key, traffic in sorted(self._received.items())},
-            "published": {key: traffic.report(now) for key, traffic in sorted(self._published.items())},
-            "stale": sorted(key for key, traffic in self._received.items() if traffic.is_stale(now)),
-            "faults": dict(self._faults),
-            **({"report": {name: tell() for name, tell in self.report.items()}} if self.report else {}),
-        }
-
-    def _answer_health(self, parameters: dict[str, str], payload: bytes) -> bytes:
-        return json.dumps(self.health()).encode()
-
-    def _suffers(self) -> list[str]:
-        return [*filter(None, [self._hangs(), self._slowness, self._clock.fault]), *self.worries()]
-
-    def _hangs(self) -> str:
-        """What hangs, in words; empty where nothing does."""
-        is_watched = time.monotonic() - self._looked_s < UNWATCHED_S
-        return self._hang if is_watched else f"nobody has looked after this process for {UNWATCHED_S:g} s"
-
-    def _look(self) -> Counter[tuple[str, str]]:
-        return self._lately.look(health.counts(self._received, self._faults), time.monotonic())
-
-    def _away(self) -> str:
-        """Why the others cannot be reached; empty where they can."""
-        if self.session is None:
-            return "not on the bus"
-        return "" if self._reachable else f"no router at {self.connection.where}"
+        """The report as JSON objects."""
+        return self.report().as_json()
 
     def fault(self, where: str, error: Exception) -> None:
         """Counts an exception; the first of its kind and place is logged with its trace. Raises a MemoryError again: what is out
@@ -463,52 +394,36 @@ class Node:
         if self._faults[kind] == 1:
             self.log.error(f"{type(error).__name__}: {error}", where=where, at=place, exc_info=error)
 
-    def _refused(self, key: str, error: BadMessage) -> None:
-        """Told of the first bad message of each kind on a key. Another release speaks on many keys at once: it is told once."""
-        if error.kind == "version" and next(self._other_versions):
-            return
-        self.log.warning("message refused; more of this kind are only counted", key=key, kind=error.kind, why=str(error))
+    def _answer_health(self, parameters: dict[str, str], payload: bytes) -> bytes:
+        return json.dumps(self.health()).encode()
 
-    def _tell_waiting(self) -> None:
-        self.log.warning(f"waiting for the router {self.connection.whereabouts}: start `penumbra router` or `penumbra up`")
+    def _judge(self, grown: Counter[tuple[str, str]], now_ns: int) -> tuple[str, list[str]]:
+        """Status and reasons; grown: what happened lately."""
+        if not self._is_open and self.session is not None:  # early on the bus: nothing is read yet
+            return health.judge("", {}, grown, [], now_ns, str(self._progress) or "not ready yet")
+        own = [*self._fitness.faults(), *(reason for worry in self._worries for reason in worry())]
+        progress = str(self._progress)
+        return health.judge(self._link.away(), self._streams.received, grown, own, now_ns, progress, self._waiting.why)
+
+    def _look(self) -> Counter[tuple[str, str]]:
+        return self._lately.look(health.counts(self._streams.received, self._faults), time.monotonic())
 
     def _keep_house(self) -> None:
         """Once a second: CPU, what should not happen, the state of the link, and the heartbeat file that a container's health
         check reads: the status and its reasons, in words."""
         self._cpu = self._process.cpu_percent() / 100
         grown = self._look()
-        session = self.session
-        if session is None:
+        if self.session is None:
             return
-        reachable = not self._needs_router or bool(session.info.routers_zid())
-        if reachable != self._reachable:
-            self._reachable = reachable
-            if reachable:
-                self.log.info("the router is back")
-            else:
-                self._tell_waiting()
+        self._link.look()
+        self._waiting.look(list(self._streams.received.values()), self.now_ns())
         heartbeat = os.environ.get("PENUMBRA_HEARTBEAT")
         if heartbeat:
-            status, reasons = health.judge(self._away(), self._received, grown, self._suffers(), self.now_ns())
+            self._streams.drain()
+            status, reasons = self._judge(grown, self.now_ns())
             fresh = Path(f"{heartbeat}.new")
             fresh.write_text(": ".join([status, "; ".join(reasons)]).removesuffix(": ") + "\n")
             fresh.replace(heartbeat)  # nobody reads half of it
-
-    def _declare(self, declare: Callable[[], None]) -> None:
-        if self.session is None:
-            self._pending.append(declare)
-        else:
-            declare()
-
-    def _spawn(self, function: Callable[[], None], name: str) -> None:
-        thread = threading.Thread(target=function, name=name, daemon=True)
-        self._threads.append(thread)
-        thread.start()
-
-
-def _names(topic: Topic) -> tuple[str, ...]:
-    """The {names} of a topic's key, without the cell's."""
-    return tuple(name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell")
 
 
 def _safe(text: str) -> str:

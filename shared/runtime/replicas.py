@@ -14,7 +14,7 @@ from typing import Protocol
 
 import zenoh
 
-from shared.runtime.bus import Traffic
+from shared.runtime.traffic import Traffic
 
 CLOCK_S = 1.0
 """Over which messages are counted to tell whether a process has another time than all others."""

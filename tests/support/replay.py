@@ -22,6 +22,8 @@ from shared.contract import topics
 from shared.contract.messages import Message, decode, encode
 from shared.contract.topics import Topic
 from shared.runtime import logs
+from shared.runtime.hang import HANG_S
+from shared.runtime.node import ServiceNode
 
 SERVICES = ("segmentation", "search", "haptics", "fusion")
 DELAY_NS = {topics.FRAME: 2_000_000, topics.MASK: 30_000_000, topics.VISION: 5_000_000, topics.HAPTIC: 1_000_000}
@@ -107,13 +109,38 @@ class Replay:
                 handler(message, names | {"publisher": topic.publishers[0]})
 
 
-class ReplayNode:
-    """What a service's `start` sees of `shared.runtime.node.Node`, on the replay's clock; a handler's exception ends it."""
+class ReplayLatest:
+    """The newest message of each key that was delivered."""
+
+    def __init__(self) -> None:
+        self._newest: dict[frozenset[tuple[str, str]], Any] = {}
+        self._count = 0
+
+    def hear(self, message: Any, names: dict[str, str]) -> None:
+        self._newest[frozenset((name, value) for name, value in names.items() if name != "publisher")] = message
+        self._count += 1
+
+    def get(self, **names: str) -> Any:
+        return self._newest.get(frozenset(names.items()))
+
+    def drain(self) -> int:
+        return self._count
+
+
+class ReplayNode(ServiceNode):
+    """A `ServiceNode` on the replay's clock; a handler's exception ends it."""
 
     def __init__(self, replay: Replay, service: str):
-        self._replay, self.cell, self.log = replay, replay.cell, logs.get(service)
-        self.report: dict[str, Callable[[], Any]] = {}
-        self.is_warm: Callable[[], bool] = lambda: True
+        self._replay, self._log = replay, logs.get(service)
+        self._warm: list[Callable[[], bool]] = []
+
+    @property
+    def cell(self) -> cells.Cell:
+        return self._replay.cell
+
+    @property
+    def log(self) -> logs.Log:
+        return self._log
 
     def now_ns(self) -> int:
         return self._replay.now_ns
@@ -133,7 +160,27 @@ class ReplayNode:
         if not from_others:
             self._replay.listen(topic, names, handler)
 
-    def every(self, period_s: float, function: Callable[[], None]) -> None:
+    def latest(self, topic: Topic, from_others: bool = False, **names: str) -> ReplayLatest:
+        latest = ReplayLatest()
+        self.subscribe(topic, latest.hear, from_others=from_others, **names)
+        return latest
+
+    def progress(self, what: str, done: int, total: int) -> None:
+        """Nobody asks during a replay."""
+
+    def tell(self, name: str, function: Callable[[], Any]) -> None:
+        """Nobody asks during a replay."""
+
+    def worry(self, function: Callable[[], Sequence[str]]) -> None:
+        """Nobody asks during a replay."""
+
+    def warm_when(self, function: Callable[[], bool]) -> None:
+        self._warm.append(function)
+
+    def is_warm(self) -> bool:
+        return all(function() for function in self._warm)
+
+    def every(self, period_s: float, function: Callable[[], None], patience_s: float = HANG_S) -> None:
         self._replay.every(round(period_s * 1e9), function)
 
     def answer(self, key: str, function: Callable[[dict[str, str], bytes], Any]) -> None:

@@ -278,6 +278,6 @@ def test_a_turned_pad_stands_out_by_its_misfit_in_the_health(table: cells.Cell, 
         window = VoltageWindow((i + 1) * 10 * MS, (i + 1) * 10 * MS, amplitude, np.full(40, 10), {})
         estimate = which.update(window.stamp_ns, window.amplitude, window.samples, skin.T_world_pads())
         misfits.update(estimate, skin, window.samples)
-    told = {name: tell() for name, tell in node.report.items()}
+    told = node.report().report
     assert max(told, key=told.__getitem__) == "misfit/p1" and told["misfit/p1"] > 6.0
     assert np.abs(rigid.pose_error(T, which.pose)[:3]).max() < 0.01

@@ -19,6 +19,7 @@ from shared.contract import messages, topics
 from shared.runtime import bus
 from shared.runtime.guard import RATE_TIMES
 from shared.runtime.node import Node
+from shared.runtime.traffic import RATE_WINDOW_S, Rate
 from tests.support.live import free_port, wait_for
 from tests.support.nodes import pose
 
@@ -283,18 +284,18 @@ def test_a_camera_may_send_at_the_rate_that_the_cell_gives_it(tmp_path):
     path = tmp_path / "cell.yaml"
     path.write_text((cells.BUILT_IN / "table.yaml").read_text().replace("rate_hz: 20", "rate_hz: 300", 1))
     node = Node("test", cells.load(path))
-    rates = [node._rate_hz(topic, {"camera": "front"}) for topic in (topics.FRAME, topics.MASK)]
-    rates += [node._rate_hz(topic, {"target": "forearm"}) for topic in (topics.VISION, topics.FUSED)]
+    rates = [node._streams.rate_hz(topic, {"camera": "front"}) for topic in (topics.FRAME, topics.MASK)]
+    rates += [node._streams.rate_hz(topic, {"target": "forearm"}) for topic in (topics.VISION, topics.FUSED)]
     assert rates == [300, 300, 300, 200]
 
 
 def test_the_rate_of_a_steady_stream_is_its_rate_and_falls_when_it_ends():
-    rate = bus.Rate()
+    rate = Rate()
     for k in range(400):
         rate.add(k * 0.005)
         if k > 10:
             assert rate.hz(k * 0.005) == pytest.approx(200, rel=0.02)
-    assert rate.hz(2.0 + 10 * bus.RATE_WINDOW_S) < 0.1
+    assert rate.hz(2.0 + 10 * RATE_WINDOW_S) < 0.1
 
 
 def test_a_query_is_answered_and_a_refusal_carries_its_text(node):

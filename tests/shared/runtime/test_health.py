@@ -1,5 +1,7 @@
 """Status and reasons of running processes, from within and from outside."""
 
+import json
+import logging
 import os
 import signal
 import subprocess
@@ -17,12 +19,15 @@ from services.launcher import display
 from services.launcher.supervised import Supervised
 from shared.cell import description as cells
 from shared.contract import topics
-from shared.runtime import bus, health
+from shared.contract.report import Report
+from shared.runtime import bus, health, progress
 from shared.runtime.node import Node
+from shared.runtime.traffic import Traffic
 from tests.support.live import free_port, wait_for
 from tests.support.nodes import pose
 
 CELL = cells.load("table")
+WAITS = "waiting for camera/front/frame: emulator is not there yet"
 FUSED = topics.FUSED.at(cell="table", target="forearm")
 
 
@@ -81,7 +86,7 @@ def test_a_process_with_nothing_to_say_is_ok_and_one_off_the_bus_is_down():
 
 
 def test_every_reason_names_what_is_missing_and_since_when():
-    never, old, fresh = (bus.Traffic(0.3) for _ in range(3))
+    never, old, fresh = (Traffic(0.3) for _ in range(3))
     now_ns = 10**12
     old.took(now_ns - 3_210_000_000, now_ns)
     fresh.took(now_ns, now_ns)
@@ -99,11 +104,77 @@ def test_every_reason_names_what_is_missing_and_since_when():
     )
 
 
+def test_missing_inputs_of_one_kind_are_one_reason():
+    now_ns = 10**12
+    pads = {f"penumbra/arm/skin/p{k}/voltages": Traffic(0.1) for k in range(8)}
+    assert health.judge("", pads, {}, [], now_ns) == ("degraded", ["nothing heard on skin/*/voltages (8) yet"])
+    for k, traffic in enumerate(pads.values()):
+        traffic.took(now_ns - (k + 1) * 100_000_000, now_ns)
+    fused = {"penumbra/arm/target/forearm/pose/fused": Traffic(0.1)}
+    expected = ["no skin/*/voltages (7 of 8) for 0.8 s", "nothing heard on target/forearm/pose/fused yet"]
+    assert health.judge("", pads | fused, {}, [], now_ns)[1] == expected
+
+
+def test_a_process_that_prepares_its_work_or_waits_for_one_that_does_is_starting():
+    missing = {"penumbra/arm/target/forearm/pose/haptic": Traffic(0.1, ("haptics",))}
+    assert health.judge("", {}, {}, [], 0, "compiling 12 of 40") == ("starting", ["compiling 12 of 40"])
+    waits = lambda traffic: f"{traffic.publishers[0]} is compiling 12 of 40"  # noqa: E731
+    found = ("starting", ["waiting for target/forearm/pose/haptic: haptics is compiling 12 of 40"])
+    assert health.judge("", missing, {}, [], 0, "", waits) == found
+    assert health.judge("", missing, {}, ["a fault"], 0, "compiling 1 of 2", waits)[0] == "degraded"
+
+
+def test_an_input_is_waited_for_while_its_publisher_starts_and_missing_when_it_should_have_come(monkeypatch):
+    answers, now_s = {"haptics": []}, [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now_s[0])
+    waiting = progress.Waiting(lambda service: [json.dumps(each.as_json()).encode() for each in answers[service]])
+    traffic = Traffic(0.1, ("haptics",))
+
+    def why(at_s):
+        now_s[0] = at_s
+        waiting.look([traffic], 0)
+        return waiting.why(traffic)
+
+    assert why(1.0) == "haptics is not there yet"
+    assert why(progress.NOBODY_S + 1.0) == "", "nobody runs it"
+    answers["haptics"] = [Report("haptics", "a", "starting", progress="compiling 12 of 40")]
+    assert why(20.0) == "haptics is compiling 12 of 40"
+    answers["haptics"] = [Report("haptics", "a", "ok")]
+    assert why(30.0) == "haptics has just started"
+    assert why(30.0 + progress.SETTLE_S) == "", "it should have been heard by now"
+    answers["haptics"] = [Report("haptics", "a", "starting")]
+    assert why(progress.STARTING_S - 1.0) == "haptics is starting"
+    assert why(progress.STARTING_S + 1.0) == "", "nothing takes that long"
+
+
+def test_progress_shows_in_the_health_before_the_node_is_open_and_is_logged_now_and_then(router, client, caplog):
+    node = client("haptics")
+    logging.getLogger("penumbra").propagate = True
+    with caplog.at_level(logging.INFO, "penumbra"):
+        for k in range(12):
+            node.progress("compiling", k, 40)
+    assert [record.getMessage() for record in caplog.records if "compiling" in record.getMessage()] == ["compiling 0 of 40"]
+    (found,) = wait_for(lambda: [each for each in seen(router) if each.service == "haptics"], 10, "the early answer")
+    assert (found.status, found.reasons) == ("starting", ("compiling 11 of 40",))
+    node.progress("compiling", 40, 40)
+    node.open()
+    report = node.report()
+    assert (report.status, report.progress) == ("ok", "")
+
+
+def test_a_topic_whose_publisher_has_nothing_to_do_in_a_cell_is_not_missed():
+    bare = CELL.model_copy(update={"pads": {}})
+    with_pads, without = Node("fusion", CELL), Node("fusion", bare)
+    for node in (with_pads, without):
+        node.subscribe(topics.HAPTIC, lambda message, names: None)
+    assert with_pads.report().stale and not without.report().stale
+
+
 def test_a_node_tells_of_stale_inputs_refusals_and_faults_as_they_happen(client):
     reader, writer = client("reader"), client("writer").open()
     reader.subscribe(topics.FUSED, lambda message, names: 1 / 0)
     reader.open()
-    assert reader.health()["reasons"] == ["nothing heard on target/forearm/pose/fused yet"]
+    assert reader.health()["reasons"] == ["waiting for target/forearm/pose/fused: fusion is not there yet"]
 
     def reasons_after(send, word):
         send()
@@ -128,7 +199,7 @@ def test_a_node_that_lost_its_router_is_down_and_says_where_it_should_be(router,
 def test_from_outside_every_instance_is_told_and_one_that_hangs_is_down(router, worker, monkeypatch):
     found = {each.service: each for each in seen(router)}
     assert found["router"].status == "ok"
-    assert (found["worker"].status, found["worker"].reasons) == ("degraded", ("nothing heard on camera/front/frame yet",))
+    assert (found["worker"].status, found["worker"].reasons) == ("starting", (WAITS,))
     monkeypatch.setattr(cell_health, "ANSWER_S", 0.2)
     worker.send_signal(signal.SIGSTOP)  # its token is there until its lease ends
     wait_for(lambda: psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED, 5, "it to stop")
@@ -142,7 +213,7 @@ def test_doctor_tells_how_the_running_processes_fare(router, worker, capsys):
     cli.main(["doctor", "--connect", router.connection.listen[0]])
     (line,) = [line for line in capsys.readouterr().out.splitlines() if " worker " in line]
     assert line.startswith("warn worker ")
-    assert line.endswith(": degraded: nothing heard on camera/front/frame yet")
+    assert line.endswith(f": starting: {WAITS}")
 
 
 def test_doctor_says_how_to_start_a_cell_whose_router_runs_alone(router):
@@ -154,7 +225,7 @@ def test_topics_hz_tells_how_the_processes_fare_but_not_itself(router, worker, c
     assert cli.main(["topics", "--hz", "--seconds", "0.5", "--connect", router.connection.listen[0]]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.strip()]
     services = {row[0]: row[2:] for row in rows[rows.index(["process", "instance", "status", "reasons"]) + 1 :]}
-    assert services == {"router": ["ok"], "worker": ["degraded", *["nothing", "heard", "on", "camera/front/frame", "yet"]]}
+    assert services == {"router": ["ok"], "worker": ["starting", *WAITS.split()]}
 
 
 def test_the_live_view_shows_what_a_running_process_suffers_from(router, worker):
@@ -163,12 +234,12 @@ def test_the_live_view_shows_what_a_running_process_suffers_from(router, worker)
     process = Supervised("worker", [])
     process.state, process.popen = "running", worker
     row = process.row(watch.local()[worker.pid])
-    assert (row.state, row.note) == ("degraded", "nothing heard on camera/front/frame yet")
+    assert (row.state, row.note) == ("starting", WAITS)
     console = Console(width=200)
     with console.capture() as drawn:
         console.print(display.table("a cell", [row], watch))
-    assert "degraded" in drawn.get() and "nothing heard on camera/front/frame yet" in drawn.get()
-    assert process.row({"status": "ok", "reasons": []}).state == "running"
+    assert "starting" in drawn.get() and WAITS in drawn.get()
+    assert process.row(Report("worker", "a", "ok")).state == "running"
 
 
 def test_the_heartbeat_tells_the_status_and_the_health_check_of_the_containers_reads_it(router, client, monkeypatch, tmp_path):

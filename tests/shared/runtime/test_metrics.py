@@ -10,6 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from shared.cell import description as cells
 from shared.contract import topics
+from shared.contract.report import Report
 from shared.runtime import bus, metrics
 from shared.runtime.node import Node
 from tests.support.live import free_port, wait_for
@@ -55,9 +56,9 @@ def test_the_page_says_what_the_health_says(served):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with Node("router", CELL, bus.Connection("router", listen=(endpoint,))) as node:
         node.subscribe(topics.FUSED, lambda message, names: 1 / 0)
-        port = served(lambda: [node.health()])
+        port = served(lambda: [node.report()])
         node.publish(topics.FUSED, pose(), target="forearm")
-        for payload in (b"garbled", b"\xc1"):
+        for payload in (b"\xc1", b"\xc1\xc1"):
             node.session.put(FUSED, payload)
         wait_for(lambda: (r := node.health())["topics"][FUSED]["bad"].get("msgpack") == 2 and r["faults"], 5, "the messages")
         samples, report = page(port), node.health()
@@ -78,9 +79,9 @@ def test_the_page_says_what_the_health_says(served):
 
 
 def report(service, instance, **told):
-    same = {"cell": "table", "host": "here", "status": "ok", "uptime_s": 1.0, "cpu": 0.5, "memory_mb": 10.0, "replicas": 1}
-    empty = {"faults": {}, "topics": {}, "published": {}}
-    return {"service": service, "instance": instance, **same, **empty, "report": told}
+    return Report(
+        service, instance, "ok", cell="table", host="here", uptime_s=1.0, cpu=0.5, memory_mb=10.0, replicas=1, report=told
+    )
 
 
 def test_one_page_covers_many_processes_with_their_restarts_and_the_state_of_the_pose(served):

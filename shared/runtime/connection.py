@@ -1,0 +1,189 @@
+"""How a process connects to the bus: its flags, and the Zenoh configuration that they make, with TLS where it is asked for."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from shared.contract import access
+from shared.runtime.slow_links import SlowLinks
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+SECURE_ENDPOINT = "tls/127.0.0.1:7447"
+SECURE_PROTOCOLS = ("tls",)
+PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
+POOL_BYTES = 4 << 20
+"""Of shared memory, at least: four frames of a small camera."""
+SHARED_BYTES = 100_000
+"""Frames go by shared memory; what is smaller takes no longer through a socket, and leaves its readers nothing behind where its
+publisher dies: they keep its pool for as long as they live."""
+ATTEMPT_MS = 500
+"""How long one attempt to reach the router may block inside Zenoh, where no signal is heard."""
+
+
+class BusError(RuntimeError):
+    """The bus cannot be used as asked; the text says what to do."""
+
+
+@dataclass(frozen=True)
+class Connection:
+    """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
+    tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise; `secure`: a
+    folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part; `service`: who
+    this is, and so whose certificate it shows; `slow`: a router's links that carry little; `pool_bytes`: of shared memory, by
+    which what is large goes to processes of the same host. Readers keep the pool of a publisher that is gone for as long as they
+    live, so it is no larger than it must be."""
+
+    mode: str | None = None
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    config: Path | None = None
+    secure: Path | None = None
+    service: str = access.VIEWER
+    slow: SlowLinks | None = None
+    pool_bytes: int = POOL_BYTES
+
+    @property
+    def default(self) -> str:
+        """The endpoint where none is given."""
+        return SECURE_ENDPOINT if self.secure else DEFAULT_ENDPOINT
+
+    @property
+    def where(self) -> str:
+        """The endpoints in words."""
+        return ", ".join(self.connect) or (f"the endpoints of {self.config}" if self.config else self.default)
+
+    @property
+    def whereabouts(self) -> str:
+        """Where a router is looked for, and what it must have."""
+        return f"at {self.where}" + (f" with a certificate of the same CA as in {self.secure}" if self.secure else "")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The Zenoh flags that every process takes."""
+    group = parser.add_argument_group("bus")
+    group.add_argument("-m", "--mode", choices=("client", "peer", "router"), help="Zenoh mode (default: client; router: router)")
+    group.add_argument("-e", "--connect", action="append", default=[], metavar="ENDPOINT",
+                       help=f"router to reach; may be repeated (default: $PENUMBRA_CONNECT or {DEFAULT_ENDPOINT}, "
+                       f"with --secure {SECURE_ENDPOINT})")  # fmt: skip
+    group.add_argument("-l", "--listen", action="append", default=[], metavar="ENDPOINT", help="endpoint to listen on")
+    group.add_argument("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5)")
+    add_secure(group)
+
+
+def add_secure(group: argparse._ActionsContainer) -> None:
+    """The one switch between a bus for this machine and one for a network."""
+    default = os.environ.get("PENUMBRA_SECURE")
+    group.add_argument(
+        "--secure", type=Path, default=Path(default) if default else None, metavar="FOLDER",
+        help="certificates of `penumbra certs`: TLS, and each may say only what is its own (default: $PENUMBRA_SECURE or off)",
+    )  # fmt: skip
+
+
+def connection(options: argparse.Namespace) -> Connection:
+    """The connection that the flags of `add_arguments` and the environment ask for."""
+    connect = tuple(options.connect)
+    if not connect and options.config is None and options.mode in (None, "client"):
+        connect = tuple(os.environ.get("PENUMBRA_CONNECT", "").split())
+    return Connection(options.mode, connect, tuple(options.listen), options.config, options.secure)
+
+
+def mode(connection: Connection) -> str:
+    """client, peer or router, as the connection or its file says. Raises BusError like `configuration`."""
+    return str(json.loads(configuration(connection).get_json("mode")))
+
+
+def configuration(connection: Connection) -> zenoh.Config:
+    """The Zenoh configuration of a connection. Raises BusError for a file or an endpoint that Zenoh does not take."""
+    try:
+        config = zenoh.Config.from_file(str(connection.config)) if connection.config else zenoh.Config()
+    except zenoh.ZError as error:
+        raise BusError(f"--config {connection.config}: a Zenoh configuration (JSON5) expected: {short(error)}") from None
+
+    def is_set(key: str) -> bool:
+        return connection.config is not None and config.get_json(key) not in ("null", "[]")
+
+    mode = connection.mode or (json.loads(config.get_json("mode")) if is_set("mode") else "client")
+    settings: dict[str, Any] = {"mode": mode}
+    if connection.connect:
+        settings["connect/endpoints"] = connection.connect
+    elif mode == "client" and not is_set("connect/endpoints"):
+        settings["connect/endpoints"] = [connection.default]
+    if connection.listen:
+        settings["listen/endpoints"] = connection.listen
+    elif mode == "router" and connection.config is None:
+        settings["listen/endpoints"] = [connection.default]
+    defaults = {
+        # one attempt is short, because Ctrl-C is not heard inside it; `open_session` repeats it, and later Zenoh itself does
+        "connect/timeout_ms": ATTEMPT_MS,
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 200, "period_increase_factor": 1},
+        # processes meet at the router and nowhere else: what is not configured is not found by chance
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,  # nor waited for
+        "transport/shared_memory/transport_optimization/pool_size": connection.pool_bytes,
+        "transport/shared_memory/transport_optimization/message_size_threshold": SHARED_BYTES,
+    }
+    settings |= {key: value for key, value in defaults.items() if not is_set(key)}
+    if connection.config is None:
+        settings["transport/link/tx/lease"] = 1000  # ms after which a frozen process is no longer alive
+    for endpoint in (*connection.connect, *connection.listen):
+        protocols = SECURE_PROTOCOLS if connection.secure else PROTOCOLS
+        if endpoint.partition("/")[0] not in protocols:  # Zenoh would try it for ever
+            raise BusError(
+                f"endpoint {endpoint!r}: PROTOCOL/ADDRESS expected, as in {connection.default}; "
+                f"protocols{' with --secure' if connection.secure else ''}: {', '.join(protocols)}"
+            )
+    if connection.secure is not None:
+        settings |= _secure(connection.secure, access.holder(connection.service, mode == "router"), mode)
+    if connection.slow is not None:
+        settings |= connection.slow.settings()
+        for side in ("connect", "listen"):
+            if (found := settings.get(f"{side}/endpoints")) is not None:
+                settings[f"{side}/endpoints"] = connection.slow.bounded(found, side == "listen")
+    for key, value in settings.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise BusError(f"{key}: {json.dumps(value)} is nothing that Zenoh takes: {short(error)}") from None
+    return config
+
+
+def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
+    """Zenoh's settings for mutual TLS, and in a router for who may say what."""
+    if mode == "peer":
+        raise BusError("--secure with --mode peer: client or router expected: only a router looks at who says what")
+    files = {name: folder / f"{name}.pem" for name in ("ca", holder, f"{holder}-key")}
+    for path in files.values():
+        try:
+            path.read_bytes()
+        except OSError as error:
+            names = ", ".join(file.name for file in files.values())
+            raise BusError(
+                f"--secure {folder}: {names} expected, {path.name} cannot be read ({error.strerror}): make them with "
+                f"`penumbra certs --out {folder}`, or copy them from where they were made"
+            ) from None
+    tls = {
+        "root_ca_certificate": str(files["ca"]),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    for side in ("listen", "connect"):
+        tls |= {f"{side}_certificate": str(files[holder]), f"{side}_private_key": str(files[f"{holder}-key"])}
+    settings: dict[str, Any] = {"transport/link/tls": tls, "transport/link/protocols": SECURE_PROTOCOLS}
+    if mode == "router":
+        settings |= {"access_control": access.control(), "low_pass_filter": access.limits()}
+    return settings
+
+
+def short(error: Exception) -> str:
+    """The first line of Zenoh's text, without the place in its sources."""
+    return str(error).partition(" at /")[0].strip().replace("\n", " ")[:300]

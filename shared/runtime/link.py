@@ -1,0 +1,96 @@
+"""The Zenoh session of a node: when it opens, what is declared on it, and how it ends."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+
+import zenoh
+
+from shared.runtime import bus
+from shared.runtime.logs import Log
+
+CLOSE_S = 0.8
+"""Closing a session on a bad network may take much longer; a process that ends does not wait for that."""
+
+
+class Link:
+    """One session and the threads that work on it. What is declared before the session is open is declared when `declare_all` is
+    called. connection: how to reach the others. stopping: set when the process is to end."""
+
+    def __init__(self, connection: bus.Connection, stopping: threading.Event, log: Log):
+        self.connection = connection
+        self.session: zenoh.Session | None = None
+        self._needs_router = bus.mode(connection) == "client"  # refuses a bad configuration before anything else is done
+        self._stopping, self._log = stopping, log
+        self._opening = threading.Lock()
+        self._pending: list[Callable[[zenoh.Session], None]] | None = []
+        self._threads: list[threading.Thread] = []
+        self._reachable = False
+
+    def open(self, patience_s: float) -> zenoh.Session:
+        """The session, opened unless it is open; waits for the router, also for another thread that opens it. Raises
+        bus.BusError."""
+        with self._opening:
+            if self.session is None:
+                self.session = bus.open_session(self.connection, self._stopping, self._report_waiting, patience_s)
+                self._reachable = True
+            return self.session
+
+    def declare(self, declare: Callable[[zenoh.Session], None]) -> None:
+        """Calls `declare(session)`, now or in `declare_all`."""
+        if self._pending is not None:
+            self._pending.append(declare)
+        elif (session := self.session) is not None:
+            declare(session)
+
+    def declare_all(self) -> None:
+        """Declares what was asked for so far; from now on everything is declared at once."""
+        assert self.session is not None, "the session must be open"
+        pending, self._pending = self._pending or [], None
+        for declare in pending:
+            declare(self.session)
+
+    def spawn(self, function: Callable[[], None], name: str) -> None:
+        """Runs a function in a thread of the node."""
+        thread = threading.Thread(target=function, name=name, daemon=True)
+        self.join(thread)
+        thread.start()
+
+    def join(self, thread: threading.Thread) -> None:
+        """Counts a thread among those that `close` waits for."""
+        self._threads.append(thread)
+
+    def close(self, others: Iterable[threading.Thread] = ()) -> None:
+        """Closes the session and waits for the node's threads and others, for at most CLOSE_S."""
+        if self.session is None:
+            return
+        session, self.session = self.session, None
+        deadline = time.monotonic() + CLOSE_S
+        closing = threading.Thread(target=session.close, name="close", daemon=True)
+        closing.start()
+        for thread in (closing, *self._threads, *others):
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, deadline - time.monotonic()))
+
+    def look(self) -> None:
+        """Looks whether the router is there, and logs where that has changed."""
+        if (session := self.session) is None:
+            return
+        reachable = not self._needs_router or bool(session.info.routers_zid())
+        if reachable != self._reachable:
+            self._reachable = reachable
+            if reachable:
+                self._log.info("the router is back")
+            else:
+                self._report_waiting()
+
+    def away(self) -> str:
+        """Why the others cannot be reached; empty where they can."""
+        if self.session is None:
+            return "not on the bus"
+        return "" if self._reachable else f"no router at {self.connection.where}"
+
+    def _report_waiting(self) -> None:
+        self._log.warning(f"waiting for the router {self.connection.whereabouts}: start `penumbra router` or `penumbra up`")

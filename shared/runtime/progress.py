@@ -1,0 +1,100 @@
+"""What a process does before it can work, and whether those that it waits for do so too."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterable
+
+from shared.contract import report
+from shared.runtime.logs import Log
+from shared.runtime.traffic import Traffic
+
+LOG_S = 2.0
+"""Between two lines of the log about one task."""
+NOBODY_S = 10.0
+"""A publisher that does not answer yet may still be on its way to the bus for so long after this process began."""
+SETTLE_S = 2.0
+"""A publisher that has just become ready may take so long for its first message."""
+STARTING_S = 120.0
+"""After so long an input that was never heard is a fault, whatever its publishers say."""
+
+
+class Progress:
+    """The tasks of a start under way, each with its steps done and in all. May be used from several threads."""
+
+    def __init__(self, log: Log):
+        self._log = log
+        self._lock = threading.Lock()
+        self._tasks: dict[str, str] = {}
+        self._logged_s: dict[str, float] = {}
+
+    def set(self, what: str, done: int, total: int) -> None:
+        """Records the state of a task, which ends with its last step."""
+        text = f"{what} {done} of {total}"
+        with self._lock:
+            if done >= total:
+                self._tasks.pop(what, None)
+                is_due = self._logged_s.pop(what, None) is not None
+            else:
+                self._tasks[what] = text
+                now_s = time.monotonic()
+                is_due = now_s - self._logged_s.get(what, -LOG_S) >= LOG_S
+                if is_due:
+                    self._logged_s[what] = now_s
+        if is_due:
+            self._log.info(text)
+
+    def __str__(self) -> str:
+        """The tasks in words; empty where there are none."""
+        with self._lock:
+            return ", ".join(self._tasks.values())
+
+
+class Waiting:
+    """Why an input that was never heard is not a fault yet: its publishers are starting, or were a moment ago.
+
+    ask: the answers to the health query of a service. `look` asks, and may block for as long as that takes; `why` does not.
+    """
+
+    def __init__(self, ask: Callable[[str], Iterable[bytes]]):
+        self._ask = ask
+        self._began_s = time.monotonic()
+        self._doing: dict[str, str] = {}  # by service that is starting
+        self._settled_s: dict[str, float] = {}  # since when a service answers that it is not
+
+    def look(self, received: Iterable[Traffic], now_ns: int) -> None:
+        """Asks the publishers of inputs that were never heard how far they are."""
+        missing = [traffic for traffic in received if traffic.stamp_ns is None and traffic.is_stale(now_ns)]
+        now_s = time.monotonic()
+        if now_s - self._began_s > STARTING_S:
+            return
+        for service in sorted({service for traffic in missing for service in traffic.publishers}):
+            reports = []
+            for answer in self._ask(service):
+                with contextlib.suppress(ValueError):  # of another release
+                    reports.append(report.read(answer))
+            starting = [found for found in reports if found.status == "starting"]
+            if starting:
+                self._doing[service] = next((found.progress for found in starting if found.progress), "")
+                self._settled_s.pop(service, None)
+            elif reports:
+                self._doing.pop(service, None)
+                self._settled_s.setdefault(service, now_s)
+            else:
+                self._doing.pop(service, None)
+                self._settled_s.pop(service, None)
+
+    def why(self, traffic: Traffic) -> str:
+        """What its publishers do, in words; empty where it should have been heard by now."""
+        now_s = time.monotonic()
+        if now_s - self._began_s > STARTING_S:
+            return ""
+        for service in traffic.publishers:
+            if service in self._doing:
+                return f"{service} is {self._doing[service] or 'starting'}"
+        settled_s = [self._settled_s[service] for service in traffic.publishers if service in self._settled_s]
+        if settled_s:
+            return f"{' or '.join(traffic.publishers)} has just started" if now_s - min(settled_s) < SETTLE_S else ""
+        return f"{' or '.join(traffic.publishers)} is not there yet" if now_s - self._began_s < NOBODY_S else ""
