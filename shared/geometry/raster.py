@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from shared.native import inner, kernel
 
 NEAR = 0.02
 """Nothing closer to the camera than this [m] is drawn."""
@@ -61,7 +62,7 @@ def silhouette(
     return out
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _project(x, y, z, fx, fy, cx, cy):
     """Sub-pixel integer coordinates of a point."""
     u = min(max(fx * x / z + cx, -_FAR_PX), _FAR_PX)
@@ -69,7 +70,7 @@ def _project(x, y, z, fx, fy, cx, cy):
     return int(math.floor(u * SUBPIXEL + 0.5)), int(math.floor(v * SUBPIXEL + 0.5))
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _clip(triangle, clipped):
     """Cuts a triangle (3, 3) at the near plane into `clipped` (4, 3); returns the number of corners left (0, 3 or 4)."""
     n = 0
@@ -87,7 +88,7 @@ def _clip(triangle, clipped):
     return n
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _span(y, ax, ay, bx, by, qx, qy, first, last):
     """The pixels [first, last] of row y (sub-pixel units) that lie inside the counter-clockwise triangle, top-left rule."""
     for e in range(3):
@@ -112,7 +113,7 @@ def _span(y, ax, ay, bx, by, qx, qy, first, last):
     return first, last
 
 
-@njit(cache=True, nogil=True)
+@kernel("f8[n, 3], i4[m, 3], f8, f8, f8, f8, out b1[h, w]")
 def _silhouette(V, faces, fx, fy, cx, cy, out):
     h, w = out.shape
     n = len(V)
@@ -135,7 +136,7 @@ def _silhouette(V, faces, fx, fy, cx, cy, out):
             _fill(corners[0, 0], corners[0, 1], corners[c - 1, 0], corners[c - 1, 1], corners[c, 0], corners[c, 1], w, h, out)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _fill(ax, ay, bx, by, qx, qy, w, h, out):
     area = (bx - ax) * (qy - ay) - (by - ay) * (qx - ax)
     if area == 0:
@@ -152,7 +153,7 @@ def _fill(ax, ay, bx, by, qx, qy, w, h, out):
             out[row, x] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel("f8[n, 3], i4[m, 3], f8, f8, f8, f8, u1[m], i8, out f4[h, w], out u1[h, w], out i4[h, w]")
 def _draw(V, faces, fx, fy, cx, cy, ids, start, depth, out_ids, out_triangles):
     triangle, clipped = np.empty((3, 3)), np.empty((4, 3))
     for f in range(len(faces)):
@@ -170,7 +171,7 @@ def _draw(V, faces, fx, fy, cx, cy, ids, start, depth, out_ids, out_triangles):
             )
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _draw_triangle(a, b, q, fx, fy, cx, cy, value, index, depth, out_ids, out_triangles):
     h, w = depth.shape
     ax, ay = _project(a[0], a[1], a[2], fx, fy, cx, cy)

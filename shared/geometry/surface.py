@@ -8,8 +8,9 @@ angle-weighted pseudonormals (Baerentzen & Aanaes 2005, DOI 10.1109/TVCG.2005.49
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from shared.native import inner, kernel
 
 Array = NDArray[np.float64]
 
@@ -94,7 +95,7 @@ def _pseudonormals(vertices: Array, faces: NDArray[np.int64]) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _closest(p, a, b, c):  # type: ignore[no-untyped-def]
     """Barycentric weights (v, w) of b and c at the point of triangle abc nearest to p, and where it lies (index as in
     `_pseudonormals`)."""
@@ -129,7 +130,7 @@ def _closest(p, a, b, c):  # type: ignore[no-untyped-def]
     return vb * scale, vc * scale, 0
 
 
-@njit(cache=True, nogil=True)
+@kernel("f8[n, 3], f8[m, 3, 3], f8[3, m], f8[m], f8[m, 7, 3], out f8[n], out f8[n, 3], out f8[n, 3]")
 def nearest_points(points, corners, centers, radii, normals, distance, nearest, gradient):  # type: ignore[no-untyped-def]
     """Fill distance (n,), nearest (n, 3) and gradient (n, 3) for points (n, 3): see `Surface.nearest`."""
     m = len(corners)

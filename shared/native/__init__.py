@@ -1,0 +1,226 @@
+"""Hot loops: functions in plain Python on numpy arrays that run as machine code, without a compiler at run time.
+
+    @inner                                             # called by kernels only: compiled into each of them
+    def _square(x): ...
+
+    @kernel("f8[n, 3], f8[3], out f8[n] -> i8")        # called from Python
+    def nearest(points, origin, distances): ...
+
+`python -m shared.native.build` compiles every kernel with numba and links them into one library per processor, `lib/*.so`, which
+is part of the repository. A symbol's name holds the `fingerprint` of the sources that it was compiled from, so compiled code that
+no longer belongs to its sources is not found, and is never called. What the library lacks (a kernel was edited; there is no
+library for this machine) is compiled at run time, where numba is installed, and kept in `jit.folder()` under that fingerprint.
+
+What runs is chosen by the environment variable PENUMBRA_NATIVE: `library` (default; see above), `jit` (never the libraries) or
+`python` (the functions themselves, interpreted: slow, but debuggers and tracebacks work).
+
+Limits on kernels: arrays are C-contiguous; what is written to is marked `out`; a result is one number, everything else goes into
+arrays; nothing is raised (a division by zero gives infinity, as numpy does); no calls of BLAS or LAPACK (`@`, `np.dot`,
+`np.linalg`): matrices are small here, so these are loops. Small arrays may be allocated.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import struct
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.native.fingerprint import fingerprint
+from shared.native.signature import Parameter, Signature
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Progress = Callable[[int, int], None]
+"""Is called with the number of the kernel that is compiled next, from 1, and how many there are to compile."""
+
+WAYS = ("library", "jit", "python")
+KERNELS: dict[str, Kernel] = {}
+"""All kernels of the modules imported so far, by name."""
+_DATA = object.__basicsize__
+"""Where a numpy array holds the address of its data: the first field after an object's header (`PyArrayObject` of numpy's C
+interface). Reading it there costs a tenth of asking for `array.ctypes.data`; `_check_layout` compares the two."""
+
+
+def kernel(signature: str, fastmath: bool = False, **records: np.dtype[Any]) -> Callable[[Callable[..., Any]], Kernel]:
+    """Makes a function a kernel.
+
+    signature: see `signature.Signature`; records: the structured dtypes that it names; fastmath: sums may be reordered, so the
+    last digits differ between processors. Raises ValueError on a signature that does not fit the function.
+    """
+    return lambda function: Kernel(function, Signature(signature, records), fastmath)
+
+
+def inner(function: Function | None = None, *, fastmath: bool = False) -> Any:
+    """Marks a function that kernels call; it stays a Python function. fastmath: as for `kernel`."""
+    if function is None:
+        return functools.partial(inner, fastmath=fastmath)
+    function.native_options = {"fastmath": fastmath}  # type: ignore[attr-defined]
+    return function
+
+
+class Kernel:
+    """A compiled function. Called with positional arguments; checks the arrays' types, layouts and sizes (TypeError), because
+    compiled code does not. Other threads run meanwhile."""
+
+    def __init__(self, function: Callable[..., Any], signature: Signature, fastmath: bool):
+        functools.update_wrapper(self, function)
+        self.function = function
+        self.signature = signature
+        self.native_options = {"fastmath": fastmath}
+        self.name = f"{function.__module__}.{function.__qualname__}"
+        names = function.__code__.co_varnames[: function.__code__.co_argcount]
+        if len(names) != len(signature.parameters):
+            raise ValueError(f"{self.name}: expected a signature of {len(names)} parameters, got {signature.text!r}")
+        self._names = names
+        self._count = len(names)
+        self._arrays = tuple((each.dtype, each.flags) if each.is_array else None for each in signature.parameters)
+        slots = [each.format for each in signature.parameters]
+        self._pack = struct.Struct("=q" + "".join(slots) + "q" * bool(signature.result)).pack
+        self._shapes: list[tuple[int, ...]] = []
+        self._code: Callable[[bytes], int] | None = None
+        KERNELS[self.name] = self
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        return fingerprint(self)
+
+    @property
+    def symbol(self) -> str:
+        """The name of the compiled function."""
+        return f"{self.name.replace('.', '_')}_{self.fingerprint}"
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._code is None and not self._load():
+            return self.function(*arguments)
+        values: list[Any] = [_DATA]
+        shapes = []
+        try:
+            for value, array in zip(arguments, self._arrays, strict=True):
+                if array is None:
+                    values.append(value)
+                    continue
+                dtype, flags = array
+                if value.dtype is not dtype or value.flags.num & flags != flags:
+                    self._check(arguments)
+                shape = value.shape
+                shapes.append(shape)
+                values.append(id(value))
+                values += shape
+            if shapes != self._shapes:
+                self._check(arguments)
+                self._shapes = shapes
+            if self.signature.result is None:
+                failed, result = self._code(self._pack(*values)), None  # type: ignore[misc]
+            else:
+                result = np.empty(1, self.signature.result)
+                failed, result = self._code(self._pack(*values, id(result))), result.item()  # type: ignore[misc]
+        except (AttributeError, ValueError, struct.error):
+            self._check(arguments)
+            raise
+        if failed:
+            raise RuntimeError(
+                f"{self.name}: the compiled code failed (out of memory, or arrays inside it that do not fit together); "
+                "set PENUMBRA_NATIVE=python to see where"
+            )
+        return result
+
+    def _check(self, arguments: tuple[Any, ...]) -> None:
+        """Raises TypeError, in words, where arguments do not fit the signature."""
+        if len(arguments) != self._count:
+            raise TypeError(f"{self.name}: expected {self._count} arguments ({', '.join(self._names)}), got {len(arguments)}")
+        sizes: dict[str, tuple[int, str]] = {}
+        for name, value, parameter in zip(self._names, arguments, self.signature.parameters, strict=True):
+            fault = parameter.fault(name, value, sizes)
+            if fault:
+                raise TypeError(f"{self.name}: {name}: expected {parameter}, got {fault}")
+
+    def _load(self) -> bool:
+        """Finds the compiled code, or compiles it; false where the Python function is to be called."""
+        if _way() == "python":
+            return False
+        with _LOCK:
+            if self._code is None:
+                self._code = _in_library(self) or _compiled([self])[0]
+        return True
+
+
+def prepare(progress: Progress | None = None) -> None:
+    """Loads all kernels of the modules imported so far, and compiles those that the library lacks, so that the first calls do not
+    have to. Raises ImportError where that takes numba and it is not installed."""
+    if _way() == "python":
+        return
+    with _LOCK:
+        missing = [each for each in KERNELS.values() if each._code is None]
+        for each in missing:
+            each._code = _in_library(each)
+        missing = [each for each in missing if each._code is None]
+        for each, code in zip(missing, _compiled(missing, progress), strict=True):
+            each._code = code
+
+
+def _way() -> str:
+    way = os.environ.get("PENUMBRA_NATIVE", "library")
+    if way not in WAYS:
+        raise ValueError(f"PENUMBRA_NATIVE: expected one of {', '.join(WAYS)}, got {way!r}")
+    return way
+
+
+def _in_library(kernel: Kernel) -> Callable[[bytes], int] | None:
+    """The kernel's code in this machine's library, None where it is not there."""
+    library = _library() if _way() == "library" else None
+    if library is None:
+        return None
+    try:
+        code = library[kernel.symbol]
+    except AttributeError:
+        return None
+    code.argtypes, code.restype = (ctypes.c_char_p,), ctypes.c_int
+    return code  # type: ignore[no-any-return]
+
+
+def _compiled(kernels: list[Kernel], progress: Progress | None = None) -> list[Callable[[bytes], int]]:
+    """The code of kernels that no library has."""
+    if not kernels:
+        return []
+    _check_layout()
+    try:
+        from shared.native import jit
+    except ImportError as error:
+        raise ImportError(
+            f"{kernels[0].name}: expected compiled code for this source and this machine in shared/native/lib, found none, and "
+            f"{error.name} is not installed to compile it; do pip install 'penumbra[native]', or restore the source"
+        ) from error
+    return jit.load(kernels, progress)
+
+
+@functools.cache
+def _library() -> ctypes.CDLL | None:
+    from shared.native.machine import library
+
+    path = library()
+    if path is None:
+        return None
+    _check_layout()
+    return ctypes.CDLL(str(path))
+
+
+@functools.cache
+def _check_layout() -> None:
+    probe: NDArray[np.float64] = np.empty(1)
+    address = ctypes.c_void_p.from_address(id(probe) + _DATA).value
+    if address != probe.ctypes.data:
+        raise RuntimeError(
+            f"numpy {np.__version__}: expected an array to hold its data's address {_DATA} bytes from its beginning; "
+            "set PENUMBRA_NATIVE=python, and report this interpreter"
+        )
+
+
+_LOCK = threading.RLock()
+
+__all__ = ["KERNELS", "Kernel", "Parameter", "Progress", "inner", "kernel", "prepare"]

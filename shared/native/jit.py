@@ -1,0 +1,80 @@
+"""Compiles kernels on the machine that runs them, and keeps the result: for sources that the committed libraries do not know."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import llvmlite.binding as llvm
+
+from shared.native import Kernel, Progress
+from shared.native.compiler import VERSIONS, Target, compiled
+
+_ENGINES: list[llvm.ExecutionEngine] = []
+"""What has been loaded stays in memory as long as these."""
+
+
+def folder() -> Path:
+    """Where compiled kernels are kept: PENUMBRA_CACHE, by default penumbra in the user's cache folder. Files are named after the
+    sources' fingerprint, the processor and the versions of the compilers, so none is ever out of date; any may be deleted."""
+    cache = os.environ.get("PENUMBRA_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "penumbra"
+    return Path(cache) / "native"
+
+
+def load(kernels: Sequence[Kernel], progress: Progress | None = None) -> list[Callable[[bytes], int]]:
+    """The code of kernels, compiled where it is not kept yet. Processes that need the same kernel compile it once: the others
+    wait."""
+    target = _this_machine()
+    files = [folder() / f"{kernel.symbol}-{target.cpu}-{'-'.join(VERSIONS.values())}.o" for kernel in kernels]
+    missing = [file for file in files if not file.exists()]
+    codes = []
+    for kernel, file in zip(kernels, files, strict=True):
+        if file in missing and progress:
+            progress(missing.index(file) + 1, len(missing))
+        codes.append(_loaded(_kept(kernel, file, target), kernel.symbol))
+    return codes
+
+
+def _this_machine() -> Target:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return Target(llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
+
+
+def _kept(kernel: Kernel, file: Path, target: Target) -> bytes:
+    with contextlib.suppress(OSError):
+        return file.read_bytes()
+    with _alone(file):
+        with contextlib.suppress(OSError):  # another process was faster
+            return file.read_bytes()
+        code = compiled([kernel], target)
+        with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as new:
+            new.write(code)  # where there is no room, the next start compiles again
+            new.flush()
+            os.replace(new.name, file)
+    return code
+
+
+@contextlib.contextmanager
+def _alone(file: Path) -> Iterator[None]:
+    """One process at a time, where files can be written at all."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context(open(file.with_suffix(".lock"), "w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _loaded(code: bytes, symbol: str) -> Callable[[bytes], int]:
+    machine = llvm.Target.from_triple(llvm.get_process_triple()).create_target_machine()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    _ENGINES.append(engine)
+    return ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_char_p)(engine.get_function_address(symbol))
