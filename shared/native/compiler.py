@@ -84,7 +84,8 @@ fill:
   %before = sub i64 %after, 1
   %mask = sub i64 0, %wide
   %aligned = and i64 %before, %mask
-  %data = inttoptr i64 %aligned to ptr
+  %distance = sub i64 %aligned, %address
+  %data = getelementptr i8, ptr %memory, i64 %distance
   store i64 1, ptr %memory
   %field = getelementptr %memory, ptr %memory, i32 0, i32 3
   store ptr %data, ptr %field
@@ -171,7 +172,7 @@ def _flags(fastmath: bool) -> Flags:
     flags: Any = Flags()  # its fields are made at run time
     flags.nrt = flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
     flags.error_model = "numpy"
-    flags.fastmath = fastmath
+    flags.fastmath = REORDERED if fastmath else False
     return flags  # type: ignore[no-any-return]
 
 
@@ -179,12 +180,15 @@ def _declare(function: Any) -> None:
     """Makes all functions that this one calls known to numba, which asks values of kinds it does not know for `_numba_type_`."""
     for _, value in used(function):
         if is_native(value) and not hasattr(value, "_numba_type_"):
-            options = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", **value.native_options)
+            fastmath = REORDERED if value.native_options["fastmath"] else False
+            options = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", fastmath=fastmath)
             _CALLED.append(numba.njit(**options)(plain(value)))
             value._numba_type_ = types.Dispatcher(_CALLED[-1])
             _declare(plain(value))
 
 
+REORDERED = {"reassoc", "nsz", "contract"}
+"""LLVM's flags for a function with `fastmath`: infinities and NaN remain what they are."""
 _CALLED: list[Any] = []
 """numba's form of the functions that kernels call: their types refer to them, but do not keep them."""
 
