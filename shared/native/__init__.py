@@ -97,7 +97,7 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Any:
         if self._code is None and not self._load():
-            return self.function(*arguments)
+            return self.function(*(_with_attributes(each) for each in arguments))
         values: list[Any] = [_DATA]
         shapes = []
         try:
@@ -162,6 +162,11 @@ def prepare(progress: Progress | None = None) -> None:
         missing = [each for each in missing if each._code is None]
         for each, code in zip(missing, _compiled(missing, progress), strict=True):
             each._code = code
+
+
+def _with_attributes(value: Any) -> Any:
+    """Records whose fields can be read as attributes, as compiled code reads them."""
+    return value.view(np.recarray) if isinstance(value, np.ndarray) and value.dtype.names else value
 
 
 def _way() -> str:

@@ -52,6 +52,30 @@ TARGETS = {
 }
 """The processors that libraries are made for, by the libraries' names."""
 
+LIBC = {"malloc", "free", "memcpy", "memmove", "memset"} | {
+    *(
+        "acos",
+        "acosh",
+        "asin",
+        "asinh",
+        "atan",
+        "atan2",
+        "atanh",
+        "cbrt",
+        "ceil",
+        "cos",
+        "cosh",
+        "erf",
+        "erfc",
+        "exp",
+        "exp2",
+        "expm1",
+    ),
+    *("fabs", "floor", "fmod", "hypot", "log", "log10", "log1p", "log2", "nearbyint", "pow", "rint", "round", "sin", "sincos"),
+    *("sinh", "sqrt", "tan", "tanh", "trunc", "expf", "logf", "sqrtf", "tanhf", "powf", "sinf", "cosf", "atan2f"),
+}
+"""What a library may call: every process with Python has these."""
+
 RUNTIME = """
 ; The memory of an array: a header (the number of references, ..., the data's address, ...) as numba lays it out, and the data.
 %memory = type { i64, ptr, ptr, ptr, i64 }
@@ -143,6 +167,12 @@ def compiled(kernels: Sequence[Kernel], target: Target, lowered: Sequence[str] |
     _internalise(module, {each.symbol for each in kernels})
     _optimise(module, machine)
     module.verify()
+    strange = {each.name for each in module.functions if each.is_declaration and each.name.split(".")[0] != "llvm"} - LIBC
+    if strange:
+        raise ValueError(
+            f"{', '.join(each.name for each in kernels)}: expected calls of libc and libm only, got {', '.join(sorted(strange))}; "
+            "write what needs it (BLAS, LAPACK, reshape, ...) as loops"
+        )
     return machine.emit_object(module)  # type: ignore[no-any-return]
 
 
@@ -181,8 +211,9 @@ def _declare(function: Any) -> None:
     for _, value in used(function):
         if is_native(value) and not hasattr(value, "_numba_type_"):
             fastmath = REORDERED if value.native_options["fastmath"] else False
-            options = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", fastmath=fastmath)
-            _CALLED.append(numba.njit(**options)(plain(value)))
+            make: Any = numba.njit  # its types leave some options out
+            make = make(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", fastmath=fastmath)
+            _CALLED.append(make(plain(value)))
             value._numba_type_ = types.Dispatcher(_CALLED[-1])
             _declare(plain(value))
 
