@@ -52,8 +52,13 @@ TARGETS = {
 }
 """The processors that libraries are made for, by the libraries' names."""
 
-LIBC = {"malloc", "free", "memcpy", "memmove", "memset"} | {
-    *(
+LIBC = set(
+    [
+        "malloc",
+        "free",
+        "memcpy",
+        "memmove",
+        "memset",
         "acos",
         "acosh",
         "asin",
@@ -70,10 +75,34 @@ LIBC = {"malloc", "free", "memcpy", "memmove", "memset"} | {
         "exp",
         "exp2",
         "expm1",
-    ),
-    *("fabs", "floor", "fmod", "hypot", "log", "log10", "log1p", "log2", "nearbyint", "pow", "rint", "round", "sin", "sincos"),
-    *("sinh", "sqrt", "tan", "tanh", "trunc", "expf", "logf", "sqrtf", "tanhf", "powf", "sinf", "cosf", "atan2f"),
-}
+        "fabs",
+        "floor",
+        "fmod",
+        "hypot",
+        "log",
+        "log10",
+        "log1p",
+        "log2",
+        "nearbyint",
+        "pow",
+        "rint",
+        "round",
+        "sin",
+        "sinh",
+        "sqrt",
+        "tan",
+        "tanh",
+        "trunc",
+        "expf",
+        "logf",
+        "sqrtf",
+        "tanhf",
+        "powf",
+        "sinf",
+        "cosf",
+        "atan2f",
+    ]
+)
 """What a library may call: every process with Python has these."""
 
 RUNTIME = """
@@ -170,8 +199,8 @@ def compiled(kernels: Sequence[Kernel], target: Target, lowered: Sequence[str] |
     strange = {each.name for each in module.functions if each.is_declaration and each.name.split(".")[0] != "llvm"} - LIBC
     if strange:
         raise ValueError(
-            f"{', '.join(each.name for each in kernels)}: expected calls of libc and libm only, got {', '.join(sorted(strange))}; "
-            "write what needs it (BLAS, LAPACK, reshape, ...) as loops"
+            f"{', '.join(each.name for each in kernels)}: expected calls of libc and libm only, "
+            f"got {', '.join(sorted(strange))}; write what needs it (BLAS, LAPACK, a reshape) as loops"
         )
     return machine.emit_object(module)  # type: ignore[no-any-return]
 

@@ -224,13 +224,16 @@ def _corner_normals(vertices, flat, area, crease, out):
     for f in range(m):
         for k in range(3):
             v = vertices[f, k]
-            total = np.zeros(3)
+            x, y, z = 0.0, 0.0, 0.0
             for e in range(start[v], start[v + 1]):
                 g = around[e]
-                if (flat[f] * flat[g]).sum() >= crease:
-                    total += area[g]
-            norm = math.sqrt((total * total).sum())
-            out[f, k] = total / norm if norm > 1e-15 else flat[f]
+                if flat[f, 0] * flat[g, 0] + flat[f, 1] * flat[g, 1] + flat[f, 2] * flat[g, 2] >= crease:
+                    x, y, z = x + area[g, 0], y + area[g, 1], z + area[g, 2]
+            norm = math.sqrt(x * x + y * y + z * z)
+            if norm > 1e-15:
+                out[f, k, 0], out[f, k, 1], out[f, k, 2] = x / norm, y / norm, z / norm
+            else:
+                out[f, k] = flat[f]
 
 
 @inner
