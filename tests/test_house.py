@@ -32,12 +32,12 @@ def test_only_the_emulator_train_py_and_characterise_py_know_the_simulated_world
 @pytest.mark.parametrize(
     ("service", "heavy"),
     [
-        ("fusion", {"torch", "cv2", "pybullet", "trimesh", *SCIPY}),
-        ("haptics", {"torch", "cv2", "trimesh", *SCIPY}),
-        ("search", {"torch", *SCIPY}),
+        ("fusion", {"numba", "torch", "cv2", "pybullet", "trimesh", *SCIPY}),
+        ("haptics", {"numba", "torch", "cv2", "trimesh", *SCIPY}),
+        ("search", {"numba", "torch", *SCIPY}),
         ("segmentation", {"numba", "pybullet", "trimesh", *SCIPY}),
-        ("posecnn", {"openvino", "pybullet", "trimesh", *SCIPY}),
-        ("emulator", {"torch"}),
+        ("posecnn", {"numba", "openvino", "pybullet", "trimesh", *SCIPY}),
+        ("emulator", {"numba", "torch"}),
         ("skin", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
         ("router", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
     ],

@@ -11,7 +11,6 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 COMMANDS = {
     "up": "start every process of a cell with a router, and show what they do",
@@ -105,18 +104,19 @@ def serve(name: str, argv: list[str]) -> int:
     die_with_parent()
     sys.setswitchinterval(SWITCH_S)
     from services import flags
+    from shared import native
     from shared.cell import description
     from shared.runtime import bus, logs
     from shared.runtime.node import Node
 
     module = importlib.import_module(f"services.{name}.service")
-    _compile_on_full_disk()
     parser = flags.parser(name, module.__doc__ or COMMANDS[name])
     flags.add_metrics(parser)
     module.arguments(parser)
     options = parser.parse_args(argv)
     options.mode = options.mode or getattr(module, "MODE", None)
     logs.configure(options.log_level, options.log_format, name)
+    native.prepare(lambda number, count: logging.getLogger(name).info("compiling %d of %d", number, count))
     _die_with_thread()
     node = Node(module.NAME, description.load(options.cell), bus.connection(options))
     with flags.metrics(parser, options.metrics_port, lambda: [node.health()]):
@@ -210,23 +210,6 @@ def _die_with_thread() -> None:
                 os._exit(1)
 
     threading.excepthook, sys.unraisablehook = end, end_without_memory
-
-
-def _compile_on_full_disk() -> None:
-    """Lets numba go on where there is no room to keep what it has compiled: it would fail, and the service with it."""
-    if "numba" not in sys.modules:
-        return
-    from numba.core.caching import IndexDataCacheFile
-
-    from shared.runtime import logs
-
-    save = IndexDataCacheFile.save
-
-    def save_where_there_is_room(file: IndexDataCacheFile, key: Any, data: Any) -> None:
-        with logs.lost_where_full():
-            save(file, key, data)
-
-    IndexDataCacheFile.save = save_where_there_is_room  # type: ignore[method-assign]
 
 
 if __name__ == "__main__":

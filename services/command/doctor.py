@@ -29,7 +29,6 @@ CORE = ("eclipse-zenoh", "msgpack", "numpy", "scipy", "pydantic", "pyyaml", "pro
 EXTRAS = {
     "torch": "segmentation",
     "openvino": "segmentation",
-    "numba": "search",
     "opencv-python-headless": "search",
     "matplotlib": "skin",
     "ruamel.yaml": "skin",

@@ -159,8 +159,9 @@ def main(channel: socket.socket, modules: Sequence[str]) -> None:
     for module in modules:
         with contextlib.suppress(ImportError):  # its service says what is not installed
             importlib.import_module(module)
-    if "numba" in sys.modules:  # the first function of a process makes it load what it knows of types
-        sys.modules["numba"].njit(lambda x: x + 1.0)(1.0)
+    from shared import native
+
+    native.load()
     threads = os.listdir("/proc/self/task")
     if len(threads) > 1:
         sys.exit(f"fork server: one thread expected after its imports, {len(threads)} came: services are started plainly")

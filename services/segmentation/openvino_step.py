@@ -3,7 +3,7 @@
 It is compiled for every size of the picture apart: for all sizes at once a step takes two thirds longer, as little can be fused.
 Compiling takes some tenths of a second, so the sizes that may come next are compiled ahead, in a thread of low priority. A size
 that is not there yet is waited for: what comes out depends on pictures alone and not on time. Converting the network takes as
-long again, so what comes of it can be kept in a file, beside what Python and numba keep.
+long again, so what comes of it can be kept in a file, in the folder PENUMBRA_CACHE or beside what Python keeps.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def kept_at(net: PredNet, dtype: torch.dtype, version: str) -> Path:
         digest.update(Path(source).read_bytes())
     for name, value in net.state_dict().items():
         digest.update(name.encode() + value.float().numpy().tobytes())
-    folder = os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent / "__pycache__"
+    folder = os.environ.get("PENUMBRA_CACHE") or Path(__file__).parent / "__pycache__"
     return Path(folder) / f"prednet-{digest.hexdigest()}.xml"
 
 

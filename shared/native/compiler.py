@@ -52,57 +52,11 @@ TARGETS = {
 }
 """The processors that libraries are made for, by the libraries' names."""
 
-LIBC = set(
-    [
-        "malloc",
-        "free",
-        "memcpy",
-        "memmove",
-        "memset",
-        "acos",
-        "acosh",
-        "asin",
-        "asinh",
-        "atan",
-        "atan2",
-        "atanh",
-        "cbrt",
-        "ceil",
-        "cos",
-        "cosh",
-        "erf",
-        "erfc",
-        "exp",
-        "exp2",
-        "expm1",
-        "fabs",
-        "floor",
-        "fmod",
-        "hypot",
-        "log",
-        "log10",
-        "log1p",
-        "log2",
-        "nearbyint",
-        "pow",
-        "rint",
-        "round",
-        "sin",
-        "sinh",
-        "sqrt",
-        "tan",
-        "tanh",
-        "trunc",
-        "expf",
-        "logf",
-        "sqrtf",
-        "tanhf",
-        "powf",
-        "sinf",
-        "cosf",
-        "atan2f",
-    ]
-)
+LIBC = {
+    "malloc", "free", "memcpy", "memmove", "memset", "acos", "asin", "asinh", "atan", "atan2", "cbrt", "cos", "cosf", "cosh",
+    "exp", "exp2", "expf", "expm1", "fmod", "hypot", "log", "log10", "log1p", "log2", "logf", "pow", "powf", "sin", "sinf",
+    "sinh", "tan", "tanh", "tanhf", "ceil", "floor", "rint", "round", "trunc", "sqrt", "sqrtf",
+}  # fmt: skip
 """What a library may call: every process with Python has these."""
 
 RUNTIME = """

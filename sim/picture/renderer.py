@@ -208,7 +208,10 @@ def _develop(image, noise, start, sigma, gain, out):
 def _corner_normals(vertices, flat, area, crease, out):
     """Writes the area-weighted mean, at each corner, of the normals of the faces around that vertex within the crease angle."""
     m = len(vertices)
-    count = np.zeros(vertices.max() + 2, np.int64)
+    last = 0
+    for f in range(m):
+        last = max(last, vertices[f, 0], vertices[f, 1], vertices[f, 2])
+    count = np.zeros(last + 2, np.int64)
     for f in range(m):
         for k in range(3):
             count[vertices[f, k] + 1] += 1

@@ -248,7 +248,7 @@ def test_masks_of_the_compiled_network_are_torch_s_but_for_rounding(monkeypatch)
 
 def test_a_converted_network_is_kept_for_the_next_start_and_made_anew_where_its_file_is_spoilt(monkeypatch, tmp_path):
     pytest.importorskip("openvino")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("PENUMBRA_CACHE", str(tmp_path))
     net = prednet.PredNet(prednet.Settings()).eval()
     image = torch.rand(1, 3, 64, 96)
     state = net.initial_state(1, 64, 96)
@@ -268,7 +268,7 @@ def test_a_converted_network_is_kept_for_the_next_start_and_made_anew_where_its_
     assert torch.equal(logits(), first)
     assert len(converted) == 2
     assert openvino_step.kept_at(prednet.PredNet(prednet.Settings()), torch.float32, "1") != path, "other weights, another file"
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "/proc/nowhere")
+    monkeypatch.setenv("PENUMBRA_CACHE", "/proc/nowhere")
     assert torch.equal(logits(), first), "also where nothing can be written"
 
 
