@@ -144,6 +144,7 @@ def gather(
     state: NDArray[np.uint8], labels: NDArray[np.uint8], intrinsics: Intrinsics, x0: int = 0, y0: int = 0, scale: int = 1
 ) -> Evidence:
     """The evidence of a mask from its states and labels (h, w); `x0`, `y0`, `scale`: its window as in `messages.Mask`."""
+    state = np.ascontiguousarray(state)
     target = (state == TARGET).astype(np.float32)
     covered = (state == COVERED).astype(np.uint8)
     known = _blur((1 - covered).astype(np.float32)) if covered.any() else None

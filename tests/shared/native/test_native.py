@@ -228,7 +228,7 @@ def test_numbers_that_do_not_fit_and_arguments_too_few_are_refused():
 
 @pytest.mark.parametrize("text", ["f9[n]", "f8[n", "f8[n] f8", "u2", "f8[n] -> f8[n]"])
 def test_a_signature_that_means_nothing_is_refused(text):
-    with pytest.raises(ValueError, match="^expected "):
+    with pytest.raises(ValueError, match=r"^expected "):
         Signature(text)
 
 
