@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import threading
-from typing import Any
+from functools import partial
 
 SWITCH_S = 0.0005
 """A reader thread waits at most this long for a computing one; Python's 5 ms would be half of the skin's period."""
@@ -22,6 +22,7 @@ def serve(name: str, argv: list[str]) -> int:
     entitle(" ".join(["penumbra", name, *argv]))
     sys.setswitchinterval(SWITCH_S)
     from services import flags
+    from shared import native
     from shared.cell import description
     from shared.contract import processes
     from shared.runtime import bus, logs
@@ -30,7 +31,6 @@ def serve(name: str, argv: list[str]) -> int:
     process = processes.find(name)
     assert process is not None, f"{name} is not in the table of processes"
     module = importlib.import_module(process.module)
-    _compile_on_full_disk()
     parser = flags.parser(name, module.__doc__ or process.about)
     flags.add_metrics(parser)
     module.arguments(parser)
@@ -39,6 +39,7 @@ def serve(name: str, argv: list[str]) -> int:
     logs.configure(options.log_level, options.log_format, name, ends_with_thread=True)
     node = Node(module.NAME, description.load(options.cell), bus.connection(options))
     with flags.metrics(parser, options.metrics_port, lambda: [node.report()]):
+        native.prepare(partial(node.progress, "compiling"))
         module.start(node, options)
         node.run()
     return leave()
@@ -70,20 +71,3 @@ def die_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != int(parent):  # it died before we asked
         sys.exit(1)
-
-
-def _compile_on_full_disk() -> None:
-    """Lets numba go on where there is no room to keep what it has compiled: it would fail, and the service with it."""
-    if "numba" not in sys.modules:
-        return
-    from numba.core.caching import IndexDataCacheFile
-
-    from shared.runtime import logs
-
-    save = IndexDataCacheFile.save
-
-    def save_where_there_is_room(file: IndexDataCacheFile, key: Any, data: Any) -> None:
-        with logs.lost_where_full():
-            save(file, key, data)
-
-    IndexDataCacheFile.save = save_where_there_is_room  # type: ignore[method-assign]

@@ -38,12 +38,12 @@ def test_only_the_robots_bodies_know_pybullet():
 @pytest.mark.parametrize(
     ("service", "heavy"),
     [
-        ("fusion", {"torch", "cv2", "pybullet", "trimesh", *SCIPY}),
-        ("haptics", {"torch", "cv2", "pybullet", "trimesh", *SCIPY}),
-        ("search", {"torch", "pybullet", "trimesh", *SCIPY}),
-        ("segmentation", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
-        ("posecnn", {"openvino", "pybullet", "trimesh", *SCIPY}),
-        ("emulator", {"torch", "pybullet", "trimesh", "scipy.special"}),
+        ("fusion", {"numba", "torch", "cv2", "pybullet", "trimesh", *SCIPY}),
+        ("haptics", {"numba", "torch", "cv2", "pybullet", "trimesh", *SCIPY}),
+        ("search", {"numba", "torch", "pybullet", "trimesh", *SCIPY}),
+        ("segmentation", {"numba", "torch", "pybullet", "trimesh", *SCIPY}),
+        ("posecnn", {"numba", "openvino", "pybullet", "trimesh", *SCIPY}),
+        ("emulator", {"numba", "torch", "pybullet", "trimesh", "scipy.special"}),
         ("skin", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
         ("router", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
     ],

@@ -17,7 +17,6 @@ from services.fusion import paper
 from services.fusion.estimate import Estimate, Refused, latest, measured
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
-from shared import native
 from shared.cell import description
 from shared.contract import messages, topics
 from shared.contract.senses import SENSES, Sense
@@ -47,7 +46,6 @@ def start(node: ServiceNode, options: argparse.Namespace, senses: Sequence[Sense
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
     if options.observer == "paper":
         senses = [sense for sense in senses if sense.name in paper.SENSES]
-    native.prepare()
     group = Group(options.observer, [node.cell.targets[name] for name in names], node.now_ns, senses)
     fusions = [Fusion(node, name, group, observer, senses) for name, observer in zip(names, group.observers, strict=True)]
 

@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from shared.geometry.rigid import Array
+from shared.native import inner, kernel
 from shared.skin.layout import Skin
 
 LIMB_RADIUS = 0.045
@@ -44,11 +44,25 @@ def nearest_points(skin: Skin, signal: Array, variance: Array) -> tuple[Array, A
     return points.reshape(*shape, pads, 3), covariances.reshape(*shape, pads, 3, 3)
 
 
-@njit(cache=True, nogil=True)
+@inner
+def _solve(H, b, x):  # type: ignore[no-untyped-def]
+    """Fills x (3,) with H x = b, for a symmetric positive definite H (Cholesky without square roots)."""
+    l1, l2 = H[1, 0] / H[0, 0], H[2, 0] / H[0, 0]
+    d1, rest = H[1, 1] - l1 * H[1, 0], H[2, 1] - l2 * H[1, 0]
+    l3 = rest / d1
+    d2 = H[2, 2] - l2 * H[2, 0] - l3 * rest
+    y1 = b[1] - l1 * b[0]
+    x[2] = (b[2] - l2 * b[0] - l3 * y1) / d2
+    x[1] = y1 / d1 - l3 * x[2]
+    x[0] = b[0] / H[0, 0] - l1 * x[1] - l2 * x[2]
+
+
+@kernel("f8[s, n], f8[s, n], i8[q], f8[n, 3], f8[n], f8[n], out f8[s, p, 3], out f8[s, p, 3, 3]")
 def _fit(signal, precision, first, centroids, peak, a2, points, covariances):  # type: ignore[no-untyped-def]
     """Gauss-Newton on (log d, g_x, g_y), pad by pad."""
     prior = np.array([1.0, 1.0 / EXPECTED_TILT**2, 1.0 / EXPECTED_TILT**2])
-    J, row = np.empty((3, 3)), np.empty(3)
+    H, J = np.empty((3, 3)), np.empty((3, 3))
+    x, b, row, step = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for s in range(len(signal)):
         for k in range(len(first) - 1):
             # Start at the gap that the strongest electrode has by itself.
@@ -56,9 +70,10 @@ def _fit(signal, precision, first, centroids, peak, a2, points, covariances):  #
             for e in range(first[k], first[k + 1]):
                 if precision[s, e] > 0.0 and signal[s, e] * math.sqrt(precision[s, e]) > 3.0:
                     d = min(d, math.sqrt(max(peak[e] / signal[s, e] - 1.0, 0.01) / a2[e]))
-            x = np.array([math.log(d), 0.0, 0.0])
+            x[0], x[1], x[2] = math.log(d), 0.0, 0.0
             for _ in range(ITERATIONS):
-                H, b = np.diag(prior), np.zeros(3)
+                H[:] = 0.0
+                H[0, 0], H[1, 1], H[2, 2] = prior[0], prior[1], prior[2]
                 b[0] = prior[0] * (math.log(EXPECTED_GAP) - x[0])
                 b[1], b[2] = -prior[1] * x[1], -prior[2] * x[2]
                 d = math.exp(x[0])
@@ -77,7 +92,7 @@ def _fit(signal, precision, first, centroids, peak, a2, points, covariances):  #
                         b[i] += precision[s, e] * row[i] * residual
                         for j in range(3):
                             H[i, j] += precision[s, e] * row[i] * row[j]
-                step = np.linalg.solve(H, b)
+                _solve(H, b, step)
                 x[0] = min(max(x[0] + min(max(step[0], -0.7), 0.7), -6.0), 0.0)
                 x[1] += min(max(step[1], -0.3), 0.3)
                 x[2] += min(max(step[2], -0.3), 0.3)
@@ -91,4 +106,7 @@ def _fit(signal, precision, first, centroids, peak, a2, points, covariances):  #
             J[:, 0] = points[s, k]
             J[0, 1], J[1, 1], J[2, 1] = -d, 0.0, -d * x[1] / rise
             J[0, 2], J[1, 2], J[2, 2] = 0.0, -d, -d * x[2] / rise
-            covariances[s, k] = J @ np.linalg.inv(H) @ J.T
+            for i in range(3):  # J H^-1 J'
+                _solve(H, J[i], step)
+                for j in range(3):
+                    covariances[s, k, i, j] = J[j, 0] * step[0] + J[j, 1] * step[1] + J[j, 2] * step[2]

@@ -19,10 +19,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from shared.geometry.rigid import Array, perturb, pose_error
+from shared.native import kernel
 from shared.skin.layout import Skin
 from shared.skin.response import Response
 
@@ -201,7 +201,7 @@ def _misfit(window: Reading, predicted: Array, z: Array) -> float:
     return float(np.minimum(z[felt] ** 2, OUTLIER**2).sum()) / max(int(felt.sum()) - KNOWN, 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel("f8[p, 4, 4], i8[n], f8[n, 8], out f8[n, 8]")
 def _to_world(T_world_pads, pad_of, jacobian, rows):  # type: ignore[no-untyped-def]
     """Derivatives (n, 8) by a pose error along each pad's own axes, along the world's."""
     for e in range(len(jacobian)):
@@ -214,7 +214,7 @@ def _to_world(T_world_pads, pad_of, jacobian, rows):  # type: ignore[no-untyped-
         rows[e, 6], rows[e, 7] = jacobian[e, 6], jacobian[e, 7]
 
 
-@njit(cache=True, nogil=True)
+@kernel("f8[n], f8[n], f8[n], f8[n], f8[n], f8[n], f8[n, 8], b1, f8, out f8[8, 8], out f8[8], out f8[n] -> f8")
 def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coarse, lasting, H, g, z):  # type: ignore[no-untyped-def]
     """Adds the information (8, 8) and gradient (8,) about the target's pose error in the world and its size, writes residuals
     (n,) and returns the robust cost."""

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -33,6 +32,7 @@ from shared.body.robot import robot_models
 from shared.cell import description as cells
 from shared.geometry.rigid import Array, from_rpy, pose_error
 from shared.geometry.surface import Surface, nearest_points
+from shared.native import kernel
 from shared.skin.layout import Skin, link_names
 from shared.skin.response import Response
 
@@ -132,7 +132,9 @@ class Scenes:
         frames = pads[:, skin.pad_of]
         electrodes = np.einsum("snij,nj->sni", frames[..., :3, :3], skin.centroids) + frames[..., :3, 3]
         size = SIZE + SIZE_SPREAD * np.sqrt(3.0) * rng.uniform(-1.0, 1.0, (count, 2))
-        gap, ahead = _gaps(electrodes, frames[..., :3, 2], T, np.exp(size), *self.surface.arrays)
+        gap, ahead = np.empty(count), np.empty(count, np.bool_)
+        normals_out = np.ascontiguousarray(frames[..., :3, 2])
+        _gaps(electrodes, normals_out, T, np.exp(size), *self.surface.arrays, gap, ahead)
         T_pads_target = np.linalg.inv(pads) @ T[:, None]
         change = np.stack([self.response.change(each, own) for each, own in zip(T_pads_target, size, strict=True)])
         signal = skin.gain * skin.sensitivity * change * (1.0 + self.response.error * rng.standard_normal(change.shape))
@@ -143,24 +145,26 @@ class Scenes:
         return {name: value[free] for name, value in scene.items()}
 
 
-@njit(cache=True, nogil=True)
-def _gaps(electrodes, normals_out, T, factors, corners, centers, radii, normals):  # type: ignore[no-untyped-def]
-    """Smallest gaps (s,) of electrodes (s, n, 3) to a surface at poses (s, 4, 4), stretched by factors (s, 2) along x and across
-    (about, where it is stretched), and whether the nearest point lies in front of its electrode, whose pad looks along
+@kernel("""f8[s, n, 3], f8[s, n, 3], f8[s, 4, 4], f8[s, 2], f8[m, 3, 3], f8[3, m], f8[m], f8[m, 7, 3], out f8[s], out b1[s]""")
+def _gaps(electrodes, normals_out, T, factors, corners, centers, radii, normals, out, ahead):  # type: ignore[no-untyped-def]
+    """Writes the smallest gaps (s,) of electrodes (s, n, 3) to a surface at poses (s, 4, 4), stretched by factors (s, 2) along x
+    and across (about, where it is stretched), and whether the nearest point lies in front of its electrode, whose pad looks along
     normals_out (s, n, 3)."""
     n = electrodes.shape[1]
-    out, ahead, distance = np.empty(len(T)), np.empty(len(T), np.bool_), np.empty(n)
-    nearest, gradient = np.empty((n, 3)), np.empty((n, 3))
+    distance, local, nearest, gradient = np.empty(n), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     for s in range(len(T)):
-        R = np.ascontiguousarray(T[s, :3, :3])
-        local = (electrodes[s] - T[s, :3, 3]) @ R
-        local[:, 0] /= factors[s, 0]
-        local[:, 1:] /= factors[s, 1]
+        for e in range(n):
+            x, y, z = electrodes[s, e, 0] - T[s, 0, 3], electrodes[s, e, 1] - T[s, 1, 3], electrodes[s, e, 2] - T[s, 2, 3]
+            for i in range(3):
+                local[e, i] = (x * T[s, 0, i] + y * T[s, 1, i] + z * T[s, 2, i]) / factors[s, 0 if i == 0 else 1]
         nearest_points(local, corners, centers, radii, normals, distance, nearest, gradient)
         k = np.argmin(distance)
         out[s] = distance[k] * factors[s, 1]
-        ahead[s] = np.sum((R @ (nearest[k] - local[k])) * normals_out[s, k]) > 0.0
-    return out, ahead
+        toward = 0.0
+        for i in range(3):
+            for j in range(3):
+                toward += normals_out[s, k, i] * T[s, i, j] * (nearest[k, j] - local[k, j])
+        ahead[s] = toward > 0.0
 
 
 def build(inputs: int) -> torch.nn.Sequential:

@@ -39,7 +39,6 @@ ONE_THREAD = {
     "OMP_WAIT_POLICY": "passive",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
 }
 """Every process is one worker: pools of threads that spin would take the cores from the others."""
 COMMON = ("shared.runtime.node", "services.flags", "services.run")
@@ -207,6 +206,9 @@ def _import(modules: Sequence[str]) -> None:
     for module in modules:
         with contextlib.suppress(ImportError):  # its service says what is not installed
             importlib.import_module(module)
+    from shared import native
+
+    native.load()
     threads = os.listdir("/proc/self/task")
     if len(threads) > 1:
         sys.exit(f"fork server: expected one thread after its imports, got {len(threads)}: services are started plainly")

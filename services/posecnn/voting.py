@@ -10,10 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from shared.geometry.rigid import Array
+from shared.native import kernel
 
 AGREES_RAD = 0.2
 """A ray that misses the centre by less than this angle agrees with it."""
@@ -44,9 +44,8 @@ def vote(pixels: Array, directions: Array, side: int, cell_px: float = 2.0) -> V
         raise ValueError("vote: at least one pixel expected, none came")
     margin = MARGIN * side
     cells = math.ceil((side + 2.0 * margin) / cell_px)
-    counts = _cast(
-        np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(directions, np.float64), -margin, cell_px, cells
-    )
+    counts = np.zeros((cells, cells), np.int32)
+    _cast(np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(directions, np.float64), -margin, cell_px, counts)
     row, column = divmod(int(np.argmax(_blurred(counts))), cells)
     centre = (np.array([column, row]) + 0.5) * cell_px - margin
     for _ in range(ROUNDS):
@@ -95,10 +94,10 @@ def _blurred(counts: NDArray[np.int32]) -> NDArray[np.int32]:
     return out
 
 
-@njit(cache=True, nogil=True)
-def _cast(pixels, directions, start, cell, cells):
-    """Votes (cells, cells) of rays; cell (i, j) begins at (start + i cell, start + j cell) [px], row before column."""
-    counts = np.zeros((cells, cells), np.int32)
+@kernel("f8[n, 2], f8[n, 2], f8, f8, out i4[m, m]")
+def _cast(pixels, directions, start, cell, counts):
+    """Adds the votes of rays; cell (i, j) begins at (start + i cell, start + j cell) [px], row before column."""
+    cells = len(counts)
     steps = int(math.ceil(1.5 * cells))
     for i in range(len(pixels)):
         x, y = (pixels[i, 0] - start) / cell, (pixels[i, 1] - start) / cell
@@ -110,4 +109,3 @@ def _cast(pixels, directions, start, cell, cells):
             counts[row, column] += 1
             x += dx
             y += dy
-    return counts

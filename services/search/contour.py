@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from services.search.evidence import Intrinsics
 from shared.body.anatomy import Mesh
 from shared.geometry import raster, rigid
+from shared.native import inner, kernel
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,8 @@ APART = 0.01
 """Two points of the contour whose depths differ by more than this [m] belong to two parts."""
 SHAPE = 0.006
 """How well the mesh's cross-section is known [m]."""
+MOST = 4096
+"""Points of a contour, at most: more than any that fits in an image."""
 CREASE = 0.8
 """Facets that meet at a larger angle [rad] are a crease of the body, and not a sample of a round surface."""
 
@@ -65,11 +67,14 @@ class Model:
         half = (FINE - 1) / 2.0
         finer = Intrinsics(k.fx * FINE, k.fy * FINE, k.cx * FINE + half, k.cy * FINE + half)
         fine = self.silhouette_of(V, finer, (x0 * FINE, y0 * FINE, (x1 - x0) * FINE, (y1 - y0) * FINE))
-        return np.asarray(trace(V, self.faces, self.edges, k.fx, k.fy, k.cx, k.cy, fine, x0, y0, w, h, spacing))
+        return trace(V, self.faces, self.edges, k.fx, k.fy, k.cx, k.cy, fine, x0, y0, w, h, spacing)
 
     def silhouette_of(self, V: Array, k: Intrinsics, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
         """The same of vertices (n, 3) [m] that are in the camera's frame already."""
-        faces = _front(V, self.faces) if self.closed else self.faces  # the far side of a closed mesh adds nothing
+        faces = self.faces
+        if self.closed:  # the far side adds nothing
+            faces = np.empty_like(faces)
+            faces = faces[: _front(V, self.faces, faces)]
         return raster.silhouette(V, faces, (k.fx, k.fy, k.cx, k.cy), window)
 
 
@@ -81,10 +86,9 @@ def _edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.array([(i, j, fs[0], fs[1] if len(fs) > 1 else -1) for (i, j), fs in found.items()], np.int32)
 
 
-@njit(cache=True, nogil=True)
-def _front(V, faces):
-    """The faces (n, 3) that turn their outside to the camera."""
-    out = np.empty_like(faces)
+@kernel("f8[v, 3], i4[n, 3], out i4[n, 3] -> i8")
+def _front(V, faces, out):
+    """Writes the faces that turn their outside to the camera, and returns their number."""
     n = 0
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -93,10 +97,10 @@ def _front(V, faces):
         if (uy * vz - uz * vy) * V[a, 0] + (uz * vx - ux * vz) * V[a, 1] + (ux * vy - uy * vx) * V[a, 2] < 0.0:
             out[n] = faces[f]
             n += 1
-    return out[:n]
+    return n
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _lean(V, edge, N, X, Y, Z):
     """How far behind (X, Y, Z) of a silhouette edge, along the line of sight, the round surface is seen edge-on [m].
 
@@ -114,8 +118,21 @@ def _lean(V, edge, N, X, Y, Z):
     return -math.asin(away) / turn * width
 
 
-@njit(cache=True, nogil=True)
-def trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing):
+def trace(
+    V: Array,
+    faces: NDArray[np.int32],
+    edges: NDArray[np.int32],
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    fine: NDArray[np.bool_],
+    x0: int,
+    y0: int,
+    w: int,
+    h: int,
+    spacing: float,
+) -> Array:
     """Points of the outer occluding contour: (n, 8) rows of X, Y, Z in the camera's frame [m], u, v, outward normal (2) and
     the length of contour [px] that the point stands for. V (n, 3) [m]; fine: silhouette of the same pose with FINE x FINE pixels
     on each of the window's, from pixel (x0, y0) on; w, h: size of the window.
@@ -123,6 +140,13 @@ def trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing):
     Where two parts (thumb and palm) end within BESIDE of one another, the points are left out: the smallest motion decides which
     of the two is the contour, so that neither predicts how it moves.
     """
+    points = np.empty((MOST, 8))
+    return points[: _trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing, points)]
+
+
+@kernel("f8[v, 3], i4[n, 3], i4[e, 4], f8, f8, f8, f8, b1[a, b], i8, i8, i8, i8, f8, out f8[m, 8] -> i8")
+def _trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing, points):
+    """Writes the points (m, 8), as many as there is room for, and returns their number: see `trace`."""
     n_faces, n_vertices = len(faces), len(V)
     N = np.empty((n_faces, 4))  # unit normal and twice the area
     front = np.empty(n_faces, np.bool_)
@@ -139,8 +163,8 @@ def trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing):
         z = max(V[i, 2], 1e-9)
         P[i, 0] = fx * V[i, 0] / z + cx
         P[i, 1] = fy * V[i, 1] / z + cy
-    out = np.empty((4096, 8))
-    outer = np.empty(4096, np.bool_)
+    out = np.empty((len(points), 8))
+    outer = np.empty(len(points), np.bool_)
     n = 0
     for e in range(len(edges)):
         i, j, f, g = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
@@ -179,22 +203,21 @@ def trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing):
         c = min(max(int(out[i, 3]) // COLUMN, 0), columns - 1)
         previous[i], last[c] = last[c], i
     kept = 0
-    points = np.empty((n, 8))
     for i in range(n):
         if outer[i] and not _beside(out, i, last, previous):
             points[kept] = out[i]
             kept += 1
-    return points[:kept]
+    return kept
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _lookup(fine, u, v):
     """Whether a silhouette of FINE times the resolution covers the point (u, v)."""
     x, y = int(math.floor((u + 0.5) * FINE)), int(math.floor((v + 0.5) * FINE))
     return 0 <= x < fine.shape[1] and 0 <= y < fine.shape[0] and fine[y, x]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _beside(points, i, last, previous):
     """Whether another part's contour runs along point i."""
     u, v, nx, ny, z = points[i, 3], points[i, 4], points[i, 5], points[i, 6], points[i, 2]
@@ -209,7 +232,7 @@ def _beside(points, i, last, previous):
     return False
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _bilinear(image, u, v):
     h, w = image.shape
     x, y = int(math.floor(u)), int(math.floor(v))
@@ -221,7 +244,7 @@ def _bilinear(image, u, v):
     return top * (1.0 - b) + bottom * b
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _nearest(image, u, v):
     """The pixel's value; 255 outside."""
     x, y = int(math.floor(u + 0.5)), int(math.floor(v + 0.5))
@@ -237,17 +260,22 @@ DROPPED, MEASURED, BOUNDED = 0, 1, 2
 has to move at least that far."""
 
 
-@njit(cache=True, nogil=True)
-def match(points, field, guarded, own, reach):
+def match(
+    points: Array, field: NDArray[np.float32], guarded: NDArray[np.uint8], own: NDArray[np.float32], reach: float
+) -> tuple[Array, NDArray[np.uint8]]:
     """Offsets r (n,) [px] along the outward normal from each contour point to the mask's boundary, and their kinds (n,).
 
     The boundary is where the mask's `field` (h, w) has the value that the silhouette's `own` field (h, w) has on the contour:
     half on a straight one, less on a finger's, which blurring makes smaller.
     """
-    n = len(points)
-    r = np.zeros(n)
-    kind = np.zeros(n, np.uint8)
-    for i in range(n):
+    r, kind = np.zeros(len(points)), np.zeros(len(points), np.uint8)
+    _match(points, field, guarded, own, reach, r, kind)
+    return r, kind
+
+
+@kernel("f8[n, 8], f4[h, w], u1[h, w], f4[h, w], f8, out f8[n], out u1[n]")
+def _match(points, field, guarded, own, reach, r, kind):
+    for i in range(len(points)):
         u, v, nx, ny = points[i, 3], points[i, 4], points[i, 5], points[i, 6]
         before = _bilinear(field, u, v)
         if before < 0.0 or _nearest(guarded, u, v) != 0:
@@ -270,11 +298,20 @@ def match(points, field, guarded, own, reach):
                 kind[i] = MEASURED
                 break
             before = value
-    return r, kind
 
 
-@njit(cache=True, nogil=True)
-def normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bounded):
+def normal_equations(
+    points: Array,
+    r: Array,
+    kind: NDArray[np.uint8],
+    weights: Array,
+    origin: Array,
+    axis: Array,
+    fx: float,
+    fy: float,
+    huber: float,
+    bounded: bool,
+) -> tuple[Array, Array, float, float, float, float, float]:
     """Of the pose error along the camera's axes and the dilation: the 7 x 7 information, its right side (7,), the length of
     contour measured [px], the sum of length times Huber-limited squared offset [px^3], the length that costs, Huber's cost (chi^2
     where all is within `huber`), and the share of the information about the roll that comes from levers longer than SHAPE.
@@ -282,8 +319,16 @@ def normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, boun
     `weights` (n,) [1/px^2] of the points; `origin` (3,) [m] and `axis` (3,) of the target; `bounded`: whether BOUNDED points
     inform, beside that they cost.
     """
-    H = np.zeros((7, 7))
-    g = np.zeros(7)
+    H, g, sums = np.zeros((7, 7)), np.zeros(7), np.empty(5)
+    origin, axis = np.ascontiguousarray(origin), np.ascontiguousarray(axis)
+    _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bounded, H, g, sums)
+    length, square, counted, cost, rolls = sums.tolist()
+    return H, g, length, square, counted, cost, rolls
+
+
+@kernel("f8[n, 8], f8[n], u1[n], f8[n], f8[3], f8[3], f8, f8, f8, b1, out f8[7, 7], out f8[7], out f8[5]")
+def _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bounded, H, g, sums):
+    """Adds to H and g, and writes the five numbers after them: see `normal_equations`."""
     J = np.empty(7)
     length, square, counted, cost = 0.0, 0.0, 0.0, 0.0
     rolls, long_rolls = 1e-12, 0.0
@@ -319,4 +364,4 @@ def normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, boun
             g[a] += weight * J[a] * r[i]
             for b in range(7):
                 H[a, b] += weight * J[a] * J[b]
-    return H, g, length, square, counted, cost, long_rolls / rolls
+    sums[0], sums[1], sums[2], sums[3], sums[4] = length, square, counted, cost, long_rolls / rolls

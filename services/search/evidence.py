@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from shared.cell.description import Camera
 from shared.contract.labels import Label
+from shared.native import kernel
 
 FREE, TARGET, COVERED = 0, 1, 2
 """State of a pixel. COVERED: something stands in front, or nothing is known there. The limb's other parts cover too: the
@@ -71,7 +71,9 @@ class Evidence:
 
     def field_of(self, silhouette: NDArray[np.bool_]) -> NDArray[np.float32]:
         """The field (h, w) of a mask that shows what a silhouette (h, w) shows, where something is known."""
-        shown = _blur(_uncovered(silhouette, self.state))
+        shown = np.empty(self.state.shape, np.float32)
+        _uncover(silhouette, self.state, shown)
+        shown = _blur(shown)
         return shown if self.known is None else _share(shown, self.known)
 
     def measurements(self, correlation: float) -> float:
@@ -142,6 +144,7 @@ def gather(
     state: NDArray[np.uint8], labels: NDArray[np.uint8], intrinsics: Intrinsics, x0: int = 0, y0: int = 0, scale: int = 1
 ) -> Evidence:
     """The evidence of a mask from its states and labels (h, w); `x0`, `y0`, `scale`: its window as in `messages.Mask`."""
+    state = np.ascontiguousarray(state)
     target = (state == TARGET).astype(np.float32)
     covered = (state == COVERED).astype(np.uint8)
     known = _blur((1 - covered).astype(np.float32)) if covered.any() else None
@@ -156,7 +159,7 @@ def gather(
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel("u1[h, w], f4[h, w], u1[h, w] -> i8")
 def _boundary_px(state, field, guarded):
     count = 0
     for y in range(state.shape[0]):
@@ -166,33 +169,42 @@ def _boundary_px(state, field, guarded):
     return count
 
 
-@njit(cache=True, nogil=True)
-def _uncovered(silhouette, state):
-    out = np.zeros(state.shape, np.float32)
+@kernel("b1[h, w], u1[h, w], out f4[h, w]")
+def _uncover(silhouette, state, out):
+    """Writes 1 where a silhouette is not covered, and 0 elsewhere."""
     for y in range(state.shape[0]):
         for x in range(state.shape[1]):
-            if silhouette[y, x] and state[y, x] != COVERED:
-                out[y, x] = 1.0
+            out[y, x] = 1.0 if silhouette[y, x] and state[y, x] != COVERED else 0.0
+
+
+def _share(shown: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
+    out = np.empty_like(shown)
+    _divide(shown, known, out)
     return out
 
 
-@njit(cache=True, nogil=True)
-def _share(shown, known):
-    out = np.zeros_like(shown)
+@kernel("f4[h, w], f4[h, w], out f4[h, w]")
+def _divide(shown, known, out):
+    """Writes shown / known, 0 where nothing is known."""
     for y in range(shown.shape[0]):
         for x in range(shown.shape[1]):
-            if known[y, x] > 1e-3:
-                out[y, x] = shown[y, x] / known[y, x]
-    return out
+            out[y, x] = shown[y, x] / known[y, x] if known[y, x] > 1e-3 else 0.0
 
 
 def _blur(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return cv2.GaussianBlur(image, (0, 0), SMOOTHING_PX, borderType=cv2.BORDER_REPLICATE).astype(np.float32, copy=False)
 
 
-@njit(cache=True, nogil=True)
-def compare(state, silhouette):
+def compare(state: NDArray[np.uint8], silhouette: NDArray[np.bool_]) -> tuple[int, int]:
     """Pixels of a silhouette (h, w) that show the target, and that are free, by a mask's states (h, w)."""
+    counts = np.empty(2, np.int64)
+    _compare(state, silhouette, counts)
+    both, free = counts.tolist()
+    return both, free
+
+
+@kernel("u1[h, w], b1[h, w], out i8[2]")
+def _compare(state, silhouette, counts):
     both, free = 0, 0
     for y in range(state.shape[0]):
         a, b = 0, 0
@@ -201,4 +213,4 @@ def compare(state, silhouette):
             b += silhouette[y, x] & (state[y, x] == FREE)
         both += a
         free += b
-    return both, free
+    counts[0], counts[1] = both, free

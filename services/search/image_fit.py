@@ -17,13 +17,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from services.search.contour import MEASURED, Model, match, normal_equations
 from services.search.evidence import Evidence, Intrinsics, compare
 from services.search.mask_fit import Fit, Limits, marginal, with_prior
 from shared.geometry import rigid
+from shared.native import inner, kernel
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uin
     """The part of an image (h, w, 3) that the evidence's window shows, and the evidence in the image's own pixels."""
     (h, w), scale = evidence.state.shape, evidence.scale
     x0, y0, width, height = evidence.x0, evidence.y0, w * scale, h * scale
-    inside = image[max(y0, 0) : max(y0 + height, 0), max(x0, 0) : max(x0 + width, 0)]
+    inside = np.ascontiguousarray(image[max(y0, 0) : max(y0 + height, 0), max(x0, 0) : max(x0 + width, 0)])
     left, top = min(max(-x0, 0), width), min(max(-y0, 0), height)
     right, bottom = width - left - inside.shape[1], height - top - inside.shape[0]
     if left or top or right or bottom:  # what lies beyond the image is COVERED, so its colours do not matter
@@ -261,10 +261,29 @@ _MIXED = 3
 """Half pixels from the edge up to which a pixel shows a mixture of both sides."""
 
 
-@njit(cache=True, nogil=True)
-def offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped, temperature, mask_sigma):
+def offsets(
+    points: Array,
+    image: NDArray[np.uint8],
+    guarded: NDArray[np.uint8],
+    by_mask: Array,
+    mask_kind: NDArray[np.uint8],
+    pooling: float,
+    floor: float,
+    clipped: float,
+    temperature: float,
+    mask_sigma: float,
+) -> tuple[Array, Array, NDArray[np.uint8]]:
     """Offset [px] of the edge along the outward normal of each contour point, its standard deviation and whether it was measured
     (DROPPED, MEASURED). The arguments after `mask_kind` are those of `ImageSettings`."""
+    n = len(points)
+    r, sigma, kind = np.zeros(n), np.ones(n), np.zeros(n, np.uint8)
+    believed = (pooling, floor, clipped, temperature, mask_sigma)
+    _offsets(points, image, guarded, by_mask, mask_kind, *believed, r, sigma, kind)
+    return r, sigma, kind
+
+
+@kernel("f8[n, 8], u1[h, w, 3], u1[h, w], f8[n], u1[n], f8, f8, f8, f8, f8, out f8[n], out f8[n], out u1[n]")
+def _offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped, temperature, mask_sigma, r, sigma, kind):
     n = len(points)
     colours = np.empty((n, _SAMPLES, 3), np.float32)
     first, last = np.empty(n, np.int64), np.empty(n, np.int64)  # of the samples that nothing covers
@@ -275,7 +294,6 @@ def offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped,
             t = s - LINE
             if abs(t) >= NEAREST:
                 _count(own[i, 0 if t < 0 else 1], colours[i, s])
-    r, sigma, kind = np.zeros(n), np.ones(n), np.zeros(n, np.uint8)
     side = np.empty((2, 10))
     mean, spread = np.empty((2, 3)), np.empty((2, 6))
     mixture = np.empty((2 * _MIXED + 1, 10))  # mean, precision and log determinant of each
@@ -334,10 +352,9 @@ def offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped,
         r[i] = first_moment / total
         sigma[i] = math.sqrt(max(second / total - r[i] * r[i], 0.0))
         kind[i] = MEASURED
-    return r, sigma, kind
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _read(point, image, guarded, colours):
     """Fills the colours along a point's line; returns the first and last sample before something covers it or it ends."""
     h, w = guarded.shape
@@ -360,7 +377,7 @@ def _read(point, image, guarded, colours):
     return first, last
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _count(sums, colour):
     r, g, b = colour[0], colour[1], colour[2]
     sums[0] += 1.0
@@ -375,7 +392,7 @@ def _count(sums, colour):
     sums[9] += b * b
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _moments(sums, floor, mean, spread):
     """Mean (3,) and covariance (6,) (rr, rg, rb, gg, gb, bb) of colours summed by `_count`."""
     n = sums[0]
@@ -388,7 +405,7 @@ def _moments(sums, floor, mean, spread):
             k += 1
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _mix(share, mean, spread, out):
     """Mean (3,), precision (6,) and log determinant of the covariance of the colours where a pixel shows `share` of the inside.
 
@@ -406,7 +423,7 @@ def _mix(share, mean, spread, out):
     out[9] = math.log(det)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _misfit(colour, mixture, clipped):
     """Squared Mahalanobis distance of a colour from a mixture, clipped, and the mixture's log determinant."""
     r, g, b = colour[0] - mixture[0], colour[1] - mixture[1], colour[2] - mixture[2]

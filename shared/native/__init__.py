@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.native.fingerprint import fingerprint
-from shared.native.signature import Parameter, Signature
+from shared.native.signature import Signature
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Progress = Callable[[int, int], None]
@@ -97,7 +97,7 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Any:
         if self._code is None and not self._load():
-            return self.function(*arguments)
+            return self.function(*(_with_attributes(each) for each in arguments))
         values: list[Any] = [_DATA]
         shapes = []
         try:
@@ -150,18 +150,28 @@ class Kernel:
         return True
 
 
-def prepare(progress: Progress | None = None) -> None:
-    """Loads all kernels of the modules imported so far, and compiles those that the library lacks, so that the first calls do not
-    have to. Raises ImportError where that takes numba and it is not installed."""
+def load() -> list[Kernel]:
+    """Loads the kernels of all modules imported so far from the library, and returns those that it lacks."""
     if _way() == "python":
-        return
+        return []
     with _LOCK:
-        missing = [each for each in KERNELS.values() if each._code is None]
-        for each in missing:
-            each._code = _in_library(each)
-        missing = [each for each in missing if each._code is None]
+        for each in KERNELS.values():
+            each._code = each._code or _in_library(each)
+        return [each for each in KERNELS.values() if each._code is None]
+
+
+def prepare(progress: Progress | None = None) -> None:
+    """Loads the kernels of all modules imported so far, and compiles those that the library lacks, so that no first call has to.
+    Raises ImportError where that takes numba and it is not installed."""
+    with _LOCK:
+        missing = load()
         for each, code in zip(missing, _compiled(missing, progress), strict=True):
             each._code = code
+
+
+def _with_attributes(value: Any) -> Any:
+    """Records whose fields can be read as attributes, as compiled code reads them."""
+    return value.view(np.recarray) if isinstance(value, np.ndarray) and value.dtype.names else value
 
 
 def _way() -> str:
@@ -223,4 +233,4 @@ def _check_layout() -> None:
 
 _LOCK = threading.RLock()
 
-__all__ = ["KERNELS", "Kernel", "Parameter", "Progress", "inner", "kernel", "prepare"]
+__all__ = ["KERNELS", "Kernel", "Progress", "inner", "kernel", "load", "prepare"]

@@ -52,6 +52,13 @@ TARGETS = {
 }
 """The processors that libraries are made for, by the libraries' names."""
 
+LIBC = {
+    "malloc", "free", "memcpy", "memmove", "memset", "acos", "asin", "asinh", "atan", "atan2", "cbrt", "cos", "cosf", "cosh",
+    "exp", "exp2", "expf", "expm1", "fmod", "hypot", "log", "log10", "log1p", "log2", "logf", "pow", "powf", "sin", "sinf",
+    "sinh", "tan", "tanh", "tanhf", "ceil", "floor", "rint", "round", "trunc", "sqrt", "sqrtf",
+}  # fmt: skip
+"""What a library may call: every process with Python has these."""
+
 RUNTIME = """
 ; The memory of an array: a header (the number of references, ..., the data's address, ...) as numba lays it out, and the data.
 %memory = type { i64, ptr, ptr, ptr, i64 }
@@ -84,7 +91,8 @@ fill:
   %before = sub i64 %after, 1
   %mask = sub i64 0, %wide
   %aligned = and i64 %before, %mask
-  %data = inttoptr i64 %aligned to ptr
+  %distance = sub i64 %aligned, %address
+  %data = getelementptr i8, ptr %memory, i64 %distance
   store i64 1, ptr %memory
   %field = getelementptr %memory, ptr %memory, i32 0, i32 3
   store ptr %data, ptr %field
@@ -142,6 +150,12 @@ def compiled(kernels: Sequence[Kernel], target: Target, lowered: Sequence[str] |
     _internalise(module, {each.symbol for each in kernels})
     _optimise(module, machine)
     module.verify()
+    strange = {each.name for each in module.functions if each.is_declaration and each.name.split(".")[0] != "llvm"} - LIBC
+    if strange:
+        raise ValueError(
+            f"{', '.join(each.name for each in kernels)}: expected calls of libc and libm only, "
+            f"got {', '.join(sorted(strange))}; write what needs it (BLAS, LAPACK, a reshape) as loops"
+        )
     return machine.emit_object(module)  # type: ignore[no-any-return]
 
 
@@ -171,7 +185,7 @@ def _flags(fastmath: bool) -> Flags:
     flags: Any = Flags()  # its fields are made at run time
     flags.nrt = flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
     flags.error_model = "numpy"
-    flags.fastmath = fastmath
+    flags.fastmath = REORDERED if fastmath else False
     return flags  # type: ignore[no-any-return]
 
 
@@ -179,12 +193,16 @@ def _declare(function: Any) -> None:
     """Makes all functions that this one calls known to numba, which asks values of kinds it does not know for `_numba_type_`."""
     for _, value in used(function):
         if is_native(value) and not hasattr(value, "_numba_type_"):
-            options = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", **value.native_options)
-            _CALLED.append(numba.njit(**options)(plain(value)))
+            fastmath = REORDERED if value.native_options["fastmath"] else False
+            make: Any = numba.njit  # its types leave some options out
+            make = make(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", fastmath=fastmath)
+            _CALLED.append(make(plain(value)))
             value._numba_type_ = types.Dispatcher(_CALLED[-1])
             _declare(plain(value))
 
 
+REORDERED = {"reassoc", "nsz", "contract"}
+"""LLVM's flags for a function with `fastmath`: infinities and NaN remain what they are."""
 _CALLED: list[Any] = []
 """numba's form of the functions that kernels call: their types refer to them, but do not keep them."""
 

@@ -76,11 +76,15 @@ def _source(code: CodeType) -> str:
 def _is_constant(value: Any) -> bool:
     if isinstance(value, tuple):
         return all(_is_constant(each) for each in value)
+    if isinstance(value, type):
+        return issubclass(value, tuple) and hasattr(value, "_fields")  # a NamedTuple
     return isinstance(value, (bool, int, float, np.generic, np.ndarray, np.dtype))
 
 
 def _constant(value: Any) -> str:
     """A value's text, the same for all versions of Python and numpy."""
+    if isinstance(value, type):
+        return f"{value.__name__}{value._fields}"
     if isinstance(value, tuple):
         return f"({', '.join(_constant(each) for each in value)})"
     if isinstance(value, np.dtype):

@@ -8,13 +8,16 @@ import fcntl
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
+import llvmlite
 import llvmlite.binding as llvm
 
 from shared.native import Kernel, Progress
-from shared.native.compiler import VERSIONS, Target, compiled
+from shared.native.fingerprint import FORMAT
 
+NUMBA = version("numba")
 _ENGINES: list[llvm.ExecutionEngine] = []
 """What has been loaded stays in memory as long as these."""
 
@@ -29,30 +32,29 @@ def folder() -> Path:
 def load(kernels: Sequence[Kernel], progress: Progress | None = None) -> list[Callable[[bytes], int]]:
     """The code of kernels, compiled where it is not kept yet. Processes that need the same kernel compile it once: the others
     wait."""
-    target = _this_machine()
-    files = [folder() / f"{kernel.symbol}-{target.cpu}-{'-'.join(VERSIONS.values())}.o" for kernel in kernels]
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    made_by = f"{llvm.get_host_cpu_name()}-{llvmlite.__version__}-{NUMBA}-{FORMAT}"
+    files = [folder() / f"{kernel.symbol}-{made_by}.o" for kernel in kernels]
     missing = [file for file in files if not file.exists()]
     codes = []
     for kernel, file in zip(kernels, files, strict=True):
         if file in missing and progress:
             progress(missing.index(file) + 1, len(missing))
-        codes.append(_loaded(_kept(kernel, file, target), kernel.symbol))
+        codes.append(_loaded(_kept(kernel, file), kernel.symbol))
     return codes
 
 
-def _this_machine() -> Target:
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    return Target(llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
-
-
-def _kept(kernel: Kernel, file: Path, target: Target) -> bytes:
+def _kept(kernel: Kernel, file: Path) -> bytes:
     with contextlib.suppress(OSError):
         return file.read_bytes()
     with _alone(file):
         with contextlib.suppress(OSError):  # another process was faster
             return file.read_bytes()
-        code = compiled([kernel], target)
+        from shared.native.compiler import Target, compiled  # numba takes a second to import
+
+        features = llvm.get_host_cpu_features().flatten()
+        code = compiled([kernel], Target(llvm.get_process_triple(), llvm.get_host_cpu_name(), features))
         with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as new:
             new.write(code)  # where there is no room, the next start compiles again
             new.flush()

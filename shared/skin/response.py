@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from shared.body import urdf
 from shared.cell import description as cells
+from shared.native import inner, kernel
 
 Array = NDArray[np.float64]
 
@@ -34,6 +34,8 @@ RIM = 0.024
 """The limb's nearness is also seen from four points so far [m] from the pad's middle, where outer electrodes are."""
 CORE = 0.01
 """Added to distances from the pad's middle [m]: in contact nothing becomes infinite."""
+LANES = 16
+"""Sums over the limb's skin are as many partial sums: two or more vectors on every processor."""
 ROUND = 0.02
 """The side from which the limb is seen fades out this near [m] to its axis, where it has no meaning."""
 STEPS = np.array([3e-4, 3e-4, 3e-4, 2e-3, 2e-3, 2e-3, 5e-3, 5e-3])
@@ -127,7 +129,7 @@ class Response:
         self._rest = [known[each].rest for each in prints]
         self.error = np.repeat([known[each].error for each in prints], self.electrodes)
         self.index = np.array([different.index(each) for each in prints])
-        points, ends = np.stack([each.points for each in own]), np.stack([each.ends for each in own])
+        points, ends = np.stack([_whole(each.points) for each in own]), np.stack([each.ends for each in own])
         mean, scale = np.stack([each.mean for each in own]), np.stack([each.scale for each in own])
         first, second, third = (_stack([each.weights[i] for each in own]) for i in range(3))
         biases = tuple(_stack([each.biases[i] for each in own]) for i in range(3))
@@ -195,9 +197,17 @@ def features(points: NDArray[np.float32], T_pad_limb: Array, size: Array) -> Arr
     """Input (n, FEATURES) of a network for limbs of these points at T_pad_limb (n, 4, 4), of sizes (n, 2)."""
     out = np.empty((len(T_pad_limb), FEATURES))
     ends = np.array([points[0].min(), points[0].max()], dtype=float)
+    points = _whole(points)
     for k in range(len(out)):
         _features(points, ends, np.ascontiguousarray(T_pad_limb[k, :3, :3]), T_pad_limb[k, :3, 3].copy(), size[k], out[k])
     return out
+
+
+def _whole(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Pieces of skin (7, k), with some without area at the end, so that there are a multiple of LANES."""
+    more = np.repeat(points[:, -1:], -points.shape[1] % LANES, axis=1)
+    more[6] = 0.0
+    return np.ascontiguousarray(np.concatenate([points, more], axis=1))
 
 
 def _stack(arrays: list[Array]) -> Array:
@@ -210,61 +220,64 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")  # a division that may raise is not vectorised
+@inner
 def _sums(px, py, pz, nx, ny, nz, area, R, t, along, across, core, out):  # type: ignore[no-untyped-def]
     """Sums over the skin before a pad, into out: for each of three powers of nearness the weight and its first moments along the
     pad's axes (12), for the middle one the second moments xx, yy, xy, zz, and from 32 on the weight as seen from right, left, top
     and bottom of the pad. All in single precision, in one loop."""
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = s10 = s11 = s12 = s13 = s14 = s15 = np.float32(0.0)
-    s16 = s17 = s18 = s19 = np.float32(0.0)
+    lanes = np.zeros((20, LANES), np.float32)  # sums of every LANES-th piece: vectors add up alike on all processors
     twice, square = np.float32(2.0 * RIM), np.float32(RIM * RIM)
     half, one = np.float32(0.5), np.float32(1.0)
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
     t0, t1, t2 = t[0], t[1], t[2]
-    for k in range(px.shape[0]):
-        a, b, c = px[k] * along, py[k] * across, pz[k] * across
-        x = r00 * a + r01 * b + r02 * c + t0
-        y = r10 * a + r11 * b + r12 * c + t1
-        z = r20 * a + r21 * b + r22 * c + t2
-        lx, ly, lz = r00 * x + r10 * y + r20 * z, r01 * x + r11 * y + r21 * z, r02 * x + r12 * y + r22 * z
-        facing = lx * nx[k] + ly * ny[k] + lz * nz[k]
-        far = x * x + y * y + z * z + core
-        near = one / far
-        seen = area[k] * (half - half * facing * math.sqrt(near))
-        w0 = seen * near * near
-        w1 = w0 * near
-        w2 = w1 * near * near
-        s0 += w0
-        s1 += w0 * x
-        s2 += w0 * y
-        s3 += w0 * z
-        s4 += w1
-        s5 += w1 * x
-        s6 += w1 * y
-        s7 += w1 * z
-        s8 += w2
-        s9 += w2 * x
-        s10 += w2 * y
-        s11 += w2 * z
-        s12 += w1 * x * x
-        s13 += w1 * y * y
-        s14 += w1 * x * y
-        s15 += w1 * z * z
-        far += square
-        right, left = one / (far - twice * x), one / (far + twice * x)
-        top, bottom = one / (far - twice * y), one / (far + twice * y)
-        s16 += seen * right * right * right
-        s17 += seen * left * left * left
-        s18 += seen * top * top * top
-        s19 += seen * bottom * bottom * bottom
-    out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = s0, s1, s2, s3, s4, s5, s6, s7
-    out[8], out[9], out[10], out[11], out[12], out[13], out[14], out[15] = s8, s9, s10, s11, s12, s13, s14, s15
-    out[32], out[33], out[34], out[35] = s16, s17, s18, s19
+    for block in range(px.shape[0] // LANES):
+        for lane in range(LANES):
+            k = LANES * block + lane
+            a, b, c = px[k] * along, py[k] * across, pz[k] * across
+            x = r00 * a + r01 * b + r02 * c + t0
+            y = r10 * a + r11 * b + r12 * c + t1
+            z = r20 * a + r21 * b + r22 * c + t2
+            lx, ly, lz = r00 * x + r10 * y + r20 * z, r01 * x + r11 * y + r21 * z, r02 * x + r12 * y + r22 * z
+            facing = lx * nx[k] + ly * ny[k] + lz * nz[k]
+            far = x * x + y * y + z * z + core
+            near = one / far
+            seen = area[k] * (half - half * facing * math.sqrt(near))
+            w0 = seen * near * near
+            w1 = w0 * near
+            w2 = w1 * near * near
+            rim = far + square
+            right, left = one / (rim - twice * x), one / (rim + twice * x)
+            top, bottom = one / (rim - twice * y), one / (rim + twice * y)
+            lanes[0, lane] += w0
+            lanes[1, lane] += w0 * x
+            lanes[2, lane] += w0 * y
+            lanes[3, lane] += w0 * z
+            lanes[4, lane] += w1
+            lanes[5, lane] += w1 * x
+            lanes[6, lane] += w1 * y
+            lanes[7, lane] += w1 * z
+            lanes[8, lane] += w2
+            lanes[9, lane] += w2 * x
+            lanes[10, lane] += w2 * y
+            lanes[11, lane] += w2 * z
+            lanes[12, lane] += w1 * x * x
+            lanes[13, lane] += w1 * y * y
+            lanes[14, lane] += w1 * x * y
+            lanes[15, lane] += w1 * z * z
+            lanes[16, lane] += seen * right * right * right
+            lanes[17, lane] += seen * left * left * left
+            lanes[18, lane] += seen * top * top * top
+            lanes[19, lane] += seen * bottom * bottom * bottom
+    for i in range(20):
+        total = np.float32(0.0)
+        for lane in range(LANES):
+            total += lanes[i, lane]
+        out[i if i < 16 else 16 + i] = total
 
 
-@njit(cache=True, nogil=True)
+@kernel("f4[7, k], f8[2], f8[3, 3], f8[3], f8[2], out f8[36]")
 def _features(points, ends, R, t, size, out):  # type: ignore[no-untyped-def]
     length, girth = math.exp(size[0]), math.exp(size[1])
     along, across, core = np.float32(length), np.float32(girth), np.float32(CORE * CORE)
@@ -311,27 +324,74 @@ def _features(points, ends, R, t, size, out):  # type: ignore[no-untyped-def]
         out[side] = math.log(out[side]) - out[4]
 
 
-@njit(cache=True, nogil=True)
+@inner(fastmath=True)
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    """The scalar product of two vectors (n,)."""
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@inner
+def _back(gradients, slopes, weights, out):  # type: ignore[no-untyped-def]
+    """Adds (gradients * slopes) @ weights to out (e, m), for gradients (e, n), slopes (n,) and weights (n, m), four rows of the
+    weights at a time."""
+    n = len(weights)
+    for i in range(0, n - n % 4, 4):
+        for row in range(len(out)):
+            f0, f1 = gradients[row, i] * slopes[i], gradients[row, i + 1] * slopes[i + 1]
+            f2, f3 = gradients[row, i + 2] * slopes[i + 2], gradients[row, i + 3] * slopes[i + 3]
+            for j in range(out.shape[1]):
+                out[row, j] += f0 * weights[i, j] + f1 * weights[i + 1, j] + f2 * weights[i + 2, j] + f3 * weights[i + 3, j]
+    for i in range(n - n % 4, n):
+        for row in range(len(out)):
+            f0 = gradients[row, i] * slopes[i]
+            for j in range(out.shape[1]):
+                out[row, j] += f0 * weights[i, j]
+
+
+@inner
+def _layer(weights, bias, x, out):  # type: ignore[no-untyped-def]
+    """A layer's output (n,) for an input (m,): tanh(weights x + bias)."""
+    for i in range(len(out)):
+        out[i] = math.tanh(_dot(weights[i], x) + bias[i])
+
+
+@inner
+def _changes(w2, b2, skip, second, x, out):  # type: ignore[no-untyped-def]
+    """The network's output (e,) for its second layer's and the skip's input."""
+    for i in range(len(out)):
+        out[i] = _dot(w2[i], second) + b2[i] + _dot(skip[i], x)
+
+
+_ARRAYS = """i8[p], f4[m, 7, k], f8[m, 2], f8[m, 36], f8[m, 36],
+    f8[m, a, 36], f8[m, a], f8[m, b, a], f8[m, b], f8[m, e, b], f8[m, e], f8[m, e, 36]"""
+"""`Response.arrays`, for the kernels' signatures: m networks of p pads, with a and b units in their layers and e electrodes."""
+
+
+@kernel(f"{_ARRAYS}, f8[p, 4, 4], f8[2], out f8[n]")
 def values(index, points, ends, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, size, out):  # type: ignore[no-untyped-def]
     """Log changes of all electrodes, into out (n,). Arguments: `Response.arrays`, T_pads_target (p, 4, 4), size (2,)."""
     e = skip.shape[1]
-    x = np.empty(FEATURES)
+    x, first, second = np.empty(FEATURES), np.empty(w0.shape[1]), np.empty(w1.shape[1])
     for p in range(len(index)):
         m = index[p]
         _features(points[m], ends[m], T[p, :3, :3], T[p, :3, 3], size, x)
-        x -= mean[m]
-        x /= scale[m]
-        first = np.tanh(np.dot(w0[m], x) + b0[m])
-        second = np.tanh(np.dot(w1[m], first) + b1[m])
-        out[p * e : (p + 1) * e] = np.dot(w2[m], second) + b2[m] + np.dot(skip[m], x)
+        for i in range(FEATURES):
+            x[i] = (x[i] - mean[m, i]) / scale[m, i]
+        _layer(w0[m], b0[m], x, first)
+        _layer(w1[m], b1[m], first, second)
+        _changes(w2[m], b2[m], skip[m], second, x, out[p * e : (p + 1) * e])
 
 
-@njit(cache=True, nogil=True)
+@kernel(f"{_ARRAYS}, f8[p, 4, 4], f8[2], out f8[n], out f8[n, 8]")
 def derivatives(index, points, ends, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, size, out, jacobian):  # type: ignore[no-untyped-def]
     """The same with derivatives, into jacobian (n, 8): see `Response.logs`."""
     e = skip.shape[1]
     x, high, low = np.empty(FEATURES), np.empty(FEATURES), np.empty(FEATURES)
-    by = np.empty((FEATURES, 8))
+    first, second, ones = np.empty(w0.shape[1]), np.empty(w1.shape[1]), np.ones(FEATURES)
+    by, back, deep = np.empty((FEATURES, 8)), np.empty((e, FEATURES)), np.empty((e, w0.shape[1]))
     R, t, other = np.empty((3, 3)), np.empty(3), np.empty(2)
     for p in range(len(index)):
         m = index[p]
@@ -352,11 +412,16 @@ def derivatives(index, points, ends, mean, scale, w0, b0, w1, b1, w2, b2, skip, 
                 _features(points[m], ends[m], R, t, other, high if side > 0 else low)
             for i in range(FEATURES):
                 by[i, k] = (high[i] - low[i]) / (2.0 * STEPS[k] * scale[m, i])
-        x -= mean[m]
-        x /= scale[m]
-        first = np.tanh(np.dot(w0[m], x) + b0[m])
-        second = np.tanh(np.dot(w1[m], first) + b1[m])
-        out[p * e : (p + 1) * e] = np.dot(w2[m], second) + b2[m] + np.dot(skip[m], x)
-        back = np.dot(w2[m] * (1.0 - second * second), w1[m])
-        back = np.dot(back * (1.0 - first * first), w0[m]) + skip[m]
-        jacobian[p * e : (p + 1) * e] = np.dot(back, by)
+        for i in range(FEATURES):
+            x[i] = (x[i] - mean[m, i]) / scale[m, i]
+        _layer(w0[m], b0[m], x, first)
+        _layer(w1[m], b1[m], first, second)
+        _changes(w2[m], b2[m], skip[m], second, x, out[p * e : (p + 1) * e])
+        deep[:], back[:], jacobian[p * e : (p + 1) * e] = 0.0, skip[m], 0.0
+        for i in range(len(second)):  # the slope of tanh
+            second[i] = 1.0 - second[i] * second[i]
+        for i in range(len(first)):
+            first[i] = 1.0 - first[i] * first[i]
+        _back(w2[m], second, w1[m], deep)
+        _back(deep, first, w0[m], back)
+        _back(back, ones, by, jacobian[p * e : (p + 1) * e])

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from shared.body.anatomy import Mesh
 from shared.cell import description as cells
 from shared.geometry import raster, rigid
 from shared.geometry.rigid import Array
+from shared.native import inner, kernel
 from sim.picture.appearance import CUFF, GLOSS, TEXTURE_FIELDS, Appearance, Look, noise_volume
 
 SHADOW_PX = 256
@@ -40,7 +40,9 @@ class Shape:
         flat = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
         # vertices at the same place count as one, so that meshes with split vertices are smooth too
         _, vertex = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)
-        return cls(mesh, _corner_normals(vertex.reshape(-1)[mesh.faces], flat, area, CREASE).astype(np.float32))
+        normals = np.empty((len(flat), 3, 3))
+        _corner_normals(np.ascontiguousarray(vertex.reshape(-1)[mesh.faces]), flat, area, CREASE, normals)
+        return cls(mesh, normals.astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ class Renderer:
         """Albedo (h, w, 3) of what lies at infinity: the camera stands still, so it is made once."""
         if self._sky is None or self._sky[0] != appearance:
             albedo = np.empty((*self._raster.ids.shape, 3), np.float32)
-            R = rigid.inverse(self._T_camera_world)[:3, :3]
+            R = rigid.inverse(self._T_camera_world)[:3, :3].copy()
             _paint_background(np.array(self._k), R, appearance.row()[None], noise_volume(), albedo)
             self._sky = appearance, albedo
         return self._sky[1]
@@ -188,7 +190,7 @@ def _grain() -> NDArray[np.float32]:
     return _GRAIN[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel("f4[n], f4[m], i8, f4, f4[3], out u1[n]")
 def _develop(image, noise, start, sigma, gain, out):
     n = len(noise)
     k = start
@@ -202,36 +204,42 @@ def _develop(image, noise, start, sigma, gain, out):
             k = 0
 
 
-@njit(cache=True)
-def _corner_normals(vertices, flat, area, crease):
-    """Area-weighted mean, at each corner, of the normals of the faces around that vertex within the crease angle."""
+@kernel("i8[m, 3], f8[m, 3], f8[m, 3], f8, out f8[m, 3, 3]")
+def _corner_normals(vertices, flat, area, crease, out):
+    """Writes the area-weighted mean, at each corner, of the normals of the faces around that vertex within the crease angle."""
     m = len(vertices)
-    count = np.zeros(vertices.max() + 2, np.int64)
+    last = 0
+    for f in range(m):
+        last = max(last, vertices[f, 0], vertices[f, 1], vertices[f, 2])
+    count = np.zeros(last + 2, np.int64)
     for f in range(m):
         for k in range(3):
             count[vertices[f, k] + 1] += 1
-    start = np.cumsum(count)
+    start = count  # of each vertex's faces, one behind the other
+    for v in range(len(count) - 1):
+        start[v + 1] += start[v]
     around = np.empty(3 * m, np.int64)
     fill = start.copy()
     for f in range(m):
         for k in range(3):
             around[fill[vertices[f, k]]] = f
             fill[vertices[f, k]] += 1
-    out = np.empty((m, 3, 3))
     for f in range(m):
         for k in range(3):
             v = vertices[f, k]
-            total = np.zeros(3)
+            x, y, z = 0.0, 0.0, 0.0
             for e in range(start[v], start[v + 1]):
                 g = around[e]
-                if (flat[f] * flat[g]).sum() >= crease:
-                    total += area[g]
-            norm = math.sqrt((total * total).sum())
-            out[f, k] = total / norm if norm > 1e-15 else flat[f]
-    return out
+                if flat[f, 0] * flat[g, 0] + flat[f, 1] * flat[g, 1] + flat[f, 2] * flat[g, 2] >= crease:
+                    x, y, z = x + area[g, 0], y + area[g, 1], z + area[g, 2]
+            norm = math.sqrt(x * x + y * y + z * z)
+            if norm > 1e-15:
+                out[f, k, 0], out[f, k, 1], out[f, k, 2] = x / norm, y / norm, z / norm
+            else:
+                out[f, k] = flat[f]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _noise(volume, x, y, z):
     """Trilinear value noise in [0, 1] with a lattice of pitch 1, whose size is a power of two."""
     wrap = volume.shape[0] - 1
@@ -249,7 +257,7 @@ def _noise(volume, x, y, z):
     return low * (one - c) + high * c
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _texture(textures, row, x, y, z, volume, out):
     """Albedo (3,) of a row of textures (Appearance.row) at body coordinates."""
     base = 0
@@ -277,7 +285,7 @@ def _texture(textures, row, x, y, z, volume, out):
         out[c] = textures[row, base + 3 + c] * (np.float32(1.0) - mix) + textures[row, base + 6 + c] * mix
 
 
-@njit(cache=True, nogil=True)
+@kernel("f8[4], f8[3, 3], f4[t, 20], f4[s, s, s], out f4[h, w, 3]")
 def _paint_background(k, R, textures, volume, out):
     """Albedo (h, w, 3) of a texture on a sphere of 3 m around the camera, whose axes are the columns of R."""
     for row in range(out.shape[0]):
@@ -290,7 +298,10 @@ def _paint_background(k, R, textures, volume, out):
             _texture(textures, 0, x, y, z, volume, out[row, column])
 
 
-@njit(cache=True, nogil=True)
+@kernel(
+    """f4[h, w], u1[h, w], i4[h, w], f8[4], f8[4, 4], f8[b, 4, 4], f4[m, 3, 3], f4[m, 3, 3], u1[m], f4[b, 20], f4[s, s, s],
+    f8[3], f4[3], f4[3], f8[4, 4], f8, f4[l, l], f4[h, w, 3], out f4[h, w, 3], out u1[h, w]"""
+)
 def _shade(
     depth, ids, triangles, k, R, T, corners, normals, face_labels, textures, volume,
     lamp, lamp_colour, ambient, T_lamp_world, lamp_f, shadow, background, image, labels,

@@ -16,13 +16,13 @@ import itertools
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from shared.body.anatomy import Mesh
 from shared.cell import description as cells
 from shared.geometry.rigid import Array
+from shared.native import kernel
 
 FEMTOFARAD = 4.0 * np.pi * 8.8541878128e-12 * 1e15
 """A unit of charge at one volt [fF]."""
@@ -319,7 +319,7 @@ def _grid(xs: Array, ys: Array, z: float) -> Array:
     return np.stack([np.stack(c, axis=1) for c in ((x0, y0, flat), (x1, y0, flat), (x1, y1, flat), (x0, y1, flat))], axis=1)
 
 
-@njit(cache=True, nogil=True)
+@kernel("f8[n, 4, 3], f8[n, 3], f8[n], f8[n, 3], out f8[n, n], out f8[n, n]")
 def _matrices(corners, normals, areas, points, potential, field):  # type: ignore[no-untyped-def]
     for j in range(len(corners)):
         nx, ny, nz = normals[j]
@@ -356,7 +356,7 @@ def _matrices(corners, normals, areas, points, potential, field):  # type: ignor
             field[i, j] = 0.0 if i == j else along / areas[j]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel("f8[n, 9, 3], f8[n, 3], f8[n], f8[p, 3], f8[p, 3], i8[b], out f8[n, p], out f8[b, n], out f8[n, p]", fastmath=True)
 def _couple(points, normals, size, pad, pad_normals, bare, potential, field, onto):  # type: ignore[no-untyped-def]
     bare_row = np.full(len(pad), -1)
     for k in range(len(bare)):

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from services.search import evidence
@@ -25,6 +24,7 @@ from services.search.evidence import COVERED, FREE, TARGET, Evidence, Intrinsics
 from services.search.mask_fit import Noise
 from shared.geometry import rigid
 from shared.geometry.rigid import Array
+from shared.native import kernel
 
 Bool = NDArray[np.bool_]
 
@@ -95,10 +95,10 @@ def level(state: NDArray[np.uint8], k: Intrinsics, x0: int, y0: int, scale: int)
     return Level(evidence.gather(state, np.zeros_like(state), k, x0, y0, scale), (distance - 0.5).astype(np.float32), scale)
 
 
-@njit(cache=True, nogil=True)
-def _difference(state, distance, silhouette, farthest):
-    """The sum of distances [px] of the pixels in which a silhouette (h, w) and the mask differ, the mask's pixels that the
-    silhouette covers, and its pixels that are free, and those that are covered."""
+@kernel("u1[h, w], f4[h, w], b1[h, w], f8, out i8[3] -> f8")
+def _difference(state, distance, silhouette, farthest, counts):
+    """The sum of distances [px] of the pixels in which a silhouette (h, w) and the mask differ. Writes the number of the mask's
+    pixels that the silhouette covers, and of its pixels that are free, and that are covered."""
     total, both, free, covered = 0.0, 0, 0, 0
     for y in range(state.shape[0]):
         for x in range(state.shape[1]):
@@ -112,7 +112,8 @@ def _difference(state, distance, silhouette, farthest):
                     covered += 1
             elif state[y, x] == TARGET:
                 total += min(distance[y, x], farthest)
-    return total, both, free, covered
+    counts[0], counts[1], counts[2] = both, free, covered
+    return total
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,9 @@ def score(model: Model, at: Level, T: Array, prior: Prior, noise: Noise = NOISE)
     """How well a pose explains the mask."""
     h, w = at.shape
     silhouette = model.silhouette(T, at.evidence.intrinsics, (0, 0, w, h))
-    total, both, free, covered = _difference(at.evidence.state, at.distance, silhouette, FARTHEST_PX / at.scale)
+    counts = np.empty(3, np.int64)
+    total = _difference(at.evidence.state, at.distance, silhouette, FARTHEST_PX / at.scale, counts)
+    both, free, covered = counts.tolist()
     # a contour that is off by r along a length l makes pixels differ whose distances sum up to l r^2 / 2
     cost = 2.0 * total * at.scale**3 / (noise.edge**2 * noise.correlation)
     return Score(cost + prior.cost(T), both, at.evidence.seen_px + free, covered)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from shared.body.anatomy import Mesh
 from shared.geometry.rigid import Array
+from shared.native import kernel
 
 Faces = NDArray[np.int32]
 
@@ -124,7 +124,8 @@ def _oriented(vertices: Array, faces: Faces) -> Faces:
     i, j = order[:-1][same], order[1:][same]
     # neighbours that are turned alike run along their common edge in opposite directions
     differ = (a[i, 0] == a[j, 0]).astype(np.int8)
-    part, flip = _spread(len(faces), owner[i], owner[j], differ)
+    part, flip = np.empty(len(faces), np.int64), np.empty(len(faces), np.int8)
+    _spread(owner[i], owner[j], differ, part, flip)
     faces = np.where(flip[:, None] == 1, faces[:, ::-1], faces)
     corners = vertices[faces]
     # the volume about the part's own middle also tells the outside of a part with holes
@@ -135,15 +136,16 @@ def _oriented(vertices: Array, faces: Faces) -> Faces:
     return np.ascontiguousarray(np.where(volume[part][:, None] < 0.0, faces[:, ::-1], faces), np.int32)
 
 
-@njit(cache=True, nogil=True)
-def _spread(n, first, second, differ):
-    """The connected part (n,) of each face, and whether (n,) it has to be flipped to be turned as the part's first."""
-    m = len(first)
+@kernel("i8[m], i8[m], i1[m], out i8[n], out i1[n]")
+def _spread(first, second, differ, part, flip):
+    """Writes the connected part of each face, and whether it has to be flipped to be turned as the part's first."""
+    m, n = len(first), len(part)
     start = np.zeros(n + 1, np.int64)
     for e in range(m):
         start[first[e] + 1] += 1
         start[second[e] + 1] += 1
-    start = np.cumsum(start)
+    for f in range(n):
+        start[f + 1] += start[f]
     fill, other, parity = start[:-1].copy(), np.empty(2 * m, np.int64), np.empty(2 * m, np.int8)
     for e in range(m):
         f, g = first[e], second[e]
@@ -151,7 +153,7 @@ def _spread(n, first, second, differ):
         other[fill[g]], parity[fill[g]] = f, differ[e]
         fill[f] += 1
         fill[g] += 1
-    part, flip, stack = np.full(n, -1, np.int64), np.zeros(n, np.int8), np.empty(n, np.int64)
+    part[:], flip[:], stack = -1, 0, np.empty(n, np.int64)
     parts = 0
     for f in range(n):
         if part[f] >= 0:
@@ -167,4 +169,3 @@ def _spread(n, first, second, differ):
                     stack[top] = g
                     top += 1
         parts += 1
-    return part, flip

@@ -2,11 +2,9 @@
 
 import functools
 import json
-import os
 import signal
 import subprocess
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,6 @@ from shared.cell import description as cells
 from shared.contract import processes, topics
 from shared.runtime import bus
 from shared.runtime.node import Node
-from tests.support import injected
 from tests.support.live import free_port, wait_for
 from tests.support.nodes import pose_json, start
 
@@ -244,35 +241,6 @@ def test_a_command_ends_quietly_when_its_reader_does(endpoint):
     watch.stdout.close()
     assert watch.stderr.read() == ""
     assert watch.wait(10) == 0
-
-
-def test_what_is_compiled_runs_also_where_there_is_no_room_to_keep_it(tmp_path):
-    code = """
-import sys
-import numba
-from services import run
-if "mended" in sys.argv:
-    run._compile_on_full_disk()
-@numba.njit(cache=True)
-def more(x):
-    return x + 1
-print(more(41))
-"""
-    source = tmp_path / "source.py"
-    source.write_text(code)
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(injected.small_disk(tmp_path / "cache", 0.1))
-        except PermissionError:
-            pytest.skip("this user may not mount a disk")
-        stack.enter_context(injected.full(tmp_path / "cache"))
-        runs = [
-            subprocess.run([sys.executable, str(source), *argv], env=environment, capture_output=True, text=True, timeout=60)
-            for argv in ([], ["mended"])
-        ]
-    assert "No space left on device" in runs[0].stderr
-    assert runs[1].stdout.strip() == "42"
 
 
 @pytest.mark.parametrize("argv", [["topics"], ["--help"], ["pose", "--json"]])

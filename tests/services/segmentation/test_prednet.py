@@ -294,13 +294,13 @@ def test_at_a_coarse_scale_the_network_sees_the_means_of_pixels():
 def test_where_the_processor_has_no_bfloat16_the_masks_are_computed_in_single_precision(isa):
     """oneDNN, which OpenVINO computes with, is told to do without; the process finds that out, and the masks are the same."""
     code = (
-        "import sys, numpy as np; from services.segmentation import infer; from shared.perception.lookout import Window;"
+        "import sys, numpy as np; from services.segmentation import inference; from shared.perception.lookout import Window;"
         "from tests.services.segmentation.test_prednet import scene; images = scene();"
-        "segmenter = infer.load_segmenter(); window = Window(0, 0, 96, 96);"
+        "segmenter = inference.load_segmenter(); window = Window(0, 0, 96, 96);"
         "masks = [segmenter(image, window, (t + 1) * 50_000_000) for t, image in enumerate(images)];"
         "np.save(sys.stdout.buffer, np.stack(masks))"
     )
-    script = f"from shared import processor; assert not processor.has_bfloat16(); {code}"
+    script = f"from shared.native import processor; assert not processor.has_bfloat16(); {code}"
     environment = {**os.environ, "ONEDNN_MAX_CPU_ISA": isa}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, env=environment)
     assert done.returncode == 0, done.stderr.decode()
