@@ -32,7 +32,7 @@ def test_only_the_emulator_train_py_and_characterise_py_know_the_simulated_world
 @pytest.mark.parametrize(
     ("service", "heavy"),
     [
-        ("fusion", {"torch", "cv2", "pybullet", "trimesh", *SCIPY}),
+        ("fusion", {"numba", "torch", "cv2", "pybullet", "trimesh", *SCIPY}),
         ("haptics", {"torch", "cv2", "trimesh", *SCIPY}),
         ("search", {"torch", *SCIPY}),
         ("segmentation", {"numba", "pybullet", "trimesh", *SCIPY}),

@@ -1,7 +1,6 @@
-"""The one table of senses: what each measures, on which topic, and what is known of its errors. Fusion reads nothing else of
-them.
+"""The one table of senses: what each measures, on which topic, and what is known of its errors.
 
-A new sense is a row here, a topic with its message, and the service that publishes it.
+Fusion knows nothing else of its senses. A new sense is a row here, a topic with its message, and the service that publishes it.
 """
 
 from __future__ import annotations
@@ -81,7 +80,7 @@ class Sense:
 SENSES = (
     # a mask's bias lasts for as long as the limb rests
     Sense("vision", topics.VISION, Measures.POSE, Errors(lasting=0.75, time_constant=1.0), usable="tracking", part="camera"),
-    # windows of the skin share no samples and the noise of its voltages is white: measured on the emulator, a fifth of the variance
-    # is the response model's and lasts
+    # windows of the skin share no samples and the noise of its voltages is white: measured on the emulator, a fifth of the
+    # variance is the response model's and lasts
     Sense("haptic", topics.HAPTIC, Measures.POSE_INFORMATION, Errors(lasting=0.2, time_constant=0.3), usable="in_range"),
 )
