@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.fusion.chi_square import quantile
 from services.search.contour import Model, match, normal_equations
 from services.search.evidence import Evidence, compare
 from shared.geometry import rigid
@@ -61,6 +62,8 @@ class Limits:
         return np.diag([self.position**-2.0] * 3 + [self.rotation**-2.0] * 3)
 
 
+GATE = quantile(0.9999, 6)
+"""Squared Mahalanobis distance that one in 10^4 right poses exceeds."""
 COARSE, FINE = (24.0, 5.0, 4), (8.0, 2.0, 8)
 """Reach of the walk [px], Huber's threshold [px], passes at most."""
 CONVERGED = 1e-3

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from services.fusion.chi_square import quantile
 from services.search import contour, detect, evidence, paper_search
 from services.search.evidence import TARGET, Evidence, Intrinsics
 from services.search.image_fit import refine
-from services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
+from services.search.mask_fit import CONVERGED, GATE, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
 from services.search.robot_depth import RobotDepth
 from shared.body import anatomy
 from shared.cell.description import Cell
@@ -34,8 +35,6 @@ FITS_EXPECTED = 0.6
 no reason to give up."""
 WRONG = 6.0
 """`Fit.misfit` from which a pose is wrong whatever its overlap."""
-GATE = 27.9
-"""Squared Mahalanobis distance, six degrees of freedom, that one in 10^4 right poses exceeds."""
 RECOGNISED = 0.5
 """Up to this hidden share a shape is the target's; a smaller piece may be anything, and is believed only where a sure prediction
 expects it."""
@@ -43,8 +42,8 @@ RECOGNISED_PX = 80.0
 """Least contour of a shape [px] that nothing sure expects."""
 SURE = 0.05
 """Standard deviation of the position [m] along its worst direction up to which a prediction is sure."""
-EXPECTED = 10.6
-"""Squared Mahalanobis distance, six degrees of freedom, from such a prediction that one in 10 right poses exceeds."""
+EXPECTED = quantile(0.9, 6)
+"""Squared Mahalanobis distance from such a prediction that one in 10 right poses exceeds."""
 PRIOR_INFLATION = 2.0
 PRIOR_FLOOR = (0.02, 0.09)
 """The prediction's standard deviations are doubled, and these [m, rad] added, before the solve leans on it: it shall only keep
@@ -53,9 +52,9 @@ JOINT_MARGIN = 0.02
 """Along the limb [m]: how far beyond its predicted near end the mask is still believed, for the prediction may be off."""
 DETECT_REACH = 1.2
 """Lengths of the target around a region of the mask that belong to it: the region may be either end."""
-HOME_GATE = 16.8
-"""Squared Mahalanobis distance from where the target is expected, six degrees of freedom, that one in 100 right poses exceeds:
-a shape further away is not believed to be the target."""
+HOME_GATE = quantile(0.99, 6)
+"""Squared Mahalanobis distance from where the target is expected that one in 100 right poses exceeds: a shape further away is not
+believed to be the target."""
 DETECT_EVERY_NS = {"lost": 250_000_000, "doubtful": 1_000_000_000}
 """Least time between two detections, for each takes as long as twenty frames that are tracked."""
 EXPLAINED = 0.5

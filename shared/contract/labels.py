@@ -13,3 +13,7 @@ class Label(IntEnum):
     FOREARM = 4
     HAND = 5
     OCCLUDER = 6
+
+
+TARGET_LABELS = (Label.FOREARM, Label.HAND)
+"""The target that the networks are trained for: a forearm with its hand. What shows a cell's own target is in its `labels`."""

@@ -14,9 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from services.posecnn.network import Dense
-from shared.contract.labels import Label
-
-TARGET_LABELS = (Label.FOREARM, Label.HAND)
+from shared.contract.labels import TARGET_LABELS
 
 
 def matrices(quaternions: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from services.search import image_fit as colours
 from services.search.contour import MEASURED, Model
 from services.search.evidence import COVERED, FREE, TARGET, Intrinsics
-from services.search.mask_fit import Fit, Limits, Noise
+from services.search.mask_fit import GATE, Fit, Limits, Noise
 from services.search.objects import basin, meshes
 from services.search.objects.basin import Level, Prior, Pyramid, Score, Shape
 from shared.body.anatomy import Mesh
@@ -167,8 +167,6 @@ def _on_picture(
     return found.T_searched, np.asarray(np.linalg.inv(np.linalg.inv(found.covariance) + prior), np.float64)
 
 
-GATE = 27.9
-"""Squared Mahalanobis distance, six degrees of freedom, that one in 10^4 right poses exceeds."""
 SHORTEST = 0.4
 """Share of the mask's boundary along which the picture has to show an edge."""
 

@@ -184,10 +184,15 @@ def test_a_row_that_nobody_publishes_changes_no_number_of_the_others() -> None:
         T = perturb(HOME, 0.01 * rng.normal(size=6) * (20.0 if k == 40 else 1.0))  # one that is refused
         assert two.measure(source, ns(0.02 * k), T, VISION) == three.measure(source, ns(0.02 * k), T, VISION)
     a, b = two.estimate(ns(1.2)), three.estimate(ns(1.2))
-    # the eigenvalues of a larger matrix are never asked for: only the order of sums could differ, and does not
+    # the rows and columns of the third bias hold zeros: the same sums in the same order
     np.testing.assert_array_equal(a.T, b.T)
     np.testing.assert_array_equal(a.covariance, b.covariance)
     assert a.sources == b.sources
+
+
+def test_the_rows_of_the_table_have_names_and_topics_of_their_own() -> None:
+    assert len({sense.name for sense in SENSES}) == len({sense.topic.name for sense in SENSES}) == len(SENSES)
+    assert all(sense.topic in topics.TOPICS for sense in SENSES)
 
 
 def test_each_sense_is_gated_by_its_own_row() -> None:
