@@ -2,6 +2,6 @@
 covariance at 200 Hz.
 
 `observer.py` is the default: an error-state filter (`kernel.py`) that knows that each sense's errors last, and takes measurements
-late and out of order. `paper.py` is the observer of the paper (section "Modified Luenberger Observer"), kept as `--observer
-paper`; it fuses the paper's two senses only.
+late and out of order. `paper.py` is the observer of the paper (section "Modified Luenberger Observer"), kept as
+`--observer paper`; it fuses the paper's two senses only.
 """

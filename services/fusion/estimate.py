@@ -162,8 +162,7 @@ def shaped(values: Array, shape: tuple[int, ...]) -> Array:
 
 
 def latest(now_ns: int | None) -> int:
-    """The latest stamp [ns] that is believed at a time: clocks of one cell differ by MAX_FUTURE_S at most. None: without a
-    clock."""
+    """Latest stamp [ns] that is believed at a time; None: without a clock. Clocks of one cell differ by MAX_FUTURE_S or less."""
     return NO_CLOCK if now_ns is None else now_ns + int(MAX_FUTURE_S * 1e9)
 
 

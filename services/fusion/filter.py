@@ -322,8 +322,8 @@ def move(one, dt, p, R, velocity, P, agility):  # type: ignore[no-untyped-def]
 
 @inner
 def _transit(P, turn, rotation, reach, decay):  # type: ignore[no-untyped-def]
-    """F times P (n, n), in place. What an angular velocity adds to the rotation is the left Jacobian of `rotation` times `reach`,
-    to first order."""
+    """F times P (n, n), in place. An angular velocity adds to the rotation the left Jacobian of `rotation` times `reach`, to
+    first order."""
     a, b, c = 0.5 * reach * rotation[0], 0.5 * reach * rotation[1], 0.5 * reach * rotation[2]
     for j in range(len(P)):
         for i in range(3):
@@ -649,7 +649,7 @@ def adopt(models, measurements, states, senses, P, rings, target, stamp_ns, T, v
 
 @kernel(
     "MODEL[t], SENSE_MODEL[n], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], "
-    "out i8[t, 2], i8[m], i8[m], i8[m], f8[m, 4, 4], f8[m, 6, 6], i8, out i8[m], out f8[size, 6]",
+    "out i8[t, 2], i8[m], i8[m], i8[m], f8[m, 4, 4], f8[m, 6, 6], i8, out i8[m], out MEASUREMENT[1], out f8[size, 6]",
     MODEL=MODEL,
     SENSE_MODEL=SENSE_MODEL,
     MEASUREMENT=MEASUREMENT,
@@ -658,10 +658,10 @@ def adopt(models, measurements, states, senses, P, rings, target, stamp_ns, T, v
 )
 def measure_all(
     models, sense_models, measurements, states, senses, P, rings,
-    targets, sources, stamps_ns, T, information, latest_ns, fates, room,
+    targets, sources, stamps_ns, T, information, latest_ns, fates, taken, PHt,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
-    """`Bank.measure`, one after the other. room (size, 6) is written to."""
-    m = np.empty(1, MEASUREMENT)[0]
+    """`Bank.measure`, one after the other. taken, PHt : room for the measurement under way, and for `step`."""
+    m = taken[0]
     for r in range(len(targets)):
         i = targets[r]
         fates[r] = fault(stamps_ns[r], T[r], information[r], latest_ns)
@@ -669,7 +669,7 @@ def measure_all(
             model = Model(models[i], sense_models)
             reduce(model, sources[r], stamps_ns[r], T[r], information[r], m)
             history = Entries(measurements[i], states[i], senses[i], P[i], rings[i])
-            fates[r] = insert(model, history, m, room) if m.rank else NOTHING
+            fates[r] = insert(model, history, m, PHt) if m.rank else NOTHING
 
 
 @kernel(
@@ -710,9 +710,9 @@ def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, 
             found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)
         for i in range(3):
             for j in range(3):
-                found.T[i, j] = R[i, j]
-            found.T[i, 3], found.T[3, i] = p[i], 0.0
-        found.T[3, 3] = 1.0
+                found.pose[i, j] = R[i, j]
+            found.pose[i, 3], found.pose[3, i] = p[i], 0.0
+        found.pose[3, 3] = 1.0
         so3.copy(covariance, found.covariance)
         total = 0.0
         for i in range(POSE):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from services.fusion import filter
 from services.fusion.estimate import ACCEPTED, FUTURE, STATES, Array, Estimate, Log, latest, refusal, shaped
-from services.fusion.records import ESTIMATE, MODEL, NEVER, POSE, SENSE_ESTIMATE, History, size
+from services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, SENSE_ESTIMATE, History, size
 from services.fusion.settings import Settings, model, sense_models
 from shared.contract.messages import FusedPose, Source
 from shared.contract.senses import SENSES, Sense
@@ -39,7 +39,7 @@ class Bank:
         self._models = np.array([model(self.settings, *given) for given in zip(homes, spreads, strict=True)], MODEL)
         self._sense_models = sense_models(senses)
         self._history = History.empty(len(homes), self.settings.capacity * len(senses), len(senses))
-        self._room = np.empty((size(len(senses)), POSE))
+        self._room = np.empty(1, MEASUREMENT), np.empty((size(len(senses)), POSE))
         filter.clear_all(*self._history)
 
     def __len__(self) -> int:
@@ -68,7 +68,7 @@ class Bank:
         fates = np.empty(len(targets), np.int64)
         filter.measure_all(
             *(self._models, self._sense_models, *self._history),
-            *(targets, sources, stamps_ns, T, information, latest(now_ns), fates, self._room),
+            *(targets, sources, stamps_ns, T, information, latest(now_ns), fates, *self._room),
         )
         columns = (each.tolist() for each in (targets, sources, stamps_ns, fates))
         for target, source, stamp_ns, fate in zip(*columns, strict=True):
@@ -118,7 +118,7 @@ class Bank:
     def _described(self, targets: slice, stamp_ns: int) -> list[Estimate]:
         found, senses = self.estimate(stamp_ns, targets)
         out = []
-        columns = (found["T"], found["velocity"], found["covariance"], found["state"].tolist(), senses.tolist())
+        columns = (found["pose"], found["velocity"], found["covariance"], found["state"].tolist(), senses.tolist())
         for T, velocity, covariance, state, known, log in zip(*columns, self.logs[targets], strict=True):
             sources = {}
             for name, (believed_ns, weight) in zip(self.names, known, strict=True):

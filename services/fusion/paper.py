@@ -40,8 +40,7 @@ from shared.geometry import rigid
 
 STEP_S = 0.01
 SENSES = {"vision": slice(0, 6), "haptic": slice(6, 12)}
-"""Rows of y, g, z and C, and blocks of R: the paper's two senses. This observer takes no others, whatever the table of senses
-has."""
+"""Rows of y, g, z and C, and blocks of R: the paper's two senses. This observer takes no others, whatever the table has."""
 C = np.vstack([np.eye(6), np.eye(6)])
 """C = dg/dx (section "Modified Luenberger-type Observer"), (12, 6)."""
 

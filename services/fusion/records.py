@@ -97,7 +97,7 @@ SENSE_STATE = np.dtype(
 
 ESTIMATE = np.dtype(
     [
-        ("T", "f8", (4, 4)),
+        ("pose", "f8", (4, 4)),
         ("velocity", "f8", POSE),
         ("covariance", "f8", (POSE, POSE)),
         ("state", "i8"),  # which of STATES
@@ -136,4 +136,5 @@ class History(NamedTuple):
 
     def of(self, targets: slice) -> History:
         """The histories of some of the targets, without a copy."""
-        return History(*(part[targets] for part in self))
+        measurements, states, senses, P, rings = self
+        return History(measurements[targets], states[targets], senses[targets], P[targets], rings[targets])

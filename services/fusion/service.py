@@ -119,12 +119,7 @@ class Fusion:
     in rank where it is silent. One that knows nothing yet goes on from what the others publish."""
 
     def __init__(
-        self,
-        node: ServiceNode,
-        target: str,
-        group: Group,
-        observer: ErrorStateObserver | PaperObserver,
-        senses: Sequence[Sense] = SENSES,
+        self, node: ServiceNode, target: str, group: Group, observer: ErrorStateObserver | PaperObserver, senses: Sequence[Sense]
     ):
         self.node, self.target, self.group, self.observer = node, target, group, observer
         self._publishers = Publishers()

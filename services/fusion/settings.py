@@ -8,9 +8,9 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fusion.chi_square import quantile
 from services.fusion.estimate import Array, Limits
 from services.fusion.records import MODEL, POSE, SENSE_MODEL
+from shared.chi_square import quantile
 from shared.contract.senses import Sense
 
 

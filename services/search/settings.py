@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-# Squared Mahalanobis distances of six degrees of freedom: quantiles of the chi-square distribution.
-ONE_IN_10 = 10.6
+from shared.chi_square import quantile
+
+ONE_IN_10 = quantile(0.9, 6)
 """Squared Mahalanobis distance that one in 10 right poses exceeds."""
-ONE_IN_100 = 16.8
+ONE_IN_100 = quantile(0.99, 6)
 """Squared Mahalanobis distance that one in 100 right poses exceeds."""
-ONE_IN_10_000 = 27.9
+ONE_IN_10_000 = quantile(0.9999, 6)
 """Squared Mahalanobis distance that one in 10,000 right poses exceeds."""
 
 

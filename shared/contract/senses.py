@@ -1,7 +1,6 @@
-"""The one table of senses: what each measures, on which topic, and what is known of its errors. Fusion reads nothing else of
-them.
+"""The one table of senses: what each measures, on which topic, and what is known of its errors.
 
-A new sense is a row here, a topic with its message, and the service that publishes it.
+Fusion knows nothing else of its senses. A new sense is a row here, a topic with its message, and the service that publishes it.
 """
 
 from __future__ import annotations

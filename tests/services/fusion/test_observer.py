@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from services.fusion import so3
-from services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Refused
+from services.fusion import filter, so3
+from services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, Refused
 from services.fusion.observer import Bank, ErrorStateObserver
 from services.fusion.paper import PaperObserver
 from services.fusion.settings import Settings
@@ -17,6 +18,7 @@ from shared.contract.messages import MAX_FUTURE_S
 from shared.contract.senses import SENSES
 from shared.geometry import rigid
 from shared.geometry.rigid import Array, perturb, pose_error
+from shared.native import Kernel
 from tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, ns, without_roll
 
 OBSERVERS = [ErrorStateObserver, PaperObserver]
@@ -336,6 +338,36 @@ def test_no_measurement_is_believed_beyond_the_floor() -> None:
     floor = SENSES[0].errors.floor
     sigma = np.sqrt(np.diag(observer.estimate(ns(0.0)).covariance))
     np.testing.assert_allclose(sigma, floor * np.array([0.1, 0.1, 0.1, 1, 1, 1]), rtol=0.02)
+
+
+def test_the_compiled_filter_does_what_its_source_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    def played() -> Estimate:
+        observer = ErrorStateObserver(HOME, SPREAD)
+        measurements = stream(0.3)
+        measurements[20] = (*measurements[20][:2], perturb(HOME, [0.5, 0, 0, 0, 0, 0]), measurements[20][3])  # that is refused
+        late = [*measurements[:10], *measurements[15:], *measurements[10:15]]
+        for measurement in late:
+            observer.measure(*measurement)
+        return observer.estimate(ns(0.32))
+
+    def interpreted(compiled: Kernel) -> Callable[..., object]:
+        def call(*arguments: object) -> object:
+            with_fields = (
+                each.view(np.recarray) if isinstance(each, np.ndarray) and each.dtype.names else each for each in arguments
+            )
+            return compiled.function(*with_fields)
+
+        return call
+
+    fast = played()
+    for name in ("clear_all", "measure_all", "estimate_all"):
+        monkeypatch.setattr(filter, name, interpreted(getattr(filter, name)))
+    slow = played()
+    # compiled code joins multiplications and additions: the last digits differ
+    np.testing.assert_allclose(fast.T, slow.T, atol=1e-11)
+    np.testing.assert_allclose(fast.covariance, slow.covariance, atol=1e-11)
+    np.testing.assert_allclose(fast.velocity, slow.velocity, atol=1e-9)
+    assert (fast.state, fast.sources.keys()) == (slow.state, slow.sources.keys())
 
 
 # ---- directions that are not observed

@@ -257,12 +257,9 @@ def test_a_camera_whose_clock_is_ahead_by_less_than_the_bus_allows_is_fused(
         return json.loads(reply)
 
     key = topics.VISION.at(cell="table", target="forearm")
+    bad = lambda: see(messages.MAX_FUTURE_S + 0.2).get("topics", {}).get(key, {}).get("bad", {})  # noqa: E731
     with fusion, user:
-        wait_for(
-            lambda: see(messages.MAX_FUTURE_S + 0.2).get("topics", {}).get(key, {}).get("bad", {}).get("future"),
-            10.0,
-            "a refusal",
-        )
+        wait_for(lambda: bad().get("future"), 10.0, "a refusal")
         accepted = lambda: see(0.8 * messages.MAX_FUTURE_S)["report"]["forearm"]["vision"]  # noqa: E731
         wait_for(lambda: accepted()["accepted"] > 3, 10.0, "measurements to be accepted")
         assert accepted()["refused"] == {}
