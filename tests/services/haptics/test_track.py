@@ -142,12 +142,20 @@ def test_a_pad_that_never_fits_loses_its_weight_and_the_others_keep_theirs(skin:
 # ---- starts
 
 
-def test_starts_from_scratch_lie_along_the_limb_clear_of_the_pads_and_end_with_the_network_s(skin: Skin):
+@pytest.fixture(scope="module")
+def limb(skin: Skin) -> Limb:
     table = cells.load("table")
     mesh = target_mesh(table.targets["forearm"], table)
-    limb, by_network = Limb(skin, Surface(mesh.vertices, mesh.faces)), rigid.transform([9.0, 0.0, 0.0])
+    return Limb(skin, Surface(mesh.vertices, mesh.faces))
+
+
+def nothing_felt(skin: Skin) -> Reading:
     ones = np.ones(len(skin))
-    reading = Reading(0.0 * ones, ones, skin.T_world_pads(), ones, 0.0 * ones)
+    return Reading(0.0 * ones, ones, skin.T_world_pads(), ones, 0.0 * ones)
+
+
+def test_starts_from_scratch_lie_along_the_limb_clear_of_the_pads_and_end_with_the_network_s(skin: Skin, limb: Limb):
+    by_network, reading = rigid.transform([9.0, 0.0, 0.0]), nothing_felt(skin)
     low = rigid.transform([0.0, 0.0, 0.02])  # inside the table
     starts = Starts(low, limb, lambda reading: by_network, SETTINGS)
     size = np.zeros(2)
@@ -157,12 +165,8 @@ def test_starts_from_scratch_lie_along_the_limb_clear_of_the_pads_and_end_with_t
     assert min(limb.gap(reading, T, size) for T in poses[:-1]) > SETTINGS.clearance - 0.01
 
 
-def test_another_start_than_the_track_is_tried_every_few_windows_and_never_from_where_the_track_is(skin: Skin):
-    table = cells.load("table")
-    mesh = target_mesh(table.targets["forearm"], table)
-    limb, home = Limb(skin, Surface(mesh.vertices, mesh.faces)), rigid.transform([0.0, 0.0, 0.2])
-    ones = np.ones(len(skin))
-    reading = Reading(0.0 * ones, ones, skin.T_world_pads(), ones, 0.0 * ones)
+def test_another_start_than_the_track_is_tried_every_few_windows_and_never_from_where_the_track_is(skin: Skin, limb: Limb):
+    home, reading = rigid.transform([0.0, 0.0, 0.2]), nothing_felt(skin)
     starts = Starts(home, limb, lambda reading: home, SETTINGS)
     due = [starts.is_due() for _ in range(3 * SETTINGS.elsewhere_every)]
     assert np.flatnonzero(due).tolist() == [SETTINGS.elsewhere_every * k - 1 for k in (1, 2, 3)]
