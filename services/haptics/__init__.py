@@ -1,7 +1,10 @@
-"""The skin's share: voltages of all pads (and the joint angles of the robot that carries them) come in, the target's pose
+"""The skin's service: voltages of all pads (and the joint angles of the robot that carries them) come in, the target's pose
 goes out, with an information matrix that is zero along what the skin does not feel.
 
-Voltages are averaged over windows (`window.py`). `estimator.py` finds the pose in each by least squares through the response
-law and the target's surface (`solve.py`), started by the paper's network (`network.py`), whose input are the nearest
-surface points per pad (`nearest.py`; paper, section "Haptic-based Pose Estimation"). `--method paper` is the network alone.
+Voltages are averaged over windows (`batches.py`); `pad_poses.py` says where the pads were. `estimator.py` finds the pose in each
+window by least squares through the response law and the target's surface (`solve.py`). It follows one or two places (`track.py`)
+and starts afresh from others (`starts.py`), such as the pose of the paper's network (`paper_network.py`), whose input are the
+nearest surface points per pad (`paper_nearest.py`; paper, section "Haptic-based Pose Estimation"). Beside the pose it learns how
+far each pad is to be believed (`trust.py`), the limb's size and the electrodes' rests (`size_and_rest.py`). Its numbers are in
+`settings.py`. `--method paper` is the network alone.
 """

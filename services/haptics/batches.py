@@ -58,7 +58,7 @@ class Collector:
 
     def __init__(self, skin: Skin, length_ns: int, patience_ns: int = 100_000_000):
         if length_ns <= 0:
-            raise ValueError(f"a window longer than nothing expected, {length_ns} ns came: give --window-ms above zero")
+            raise ValueError(f"expected a window longer than nothing, got {length_ns} ns: give --window-ms above zero")
         self.skin, self.length_ns, self.patience_ns = skin, length_ns, patience_ns
         self._index = {name: k for k, name in enumerate(skin.pads)}
         self._stamps: list[NDArray[np.int64]] = [np.empty(0, np.int64) for _ in skin.pads]
@@ -73,12 +73,12 @@ class Collector:
         Raises ValueError for an unknown pad, another number of electrodes than the cell has, or a period that is not positive.
         """
         if pad not in self._index:
-            raise ValueError(f"a pad of {', '.join(self._index)} expected, {pad!r} came: compare the cell files")
+            raise ValueError(f"expected a pad of {', '.join(self._index)}, got {pad!r}: compare the cell files")
         k = self._index[pad]
         if volts.ndim != 2 or volts.shape[1] != self._volts[k].shape[1]:
-            raise ValueError(f"pad {pad}: rows of {self._volts[k].shape[1]} electrodes expected, shape {volts.shape} came")
+            raise ValueError(f"pad {pad}: expected rows of {self._volts[k].shape[1]} electrodes, got shape {volts.shape}")
         if period_ns <= 0:
-            raise ValueError(f"pad {pad}: a positive period_ns expected, {period_ns} came")
+            raise ValueError(f"pad {pad}: expected a positive period_ns, got {period_ns}")
         if stamp_ns <= self._newest[k]:
             if self._newest[k] - stamp_ns < self.patience_ns:
                 return None  # a repeated or overtaken batch

@@ -30,10 +30,10 @@ class PadPoses:
     def add(self, robot: str, stamp_ns: int, joints: Array) -> None:
         """Take joint angles (j,) [rad]. Raises ValueError for an unknown robot or another number of joints than it has."""
         if robot not in self.models:
-            raise ValueError(f"a robot of {', '.join(self.models) or 'none'} expected, {robot!r} came: compare the cell files")
+            raise ValueError(f"expected a robot of {', '.join(self.models) or 'none'}, got {robot!r}: compare the cell files")
         wanted = len(self.models[robot].joints)
         if joints.shape != (wanted,):
-            raise ValueError(f"robot {robot}: {wanted} joint angles expected, shape {joints.shape} came")
+            raise ValueError(f"robot {robot}: expected {wanted} joint angles, got shape {joints.shape}")
         self._history[robot].add(stamp_ns, joints)
 
     def at(self, stamp_ns: int) -> tuple[Array, Array] | None:

@@ -28,11 +28,11 @@ from shared.skin.response import Response
 NAME = "haptics"
 WEIGHTS = Path(__file__).parent / "weights"
 SHARE = 0.01
-"""Of one window in a pad's mean misfit: two seconds are remembered."""
+"""Weight of the newest window in a pad's mean misfit: two seconds are remembered."""
 WORST = 10.0
-"""A larger residual, in standard deviations, counts as this one."""
+"""Largest residual, in standard deviations, that an electrode contributes to its pad's mean misfit."""
 LASTING_NS = 1_000_000_000
-"""A fault, or its end, is told when it has lasted this long."""
+"""Time [ns] that a fault, or its end, must last before it is logged."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,10 +1,10 @@
 """Finds the pose of the target in a camera's mask and image.
 
 In: masks, frames, robot joints, and the fused pose as prediction. Out: the camera's pose with covariance, overlap, hidden share,
-state. `fit.py` is a least-squares fit of the mesh's occluding contour (`contour.py`) to the mask's boundary that ignores what is
-hidden (after SRT3D, Stoiber et al. 2022, doi:10.1007/s11263-022-01579-8, with mask boundaries in place of colour statistics);
-`refine.py` goes on from there on the image itself, by the colours on both sides of the contour; `overlap.py` is the paper's
-gradient ascent on the overlap f_m. `evidence.py` says what each pixel tells about the target, `detect.py` finds the target
-without a prediction, and `search.py` puts them together. `objects.py` does the same for any rigid mesh and mask files (`search
-refine`, `search track`; `tools.py` is their command line), from far starts by `basin.py`.
+state. `mask_fit.py` is a least-squares fit of the mesh's occluding contour (`contour.py`) to the mask's boundary that ignores
+what is hidden (after SRT3D, Stoiber et al. 2022, doi:10.1007/s11263-022-01579-8, with mask boundaries in place of colour
+statistics); `image_fit.py` goes on from there on the image itself, by the colours on both sides of the contour;
+`paper_search.py` is the paper's gradient ascent on the overlap f_m. `evidence.py` says what each pixel tells about the target,
+`detect.py` finds the target without a prediction, `verdict.py` judges the pose, and `tracker.py` puts them together; its numbers
+are in `settings.py`. `objects/` does the same for any rigid mesh and mask files (`search refine`, `search track`).
 """

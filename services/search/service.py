@@ -52,7 +52,7 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
     def on_joints(message: Joints, names: dict[str, str]) -> None:
         robot, expected = names["robot"], len(cell.robots[names["robot"]].joints)
         if len(message.position) != expected:
-            raise ValueError(f"joints of {robot}: {expected} values expected, {len(message.position)} came")
+            raise ValueError(f"joints of {robot}: expected {expected} values, got {len(message.position)}")
         history[robot].add(message.stamp_ns, message.position)
 
     def on_mask(message: Mask, names: dict[str, str]) -> None:

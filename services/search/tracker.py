@@ -88,12 +88,14 @@ class Search:
         h, w = mask.labels.shape
         if mask.scale < 1 or h * mask.scale > 2 * self._camera.height or w * mask.scale > 2 * self._camera.width:
             raise ValueError(
-                f"mask: a window of an image of {self._camera.width} x {self._camera.height} at a scale of at least 1 expected, "
-                f"{w} x {h} at scale {mask.scale} came: check the segmentation's camera"
+                f"mask: expected a window of an image of {self._camera.width} x {self._camera.height} at a scale of at least 1, "
+                f"got {w} x {h} at scale {mask.scale}: check the segmentation's camera"
             )
         if image is not None and image.shape[:2] != (self._camera.height, self._camera.width):
-            expected_size, came = f"{self._camera.width} x {self._camera.height}", f"{image.shape[1]} x {image.shape[0]}"
-            raise ValueError(f"image: {expected_size} expected, as the mask's camera has, {came} came")
+            raise ValueError(
+                f"image: expected {self._camera.width} x {self._camera.height} as of the mask's camera, "
+                f"got {image.shape[1]} x {image.shape[0]}"
+            )
         T_start = self._T_camera_world @ (self._target.home.transform if T_prior is None else T_prior)
         if self.method == "paper":
             return self._paper(self._gather(mask, T_start, joints), T_start)

@@ -43,9 +43,9 @@ LEAST = 4
 LEAST_EMPTY = 25
 """Moments with nothing near from which an offset is told."""
 NOTHING_V = 5e-4
-"""Predicted signals [V] below this count as an empty scene …"""
+"""Predicted signal [V] below which a scene counts as empty."""
 OFFSET_V = 3e-3
-"""… in which no electrode may read more than this [V]."""
+"""Largest signal [V] that a healthy electrode reads in an empty scene."""
 
 
 @dataclass

@@ -38,9 +38,9 @@ PATIENCE_S = 14e-3
 PACE_S = 0.7e-3
 """Between probes: a board takes up a command half a millisecond after it came, if no other has come until then."""
 PROBE_S = 3e-3
-"""Waiting for the answer to the last probe …"""
+"""Time [s] for which the answer to the last probe of a round is waited for."""
 LAST_PACE_S = 0.015
-"""… and to every one before a board is given up."""
+"""Time [s] between probes, and for their answers, in the round before a board is given up."""
 QUIET_S = 2e-3
 """A line on which nothing comes for so long is quiet: USB hands over what came once a millisecond."""
 TURN = np.radians(2.0)

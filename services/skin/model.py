@@ -35,11 +35,11 @@ Array = np.ndarray
 POSES, POSES_BACKED = 45_000, 3_000
 """Fields solved for a bare pad, and for one more mounting."""
 POSTURES = 80
-"""Of the robot, for what its other links change at a pad …"""
+"""Number of the robot's postures in which the effect of its other links on a pad is computed."""
 LINK_PANELS = (8, 8)
-"""… each in so many rows and columns of panels …"""
+"""Rows and columns of panels into which each of these links is cut."""
 JOINED = 0.005
-"""… without what lies in the pad's own link or nearer to it than this [m]."""
+"""Least distance from the pad [m] of such panels. What is nearer, or in the pad's own link, is part of its mounting."""
 LIMBS = 32
 """Sizes of limbs: each must be prepared, so poses share them."""
 LENGTH, GIRTH = (-0.12, 0.10), (-0.31, 0.15)

@@ -26,9 +26,9 @@ BYTE_S = 10 / BAUD
 CLOCK_HZ = 120e6
 """Every period is a whole number of ticks of this clock."""
 SAMPLE_HZ = 400e3
-"""Samples a second of a channel after power-on …"""
+"""Samples a second of a channel after power-on."""
 ELECTRODE_HZ = 100e3
-"""… and the excitation's frequency."""
+"""Frequency [Hz] of the excitation after power-on."""
 CHANNELS = 6
 COMMAND_BYTES = 16
 HEAD_BYTES = 16
@@ -41,10 +41,10 @@ MOST_MEASURES = 65_504
 FULL_SCALE = 4095
 """The largest value of one sample, 12 bits."""
 UNUSED = 0xFFFF_FFFF
-"""`measures` of a command that has none …"""
+"""Value of `measures` in a command that sets none."""
 KEEP = struct.unpack("<f", b"\xff\xff\xff\xfe")[0]
-"""… and a frequency that is not to be changed: any negative one. With these no 16 bytes across two commands look like another
-command, so a board that lost a byte stays silent and does nothing that was not asked for."""
+"""Frequency in a command that leaves it as it is: any negative one does. With UNUSED and KEEP no 16 bytes across two commands
+look like another command, so a board that lost a byte stays silent and does nothing that was not asked for."""
 OVERRUN = b"Error\r\n"
 """What the firmware prints, on the same line and at any place, when its converter was not read in time."""
 

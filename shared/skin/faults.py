@@ -238,9 +238,9 @@ class Suspicion:
 
 
 MISFIT = 4.0
-"""Mean squared residual, in variances, from which a pad does not fit, whatever the reason …"""
+"""Mean squared residual, in variances, from which a pad does not fit, whatever the reason."""
 SUSPECT = 0.5
-"""… and from which it does not where there is a reason that explains it."""
+"""Mean squared residual, in variances, from which a pad does not fit where a reason is found that explains it."""
 EXPLAINED = 0.4
 """What an explanation must leave of the misfit at most."""
 MODEL_ERROR = 0.05

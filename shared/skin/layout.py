@@ -21,9 +21,9 @@ from shared.geometry.rigid import Array
 GAIN_GAPS = (0.02, 0.05, 0.10)
 """Gaps [m] at which a calibrated law is compared with the designed one."""
 HOME_SIGMAS = 3.0
-"""A target is within so many standard deviations of its home …"""
+"""Distance from its home, in standard deviations, within which a target is taken to stay."""
 RANGES = 2.0
-"""… and is felt from less than so many times a pad's range."""
+"""Largest distance of a target, in ranges of a pad, at which the pad belongs to those that may feel it."""
 
 
 def electrode_positions(pad_type: cells.PadType) -> Array:

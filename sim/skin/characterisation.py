@@ -25,9 +25,9 @@ ANGLES_DEG = np.arange(10) * 10.0
 PLANE_M = 0.01
 """How far the plane lies above what is scanned."""
 MARGIN_M = (0.06, 0.08)
-"""How far a scan goes on beyond its part, along the limb and across …"""
+"""Lengths [m] by which a scan goes beyond its part of the limb, along the limb and across it."""
 OVER_M = 0.03
-"""… and over the part before it, nearer to the elbow."""
+"""Length [m] by which a scan reaches over the part before its own, nearer to the elbow."""
 ALONG = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """R_limb_pad: the pad above the limb looks down on it, which lies along its y."""
 EMPTY_SAMPLES = 1000

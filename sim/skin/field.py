@@ -29,9 +29,10 @@ FEMTOFARAD = 4.0 * np.pi * 8.8541878128e-12 * 1e15
 PERSON_PF = 150.0
 """A person's capacitance to ground [pF]; 100 to 200 are usual, and it hardly matters which."""
 SECTOR = math.radians(11.0)
-"""Widest angle of a panel on the board …"""
+"""Largest angle [rad] that a panel on the board spans."""
 PARTS = 6
-"""… and how many lie side by side across a piece of copper: twice as many of both change a change of capacitance by 3 %."""
+"""Number of panels side by side across a piece of copper. Panels of half the size in both directions alter a change of
+capacitance by 3 %."""
 NEAR = 2.5
 """A body's panel nearer to the pad than so many times its own size counts as nine points instead of one."""
 ACCURACY = 1e-5

@@ -108,5 +108,5 @@ def test_a_mask_beside_the_limb_is_put_right_or_not_believed(visible):
 
 def test_an_image_of_another_camera_is_refused(visible):
     shot = visible[0]
-    with pytest.raises(ValueError, match=r"image: 640 x 480 expected.*320 x 240 came"):
+    with pytest.raises(ValueError, match=r"image: expected 640 x 480.*got 320 x 240"):
         Search(shot.cell).update(mask(shot, shot.T_world_target), shot.T_world_target, PRIOR, shot.joints, shot.image[::2, ::2])

@@ -281,9 +281,9 @@ def test_a_coarser_mask_and_one_that_hangs_over_the_border_give_the_same_pose(se
 
 
 def test_a_mask_of_another_camera_is_refused_with_what_came(search):
-    with pytest.raises(ValueError, match="640 x 480 at a scale of at least 1 expected, 2000 x 10 at scale 1 came"):
+    with pytest.raises(ValueError, match="640 x 480 at a scale of at least 1, got 2000 x 10 at scale 1"):
         search.update(Mask(stamp_ns=0, labels=np.zeros((10, 2000), np.uint8), x0=0, y0=0, scale=1))
-    with pytest.raises(ValueError, match="at scale 0 came"):
+    with pytest.raises(ValueError, match="at scale 0: check"):
         search.update(Mask(stamp_ns=0, labels=np.zeros((10, 10), np.uint8), x0=0, y0=0, scale=0))
     with pytest.raises(ValueError, match="expected one of default, paper, got 'best'"):
         Search(CELL, method="best")
