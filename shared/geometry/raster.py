@@ -155,40 +155,52 @@ def _fill(ax, ay, bx, by, qx, qy, w, h, out):
 
 @kernel("f8[n, 3], i4[m, 3], f8, f8, f8, f8, u1[m], i8, out f4[h, w], out u1[h, w], out i4[h, w]")
 def _draw(V, faces, fx, fy, cx, cy, ids, start, depth, out_ids, out_triangles):
+    n = len(V)
+    P = np.empty((n, 2), np.int64)
+    for i in range(n):
+        if V[i, 2] >= NEAR:
+            P[i, 0], P[i, 1] = _project(V[i, 0], V[i, 1], V[i, 2], fx, fy, cx, cy)
     triangle, clipped = np.empty((3, 3)), np.empty((4, 3))
+    corners = np.empty((4, 2), np.int64)
     for f in range(len(faces)):
-        for k in range(3):
-            triangle[k] = V[faces[f, k]]
-        if triangle[0, 2] >= NEAR and triangle[1, 2] >= NEAR and triangle[2, 2] >= NEAR:
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        if V[i, 2] >= NEAR and V[j, 2] >= NEAR and V[k, 2] >= NEAR:
             _draw_triangle(
-                triangle[0], triangle[1], triangle[2], fx, fy, cx, cy, ids[f], start + f, depth, out_ids, out_triangles
-            )
+                P[i, 0], P[i, 1], V[i, 2], P[j, 0], P[j, 1], V[j, 2], P[k, 0], P[k, 1], V[k, 2],
+                ids[f], start + f, depth, out_ids, out_triangles,
+            )  # fmt: skip
             continue
+        triangle[0], triangle[1], triangle[2] = V[i], V[j], V[k]
         m = _clip(triangle, clipped)
+        for c in range(m):
+            corners[c, 0], corners[c, 1] = _project(clipped[c, 0], clipped[c, 1], clipped[c, 2], fx, fy, cx, cy)
         for c in range(2, m):
             _draw_triangle(
-                clipped[0], clipped[c - 1], clipped[c], fx, fy, cx, cy, ids[f], start + f, depth, out_ids, out_triangles
-            )
+                corners[0, 0], corners[0, 1], clipped[0, 2],
+                corners[c - 1, 0], corners[c - 1, 1], clipped[c - 1, 2],
+                corners[c, 0], corners[c, 1], clipped[c, 2],
+                ids[f], start + f, depth, out_ids, out_triangles,
+            )  # fmt: skip
 
 
 @inner
-def _draw_triangle(a, b, q, fx, fy, cx, cy, value, index, depth, out_ids, out_triangles):
+def _draw_triangle(ax, ay, az, bx, by, bz, qx, qy, qz, value, index, depth, out_ids, out_triangles):
+    """A triangle of three points in the image (sub-pixel units) with their depths [m]."""
     h, w = depth.shape
-    ax, ay = _project(a[0], a[1], a[2], fx, fy, cx, cy)
-    bx, by = _project(b[0], b[1], b[2], fx, fy, cx, cy)
-    qx, qy = _project(q[0], q[1], q[2], fx, fy, cx, cy)
     area = (bx - ax) * (qy - ay) - (by - ay) * (qx - ax)
     if area == 0:
         return
-    za, zb, zq = 1.0 / a[2], 1.0 / b[2], 1.0 / q[2]
-    if area < 0:
-        bx, by, qx, qy = qx, qy, bx, by
-        zb, zq = zq, zb
-        area = -area
     first_row = max(0, -(-min(ay, by, qy) // SUBPIXEL))
     last_row = min(h - 1, max(ay, by, qy) // SUBPIXEL)
     left = max(0, -(-min(ax, bx, qx) // SUBPIXEL))
     right = min(w - 1, max(ax, bx, qx) // SUBPIXEL)
+    if first_row > last_row or left > right:
+        return
+    za, zb, zq = 1.0 / az, 1.0 / bz, 1.0 / qz
+    if area < 0:
+        bx, by, qx, qy = qx, qy, bx, by
+        zb, zq = zq, zb
+        area = -area
     # the inverse depth is linear in the image: 1/z = z0 + gx x + gy y
     dxb, dyb, dxq, dyq = bx - ax, by - ay, qx - ax, qy - ay
     gx = ((zb - za) * dyq - (zq - za) * dyb) / area * SUBPIXEL

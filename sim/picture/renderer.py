@@ -28,10 +28,12 @@ CREASE = math.cos(math.radians(50.0))
 
 @dataclass(frozen=True)
 class Shape:
-    """A mesh prepared for shading: `normals` (m, 3, 3), one per corner of every face, smooth except across creases."""
+    """A mesh prepared for shading: `normals` (m, 3, 3), one per corner of every face, smooth except across creases; `corners`
+    (m, 3, 3) of every face, in the body's frame."""
 
     mesh: Mesh
     normals: NDArray[np.float32] = field(repr=False)
+    corners: NDArray[np.float32] = field(repr=False)
 
     @classmethod
     def of(cls, mesh: Mesh) -> Shape:
@@ -42,7 +44,7 @@ class Shape:
         _, vertex = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)
         normals = np.empty((len(flat), 3, 3))
         _corner_normals(np.ascontiguousarray(vertex.reshape(-1)[mesh.faces]), flat, area, CREASE, normals)
-        return cls(mesh, normals.astype(np.float32))
+        return cls(mesh, normals.astype(np.float32), corners.astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,10 @@ class Picture:
 
 
 class Renderer:
-    """Renders scenes for one camera, or for a window of its image at a coarser scale (for training on crops)."""
+    """Renders scenes for one camera, or for a window of its image at a coarser scale (for training on crops).
+
+    One picture after another: what a picture has in common with the last one (background, meshes, memory) is kept.
+    """
 
     def __init__(self, camera: cells.Camera, window: tuple[int, int, int, int] | None = None, scale: int = 1):
         x0, y0, width, height = window or (0, 0, camera.width, camera.height)
@@ -76,34 +81,35 @@ class Renderer:
             (camera.cy - y0 - (scale - 1) / 2) / scale,
         )
         self._raster = raster.Raster(width // scale, height // scale)
-        self._sky: tuple[Appearance, NDArray[np.float32]] | None = None
+        self._sky: tuple[object, NDArray[np.float32]] | None = None
+        self._faces: tuple[list[Shape], _Faces] | None = None
+        self._image, self._blurred = (np.empty((*self._raster.ids.shape, 3), np.float32) for _ in range(2))
         self._shadow = raster.Raster(SHADOW_PX, SHADOW_PX)
 
     def render(self, bodies: list[Body], look: Look, rng: np.random.Generator) -> Picture:
         """The picture of `bodies` (at most 254) under the light and sensor of `look`; `rng` draws the noise."""
         view = self._raster
         view.clear()
-        tables = _Tables(bodies)
+        faces = self._faces_of([body.shape for body in bodies])
         for index, body in enumerate(bodies):
             vertices = rigid.apply(self._T_camera_world @ body.T_world_body, body.shape.mesh.vertices)
             view.draw(vertices, body.shape.mesh.faces, *self._k, index)
         lamp = np.asarray(look.lamp, float)
         T_lamp_world, lamp_f = self._cast_shadow(bodies, lamp)
         T_world_camera = rigid.inverse(self._T_camera_world)
-        height, width = view.ids.shape
-        image = np.empty((height, width, 3), np.float32)
-        labels = np.empty((height, width), np.uint8)
+        image, labels = self._image, np.zeros(view.ids.shape, np.uint8)
+        np.copyto(image, self._background(look))
         _shade(
             view.depth,
             view.ids,
             view.triangles,
             np.array(self._k),
             T_world_camera,
-            tables.T_body_world,
-            tables.corners,
-            tables.normals,
-            tables.labels,
-            tables.textures,
+            np.array([rigid.inverse(body.T_world_body) for body in bodies]).reshape(-1, 4, 4),
+            faces.corners,
+            faces.normals,
+            faces.labels,
+            np.array([body.appearance.row() for body in bodies], np.float32).reshape(-1, TEXTURE_FIELDS),
             noise_volume(),
             lamp,
             np.asarray(look.lamp_colour, np.float32),
@@ -111,20 +117,27 @@ class Renderer:
             T_lamp_world,
             lamp_f,
             self._shadow.depth,
-            self._background(look.background),
             image,
             labels,
         )
-        return Picture(_expose(image, look, rng), labels, view.ids.copy())
+        return Picture(_expose(image, self._blurred, look, rng), labels, view.ids.copy())
 
-    def _background(self, appearance: Appearance) -> NDArray[np.float32]:
-        """Albedo (h, w, 3) of what lies at infinity: the camera stands still, so it is made once."""
-        if self._sky is None or self._sky[0] != appearance:
-            albedo = np.empty((*self._raster.ids.shape, 3), np.float32)
+    def _background(self, look: Look) -> NDArray[np.float32]:
+        """What lies at infinity (h, w, 3) in the light of a look: the camera stands still, so it is made once."""
+        drawn = look.background, look.ambient, look.lamp_colour
+        if self._sky is None or self._sky[0] != drawn:
+            albedo = np.empty_like(self._image)
             R = rigid.inverse(self._T_camera_world)[:3, :3].copy()
-            _paint_background(np.array(self._k), R, appearance.row()[None], noise_volume(), albedo)
-            self._sky = appearance, albedo
+            _paint_background(np.array(self._k), R, look.background.row()[None], noise_volume(), albedo)
+            light = np.asarray(look.ambient, np.float32) + np.float32(0.5) * np.asarray(look.lamp_colour, np.float32)
+            self._sky = drawn, albedo * light
         return self._sky[1]
+
+    def _faces_of(self, shapes: list[Shape]) -> _Faces:
+        known = self._faces and len(self._faces[0]) == len(shapes)
+        if not (self._faces and known and all(a is b for a, b in zip(self._faces[0], shapes, strict=True))):
+            self._faces = shapes, _Faces(shapes)
+        return self._faces[1]
 
     def _cast_shadow(self, bodies: list[Body], lamp: Array) -> tuple[Array, float]:
         """Fills the shadow map; returns T_lamp_world and the map's focal length [px]. The map covers the movable bodies."""
@@ -136,7 +149,7 @@ class Renderer:
         up = (0.0, 1.0, 0.0) if abs(lamp[0]) + abs(lamp[1]) < 0.1 else (0.0, 0.0, 1.0)
         T_lamp_world = rigid.inverse(rigid.look_at(lamp, np.median(centres, axis=0), up))
         placed = [rigid.apply(T_lamp_world @ body.T_world_body, body.shape.mesh.vertices) for body in casters]
-        extent = max(float(np.quantile(np.abs(v[:, :2] / np.maximum(v[:, 2:], 0.1)), 0.98)) for v in placed)
+        extent = max(_quantile(np.abs(v[:, :2] / np.maximum(v[:, 2:], 0.1)), 0.98) for v in placed)
         focal = (SHADOW_PX / 2 - 2) / min(max(extent, 0.15), 1.2)
         centre = SHADOW_PX / 2 - 0.5
         for body, vertices in zip(casters, placed, strict=True):
@@ -148,32 +161,40 @@ class Renderer:
         body = bodies[index]
         vertices = rigid.apply(self._T_camera_world @ body.T_world_body, body.shape.mesh.vertices)
         height, width = picture.bodies.shape
-        whole = int(raster.silhouette(vertices, body.shape.mesh.faces, self._k, (0, 0, width, height)).sum())
-        return 1.0 - int((picture.bodies == index).sum()) / whole if whole else 1.0
+        whole = np.count_nonzero(raster.silhouette(vertices, body.shape.mesh.faces, self._k, (0, 0, width, height)))
+        return 1.0 - np.count_nonzero(picture.bodies == index) / whole if whole else 1.0
 
 
-class _Tables:
+class _Faces:
     """All bodies' triangles behind one another, as the shading pass reads them."""
 
-    def __init__(self, bodies: list[Body]):
-        meshes = [body.shape.mesh for body in bodies]
-        self.T_body_world = np.array([rigid.inverse(body.T_world_body) for body in bodies]).reshape(-1, 4, 4)
-        self.corners = np.concatenate(
-            [mesh.vertices[mesh.faces].astype(np.float32) for mesh in meshes] or [np.zeros((0, 3, 3), np.float32)]
-        )
-        self.normals = np.concatenate([body.shape.normals for body in bodies] or [np.zeros((0, 3, 3), np.float32)])
-        self.labels = np.concatenate([mesh.labels for mesh in meshes] or [np.zeros(0, np.uint8)])
-        self.textures = np.array([body.appearance.row() for body in bodies], np.float32).reshape(-1, TEXTURE_FIELDS)
+    def __init__(self, shapes: list[Shape]):
+        self.corners = np.concatenate([shape.corners for shape in shapes] or [np.zeros((0, 3, 3), np.float32)])
+        self.normals = np.concatenate([shape.normals for shape in shapes] or [np.zeros((0, 3, 3), np.float32)])
+        self.labels = np.concatenate([shape.mesh.labels for shape in shapes] or [np.zeros(0, np.uint8)])
 
 
-def _expose(image: NDArray[np.float32], look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The sensor: blur, shot and read noise, gamma of the display, 8 bits, and what JPEG leaves of them."""
+def _quantile(x: Array, share: float) -> float:
+    """What numpy's quantile says, to the last bit, in a seventh of its time."""
+    where = (x.size - 1) * share
+    low = int(where)
+    high, t = min(low + 1, x.size - 1), where - low
+    ordered = np.partition(x.ravel(), (low, high))
+    a, b = float(ordered[low]), float(ordered[high])
+    return a + (b - a) * t if t < 0.5 else b - (b - a) * (1.0 - t)
+
+
+def _expose(image: NDArray[np.float32], blurred: NDArray[np.float32], look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The sensor: blur, shot and read noise, gamma of the display, 8 bits, and what JPEG leaves of them. `blurred`: memory of the
+    image's size."""
     if look.blur_px > 0:
-        image = np.asarray(cv2.GaussianBlur(image, (0, 0), look.blur_px), np.float32)
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), look.blur_px, dst=blurred), np.float32)
     noise = _grain()
     start = int(rng.integers(0, noise.size - 1))
     out = np.empty(image.shape, np.uint8)
-    _develop(image.reshape(-1), noise, start, np.float32(look.noise), np.asarray(look.gain, np.float32), out.reshape(-1))
+    height, width = image.shape[:2]
+    gain = np.tile(np.asarray(look.gain, np.float32), width)
+    _develop(image.reshape(height, -1), noise, start, np.float32(look.noise), gain, out.reshape(height, -1))
     if look.jpeg is not None:
         _, packed = cv2.imencode(".jpg", cv2.cvtColor(out, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, look.jpeg])
         return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1].copy()
@@ -190,18 +211,29 @@ def _grain() -> NDArray[np.float32]:
     return _GRAIN[0]
 
 
-@kernel("f4[n], f4[m], i8, f4, f4[3], out u1[n]")
+@kernel("f4[h, w], f4[m], i8, f4, f4[w], out u1[h, w]")
 def _develop(image, noise, start, sigma, gain, out):
-    n = len(noise)
+    """Rows (h, 3 w) of an image, with as much noise as they need from `start` on, at its end again from its beginning."""
     k = start
+    for row in range(len(image)):
+        first = 0
+        while first < image.shape[1]:
+            last = min(image.shape[1], first + len(noise) - k)
+            n = last - first
+            _develop_run(image[row, first:last], noise[k : k + n], sigma, gain[first:last], out[row, first:last])
+            first, k = last, (k + n) % len(noise)
+
+
+@inner
+def _develop_run(image, noise, sigma, gain, out):
+    """Values behind one another, without a branch: the compiler makes vectors of them."""
     for i in range(len(image)):
-        value = max(image[i] * gain[i % 3], np.float32(0.0))
-        value = math.sqrt(value)  # a display's gamma, near enough
-        value += sigma * noise[k] * (np.float32(0.6) + np.float32(0.4) * value)
-        out[i] = np.uint8(min(max(value, 0.0), 1.0) * 255.0 + 0.5)
-        k += 1
-        if k == n:
-            k = 0
+        value = image[i] * gain[i]
+        value = math.sqrt(value if value > np.float32(0.0) else np.float32(0.0))  # a display's gamma, near enough
+        value += sigma * noise[i] * (np.float32(0.6) + np.float32(0.4) * value)
+        value = value if value > np.float32(0.0) else np.float32(0.0)
+        value = value if value < np.float32(1.0) else np.float32(1.0)
+        out[i] = np.uint8(np.int32(np.float64(value) * 255.0 + 0.5))
 
 
 @kernel("i8[m, 3], f8[m, 3], f8[m, 3], f8, out f8[m, 3, 3]")
@@ -300,12 +332,13 @@ def _paint_background(k, R, textures, volume, out):
 
 @kernel(
     """f4[h, w], u1[h, w], i4[h, w], f8[4], f8[4, 4], f8[b, 4, 4], f4[m, 3, 3], f4[m, 3, 3], u1[m], f4[b, 20], f4[s, s, s],
-    f8[3], f4[3], f4[3], f8[4, 4], f8, f4[l, l], f4[h, w, 3], out f4[h, w, 3], out u1[h, w]"""
+    f8[3], f4[3], f4[3], f8[4, 4], f8, f4[l, l], out f4[h, w, 3], out u1[h, w]"""
 )
 def _shade(
     depth, ids, triangles, k, R, T, corners, normals, face_labels, textures, volume,
-    lamp, lamp_colour, ambient, T_lamp_world, lamp_f, shadow, background, image, labels,
+    lamp, lamp_colour, ambient, T_lamp_world, lamp_f, shadow, image, labels,
 ):  # fmt: skip
+    """Image and labels where there is a body; elsewhere they stay."""
     h, w = ids.shape
     albedo = np.empty(3, np.float32)
     size = shadow.shape[0]
@@ -314,13 +347,10 @@ def _shade(
     for row in range(h):
         dy = (row - k[3]) / k[1]
         for column in range(w):
-            dx = (column - k[2]) / k[0]
             body = ids[row, column]
             if body == 255:
-                for c in range(3):
-                    image[row, column, c] = background[row, column, c] * (ambient[c] + np.float32(0.5) * lamp_colour[c])
-                labels[row, column] = 0
                 continue
+            dx = (column - k[2]) / k[0]
             # the pixel's ray in the world, of unit depth
             rx = R[0, 0] * dx + R[0, 1] * dy + R[0, 2]
             ry = R[1, 0] * dx + R[1, 1] * dy + R[1, 2]

@@ -82,6 +82,15 @@ def test_a_known_target_is_looked_at_until_its_pose_is_old(far):
     assert lookout.look(2 * S) == wide
 
 
+def test_what_is_foreseen_is_what_will_be_looked_at_and_changes_nothing(far):
+    lookout, T = Lookout(far, "front"), rigid.from_rpy((0.05, 0.02, 0.25), (0.1, 0.0, 0.3))
+    lookout.hear(fused(T))
+    now = lookout.look(S)
+    wide = lookout.foresee(2 * S)  # by then the pose is too old
+    assert wide != now and lookout.window == now and lookout.foresee(S) == now
+    assert lookout.look(2 * S) == wide
+
+
 def test_a_home_out_of_the_picture_is_looked_for_everywhere(far):
     away = far.targets["forearm"].model_copy(update={"home": description.Placement(position=(0.0, -20.0, 0.2))})
     lookout = Lookout(far.model_copy(update={"targets": {"forearm": away}}), "front")
