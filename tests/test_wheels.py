@@ -16,14 +16,10 @@ APART = {"torch"}
 
 
 def wanted(requirements: list[str], python: str) -> set[str]:
-    """What a list asks for under a Python, the project's own extras left out. pip would judge markers by the Python it runs
-    on."""
+    """What a list asks for under a Python, without the project's own extras. pip would judge markers by the Python it runs on."""
     here = {**default_environment(), "python_version": python, "python_full_version": f"{python}.0", "extra": ""}
-    found = map(Requirement, requirements)
-    kept = (
-        each for each in found if each.name not in {PROJECT["name"], *APART} and (not each.marker or each.marker.evaluate(here))
-    )
-    return {f"{each.name}{each.specifier}" for each in kept}
+    foreign = [each for each in map(Requirement, requirements) if each.name not in {PROJECT["name"], *APART}]
+    return {f"{each.name}{each.specifier}" for each in foreign if not each.marker or each.marker.evaluate(here)}
 
 
 def everything(python: str) -> set[str]:

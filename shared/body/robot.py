@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,9 +17,6 @@ from shared.cell import description as cells
 from shared.contract.labels import Label
 from shared.geometry import rigid
 from shared.geometry.rigid import Array
-
-if TYPE_CHECKING:
-    import trimesh
 
 
 class RobotModel:
@@ -141,8 +137,7 @@ def _solid(solid: urdf.Solid, path: Path) -> tuple[Array, Array]:
     if solid.file is not None:
         vertices, faces = _plain_obj(solid.file) or _mesh_file(solid.file, f"{path}:{solid.line}")
         return vertices * solid.size, faces
-    primitive = _primitive(solid.kind, solid.size)
-    return np.asarray(primitive.vertices), np.asarray(primitive.faces)
+    return _primitive(solid.kind, solid.size)
 
 
 def _plain_obj(file: Path) -> tuple[Array, Array] | None:
@@ -173,13 +168,15 @@ def _mesh_file(file: Path, place: str) -> tuple[Array, Array]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def _primitive(kind: urdf.SolidKind, size: tuple[float, ...]) -> trimesh.Trimesh:
+def _primitive(kind: urdf.SolidKind, size: tuple[float, ...]) -> tuple[Array, Array]:
     from trimesh import creation
 
     if kind == "box":
-        return creation.box(extents=size)
-    if kind == "sphere":
-        return creation.icosphere(subdivisions=2, radius=size[0])
-    if kind == "cylinder":
-        return creation.cylinder(radius=size[0], height=size[1], sections=24)
-    return creation.capsule(radius=size[0], height=size[1], count=[24, 12])
+        solid = creation.box(extents=size)
+    elif kind == "sphere":
+        solid = creation.icosphere(subdivisions=2, radius=size[0])
+    elif kind == "cylinder":
+        solid = creation.cylinder(radius=size[0], height=size[1], sections=24)
+    else:
+        solid = creation.capsule(radius=size[0], height=size[1], count=[24, 12])
+    return np.asarray(solid.vertices), np.asarray(solid.faces)
