@@ -37,7 +37,7 @@ def test_only_the_emulator_train_py_and_characterise_py_know_the_simulated_world
         ("search", {"torch", *SCIPY}),
         ("segmentation", {"numba", "pybullet", "trimesh", *SCIPY}),
         ("posecnn", {"openvino", "pybullet", "trimesh", *SCIPY}),
-        ("emulator", {"torch", "trimesh", "scipy.special"}),
+        ("emulator", {"torch", "trimesh", *SCIPY}),
         ("skin", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
         ("router", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
     ],
