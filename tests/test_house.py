@@ -43,7 +43,7 @@ def test_only_the_robots_bodies_know_pybullet():
         ("search", {"numba", "torch", "pybullet", "trimesh", *SCIPY}),
         ("segmentation", {"numba", "torch", "pybullet", "trimesh", *SCIPY}),
         ("posecnn", {"numba", "openvino", "pybullet", "trimesh", *SCIPY}),
-        ("emulator", {"numba", "torch", "pybullet", "trimesh", "scipy.special"}),
+        ("emulator", {"numba", "torch", "pybullet", "trimesh", *SCIPY}),
         ("skin", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
         ("router", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
     ],

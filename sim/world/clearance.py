@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from shared.body.anatomy import Mesh
 from shared.body.robot import RobotModel
@@ -22,6 +21,17 @@ TABLE_CLEARANCE = 0.025
 """Demanded distance [m] to the table and to pads in it; between the planned instants it shrinks by less than 5 mm."""
 SAMPLE = 0.02
 """Distance [m] between the points that stand for a hull."""
+
+
+def rotations(rpy: Array) -> Array:
+    """The matrices (k, 3, 3) of roll, pitch, yaw (k, 3) [rad] about the fixed x, y, z axes, as `geometry.from_rpy` has them."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy).T, np.sin(rpy).T
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def hull_points(mesh: Mesh, spacing: float = SAMPLE) -> Array:
@@ -105,7 +115,7 @@ class Clearance:
 
     def __call__(self, times: Array, poses: Array) -> float:
         """The least of what is left over [m] at times (k,) [s of the scene] and poses of the target (k, 6); at most 1 cm."""
-        T_target = frame(Rotation.from_euler("xyz", poses[:, 3:]).as_matrix(), poses[:, :3])
+        T_target = frame(rotations(poses[:, 3:]), poses[:, :3])
         placed = list(zip(self._parts, self._person.poses(T_target), strict=True))
         least = np.inf
         if self._table:  # forearm and upper arm: the torso stands behind the table

@@ -15,13 +15,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from shared.body.anatomy import Mesh
 from shared.body.robot import robot_models
 from shared.cell import description as cells
 from shared.contract.messages import Frame, Joints, Message, Truth, Voltages
 from shared.contract.topics import FRAME, JOINTS, TRUTH, VOLTAGES, Topic
+from shared.geometry import rigid
 from shared.geometry.rigid import Array
 from shared.perception.lookout import Lookout
 from shared.skin.layout import link_names
@@ -319,7 +319,7 @@ class Sensors:
             target=target,
             frame=self.world.cell.frame,
             position=placed.pose[:3],
-            orientation=Rotation.from_euler("xyz", placed.pose[3:]).as_quat(canonical=True),
+            orientation=rigid.position_orientation(rigid.from_rpy(placed.pose[:3], placed.pose[3:]))[1],
             velocity=placed.velocity,
             hidden=next((hidden for seen_ns, hidden in reversed(tuple(self._hidden[target])) if seen_ns <= at_ns), 0.0),
             gap=float(self.world.gaps(state, target).min(initial=FAR)),

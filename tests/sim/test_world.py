@@ -13,7 +13,7 @@ from shared.contract.topics import TRUTH, VOLTAGES
 from shared.geometry import rigid
 from shared.geometry.surface import Surface
 from sim.picture.occluder import AWAY, OcclusionSchedule, box
-from sim.world.clearance import hull_points
+from sim.world.clearance import hull_points, rotations
 from sim.world.motion import Clock
 from sim.world.world import BATCH, TICK_NS, Sensors, World, record
 from tests.support.cells import derive
@@ -300,3 +300,9 @@ def test_a_box_is_closed_and_its_triangles_face_outwards():
     assert solid.volume == pytest.approx(0.2 * 0.4 * 0.6)
     np.testing.assert_allclose(solid.bounds, [[0.9, 1.8, 2.7], [1.1, 2.2, 3.3]])
     np.testing.assert_array_equal(shape.faces, trimesh.creation.box().faces)
+
+
+def test_many_rotations_at_once_are_those_of_one_after_another():
+    angles = np.random.default_rng(1).uniform(-3.0, 3.0, (50, 3))
+    expected = [rigid.from_rpy(np.zeros(3), rpy)[:3, :3] for rpy in angles]
+    np.testing.assert_allclose(rotations(angles), expected, atol=1e-12)  # rounding
