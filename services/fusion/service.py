@@ -37,7 +37,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: ServiceNode, options: argparse.Namespace) -> None:
-    """Wires one observer per target, and one timer for all. Raises CellError for a target that the cell does not have."""
+    """Wires one observer per target, and one timer for all. Raises CellError for a target that the cell does not have.
+
+    Threads: readers of vision and skin, the timer and the answers share the observers of a `Group` under its lock; `state` and
+    what is known of other replicas belong to the timer; `Publishers` has a stream for each reader, which alone uses it.
+    """
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
     warm_up(OBSERVERS[options.observer])
     group = Group(options.observer, [node.cell.targets[name] for name in names], node.now_ns)

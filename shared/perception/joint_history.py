@@ -14,7 +14,8 @@ STALE_NS = 200_000_000
 
 
 class JointHistory:
-    """The last joint angles of one robot, to be read at the stamp of a frame."""
+    """The last joint angles of one robot, to be read at the stamp of a frame. One thread adds; others may ask, as what they look
+    through is a copy."""
 
     def __init__(self, size: int = 256):
         self._samples: deque[tuple[int, Array]] = deque(maxlen=size)
