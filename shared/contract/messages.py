@@ -47,8 +47,8 @@ UNIT_TOLERANCE = 1e-3
 ROUNDING = 1e-6
 """What shares and matrices may be off by rounding, relative."""
 SMALL = 64
-"""Up to so many numbers Python makes a norm as fast as NumPy, and several times faster where NumPy's code is in no cache, as with
-a message every few milliseconds."""
+"""Up to so many numbers Python makes a norm as fast as NumPy, and several times faster where NumPy's code is in no cache, as
+with a message every few milliseconds."""
 LONGEST_TEXT, MOST_SOURCES = 256, 32
 """Characters of a name, and senses of a pose: more than any message needs, less than fills a memory."""
 
@@ -317,8 +317,8 @@ class _Codec(typing.Generic[M]):
         if spec.numpy.kind != "f":
             return array
         # the norm is soon made, and small where all is well; else each number is looked at, also where it is NaN
-        small = array.size <= SMALL
-        norm = math.hypot(*data.cast(spec.numpy.char)) if small else math.sqrt(float(np.vdot(array, array)))
+        small, form = array.size <= SMALL, typing.cast(Literal["d"], spec.numpy.char)
+        norm = math.hypot(*data.cast(form)) if small else math.sqrt(float(np.vdot(array, array)))
         if not norm <= LARGEST and not np.abs(array).max() <= LARGEST:
             count = int((~(np.abs(array) <= LARGEST)).sum())
             wanted = f"finite numbers up to {LARGEST:g} expected, {count} of {array.size} are not"
