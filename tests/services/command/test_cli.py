@@ -96,9 +96,9 @@ def test_no_router_is_one_line_that_says_how_to_start_one(capsys):
 
 
 def test_a_missing_package_is_one_line_with_the_extra_that_installs_it():
-    code = "import sys; sys.modules['msgpack'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; sys.modules['msgspec'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
     result = run("fusion", code=code)
-    assert (result.returncode, result.stderr) == (2, "penumbra fusion: msgpack is not installed: pip install -e '.[fusion]'\n")
+    assert (result.returncode, result.stderr) == (2, "penumbra fusion: msgspec is not installed: pip install -e '.[fusion]'\n")
 
 
 def test_an_import_error_in_our_own_code_is_not_explained_away():
