@@ -296,7 +296,7 @@ class _Codec(typing.Generic[M]):
             version = _version(payload)
         except msgspec.ValidationError:
             return BadMessage("map", f"{where}: a map of fields expected ({error!s:.300})")
-        except (msgspec.DecodeError, RecursionError) as worse:
+        except (ValueError, RecursionError) as worse:  # msgspec raises UnicodeDecodeError, too
             return BadMessage("msgpack", f"{where}: MessagePack expected, came {payload[:16]!r}… ({worse!s:.100})")
         if version != VERSION:
             why = f"wire version {VERSION} expected, {_short(version)} came: run one release of Penumbra everywhere"
