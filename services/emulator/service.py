@@ -39,7 +39,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: Node, options: argparse.Namespace) -> None:
-    """Every stream has a turn of its own: what is due next is made ready before its instant, as a real sensor would have it."""
+    """Threads: the skin's timer, one timer a camera and the answers share the world; motions and occluders have locks of their
+    own, and commands replace what the timers read.
+
+    Every stream has a turn of its own: what is due next is made ready before its instant, as a real sensor would have it."""
     cell = node.cell
     world = World(cell, options.seed)
     world.plan(PLAN_S)

@@ -42,7 +42,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def start(node: ServiceNode, options: argparse.Namespace, senses: Sequence[Sense] = SENSES) -> None:
     """Wires one observer per target, and one timer for all. senses: whose measurements are taken; the paper's observer takes its
-    two alone. Raises CellError for a target that the cell does not have."""
+    two alone. Raises CellError for a target that the cell does not have.
+
+    Threads: the senses' readers, the timer and the answers share the observers of a `Group` under its lock; `state` and what is
+    known of other replicas belong to the timer; `Publishers` has a stream for each reader, which alone uses it.
+    """
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
     if options.observer == "paper":
         senses = [sense for sense in senses if sense.name in paper.SENSES]

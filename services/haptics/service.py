@@ -43,6 +43,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: ServiceNode, options: argparse.Namespace) -> None:
+    """Subscribes; every window of voltages is solved for every target that this replica owns.
+
+    Threads: the collector, the estimators and what they report belong to the reader of voltages; `poses` has a lock of its own,
+    because the reader of joints adds to it.
+    """
     cell = node.cell
     skin = Skin(cell)
     poses = PadPoses(cell, skin, robot_models(cell))
@@ -50,7 +55,11 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
     near = {name: found for name in cell.targets if len((found := Near.of(cell, name)).pads)}
     for name in cell.targets.keys() - near.keys():
         node.log.info("never felt: no pad is where it may come", target=name)
-    estimators = {name: estimator(node, options, found.cell, name) for name, found in near.items()}
+    estimators = {}
+    for k, (name, found) in enumerate(near.items()):
+        node.progress("preparing estimators", k, len(near))
+        estimators[name] = estimator(node, options, found.cell, name)
+    node.progress("preparing estimators", len(near), len(near))
     backlog = Backlog()
     told = Faults(node)
     misfits = Misfits(node)

@@ -25,7 +25,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: ServiceNode, options: argparse.Namespace) -> None:
-    """Subscribes; every frame is searched for every target that its camera can see and this replica owns."""
+    """Subscribes; every frame is searched for every target that its camera can see and this replica owns.
+
+    Threads: the lookout and the estimators of a camera belong to the reader of its frames.
+    """
     torch.set_num_threads(1)
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
@@ -38,8 +41,10 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
         for target in targets
         if target in lookout.targets
     }
-    for estimator in estimators.values():
+    for k, estimator in enumerate(estimators.values()):
+        node.progress("preparing estimators", k, len(estimators))
         estimator.prepare()
+    node.progress("preparing estimators", len(estimators), len(estimators))
     fused = node.latest(FUSED)
 
     def on_frame(frame: Frame, names: dict[str, str]) -> None:

@@ -30,7 +30,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: ServiceNode, options: argparse.Namespace) -> None:
-    """Subscribes; every mask is searched for every target that its camera can see and this replica owns."""
+    """Subscribes; every mask is searched for every target that its camera can see and this replica owns.
+
+    Threads: `history[robot]` belongs to the reader of that robot's joints, `frames[camera]` to the reader of that camera's
+    frames. The reader of its masks takes what is there at that moment; the searches of a camera are that reader's alone.
+    """
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
     targets = [cell.one("targets", options.target)] if options.target else list(cell.targets)
@@ -39,8 +43,10 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
     for camera in cameras:
         if not seen[camera]:
             node.log.warning("no target's home is in the picture: nothing is searched there", camera=camera)
-    for search in searches.values():
+    for k, search in enumerate(searches.values()):
+        node.progress("preparing searches", k, len(searches))
         search.prepare()
+    node.progress("preparing searches", len(searches), len(searches))
     history = {robot: JointHistory(JOINTS_NEAR_NS) for robot in cell.robots}
     fused = {target: node.latest(FUSED, target=target) for target in targets}
     frames: dict[str, tuple[Frame, ...]] = dict.fromkeys(cameras, ())

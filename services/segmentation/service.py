@@ -28,7 +28,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: ServiceNode, options: argparse.Namespace) -> None:
-    """Segment the frames of the cell's cameras that this replica owns."""
+    """Segment the frames of the cell's cameras that this replica owns.
+
+    Threads: the reader of a camera's frames and the timer `follow` share its lookout, under a lock, and its segmenter, of which
+    the timer only prepares windows, and only while another replica owns the camera.
+    """
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
 

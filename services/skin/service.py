@@ -38,7 +38,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def start(node: Node, options: argparse.Namespace) -> None:
-    """Each pad has a thread of its own: its boards are asked together."""
+    """Each pad has a thread of its own, to which its `Session` belongs: its boards are asked together. The health report, in
+    another thread, only reads counters."""
     if not 0 < options.cycles <= 60_000:
         raise cells.CellError(f"--cycles: 1 to 60000 expected, {options.cycles} came")
     for pad, readers in pads(node.cell, options.port, options.pad).items():

@@ -6,6 +6,7 @@ down: it is cut off from the others.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
@@ -62,7 +63,7 @@ def judge(
     known: Counter[str] = Counter()
     for key, traffic in sorted(received.items()):
         pattern = _pattern(key)
-        known[pattern] += 1
+        known[pattern] += math.isfinite(traffic.stale_s)  # others, as the counters of unknown keys, are never missing
         if traffic.is_stale(now_ns):
             age_s = traffic.age_s(now_ns)
             why = "late" if age_s is not None else waits(traffic)

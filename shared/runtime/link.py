@@ -63,14 +63,19 @@ class Link:
         self._threads.append(thread)
 
     def close(self, others: Iterable[threading.Thread] = ()) -> None:
-        """Closes the session and waits for the node's threads and others, for at most CLOSE_S."""
-        if self.session is None:
-            return
-        session, self.session = self.session, None
+        """Closes the session and waits for the node's threads and others, for about CLOSE_S. `stopping` must be set: a thread
+        that opens the session gives up then."""
         deadline = time.monotonic() + CLOSE_S
-        closing = threading.Thread(target=session.close, name="close", daemon=True)
-        closing.start()
-        for thread in (closing, *self._threads, *others):
+        is_settled = self._opening.acquire(timeout=CLOSE_S)
+        session, self.session = self.session, None
+        if is_settled:
+            self._opening.release()
+        threads = [*self._threads, *others]
+        if session is not None:
+            closing = threading.Thread(target=session.close, name="close", daemon=True)
+            closing.start()
+            threads.insert(0, closing)
+        for thread in threads:
             if thread is not threading.current_thread():
                 thread.join(max(0.0, deadline - time.monotonic()))
 

@@ -15,6 +15,7 @@ thread.
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import re
@@ -120,7 +121,8 @@ class Node:
         self._streams = Streams(cell, self._link, self.replicas, lambda: self.now_ns(), self._fitness.turn, self.fault, self.log)
         self._queries = Queries(service, self._link, self.fault)
         self._progress = Progress(self.log)
-        self._is_announced = False
+        self._is_announced = self._is_early = False
+        self._announcing = threading.Lock()
         self._waiting = Waiting(lambda name: self.query(topics.health(cell.name, name), timeout_s=ASK_S))
         self._faults: dict[str, int] = {}
         self._lately = health.Lately()
@@ -161,14 +163,17 @@ class Node:
 
     def _announce(self, session: zenoh.Session) -> None:
         """Answers the health query from now on."""
-        if not self._is_announced:
+        with self._announcing:
+            if self._is_announced:
+                return
             self._is_announced = True
             self._queries.serve(session, topics.health(self.cell.name, self.service, self.instance), self._answer_health)
 
     def _announce_early(self) -> None:
         """Lets others see how far a process is that is not open yet."""
         try:
-            self._announce(self._link.open(float("inf")))
+            if not self.stopping.is_set():
+                self._announce(self._link.open(float("inf")))
         except bus.BusError:  # `open` raises it again
             return
 
@@ -326,7 +331,9 @@ class Node:
         step ends it. Until then its status is `starting` with the reason `compiling 12 of 40`, on the bus also before the node is
         open, and so is that of whoever waits for it; the log has a line every 2 s."""
         self._progress.set(what, done, total)
-        if not self._is_announced and not self.stopping.is_set():
+        if not self._is_early and not self._is_open:
+            self._is_early = True
+            atexit.register(self.close)  # where `start` fails, too: Zenoh aborts a process that ends with an open session
             self._link.spawn(self._announce_early, "announce")
 
     def tell(self, name: str, function: Callable[[], Any]) -> None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 
 from shared.contract import report
+from shared.runtime import bus
 from shared.runtime.logs import Log
 from shared.runtime.traffic import Traffic
 
@@ -55,7 +56,8 @@ class Progress:
 class Waiting:
     """Why an input that was never heard is not a fault yet: its publishers are starting, or were a moment ago.
 
-    ask: the answers to the health query of a service. `look` asks, and may block for as long as that takes; `why` does not.
+    ask: the answers to the health query of a service; raises bus.Refused where it is there and too busy to answer. `look` asks,
+    and may block for as long as that takes; `why` does not.
     """
 
     def __init__(self, ask: Callable[[str], Iterable[bytes]]):
@@ -72,7 +74,13 @@ class Waiting:
             return
         for service in sorted({service for traffic in missing for service in traffic.publishers}):
             reports = []
-            for answer in self._ask(service):
+            try:
+                answers = self._ask(service)
+            except bus.Refused:  # it compiles, say
+                self._doing.setdefault(service, "")
+                self._settled_s.pop(service, None)
+                continue
+            for answer in answers:
                 with contextlib.suppress(ValueError):  # of another release
                     reports.append(report.read(answer))
             starting = [found for found in reports if found.status == "starting"]

@@ -28,10 +28,15 @@ Handler = Callable[[Any, dict[str, str]], None]
 class _Publisher(NamedTuple):
     """What publishing on one key needs, looked up once."""
 
-    zenoh: zenoh.Publisher
+    publisher: zenoh.Publisher
     traffic: Traffic
     source: zenoh.EntityGlobalId
     numbers: itertools.count[int]
+    ready: list[zenoh.SourceInfo]
+
+    def number(self) -> zenoh.SourceInfo:
+        """The sender and number of the next message."""
+        return zenoh.SourceInfo(self.source, next(self.numbers) % NUMBERS)
 
 
 class Streams:
@@ -70,12 +75,18 @@ class Streams:
             found = self._publishers.setdefault(identity, self._declare_publisher(session, topic, names))
         payload = encode(message)
         try:
-            found.zenoh.put(payload, source_info=zenoh.SourceInfo(found.source, next(found.numbers) % NUMBERS))
+            source_info = found.ready.pop()  # made after the last message: this one is on its way the sooner
+        except IndexError:  # another thread publishes on this key, too
+            source_info = found.number()
+        try:
+            found.publisher.put(payload, source_info=source_info)
         except zenoh.ZError:
             if self._link.session is not None:  # else: closed meanwhile
                 raise
             return
         found.traffic.took(message.stamp_ns, self._now_ns())
+        if not found.ready:
+            found.ready.append(found.number())
 
     def subscribe(self, topic: Topic, handler: Handler, owned: Sequence[str], from_others: bool, names: dict[str, str]) -> None:
         """As `Node.subscribe`; owned: the streams that this replica must own one of."""
@@ -138,7 +149,7 @@ class Streams:
             congestion_control=zenoh.CongestionControl.BLOCK if topic.qos is QoS.NEVER_DROP else zenoh.CongestionControl.DROP,
             priority=getattr(zenoh.Priority, topic.priority.value),
         )
-        return _Publisher(publisher, self.published.setdefault(key, Traffic(topic.stale_s)), publisher.id, itertools.count())
+        return _Publisher(publisher, self.published.setdefault(key, Traffic(topic.stale_s)), publisher.id, itertools.count(), [])
 
     def rate_hz(self, topic: Topic, names: dict[str, str]) -> float:
         """How often a key's publisher sends: as the table says, but for what follows the cameras' own rates."""

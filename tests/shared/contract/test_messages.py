@@ -234,3 +234,8 @@ def test_a_large_array_that_is_not_what_it_says_is_refused(change):
     }[change]
     with pytest.raises(BadMessage):
         messages.decode(messages.Frame, damaged)
+
+
+@pytest.mark.parametrize("version", [b"\xa1\x83", b"\x81\xa1\x83\x01"], ids=["text", "key"])
+def test_a_version_that_is_no_utf_8_is_refused(version):
+    assert refused(messages.Frame, b"\x81\xa7version" + version).kind == "msgpack"

@@ -17,6 +17,7 @@ import zenoh
 from shared.cell import description as cells
 from shared.contract import messages, topics
 from shared.runtime import bus
+from shared.runtime import reader as reader_module
 from shared.runtime.guard import RATE_TIMES
 from shared.runtime.node import Node
 from shared.runtime.traffic import RATE_WINDOW_S, Rate
@@ -429,9 +430,9 @@ def test_zenoh_endpoints_are_taken_from_the_environment_where_no_flag_gives_them
 
 
 def parse(argv):
-    from services import flags
+    from services import flags as arguments
 
-    return flags.parser("test", "").parse_args(argv)
+    return arguments.parser("test", "").parse_args(argv)
 
 
 def test_many_frames_a_second_pass_through_shared_memory_or_tcp_unchanged(node):
@@ -452,6 +453,65 @@ def test_the_session_of_another_zenoh_program_reads_what_a_node_publishes(node, 
         subscriber = session.declare_subscriber("penumbra/table/target/forearm/pose/fused", zenoh.handlers.RingChannel(1))
         sample = until(subscriber.try_recv, lambda: writer.publish(topics.FUSED, pose(x=0.5), target="forearm"), "a sample")
         assert messages.decode(messages.FusedPose, sample.payload.to_bytes()).position[0] == 0.5
+
+
+def test_the_latest_message_is_decoded_only_when_it_is_looked_at_and_all_are_counted(node, monkeypatch):
+    decoded = []
+    monkeypatch.setattr(reader_module, "decode", lambda *arguments: decoded.append(1) or messages.decode(*arguments))
+    reader, writer = node(), node()
+    latest = reader.latest(topics.FUSED)
+    assert latest.get(target="forearm") is None
+    reader.open(), writer.open()
+    until(lambda: latest.drain() >= 20, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "twenty poses")
+    assert not decoded
+    sent = pose(x=0.5)
+    writer.publish(topics.FUSED, sent, target="forearm")
+    wait_for(lambda: latest.get(target="forearm").stamp_ns == sent.stamp_ns, 5, "the newest pose")
+    assert latest.get(target="forearm").position[0] == 0.5
+    before = len(decoded)
+    assert latest.get(target="forearm") is latest.get(target="forearm") and len(decoded) == before
+    key = topics.FUSED.at(cell="table", target="forearm")
+    row = reader.health()["topics"][key]
+    assert (row["count"], row["dropped"], row["delay_s"]) == (latest.drain(), 0, None)
+    assert wait_for(lambda: reader.health()["topics"][key]["stale"], 5, "it to be missed")
+    with pytest.raises(KeyError):
+        latest.get(target="leg")
+
+
+def test_what_a_reader_refuses_the_latest_message_refuses_too(node):
+    reader, writer, replayer = node(), node(), node().open()
+    latest, key = reader.latest(topics.FUSED, target="forearm"), topics.FUSED.at(cell="table", target="forearm")
+    tape = replayer.session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+    reader.open(), writer.open()
+    bad = lambda: reader.health()["topics"][key]["bad"]  # noqa: E731
+    publish = lambda message: lambda: writer.publish(topics.FUSED, message, target="forearm")  # noqa: E731
+    good = pose()
+    until(lambda: latest.get(target="forearm"), publish(good), "a pose")
+    sample = wait_for(tape.try_recv, 5, "the recorded pose")
+    until(lambda: bad().get("past"), publish(pose(1)), "an old stamp refused")
+    until(lambda: bad().get("msgpack"), lambda: writer.session.put(key, b"\xc1"), "garbage refused")
+    until(lambda: bad().get("delete"), lambda: writer.session.delete(key), "a deletion refused")
+    other = msgpack.packb({"version": messages.VERSION + 1, "stamp_ns": time.time_ns()})
+    until(lambda: bad().get("version"), lambda: writer.session.put(key, other), "another version refused")
+    until(
+        lambda: bad().get("replayed"),
+        lambda: replayer.session.put(key, sample.payload, source_info=sample.source_info),
+        "a replay refused",
+    )
+    assert latest.get(target="forearm").stamp_ns == good.stamp_ns, "what was refused is not shown"
+
+
+def test_a_pose_that_looks_well_from_outside_and_is_not_is_refused_when_it_is_looked_at(node):
+    reader, writer = node(), node()
+    latest, key = reader.latest(topics.FUSED, target="forearm"), topics.FUSED.at(cell="table", target="forearm")
+    reader.open(), writer.open()
+
+    def put():
+        writer.session.put(key, msgpack.packb({"version": messages.VERSION, "stamp_ns": time.time_ns()}))
+
+    until(lambda: latest.drain(), put, "a message with a good head")
+    assert latest.get(target="forearm") is None
+    assert reader.health()["topics"][key]["bad"] == {"fields": 1}
 
 
 def test_this_process_is_named_in_its_instance(node):
