@@ -133,7 +133,7 @@ class Scenes:
         electrodes = np.einsum("snij,nj->sni", frames[..., :3, :3], skin.centroids) + frames[..., :3, 3]
         size = SIZE + SIZE_SPREAD * np.sqrt(3.0) * rng.uniform(-1.0, 1.0, (count, 2))
         gap, ahead = np.empty(count), np.empty(count, np.bool_)
-        normals_out = np.ascontiguousarray(frames[..., :3, 2])
+        electrodes, normals_out = np.ascontiguousarray(electrodes), np.ascontiguousarray(frames[..., :3, 2])
         _gaps(electrodes, normals_out, T, np.exp(size), *self.surface.arrays, gap, ahead)
         T_pads_target = np.linalg.inv(pads) @ T[:, None]
         change = np.stack([self.response.change(each, own) for each, own in zip(T_pads_target, size, strict=True)])

@@ -84,7 +84,7 @@ def _is_constant(value: Any) -> bool:
 def _constant(value: Any) -> str:
     """A value's text, the same for all versions of Python and numpy."""
     if isinstance(value, type):
-        return f"{value.__name__}{value._fields}"
+        return f"{value.__name__}{value._fields}"  # type: ignore[attr-defined]
     if isinstance(value, tuple):
         return f"({', '.join(_constant(each) for each in value)})"
     if isinstance(value, np.dtype):
