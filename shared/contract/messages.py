@@ -308,12 +308,16 @@ class _Codec(typing.Generic[M]):
         return BadMessage(kind, f"{where}: {error!s:.300}")
 
     def _unpacked(self, name: str, spec: _ArraySpec, dtype: str, shape: tuple[int, ...], data: memoryview) -> np.ndarray:
-        """A view of the bytes of an array, when its values have been looked at."""
+        """The array (read-only) whose bytes these are, when its values have been looked at: a view, or, where numbers do not
+        begin at a multiple of their size, a copy. Large arrays have values of one byte, which begin anywhere."""
         expected = spec.numpy.itemsize * math.prod(shape)
         if len(data) != expected:
             came = f"{expected} bytes for {dtype} {list(shape)} expected, {len(data)} came"
             raise BadMessage("array", f"{self.kind.__name__}.{name}: {came}")
         array: np.ndarray = np.ndarray(shape, spec.numpy, data)
+        if not array.flags.aligned:
+            array = array.copy()
+            array.flags.writeable = False
         if spec.numpy.kind != "f":
             return array
         # the norm is soon made, and small where all is well; else each number is looked at, also where it is NaN
