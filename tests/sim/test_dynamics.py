@@ -180,7 +180,9 @@ def python(code: str) -> subprocess.CompletedProcess:
 
 
 def test_a_world_with_a_robot_is_silent():
-    done = python("from shared import cell; from sim.world import World; World(cell.load('arm'), 0).state(1.0)")
+    done = python(
+        "from shared.cell import description; from sim.world.world import World; World(description.load('arm'), 0).state(1.0)"
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 

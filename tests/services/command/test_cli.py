@@ -145,7 +145,7 @@ def test_pose_as_json_is_exactly_what_fusion_answers(endpoint, capsys):
 
 def test_pose_loads_nothing_heavy(endpoint):
     program = (
-        "import sys; from services import cli; cli.main(['pose', '--json', '--connect', sys.argv[1]]); "
+        "import sys; from services.command import cli; cli.main(['pose', '--json', '--connect', sys.argv[1]]); "
         "print([name for name in ('torch', 'numba', 'cv2', 'pybullet', 'trimesh') if name in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", program, endpoint], capture_output=True, text=True, timeout=30)

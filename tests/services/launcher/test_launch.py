@@ -365,7 +365,7 @@ def test_the_children_of_up_import_nothing_from_the_current_folder(tmp_path):
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
     flags = ["up", "--port", str(free_port()), "--seconds", "3", *NOTHING, "--replicas", "fusion=1"]
     for fork in (True, False):  # without a fork server every process is started plainly
-        broken = "" if fork else "from services import forkserver; forkserver.ForkServer.start = lambda self: None; "
+        broken = "" if fork else "from services.launcher import forkserver; forkserver.ForkServer.start = lambda self: None; "
         command = [
             sys.executable,
             "-P",

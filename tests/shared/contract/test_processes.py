@@ -24,8 +24,16 @@ from tests.support.live import free_port
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 DECLARED = PROJECT["project"]["optional-dependencies"]
+
+
+def of_extra(extra, line):
+    """A requirement of an extra as a package's metadata have it; it may have a marker of its own."""
+    requirement, _, marker = line.partition(";")
+    return f"{requirement}; {f'({marker}) and ' if marker else ''}extra == '{extra}'"
+
+
 EXTRAS = doctor.requirements(
-    [*PROJECT["project"]["dependencies"], *(f"{line}; extra == '{extra}'" for extra, lines in DECLARED.items() for line in lines)]
+    [*PROJECT["project"]["dependencies"], *(of_extra(extra, line) for extra, lines in DECLARED.items() for line in lines)]
 )
 NAMES = [process.name for process in PROCESSES]
 TOOLS = {
@@ -198,7 +206,7 @@ def with_echo(tmp_path_factory):
     root = tmp_path_factory.mktemp("house")
     for folder in ("services", "shared", "sim"):
         shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    table = root / "shared" / "processes.py"
+    table = root / "shared" / "contract" / "processes.py"
     before, after = table.read_text().split("\n)\n\nLAUNCHER = ")
     table.write_text(f"{before}{ROW}\nLAUNCHER = {after}")
     own = root / "services" / "echo"
@@ -222,7 +230,7 @@ def test_a_new_service_is_in_the_help_and_its_tools_and_flags_work(with_echo):
 
 
 def test_a_new_service_is_allowed_to_answer_and_report_on_a_secured_bus(with_echo):
-    code = "import json; from shared import access; print(json.dumps(access.control()))"
+    code = "import json; from shared.contract import access; print(json.dumps(access.control()))"
     rules = json.loads(subprocess.run([sys.executable, "-c", code], cwd=with_echo, capture_output=True, text=True).stdout)
     (answers,) = (rule for rule in rules["rules"] if rule["id"] == "echo answers")
     assert answers["key_exprs"] == [topics.health("*", "echo"), topics.current_pose("*", "*")]

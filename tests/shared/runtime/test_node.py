@@ -444,7 +444,7 @@ def test_a_log_on_a_full_disk_loses_lines_and_a_closed_one_is_told():
 
 
 def test_a_process_whose_thread_fails_ends_and_says_why():
-    code = "import threading, time; from shared import logs; logs.configure(ends_with_thread=True); "
+    code = "import threading, time; from shared.runtime import logs; logs.configure(ends_with_thread=True); "
     code += "threading.Thread(target=lambda: 1 / 0).start(); time.sleep(60)"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
     assert ended.returncode == 1
