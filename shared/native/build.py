@@ -78,7 +78,7 @@ def main() -> int:
     if os.environ.get("PYTHONHASHSEED") != "0":  # the order of sets decides on the order of some instructions
         command = [sys.executable, "-m", "shared.native.build", *sys.argv[1:]]
         os.execve(sys.executable, command, {**os.environ, "PYTHONHASHSEED": "0"})
-    parser = argparse.ArgumentParser(prog="python -m shared.native.build", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m shared.native.build", description=__doc__, allow_abbrev=False)
     parser.add_argument("--check", action="store_true", help="build, and compare with what is there")
     options = parser.parse_args()
     import_kernels()

@@ -134,7 +134,7 @@ def test_times_may_be_asked_for_in_any_order_and_runs_are_alike(panda):
 
 
 def test_a_time_that_is_forgotten_is_reported(panda, monkeypatch):
-    monkeypatch.setattr("sim.dynamics.KEPT", 50)
+    monkeypatch.setattr("sim.world.dynamics.KEPT", 50)
     robots = moved(panda, sweep)
     robots.at(2.0)
     with pytest.raises(ValueError, match=r"expected a time of the last 1 s, got 0.5 s: make a new world"):
@@ -188,7 +188,7 @@ def test_a_world_with_a_robot_is_silent():
 
 def test_without_pybullet_cells_without_robots_run_and_others_say_what_to_install():
     code = """import sys; sys.modules["pybullet"] = None
-from shared import cell; from sim.world import World
+from shared.cell import description as cell; from sim.world.world import World
 print(World(cell.load("table"), 0).state(1.0).joints)
 World(cell.load("arm"), 0)"""
     done = python(code)

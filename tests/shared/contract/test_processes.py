@@ -253,8 +253,9 @@ def test_up_starts_a_new_service_with_its_flags(with_echo):
 def test_no_parser_takes_abbreviated_flags():
     assert flags.Parser().allow_abbrev is False
     paths = [path for folder in ("services", "shared", "sim", "tests/bench") for path in (ROOT / folder).rglob("*.py")]
-    own = ROOT / "services" / "arguments.py"
-    assert not [path for path in paths if "ArgumentParser(" in path.read_text() and path != own]
+    own = ROOT / "services" / "flags.py"
+    others = [path for path in paths if path != own and "ArgumentParser(" in path.read_text()]
+    assert all("allow_abbrev=False" in path.read_text() for path in others), others
 
 
 def test_up_gives_every_flag_of_the_table_to_its_process():

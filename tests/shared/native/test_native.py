@@ -54,7 +54,7 @@ def test_a_library_is_what_its_sources_give(tmp_path):
     compared by `python -m shared.native.build --check`."""
     code = """
         import hashlib, sys
-        from shared import raster, surface
+        from shared.geometry import raster, surface
         from shared.native import KERNELS
         from shared.native.compiler import TARGETS, compiled
         kernels = [KERNELS[name] for name in sorted(KERNELS)]
@@ -249,7 +249,7 @@ def test_no_service_imports_numba_when_its_kernels_are_called():
     code = """
         import sys
         import numpy as np
-        from shared import raster
+        from shared.geometry import raster
         V, faces = np.array([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]]), np.array([[0, 1, 2]], np.int32)
         assert raster.silhouette(V, faces, (9.0, 9.0, 0.0, 0.0), (0, 0, 9, 9)).any()
         assert not {"numba", "llvmlite"} & set(sys.modules)
