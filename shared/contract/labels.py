@@ -13,3 +13,7 @@ class Label(IntEnum):
     FOREARM = 4
     HAND = 5
     OCCLUDER = 6
+
+
+UNLABELLED = 255
+"""What masks to learn from hold where nobody knows the class: neither losses nor scores look there."""
