@@ -138,12 +138,9 @@ class Recordings:
         self.calibration = [pieces[i] for i in order[:tenth]]
         self.held_out = [pieces[i] for i in order[tenth : 2 * tenth]]
         self._train = [pieces[i] for i in order[2 * tenth :]]
+        self.count = len(self._train)
         self.side = min(piece.side for piece in pieces)
         self.sources = ({"folder": folder.name, "sequences": tenth}, {"folder": folder.name, "sequences": len(self.held_out)})
-
-    def ensure(self, count: int) -> int:
-        """How many sequences may be used: all of them, at once."""
-        return len(self._train)
 
     def __getitem__(self, index: int) -> Recorded:
         return self._train[index]

@@ -1,19 +1,19 @@
 """Makes weights/ again: `penumbra segmentation train`; with --data, weights for a user's own frames and masks.
 
-Simulated sequences are rendered by a second process into a growing data set on disk while the network learns from those there.
-Step n takes its sequences, patches and colours from a generator seeded by (seed, n), and all schedules are functions of the
-progress, so that a run of --steps interrupted and resumed ends with the same weights as one that was not.
+Every step renders simulated sequences that no other step sees: that costs a fifth of it. Step n takes its sequences, patches and
+colours from a generator seeded by (seed, n), and all schedules are functions of the progress, so that a run of --steps
+interrupted and resumed ends with the same weights as one that was not. For days in the background, over several machines:
+
+  OMP_NUM_THREADS=1 nice -n 19 penumbra segmentation train --size 16 32 64 128 --steps 150000 --resume --compact FILE
 """
 
 from __future__ import annotations
 
 import argparse
 import datetime
-import multiprocessing
-import os
+import functools
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -31,30 +31,34 @@ from sim.sets import sequences
 
 VALIDATION_SEED = 1_000_000
 """Added to the seed for held-out data: nothing there was ever trained on."""
+VARIETY = sequences.Variety(frames=5, size=176, real=0.7)
+"""Of the sequences that are learned from."""
+ENDLESS = 2**31
+"""Number of sequences of a set that has no end."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How training goes. `peak_rate`: of Adam's one cycle; `frames`: that a step plays; `patches`: (from which progress on,
-    pixels a side, sequences a batch); `reuse`: how often a sequence is visited on average while the data set grows up to `most`
-    sequences; `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`:
-    of the weights that are exported; `seen`: (frames that the state has seen before those that are learned from, how often)."""
+    """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`; `frames`:
+    that a step plays; `patches`: (from which progress on, pixels a side, sequences a batch); `error_weight`, `focal_weight`,
+    `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights that are exported; `seen`:
+    (frames that the state has seen before those that are learned from, how often)."""
 
-    peak_rate: float = 3e-3
+    peak_rate: float = 2e-3
+    warm_up: int = 100
+    cool_down: float = 0.3
     frames: int = 5
-    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.1, 128, 4), (0.4, 160, 3))
-    reuse: int = 4
-    most: int = 6000
+    patches: tuple[tuple[float, int, int], ...] = ((0.0, 128, 4), (0.5, 160, 3))
     error_weight: float = 0.3
     focal_weight: float = 5.0
     target_weight: float = 1.0
     clip: float = 1.0
-    averaging: float = 0.995
+    averaging: float = 0.999
     seen: tuple[tuple[int, float], ...] = ((0, 0.4), (4, 0.3), (12, 0.2), (36, 0.1))
 
-    def rate(self, progress: float) -> float:
-        """The learning rate at a progress in [0, 1]."""
-        return self.peak_rate * training.one_cycle(progress, 0.15)
+    def rate(self, progress: float, steps: int) -> float:
+        """The learning rate at a progress in [0, 1], so many steps after the optimiser's first."""
+        return self.peak_rate * training.trapezoid(progress, steps, self.warm_up, self.cool_down)
 
     def before(self, rng: np.random.Generator) -> int:
         """Frames that the state shall have seen, drawn from `seen`."""
@@ -80,8 +84,9 @@ class Data(Protocol):
     def calibration(self) -> Iterable[Labelled]: ...
     @property
     def held_out(self) -> Iterable[Labelled]: ...
-    def ensure(self, count: int) -> int:
-        """Wait until `count` sequences are there, or all; returns how many may be used."""
+    @property
+    def count(self) -> int:
+        """How many sequences there are to choose from."""
 
     def __getitem__(self, index: int, /) -> Any: ...
     def close(self) -> None:
@@ -91,36 +96,37 @@ class Data(Protocol):
 Render = Callable[[int, int], sequences.Sequence]
 
 
+def _varied(seed: int, index: int) -> sequences.Sequence:
+    return sequences.render(seed, index, VARIETY)
+
+
 class Simulated:
-    """Sequences rendered in order by a process of low priority, kept on disk. `each`: for the calibration, and for the score;
-    `render`: sequence of a seed and an index, a function that another process can import."""
+    """Sequences rendered when they are asked for. `each`: for the calibration, and for the score; `learned`, `scored`: sequence
+    of a seed and an index, to learn from, and for calibration and score; `most`: how many to learn from, kept in memory then."""
 
     jitter = 0.2
     """Less than the authors' of photographs: our renderer varies the light itself."""
-    side = sequences.Variety.size
+    side = VARIETY.size
 
-    def __init__(self, folder: Path, seed: int, most: int, each: int = 60, render: Render = sequences.render):
-        folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._seed, self._most, self._each, self._render = folder, seed, most, each, render
-        self._asked = 0
-        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=os.nice, initargs=(10,))
-        self._pending: list[Future[None]] = []
-        self._arrays: list[NDArray[np.uint8]] = []
-
-    def ensure(self, count: int, ahead: int = 64) -> int:
-        """Wait until `count` sequences (at most `most`) are there, ask for some more; returns how many may be used."""
-        count = min(count, self._most)
-        for index in range(self._asked, min(count + ahead, self._most)):
-            self._pending.append(self._pool.submit(_render_to, self._path(index), self._render, self._seed, index))
-            self._asked = index + 1
-        while len(self._arrays) < count:
-            self._pending[len(self._arrays)].result()
-            self._arrays.append(np.load(self._path(len(self._arrays)), mmap_mode="r"))
-        return count
+    def __init__(
+        self,
+        seed: int,
+        each: int = 60,
+        learned: Render = _varied,
+        scored: Render = sequences.render,
+        most: int | None = None,
+    ):
+        self._seed, self._each, self._learned, self._scored = seed, each, learned, scored
+        self.count = ENDLESS if most is None else most
+        self._kept = functools.lru_cache(maxsize=most or 0)(self._rendered)
 
     def __getitem__(self, index: int) -> NDArray[np.uint8]:
-        """Red, green, blue and class (frames, h, w, 4) of a sequence that is there."""
-        return self._arrays[index]
+        """Red, green, blue and class (frames, h, w, 4) of a sequence."""
+        return self._kept(index)
+
+    def _rendered(self, index: int) -> NDArray[np.uint8]:
+        sequence = self._learned(self._seed, index)
+        return np.concatenate([sequence.images, sequence.labels[..., None]], axis=-1)
 
     @property
     def sources(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -130,28 +136,15 @@ class Simulated:
     @property
     def calibration(self) -> Iterator[sequences.Sequence]:
         """Sequences for the calibration, rendered as they are asked for."""
-        return (self._render(VALIDATION_SEED + self._seed, index) for index in range(self._each))
+        return (self._scored(VALIDATION_SEED + self._seed, index) for index in range(self._each))
 
     @property
     def held_out(self) -> Iterator[sequences.Sequence]:
         """Sequences for the score."""
-        return (self._render(VALIDATION_SEED + self._seed + 1, index) for index in range(self._each))
+        return (self._scored(VALIDATION_SEED + self._seed + 1, index) for index in range(self._each))
 
     def close(self) -> None:
-        """Render no more."""
-        self._pool.shutdown(cancel_futures=True)
-
-    def _path(self, index: int) -> Path:
-        return self._folder / f"{self._seed}-{index:06d}.npy"
-
-
-def _render_to(path: Path, render: Render, seed: int, index: int) -> None:
-    if path.is_file():
-        return
-    sequence = render(seed, index)
-    part = path.with_suffix(".part.npy")
-    np.save(part, np.concatenate([sequence.images, sequence.labels[..., None]], axis=-1))
-    part.replace(path)  # a file is there wholly or not at all
+        """Nothing is open."""
 
 
 class Trainer(training.Trainer[PredNet, Data]):
@@ -171,16 +164,15 @@ class Trainer(training.Trainer[PredNet, Data]):
         size, batch = self.schedule.patch(progress)
         size = min(size, data.side)
         rng = np.random.default_rng([self.seed, 1, self.step])
-        count = data.ensure(8 * batch + self.step * batch // self.schedule.reuse)
-        images, labels = draw_batch(
-            [data[i] for i in rng.integers(count, size=batch)], self.schedule.frames, size, rng, data.jitter
-        )
+        chosen = [data[int(i)] for i in rng.integers(data.count, size=batch)]
+        images, labels = draw_batch(chosen, self.schedule.frames, size, rng, data.jitter)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
             parts = self._losses(images, labels, self.schedule.before(rng))
         schedule = self.schedule
         weights = {"focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
         total = parts["dice"] + sum(weight * parts[name] for name, weight in weights.items())
-        self.descend(total, schedule.rate(progress), schedule.clip, schedule.averaging)
+        rate = schedule.rate(progress, self.step - self.warm_from)
+        self.descend(total, rate, schedule.clip, schedule.averaging)
         return {name: float(value.detach()) for name, value in parts.items()} | {"total": float(total.detach())}
 
     def _losses(self, images: torch.Tensor, labels: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
@@ -300,7 +292,6 @@ def arguments() -> argparse.ArgumentParser:
         help="start from these weights (without a value: the committed ones), of their size, instead of random ones",
     )
     parser.add_argument("--data", type=Path, help="your own frames and masks, in the forms below, instead of simulated sequences")
-    parser.add_argument("--cache", type=Path, default=Path("segmentation-data"), help="folder of rendered sequences (some GB)")
     parser.add_argument(
         "--out", type=Path, help="the weights, their card beside them (default: the committed ones; with --data segmentation.npz)"
     )
@@ -314,8 +305,8 @@ def main(argv: list[str] | None = None) -> int:
     schedule = Schedule()
     if options.error_weight is not None:
         schedule = replace(schedule, error_weight=options.error_weight)
-    if options.resume and options.checkpoint.is_file():
-        trainer = Trainer.restore(options.checkpoint, schedule)
+    if checkpoint := training.begun(options):
+        trainer = Trainer.restore(checkpoint, schedule)
     elif options.start:
         trainer = Trainer.begin(options.start, schedule, options.seed)
     else:
@@ -324,9 +315,7 @@ def main(argv: list[str] | None = None) -> int:
         trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.cell), schedule, options.seed)
     try:
         data: Data = (
-            recordings.Recordings(options.data, trainer.seed)
-            if options.data
-            else Simulated(options.cache, trainer.seed, schedule.most, options.held_out)
+            recordings.Recordings(options.data, trainer.seed) if options.data else Simulated(trainer.seed, options.held_out)
         )
     except recordings.DataError as error:
         print(f"penumbra segmentation train: {error}", file=sys.stderr)
