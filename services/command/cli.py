@@ -37,6 +37,7 @@ SERVICES = ("router", "emulator", "segmentation", "search", "posecnn", "skin", "
 TOOLS = {
     ("segmentation", "train"): "services.segmentation.training.train:main",
     ("segmentation", "infer"): "services.segmentation.files:main",
+    ("segmentation", "photographs"): "services.segmentation.training.photographs:main",
     ("search", "refine"): "services.search.objects.tools:refine",
     ("search", "track"): "services.search.objects.tools:track",
     ("posecnn", "train"): "services.posecnn.training.train:main",

@@ -147,7 +147,7 @@ def filmed(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.ui
         out[t] = (np.clip(picture, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
         if quality is not None:
             _, packed = cv2.imencode(".jpg", out[t], [cv2.IMWRITE_JPEG_QUALITY, quality])
-            out[t] = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+            out[t] = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)
     return out
 
 

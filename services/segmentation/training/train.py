@@ -12,12 +12,14 @@ from __future__ import annotations
 import argparse
 import datetime
 import functools
+import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -27,6 +29,8 @@ from services.segmentation.prednet import PredNet, Settings
 from services.segmentation.training import loss, recordings
 from services.segmentation.training.evaluate import Labelled, calibrate, held_out
 from shared import training
+from shared.contract.labels import UNLABELLED, Label
+from sim.picture import looks
 from sim.sets import sequences
 
 VALIDATION_SEED = 1_000_000
@@ -147,6 +151,75 @@ class Simulated:
         """Nothing is open."""
 
 
+class Mixed:
+    """Recordings and simulated sequences. `share`: how many of those that are learned from are simulated; of the recordings, half
+    have simulated robots and occluders in front, some of these an arm, too. Calibrated on simulated ones, scored on both."""
+
+    jitter = 0.3
+    """Between that of simulated sequences and that of recordings alone."""
+    side = VARIETY.size
+    count = ENDLESS
+
+    def __init__(self, recorded: recordings.Recordings, simulated: Simulated, share: float, seed: int):
+        self._recorded, self._simulated, self._share, self._seed = recorded, simulated, share, seed
+        self.calibration = simulated.calibration
+        self.held_out = itertools.chain(simulated.held_out, recorded.held_out)
+        of_simulated, of_recorded = simulated.sources[1], recorded.sources[1]
+        self.sources = simulated.sources[0], {**of_simulated, **of_recorded, "simulated": share}
+
+    def __getitem__(self, index: int) -> NDArray[np.uint8]:
+        """Red, green, blue and class (frames, h, w, 4) of a sequence."""
+        rng = np.random.default_rng([self._seed, 5, index])
+        if rng.random() < self._share:
+            return self._simulated[index]
+        film = moved(self._recorded[int(rng.integers(self._recorded.count))], VARIETY.frames, VARIETY.size, rng)
+        if rng.random() < 0.5:
+            film = pasted(film, self._simulated[index], rng)
+        return np.concatenate([looks.filmed(film[..., :3], rng), film[..., 3:]], axis=-1)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """So many frames of a recording as a camera of `size` pixels a side that is turned, nearer or farther, and moves shows them:
+    (frames, size, size, 4); what lies outside of the picture is UNLABELLED."""
+    start = int(rng.integers(0, len(recorded) - frames + 1))
+    film = recorded[start : start + frames]
+    middle = rng.integers(0, film.shape[1:3])
+    target = np.argwhere(np.isin(film[frames // 2, ..., 3], inference.TARGET_LABELS))
+    if len(target) and rng.random() < 0.8:
+        middle = target[rng.integers(len(target))] + rng.integers(-size // 6, size // 6 + 1, 2)
+    zoom = np.exp(rng.uniform(np.log(0.5), np.log(3.0)))
+    angle = rng.normal(0.0, 20.0) if rng.random() < 0.7 else rng.uniform(-180.0, 180.0)
+    speed = rng.random() ** 1.5
+    shift, turn, grow = speed * rng.uniform(-8.0, 8.0, 2), speed * rng.uniform(-2.0, 2.0), 1.0 + speed * rng.uniform(-0.02, 0.02)
+    out = np.empty((frames, size, size, 4), np.uint8)
+    for t, frame in enumerate(film):
+        since = t - frames // 2
+        place = cv2.getRotationMatrix2D((float(middle[1]), float(middle[0])), angle + since * turn, zoom * grow**since)
+        place[:, 2] += size / 2.0 - middle[::-1] + since * shift
+        smaller = cv2.INTER_AREA if zoom < 1.0 else cv2.INTER_LINEAR
+        picture, labels = np.ascontiguousarray(frame[..., :3]), np.ascontiguousarray(frame[..., 3])
+        out[t, ..., :3] = cv2.warpAffine(picture, place, (size, size), flags=smaller, borderMode=cv2.BORDER_REFLECT)
+        out[t, ..., 3] = cv2.warpAffine(labels, place, (size, size), flags=cv2.INTER_NEAREST, borderValue=float(UNLABELLED))
+    return out
+
+
+def pasted(film: NDArray[np.uint8], over: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A film (frames, h, w, 4) with the robot and the occluders of another in front; half of the time its person, too."""
+    front = [Label.ROBOT, Label.OCCLUDER]
+    if rng.random() < 0.5:
+        front += [Label.TORSO, Label.UPPER_ARM, Label.FOREARM, Label.HAND]
+    out = film.copy()
+    for below, above in zip(out, over, strict=True):
+        cover = np.isin(above[..., 3], front)
+        soft = cv2.GaussianBlur(cover.astype(np.float32), (0, 0), 0.7)[..., None]  # as the lens does along an edge
+        below[..., :3] = (soft * above[..., :3] + (1.0 - soft) * below[..., :3] + 0.5).astype(np.uint8)
+        below[cover, 3] = above[cover, 3]
+    return out
+
+
 class Trainer(training.Trainer[PredNet, Data]):
     """PredNet being trained."""
 
@@ -200,9 +273,13 @@ class Trainer(training.Trainer[PredNet, Data]):
         }
 
     @classmethod
-    def begin(cls, path: Path, schedule: Schedule, seed: int) -> Trainer:
-        """A trainer that starts from weights with a card; the card it writes tells of them."""
+    def begin(cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None) -> Trainer:
+        """A trainer that starts from weights with a card, grown to more channels where these are given; the card it writes tells
+        of them. Raises ValueError where they are fewer."""
         net, card = prednet.load(path)
+        if channels is not None:
+            torch.manual_seed(seed)
+            net = prednet.grown(net, replace(net.settings, channels=channels))
         trainer = cls(net.settings, schedule, seed)
         trainer.net.load_state_dict(net.state_dict())
         trainer.average.load_state_dict(net.state_dict())
@@ -275,7 +352,7 @@ def arguments() -> argparse.ArgumentParser:
     """The flags of `penumbra segmentation train`."""
     parser = argparse.ArgumentParser(
         prog="penumbra segmentation train",
-        description="Train the segmentation network on simulated sequences, or on your own frames and masks.",
+        description="Train the segmentation network on simulated sequences, on your own frames and masks, or both.",
         epilog=recordings.__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -289,9 +366,16 @@ def arguments() -> argparse.ArgumentParser:
         type=Path,
         nargs="?",
         const=inference.WEIGHTS,
-        help="start from these weights (without a value: the committed ones), of their size, instead of random ones",
+        help="start from these weights (without a value: the committed ones), grown to --size, instead of random ones",
     )
     parser.add_argument("--data", type=Path, help="your own frames and masks, in the forms below, instead of simulated sequences")
+    parser.add_argument(
+        "--simulated",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="with --data: of the sequences, so that nothing is forgotten",
+    )
     parser.add_argument(
         "--out", type=Path, help="the weights, their card beside them (default: the committed ones; with --data segmentation.npz)"
     )
@@ -308,15 +392,18 @@ def main(argv: list[str] | None = None) -> int:
     if checkpoint := training.begun(options):
         trainer = Trainer.restore(checkpoint, schedule)
     elif options.start:
-        trainer = Trainer.begin(options.start, schedule, options.seed)
+        trainer = Trainer.begin(options.start, schedule, options.seed, tuple(options.size) if options.size else None)
     else:
         channels = tuple(options.size or Settings.channels)
         kernels = (*(3 for _ in channels[:-2]), 5, 5)
         trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.cell), schedule, options.seed)
+    simulated = Simulated(trainer.seed, options.held_out)
+    data: Data = simulated
     try:
-        data: Data = (
-            recordings.Recordings(options.data, trainer.seed) if options.data else Simulated(trainer.seed, options.held_out)
-        )
+        if options.data:
+            data = recorded = recordings.Recordings(options.data, trainer.seed)
+            if options.simulated:
+                data = Mixed(recorded, simulated, options.simulated, trainer.seed)
     except recordings.DataError as error:
         print(f"penumbra segmentation train: {error}", file=sys.stderr)
         return 2
