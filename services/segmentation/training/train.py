@@ -361,6 +361,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--delay", action=argparse.BooleanOptionalAction, default=False, help="axonal delays between the layers")
     parser.add_argument("--cell", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations")
     parser.add_argument("--error-weight", type=float, help="of the prediction errors in the loss (default: 0.3; 0: without)")
+    parser.add_argument("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate (default: %(default)g)")
     parser.add_argument(
         "--start",
         type=Path,
@@ -386,7 +387,7 @@ def arguments() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Train, then write weights and card."""
     options = arguments().parse_args(argv)
-    schedule = Schedule()
+    schedule = Schedule(peak_rate=options.rate)
     if options.error_weight is not None:
         schedule = replace(schedule, error_weight=options.error_weight)
     if checkpoint := training.begun(options):
