@@ -1,4 +1,9 @@
-"""How networks are trained: a trainer with checkpoints, the loop of so many steps, or minutes over all runs, and its flags."""
+"""How networks are trained: a trainer with checkpoints, the loop of so many steps, or minutes over all runs, and its flags.
+
+A training may last days, in the background of other work: time counts as the processor's, so that a process that is stopped
+(SIGSTOP) or waits loses nothing, checkpoints are replaced whole, and beside the exact checkpoint a compact one can be written,
+small enough to travel with the sources from one machine to the next.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +37,9 @@ N = TypeVar("N", bound=torch.nn.Module)
 class Trainer(ABC, Generic[N, D]):
     """A network `net` that learns from data, its optimiser, and the running average of its weights, which is exported.
 
-    SETTINGS: the dataclass of the network's settings. step, minutes: so many so far, over all runs. started_from: what the card
-    of the weights told that it began with, None where it began with nothing.
+    SETTINGS: the dataclass of the network's settings. step, minutes (of the processor's time): so many so far, over all runs.
+    warm_from: the step at which the optimiser knew nothing. started_from: what the card of the weights told that it began with,
+    None where it began with nothing.
     """
 
     SETTINGS: ClassVar[type]
@@ -41,7 +47,7 @@ class Trainer(ABC, Generic[N, D]):
     def __init__(self, settings: Any, schedule: Any, seed: int, net: N, optimizer: torch.optim.Optimizer):
         self.settings, self.schedule, self.seed = settings, schedule, seed
         self.net, self.average, self.optimizer = net, copy.deepcopy(net), optimizer
-        self.step, self.minutes = 0, 0.0
+        self.step, self.minutes, self.warm_from = 0, 0.0, 0
         self.started_from: dict[str, Any] | None = None
 
     @abstractmethod
@@ -63,14 +69,21 @@ class Trainer(ABC, Generic[N, D]):
                 if mean.is_floating_point():
                     mean.lerp_(value, 1.0 - keep)
 
-    def save(self, path: Path) -> None:
-        """Writes a checkpoint from which `restore` goes on."""
+    def save(self, path: Path, is_compact: bool = False) -> None:
+        """Writes a checkpoint from which `restore` goes on: exactly, or, `is_compact`, of a quarter of the size, in half
+        precision and without the optimiser's moments, which Adam gathers again within its first hundred steps."""
+
+        def stored(net: torch.nn.Module) -> dict[str, torch.Tensor]:
+            values = net.state_dict()
+            return {name: value.half() if value.is_floating_point() else value for name, value in values.items()}
+
         content = {
-            "net": self.net.state_dict(),
-            "average": self.average.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "net": stored(self.net) if is_compact else self.net.state_dict(),
+            "average": stored(self.average) if is_compact else self.average.state_dict(),
+            "optimizer": None if is_compact else self.optimizer.state_dict(),
             "step": self.step,
             "minutes": self.minutes,
+            "warm_from": self.warm_from,
             "settings": asdict(self.settings),
             "seed": self.seed,
             "started_from": self.started_from,
@@ -81,13 +94,17 @@ class Trainer(ABC, Generic[N, D]):
 
     @classmethod
     def restore(cls, path: Path, schedule: Any) -> Self:
-        """The trainer of a checkpoint; network and seed are the checkpoint's."""
+        """The trainer of a checkpoint, exact or compact; network and seed are the checkpoint's."""
         content = torch.load(path, weights_only=True)
         trainer = cls(cls.SETTINGS(**content["settings"]), schedule, content["seed"])  # type: ignore[call-arg]
         trainer.net.load_state_dict(content["net"])
         trainer.average.load_state_dict(content["average"])
-        trainer.optimizer.load_state_dict(content["optimizer"])
         trainer.step, trainer.minutes, trainer.started_from = content["step"], content["minutes"], content["started_from"]
+        if content["optimizer"] is None:
+            trainer.warm_from = trainer.step
+        else:
+            trainer.optimizer.load_state_dict(content["optimizer"])
+            trainer.warm_from = content["warm_from"]
         return trainer
 
 
@@ -110,14 +127,32 @@ def recoloured(picture: NDArray[np.float32], rng: np.random.Generator, amount: f
     return np.clip((mean + np.float32(contrast) * (picture - mean)) * gain, 0.0, 1.0, dtype=np.float32)
 
 
+def trapezoid(progress: float, steps: int, warm_up: int, cool_down: float) -> float:
+    """The learning rate as a share of its peak: up over the `warm_up` steps after the optimiser's first, then constant, and down
+    over the last share `cool_down` of the progress in [0, 1]. Unlike a cycle it may be made longer while it runs, and the
+    averaged weights are good at any time (Hägele et al. 2024, arXiv:2405.18392)."""
+    return min((steps + 1) / warm_up, 1.0) * max(min((1.0 - progress) / cool_down, 1.0), 0.005)
+
+
 def add_arguments(parser: argparse.ArgumentParser, name: str, minutes: float) -> None:
     """The flags of every training; minutes: how long it takes where nothing else is asked for."""
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--minutes", type=float, default=minutes, help="train for so long (default: %(default)g)")
+    length.add_argument("--minutes", type=float, default=minutes, help="of the processor's time to train (default: %(default)g)")
     length.add_argument("--steps", type=int, help="train for so many steps instead: the same result on every run of one machine")
     parser.add_argument("--seed", type=int, default=0, help="of data, initial weights and batches")
     parser.add_argument("--checkpoint", type=Path, default=Path(f"{name}.checkpoint"), help="written every few minutes")
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if there is one")
+    parser.add_argument(
+        "--compact", type=Path, help="a checkpoint of a quarter of the size, written as often: to keep with the sources"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the checkpoint if there is one, else from the compact one if there is"
+    )
+
+
+def begun(options: argparse.Namespace) -> Path | None:
+    """The checkpoint to go on from, None where none is asked for or there is none."""
+    places = (options.checkpoint, options.compact) if options.resume else ()
+    return next((path for path in places if path is not None and path.is_file()), None)
 
 
 def complete(trainer: Trainer[Any, D], data: D, options: argparse.Namespace) -> bool:
@@ -126,9 +161,9 @@ def complete(trainer: Trainer[Any, D], data: D, options: argparse.Namespace) -> 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     torch.set_num_threads(1)
     try:
-        run(trainer, data, options.steps, options.minutes, options.checkpoint)
+        run(trainer, data, options.steps, options.minutes, options.checkpoint, options.compact)
     except KeyboardInterrupt:
-        trainer.save(options.checkpoint)
+        save(trainer, options.checkpoint, options.compact)
         print(f"stopped at step {trainer.step}: go on with --resume --checkpoint {options.checkpoint}")
         return False
     finally:
@@ -136,26 +171,42 @@ def complete(trainer: Trainer[Any, D], data: D, options: argparse.Namespace) -> 
     return True
 
 
+def save(trainer: Trainer[Any, Any], checkpoint: Path, compact: Path | None) -> None:
+    """Writes the exact checkpoint, and the compact one where it is asked for."""
+    trainer.save(checkpoint)
+    if compact is not None:
+        trainer.save(compact, is_compact=True)
+
+
 def run(
-    trainer: Trainer[Any, D], data: D, steps: int | None, minutes: float, checkpoint: Path, save_every_s: float = 120.0
+    trainer: Trainer[Any, D],
+    data: D,
+    steps: int | None,
+    minutes: float,
+    checkpoint: Path,
+    compact: Path | None = None,
+    save_every_s: float = 120.0,
 ) -> dict[str, float]:
-    """Train up to so many steps, or minutes (over all runs); shows a progress bar. Returns the loss's parts, smoothed."""
+    """Train up to so many steps, or minutes (over all runs); shows a progress bar, or, where nobody looks, prints a line with
+    every checkpoint. Returns the loss's parts, smoothed."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     total = steps if steps is not None else int(minutes * 60)
-    saved = last = time.monotonic()
+    saved, last = time.monotonic(), time.process_time()
     smooth: dict[str, float] = {}
     with Progress(*columns) as bar:
         task = bar.add_task("steps" if steps is not None else "seconds", total=total)
         while (progress := trainer.step / steps if steps is not None else trainer.minutes / minutes if minutes else 1.0) < 1.0:
             for name, value in trainer.train_step(data, progress).items():
                 smooth[name] = value if name not in smooth else smooth[name] + 0.02 * (value - smooth[name])
-            now = time.monotonic()
+            now = time.process_time()
             trainer.minutes += (now - last) / 60.0
             last = now
-            text = "  ".join(f"{name} {value:.3f}" for name, value in smooth.items())
-            bar.update(task, completed=int(progress * total), description=f"step {trainer.step}  {text}")
-            if now - saved > save_every_s:
-                trainer.save(checkpoint)
-                saved = now
-    trainer.save(checkpoint)
+            text = f"step {trainer.step}  " + "  ".join(f"{name} {value:.3f}" for name, value in smooth.items())
+            bar.update(task, completed=int(progress * total), description=text)
+            if time.monotonic() - saved > save_every_s:
+                save(trainer, checkpoint, compact)
+                saved = time.monotonic()
+                if not bar.console.is_terminal:
+                    print(f"{time.strftime('%d %H:%M:%S')}  {trainer.minutes:.1f} min  {text}", flush=True)
+    save(trainer, checkpoint, compact)
     return smooth

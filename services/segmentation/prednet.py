@@ -16,6 +16,7 @@ References: Lotter, Kreiman, Cox 2017 (arXiv:1605.08104); Linsley, Kim, Veerabad
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +166,29 @@ class PredNet(nn.Module):
 def stored(net: PredNet) -> Model:
     """The network as it is stored and run."""
     return Model(net.settings, {name: value.detach().float().numpy().copy() for name, value in net.state_dict().items()})
+
+
+def grown(net: PredNet, settings: Settings) -> PredNet:
+    """A network with more channels that gives the masks of `net`: its own channels come first and do not hear of the new ones,
+    which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641). Raises ValueError where it would not be larger."""
+    old = net.settings
+    same = replace(settings, channels=old.channels) == old
+    if not same or any(new < before for new, before in zip(settings.channels, old.channels, strict=True)):
+        raise ValueError(f"expected at least the channels {old.channels} and otherwise the network of {old}, got {settings}")
+    larger = PredNet(settings)
+    with torch.no_grad():
+        for (name, value), before in zip(larger.named_parameters(), net.parameters(), strict=True):
+            rows = torch.arange(before.shape[0])
+            if before.ndim == 1:
+                value[rows] = before
+                continue
+            columns = torch.arange(before.shape[1])
+            if name.startswith(("ascend.", "drive.")):  # errors: what was too little, behind it what was too much
+                half = before.shape[1] // 2
+                columns[half:] += value.shape[1] // 2 - half
+            value[rows] = 0.0
+            value[rows[:, None], columns] = before
+    return larger
 
 
 def save(path: Path, net: PredNet, card: dict[str, Any]) -> None:

@@ -27,3 +27,5 @@ COLOURS: dict[Label, tuple[int, int, int]] = {
     Label.OCCLUDER: (200, 60, 60),
 }
 """The colour [RGB, of 255] of each class where a mask is shown over its picture; the background stays as it is."""
+UNLABELLED = 255
+"""What masks to learn from hold where nobody knows the class: neither losses nor scores look there."""

@@ -118,6 +118,7 @@ PROCESSES = (
         tools=(
             Tool("train", "services.segmentation.training.train:main", extra="segmentation,train"),
             Tool("infer", "services.segmentation.files:main", extra="segmentation"),
+            Tool("photographs", "services.segmentation.training.photographs:main", extra="segmentation"),
         ),
         trained_by="train",
     ),

@@ -55,7 +55,7 @@ TARGETS = {
 LIBC = {
     "malloc", "free", "memcpy", "memmove", "memset", "acos", "asin", "asinh", "atan", "atan2", "cbrt", "cos", "cosf", "cosh",
     "exp", "exp2", "expf", "expm1", "fmod", "hypot", "log", "log10", "log1p", "log2", "logf", "pow", "powf", "sin", "sinf",
-    "sinh", "tan", "tanh", "tanhf", "ceil", "floor", "rint", "round", "trunc", "sqrt", "sqrtf",
+    "sinh", "sincos", "tan", "tanh", "tanhf", "ceil", "floor", "rint", "round", "trunc", "sqrt", "sqrtf",
 }  # fmt: skip
 """What a library may call: every process with Python has these."""
 

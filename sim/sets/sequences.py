@@ -8,7 +8,7 @@ that stands still, at scales from those of a far arm or a coarse whole frame to 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -20,7 +20,7 @@ from shared.cell import description as cells
 from shared.contract.labels import Label
 from shared.geometry import rigid
 from shared.geometry.rigid import Array
-from sim.picture import appearance
+from sim.picture import appearance, limb, looks
 from sim.picture.appearance import Appearance
 from sim.picture.occluder import Panel, box
 from sim.picture.renderer import Body, Renderer, Shape
@@ -30,12 +30,17 @@ CELLS = ("table", "arm")
 PERIOD_S = 0.05
 ASTRAY = 0.12
 """Share of sequences whose window lies anywhere in the frame."""
+ARM_PX = (8.0, 120.0)
+"""Bounds of the forearm's width in the picture [px] where sequences are drawn as real cameras may show them."""
+ARM_M = 0.085
+"""Width of a forearm [m] by which it gets there."""
 
 
 @dataclass(frozen=True)
 class Variety:
     """What is drawn. frames; size [px] of the window; scale: bounds of the focal length relative to the cell's camera; speed
-    [m/s] and turn [rad/s]: the target's largest; jitter [m]: how far the window's middle is off the target's."""
+    [m/s] and turn [rad/s]: the target's largest; jitter [m]: how far the window's middle is off the target's; real: share of
+    sequences with the looks, hands, sizes and cameras of `sim.picture.looks`, `sim.picture.limb` and ARM_PX."""
 
     frames: int = 8
     size: int = 192
@@ -43,6 +48,7 @@ class Variety:
     speed: float = 0.5
     turn: float = 1.2
     jitter: float = 0.06
+    real: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -78,9 +84,11 @@ class Thing:
 def render(seed: int, index: int, variety: Variety = Variety()) -> Sequence:
     """Sequence `index` of the endless data set `seed`."""
     rng = np.random.default_rng([seed, index])
-    camera, things = scene(rng, variety)
-    look = appearance.look(rng, tuple(things[0].T[0, :3, 3]))
-    x0, y0 = _window(camera, things[0], variety, rng)
+    is_real = variety.real > 0.0 and rng.random() < variety.real
+    camera, things = scene(rng, variety, is_real)
+    around = tuple(things[0].T[0, :3, 3])
+    look = looks.look(rng, around) if is_real else appearance.look(rng, around)
+    x0, y0 = _window(camera, things[0], variety, rng, anywhere=is_real)
     renderer = Renderer(camera, (x0, y0, variety.size, variety.size))
     images, labels, hidden = [], [], []
     for t in range(variety.frames):
@@ -89,29 +97,35 @@ def render(seed: int, index: int, variety: Variety = Variety()) -> Sequence:
         images.append(picture.image)
         labels.append(picture.labels)
         hidden.append(renderer.hidden_fraction(picture, bodies, 0))
+    film = np.stack(images)
+    if is_real:
+        film = looks.filmed(film, rng)
     T_camera_target = np.stack([rigid.inverse(camera.T_world_camera) @ T for T in things[0].T])
     poses = Poses(
         T_camera_target, np.array([camera.fx, camera.fy, camera.cx - x0, camera.cy - y0]), things[0].shape.mesh.vertices
     )
-    return Sequence(np.stack(images), np.stack(labels), np.array(hidden), poses)
+    return Sequence(film, np.stack(labels), np.array(hidden), poses)
 
 
-def _window(camera: cells.Camera, target: Thing, variety: Variety, rng: np.random.Generator) -> tuple[int, int]:
-    """The window's first column and row: around the target in the middle of the sequence, or, some times, anywhere."""
+def _window(camera: cells.Camera, target: Thing, variety: Variety, rng: np.random.Generator, anywhere: bool) -> tuple[int, int]:
+    """The window's first column and row: around the target in the middle of the sequence (`anywhere` on it: around one of its
+    points), or, some times, anywhere in the frame."""
     room = np.array([camera.width, camera.height]) - variety.size
     if rng.random() < ASTRAY:
         x0, y0 = rng.integers(0, room + 1)
         return int(x0), int(y0)
     vertices = target.shape.mesh.vertices
-    middle = rigid.apply(target.T[variety.frames // 2], (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
+    point = vertices[rng.integers(len(vertices))] if anywhere else (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    middle = rigid.apply(target.T[variety.frames // 2], point)
     x, y, z = rigid.apply(rigid.inverse(camera.T_world_camera), middle + rng.uniform(-1.0, 1.0, 3) * variety.jitter)
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     x0, y0 = np.clip(np.round([u, v]).astype(int) - variety.size // 2, 0, room)
     return int(x0), int(y0)
 
 
-def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells.Camera, list[Thing]]:
-    """A camera and the things in front of it, the target first."""
+def scene(rng: np.random.Generator, variety: Variety = Variety(), is_real: bool = False) -> tuple[cells.Camera, list[Thing]]:
+    """A camera and the things in front of it, the target first; `is_real`: with hands, clothes, sizes and things as real cameras
+    may show them."""
     cell = _cell(CELLS[rng.integers(len(CELLS))])
     assert cell.sim is not None
     times: Array = np.arange(variety.frames, dtype=float) * PERIOD_S - variety.frames * PERIOD_S / 2
@@ -120,8 +134,10 @@ def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells
     shoulder = np.asarray(cell.sim.shoulder) + rng.normal(0.0, 0.06, 3)
     target = next(iter(cell.targets.values()))
     person = Person(varied, cell.sim.model_copy(update={"shoulder": tuple(shoulder)}), target)
+    if is_real:
+        person.meshes[0] = limb.mesh(varied.body, rng)
     T_target = path(cell.sim.motion, variety, times, rng)
-    clothes = appearance.person(rng)
+    clothes = looks.person(rng) if is_real else appearance.person(rng)
     things = [
         Thing(Shape.of(mesh), T, clothes[label])
         for label, mesh, T in zip(
@@ -130,11 +146,42 @@ def scene(rng: np.random.Generator, variety: Variety = Variety()) -> tuple[cells
     ]
     middle = T_target[len(times) // 2]
     camera = _camera(next(iter(cell.cameras.values())), middle[:3, 3], variety, rng)
+    if is_real:
+        camera = _zoomed(camera, middle[:3, 3], variety, rng)
+        things += _worn_and_held(varied.body, T_target, rng)
     things += _robot(cell, times, rng)
-    things += furniture(cell.sim.table or (1.2, 0.8), len(times), rng)
-    for _ in range(rng.choice([0, 1, 2], p=[0.2, 0.65, 0.15])):
-        things.append(_between(camera, person.meshes[0], T_target, times, rng))
+    table = furniture(cell.sim.table or (1.2, 0.8), len(times), rng)
+    if is_real:
+        table = [replace(thing, appearance=looks.thing(rng)) if rng.random() < 0.4 else thing for thing in table]
+    things += table
+    for _ in range(rng.choice([0, 1, 2], p=[0.35, 0.5, 0.15] if is_real else [0.2, 0.65, 0.15])):
+        between = _between(camera, person.meshes[0], T_target, times, rng)
+        things.append(replace(between, appearance=looks.thing(rng)) if is_real else between)
     return camera, things
+
+
+def _zoomed(camera: cells.Camera, target: Array, variety: Variety, rng: np.random.Generator) -> cells.Camera:
+    """The camera with a focal length that shows a forearm at a place [m] as wide as ARM_PX allows; its frame grows with it."""
+    low, high = np.log(ARM_PX)
+    distance = np.linalg.norm(np.asarray(camera.position) - target)
+    scale = float(np.exp(rng.uniform(low, high)) * distance / (ARM_M * camera.fx))
+    width, height = (max(round(scale * n), variety.size) for n in (camera.width, camera.height))
+    lens = {"fx": scale * camera.fx, "fy": scale * camera.fy, "cx": (width - 1) / 2.0, "cy": (height - 1) / 2.0}
+    return camera.model_copy(update={"width": width, "height": height, **lens})
+
+
+def _worn_and_held(body: cells.Body, T_target: Array, rng: np.random.Generator) -> list[Thing]:
+    """Now and then a watch, and something in the hand, which covers it as an occluder does."""
+    things = []
+    if rng.random() < 0.3:
+        things.append(Thing(Shape.of(limb.band(body, rng)), T_target, Appearance(looks.cloth(rng), gloss=rng.uniform(0.0, 0.5))))
+    if rng.random() < 0.3:
+        mesh = shape(rng)
+        mesh = replace(mesh, vertices=rng.uniform(0.25, 0.7) * mesh.vertices)
+        palm = (body.forearm_length / 2.0 + rng.uniform(0.4, 0.9) * body.hand_length, rng.normal(0.0, 0.02), -0.03)
+        T_target_thing = rigid.from_rpy(palm, rng.uniform(-np.pi, np.pi, 3))
+        things.append(Thing(Shape.of(mesh), T_target @ T_target_thing, looks.thing(rng)))
+    return things
 
 
 @functools.cache

@@ -37,7 +37,9 @@ VARIANTS: dict[str, tuple[Settings, float]] = {
 """Network and weight of the prediction errors in the loss."""
 SIDE = 96
 """Pixels a side of a sequence's pictures."""
-SCHEDULE = replace(train.Schedule(), patches=((0.0, 64, 6),), seen=((0, 0.5), (4, 0.5)), most=300)
+SCHEDULE = replace(train.Schedule(), patches=((0.0, 64, 6),), seen=((0, 0.5), (4, 0.5)))
+SEQUENCES = 300
+"""That are learned from."""
 HELD_OUT = 40
 """Sequences for the calibration, and as many for the score."""
 
@@ -76,28 +78,24 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--minutes", type=above_zero, default=7.0, help="training of the first variant (default: 7)")
     parser.add_argument("--steps", type=positive, help="steps of every variant instead")
     parser.add_argument("--seed", type=int, default=1, help="draws weights, training data and, far away, held-out data")
-    parser.add_argument("--cache", type=Path, help="folder of rendered sequences (default: rendered anew, then deleted)")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     console, steps = Console(), options.steps
     found: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
-        cache = options.cache or Path(folder) / "sequences"
-        data = train.Simulated(cache, options.seed, SCHEDULE.most, HELD_OUT, easy)
-        try:
-            data.ensure(SCHEDULE.most)
-            for name in VARIANTS:
-                console.print(f"training: {name}")
-                trainer, last = learn(name, data, options.seed, options.minutes, steps, Path(folder))
-                steps = steps or trainer.step
-                parameters = sum(p.numel() for p in trainer.net.parameters())
-                about = {"variant": name, "parameters": parameters, "steps": trainer.step, "minutes": round(trainer.minutes, 1)}
-                found.append({**about, "loss": last, **score(trainer, data, options.seed)})
-                if options.json:
-                    options.json.write_text(json.dumps({"seed": options.seed, "variants": found}, indent=1) + "\n")
-        finally:
-            data.close()
+        data = train.Simulated(options.seed, HELD_OUT, easy, easy, SEQUENCES)
+        for index in range(SEQUENCES):  # rendered ahead: the variants' minutes are those of learning
+            data[index]
+        for name in VARIANTS:
+            console.print(f"training: {name}")
+            trainer, last = learn(name, data, options.seed, options.minutes, steps, Path(folder))
+            steps = steps or trainer.step
+            parameters = sum(p.numel() for p in trainer.net.parameters())
+            about = {"variant": name, "parameters": parameters, "steps": trainer.step, "minutes": round(trainer.minutes, 1)}
+            found.append({**about, "loss": last, **score(trainer, data, options.seed)})
+            if options.json:
+                options.json.write_text(json.dumps({"seed": options.seed, "variants": found}, indent=1) + "\n")
     show(found, options.seed, console)
     return 0
 

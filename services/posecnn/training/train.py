@@ -312,8 +312,8 @@ def main(argv: list[str] | None = None) -> int:
     """Train, then write weights and card."""
     options = arguments().parse_args(argv)
     schedule = Schedule()
-    if options.resume and options.checkpoint.is_file():
-        trainer = Trainer.restore(options.checkpoint, schedule)
+    if checkpoint := training.begun(options):
+        trainer = Trainer.restore(checkpoint, schedule)
     else:
         trainer = Trainer(PoseCnnSettings(), schedule, options.seed)
     data = RenderedPictures(options.cache, trainer.seed, schedule.most)

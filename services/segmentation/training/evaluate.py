@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt
 
 from services.segmentation.inference import TARGET_LABELS, classes
 from services.segmentation.prednet import PredNet
-from shared.contract.labels import Label
+from shared.contract.labels import UNLABELLED, Label
 
 WARM_UP = 3
 """Frames at the start of a sequence that do not count: the state knows nothing yet."""
@@ -71,8 +71,9 @@ def calibrate(net: PredNet, data: Iterable[Labelled]) -> tuple[float, dict[str, 
     ratios = []
     for sequence in data:
         for logits, labels in itertools.islice(zip(run(net, sequence.images), sequence.labels, strict=True), WARM_UP, None):
-            m = (logits[target].amax(0) - logits[other].amax(0)).numpy()
-            t = np.isin(labels, TARGET_LABELS)
+            known = labels != UNLABELLED
+            m = (logits[target].amax(0) - logits[other].amax(0)).numpy()[known]
+            t = np.isin(labels[known], TARGET_LABELS)
             if t.any() and ((m > 0) & t).sum() >= GOOD * ((m > 0) | t).sum():
                 ratios.append((m.size - np.searchsorted(np.sort(m.ravel()), -offsets, side="right")) / t.sum())
     if not ratios:
@@ -91,6 +92,7 @@ def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str,
     for sequence in data:
         found = np.stack([classes((logits + bias).numpy()) for logits in run(net, sequence.images)])[WARM_UP:]
         labels = sequence.labels[WARM_UP:]
+        found[labels == UNLABELLED] = UNLABELLED  # which is no class
         for label in Label:
             both[label] += np.sum((found == label) & (labels == label))
             either[label] += np.sum((found == label) | (labels == label))

@@ -1,5 +1,5 @@
 """The training loss: sum of the layers' prediction errors + Dice + focal (section "PredNet Model"), and once more
-Dice of the target's classes as one, which is what the search looks at."""
+Dice of the target's classes as one, which is what the search looks at. Pixels that are UNLABELLED count nowhere."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from services.segmentation.inference import TARGET_LABELS
+from shared.contract.labels import UNLABELLED
 
 ERROR_WEIGHTS = (1.0, 0.1)
 """Of the first layer's prediction error and of every other's, as in Lotter et al. 2017 (L_all): an upper layer can also lower its
@@ -20,8 +21,9 @@ def dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
     logits (batch, classes, h, w), labels (batch, h, w) int64; counted over the whole batch. `smooth` [pixels] keeps a class of a
     few pixels from weighing as much as a large one.
     """
-    probability = logits.softmax(1)
-    truth = F.one_hot(labels, logits.shape[1]).movedim(-1, 1).to(probability.dtype)
+    known = (labels != UNLABELLED)[:, None]
+    probability = logits.softmax(1) * known
+    truth = F.one_hot(labels.where(known[:, 0], 0), logits.shape[1]).movedim(-1, 1) * known.to(probability.dtype)
     both, sum_p, sum_t = ((probability * truth).sum((0, 2, 3)), probability.sum((0, 2, 3)), truth.sum((0, 2, 3)))
     score = (2.0 * both + smooth) / (sum_p + sum_t + smooth)
     present = sum_t > 0
@@ -32,7 +34,7 @@ def target_dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
     """1 - the mean over the pictures that show the target of 2 |P and T| / (|P| + |T|), its classes taken as one: a picture of
     which little is visible weighs as much as another. Shapes as for `dice`."""
     target = list(TARGET_LABELS)
-    probability = logits.softmax(1)[:, target].sum(1)
+    probability = logits.softmax(1)[:, target].sum(1) * (labels != UNLABELLED)
     truth = torch.isin(labels, torch.tensor(target)).to(probability.dtype)
     both, sum_p, sum_t = ((probability * truth).sum((1, 2)), probability.sum((1, 2)), truth.sum((1, 2)))
     score = (2.0 * both + smooth) / (sum_p + sum_t + smooth)
@@ -42,8 +44,8 @@ def target_dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
 
 def focal(logits: Tensor, labels: Tensor, gamma: float = 2.0) -> Tensor:
     """Mean of -(1 - p)^gamma log p of the true class (Lin et al. 2017, doi:10.1109/ICCV.2017.324). Shapes as for `dice`."""
-    log_p = -F.cross_entropy(logits, labels, reduction="none")
-    return (-((1.0 - log_p.exp()) ** gamma) * log_p).mean()
+    log_p = -F.cross_entropy(logits, labels, reduction="none", ignore_index=UNLABELLED)  # zero where unlabelled
+    return (-((1.0 - log_p.exp()) ** gamma) * log_p).sum() / (labels != UNLABELLED).sum().clamp(min=1)
 
 
 def prediction_error(missed: list[Tensor]) -> Tensor:

@@ -6,10 +6,11 @@
                        to the folder or to images/ in it; polygons or run lengths, later annotations over earlier ones
 
 Pictures may be JPEG or BMP as well. A mask is a PNG with one channel that holds a class for every pixel: 0 background, 1 robot,
-2 torso, 3 upper arm, 4 forearm, 5 hand, 6 occluder (`shared.contract.labels.Label`); in COCO, categories have these names. What
-is not labelled counts as background. The files of a subfolder are the frames of one sequence in the order of their names (as
-text: write 0001.png); pictures that lie in no subfolder are single ones, each a sequence that stands still. A tenth of the
-sequences, or of their pieces of 40 frames, is kept for the calibration, another for the score.
+2 torso, 3 upper arm, 4 forearm, 5 hand, 6 occluder (`shared.contract.labels.Label`), 255 unlabelled: nothing is learned from
+there; in COCO, categories have these names, and what is not labelled counts as background. The files of a subfolder are the
+frames of one sequence in the order of their names (as text: write 0001.png); pictures that lie in no subfolder are single ones,
+each a sequence that stands still. A tenth of the sequences, or of their pieces of 40 frames, is kept for the calibration, another
+for the score.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.contract.labels import Label
+from shared.contract.labels import UNLABELLED, Label
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 PIECE = 40
@@ -36,7 +37,7 @@ UNIT = 8
 """Pictures are cut to multiples of this many pixels a side: what the network can take."""
 SMALLEST = 32
 """Pixels a side that a picture has at least."""
-CLASSES = ", ".join(f"{label.value} {label.name.lower()}" for label in Label)
+CLASSES = ", ".join(f"{label.value} {label.name.lower()}" for label in Label) + f", {UNLABELLED} unlabelled"
 
 
 class DataError(ValueError):
@@ -137,12 +138,9 @@ class Recordings:
         self.calibration = [pieces[i] for i in order[:tenth]]
         self.held_out = [pieces[i] for i in order[tenth : 2 * tenth]]
         self._train = [pieces[i] for i in order[2 * tenth :]]
+        self.count = len(self._train)
         self.side = min(piece.side for piece in pieces)
         self.sources = ({"folder": folder.name, "sequences": tenth}, {"folder": folder.name, "sequences": len(self.held_out)})
-
-    def ensure(self, count: int) -> int:
-        """How many sequences may be used: all of them, at once."""
-        return len(self._train)
 
     def __getitem__(self, index: int) -> Recorded:
         return self._train[index]
@@ -207,7 +205,7 @@ def read_mask(path: Path) -> NDArray[np.uint8]:
         if not (mask[..., :1] == mask[..., 1:3]).all():
             raise DataError(f"{path}: one channel of class indices expected ({CLASSES}), colours or a palette came")
         mask = mask[..., 0]
-    wrong = np.argwhere(mask > max(Label))
+    wrong = np.argwhere((mask > max(Label)) & (mask != UNLABELLED))
     if len(wrong):
         r, c = wrong[0]
         raise DataError(f"{path}: classes {CLASSES} expected, {mask[r, c]} came at row {r}, column {c}")

@@ -1,23 +1,25 @@
 """Makes weights/ again: `penumbra segmentation train`; with --data, weights for a user's own frames and masks.
 
-Simulated sequences are rendered by a second process into a growing data set on disk while the network learns from those there.
-Step n takes its sequences, patches and colours from a generator seeded by (seed, n), and all schedules are functions of the
-progress, so that a run of --steps interrupted and resumed ends with the same weights as one that was not.
+Every step renders simulated sequences that no other step sees: that costs a fifth of it. Step n takes its sequences, patches and
+colours from a generator seeded by (seed, n), and all schedules are functions of the progress, so that a run of --steps
+interrupted and resumed ends with the same weights as one that was not. For days in the background, over several machines:
+
+  OMP_NUM_THREADS=1 nice -n 19 penumbra segmentation train --size 16 32 64 128 --steps 150000 --resume --compact FILE
 """
 
 from __future__ import annotations
 
 import argparse
 import datetime
-import multiprocessing
-import os
+import functools
+import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -28,35 +30,41 @@ from services.segmentation.prednet import PredNet, Settings
 from services.segmentation.training import loss, recordings
 from services.segmentation.training.evaluate import Labelled, calibrate, held_out
 from shared import training
+from shared.contract.labels import UNLABELLED, Label
 from shared.native import processor
+from sim.picture import looks
 from sim.sets import sequences
 
 VALIDATION_SEED = 1_000_000
 """Added to the seed for held-out data: nothing there was ever trained on."""
+VARIETY = sequences.Variety(frames=5, size=176, real=0.7)
+"""Of the sequences that are learned from."""
+ENDLESS = 2**31
+"""Number of sequences of a set that has no end."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How training goes. `peak_rate`: of Adam's one cycle; `frames`: that a step plays; `patches`: (from which progress on,
-    pixels a side, sequences a batch); `reuse`: how often a sequence is visited on average while the data set grows up to `most`
-    sequences; `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`:
-    of the weights that are exported; `seen`: (frames that the state has seen before those that are learned from, how often)."""
+    """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`; `frames`:
+    that a step plays; `patches`: (from which progress on, pixels a side, sequences a batch); `error_weight`, `focal_weight`,
+    `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights that are exported; `seen`:
+    (frames that the state has seen before those that are learned from, how often)."""
 
-    peak_rate: float = 3e-3
+    peak_rate: float = 2e-3
+    warm_up: int = 100
+    cool_down: float = 0.3
     frames: int = 5
-    patches: tuple[tuple[float, int, int], ...] = ((0.0, 96, 8), (0.1, 128, 4), (0.4, 160, 3))
-    reuse: int = 4
-    most: int = 6000
+    patches: tuple[tuple[float, int, int], ...] = ((0.0, 128, 4), (0.5, 160, 3))
     error_weight: float = 0.3
     focal_weight: float = 5.0
     target_weight: float = 1.0
     clip: float = 1.0
-    averaging: float = 0.995
+    averaging: float = 0.999
     seen: tuple[tuple[int, float], ...] = ((0, 0.4), (4, 0.3), (12, 0.2), (36, 0.1))
 
-    def rate(self, progress: float) -> float:
-        """The learning rate at a progress in [0, 1]."""
-        return self.peak_rate * training.one_cycle(progress, 0.15)
+    def rate(self, progress: float, steps: int) -> float:
+        """The learning rate at a progress in [0, 1], so many steps after the optimiser's first."""
+        return self.peak_rate * training.trapezoid(progress, steps, self.warm_up, self.cool_down)
 
     def before(self, rng: np.random.Generator) -> int:
         """Frames that the state shall have seen, drawn from `seen`."""
@@ -82,8 +90,9 @@ class Data(Protocol):
     def calibration(self) -> Iterable[Labelled]: ...
     @property
     def held_out(self) -> Iterable[Labelled]: ...
-    def ensure(self, count: int) -> int:
-        """Wait until `count` sequences are there, or all; returns how many may be used."""
+    @property
+    def count(self) -> int:
+        """How many sequences there are to choose from."""
 
     def __getitem__(self, index: int, /) -> Any: ...
     def close(self) -> None:
@@ -93,36 +102,37 @@ class Data(Protocol):
 Render = Callable[[int, int], sequences.Sequence]
 
 
+def _varied(seed: int, index: int) -> sequences.Sequence:
+    return sequences.render(seed, index, VARIETY)
+
+
 class Simulated:
-    """Sequences rendered in order by a process of low priority, kept on disk. `each`: for the calibration, and for the score;
-    `render`: sequence of a seed and an index, a function that another process can import."""
+    """Sequences rendered when they are asked for. `each`: for the calibration, and for the score; `learned`, `scored`: sequence
+    of a seed and an index, to learn from, and for calibration and score; `most`: how many to learn from, kept in memory then."""
 
     jitter = 0.2
     """Less than the authors' of photographs: our renderer varies the light itself."""
-    side = sequences.Variety.size
+    side = VARIETY.size
 
-    def __init__(self, folder: Path, seed: int, most: int, each: int = 60, render: Render = sequences.render):
-        folder.mkdir(parents=True, exist_ok=True)
-        self._folder, self._seed, self._most, self._each, self._render = folder, seed, most, each, render
-        self._asked = 0
-        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=os.nice, initargs=(10,))
-        self._pending: list[Future[None]] = []
-        self._arrays: list[NDArray[np.uint8]] = []
-
-    def ensure(self, count: int, ahead: int = 64) -> int:
-        """Wait until `count` sequences (at most `most`) are there, ask for some more; returns how many may be used."""
-        count = min(count, self._most)
-        for index in range(self._asked, min(count + ahead, self._most)):
-            self._pending.append(self._pool.submit(_render_to, self._path(index), self._render, self._seed, index))
-            self._asked = index + 1
-        while len(self._arrays) < count:
-            self._pending[len(self._arrays)].result()
-            self._arrays.append(np.load(self._path(len(self._arrays)), mmap_mode="r"))
-        return count
+    def __init__(
+        self,
+        seed: int,
+        each: int = 60,
+        learned: Render = _varied,
+        scored: Render = sequences.render,
+        most: int | None = None,
+    ):
+        self._seed, self._each, self._learned, self._scored = seed, each, learned, scored
+        self.count = ENDLESS if most is None else most
+        self._kept = functools.lru_cache(maxsize=most or 0)(self._rendered)
 
     def __getitem__(self, index: int) -> NDArray[np.uint8]:
-        """Red, green, blue and class (frames, h, w, 4) of a sequence that is there."""
-        return self._arrays[index]
+        """Red, green, blue and class (frames, h, w, 4) of a sequence."""
+        return self._kept(index)
+
+    def _rendered(self, index: int) -> NDArray[np.uint8]:
+        sequence = self._learned(self._seed, index)
+        return np.concatenate([sequence.images, sequence.labels[..., None]], axis=-1)
 
     @property
     def sources(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -132,28 +142,84 @@ class Simulated:
     @property
     def calibration(self) -> Iterator[sequences.Sequence]:
         """Sequences for the calibration, rendered as they are asked for."""
-        return (self._render(VALIDATION_SEED + self._seed, index) for index in range(self._each))
+        return (self._scored(VALIDATION_SEED + self._seed, index) for index in range(self._each))
 
     @property
     def held_out(self) -> Iterator[sequences.Sequence]:
         """Sequences for the score."""
-        return (self._render(VALIDATION_SEED + self._seed + 1, index) for index in range(self._each))
+        return (self._scored(VALIDATION_SEED + self._seed + 1, index) for index in range(self._each))
 
     def close(self) -> None:
-        """Render no more."""
-        self._pool.shutdown(cancel_futures=True)
-
-    def _path(self, index: int) -> Path:
-        return self._folder / f"{self._seed}-{index:06d}.npy"
+        """Nothing is open."""
 
 
-def _render_to(path: Path, render: Render, seed: int, index: int) -> None:
-    if path.is_file():
-        return
-    sequence = render(seed, index)
-    part = path.with_suffix(".part.npy")
-    np.save(part, np.concatenate([sequence.images, sequence.labels[..., None]], axis=-1))
-    part.replace(path)  # a file is there wholly or not at all
+class Mixed:
+    """Recordings and simulated sequences. `share`: how many of those that are learned from are simulated; of the recordings, half
+    have simulated robots and occluders in front, some of these an arm, too. Calibrated on simulated ones, scored on both."""
+
+    jitter = 0.3
+    """Between that of simulated sequences and that of recordings alone."""
+    side = VARIETY.size
+    count = ENDLESS
+
+    def __init__(self, recorded: recordings.Recordings, simulated: Simulated, share: float, seed: int):
+        self._recorded, self._simulated, self._share, self._seed = recorded, simulated, share, seed
+        self.calibration = simulated.calibration
+        self.held_out = itertools.chain(simulated.held_out, recorded.held_out)
+        of_simulated, of_recorded = simulated.sources[1], recorded.sources[1]
+        self.sources = simulated.sources[0], {**of_simulated, **of_recorded, "simulated": share}
+
+    def __getitem__(self, index: int) -> NDArray[np.uint8]:
+        """Red, green, blue and class (frames, h, w, 4) of a sequence."""
+        rng = np.random.default_rng([self._seed, 5, index])
+        if rng.random() < self._share:
+            return self._simulated[index]
+        film = moved(self._recorded[int(rng.integers(self._recorded.count))], VARIETY.frames, VARIETY.size, rng)
+        if rng.random() < 0.5:
+            film = pasted(film, self._simulated[index], rng)
+        return np.concatenate([looks.filmed(film[..., :3], rng), film[..., 3:]], axis=-1)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """So many frames of a recording as a camera of `size` pixels a side that is turned, nearer or farther, and moves shows them:
+    (frames, size, size, 4); what lies outside of the picture is UNLABELLED."""
+    start = int(rng.integers(0, len(recorded) - frames + 1))
+    film = recorded[start : start + frames]
+    middle = rng.integers(0, film.shape[1:3])
+    target = np.argwhere(np.isin(film[frames // 2, ..., 3], inference.TARGET_LABELS))
+    if len(target) and rng.random() < 0.8:
+        middle = target[rng.integers(len(target))] + rng.integers(-size // 6, size // 6 + 1, 2)
+    zoom = np.exp(rng.uniform(np.log(0.5), np.log(3.0)))
+    angle = rng.normal(0.0, 20.0) if rng.random() < 0.7 else rng.uniform(-180.0, 180.0)
+    speed = rng.random() ** 1.5
+    shift, turn, grow = speed * rng.uniform(-8.0, 8.0, 2), speed * rng.uniform(-2.0, 2.0), 1.0 + speed * rng.uniform(-0.02, 0.02)
+    out = np.empty((frames, size, size, 4), np.uint8)
+    for t, frame in enumerate(film):
+        since = t - frames // 2
+        place = cv2.getRotationMatrix2D((float(middle[1]), float(middle[0])), angle + since * turn, zoom * grow**since)
+        place[:, 2] += size / 2.0 - middle[::-1] + since * shift
+        smaller = cv2.INTER_AREA if zoom < 1.0 else cv2.INTER_LINEAR
+        picture, labels = np.ascontiguousarray(frame[..., :3]), np.ascontiguousarray(frame[..., 3])
+        out[t, ..., :3] = cv2.warpAffine(picture, place, (size, size), flags=smaller, borderMode=cv2.BORDER_REFLECT)
+        out[t, ..., 3] = cv2.warpAffine(labels, place, (size, size), flags=cv2.INTER_NEAREST, borderValue=float(UNLABELLED))
+    return out
+
+
+def pasted(film: NDArray[np.uint8], over: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A film (frames, h, w, 4) with the robot and the occluders of another in front; half of the time its person, too."""
+    front = [Label.ROBOT, Label.OCCLUDER]
+    if rng.random() < 0.5:
+        front += [Label.TORSO, Label.UPPER_ARM, Label.FOREARM, Label.HAND]
+    out = film.copy()
+    for below, above in zip(out, over, strict=True):
+        cover = np.isin(above[..., 3], front)
+        soft = cv2.GaussianBlur(cover.astype(np.float32), (0, 0), 0.7)[..., None]  # as the lens does along an edge
+        below[..., :3] = (soft * above[..., :3] + (1.0 - soft) * below[..., :3] + 0.5).astype(np.uint8)
+        below[cover, 3] = above[cover, 3]
+    return out
 
 
 class Trainer(training.Trainer[PredNet, Data]):
@@ -173,16 +239,15 @@ class Trainer(training.Trainer[PredNet, Data]):
         size, batch = self.schedule.patch(progress)
         size = min(size, data.side)
         rng = np.random.default_rng([self.seed, 1, self.step])
-        count = data.ensure(8 * batch + self.step * batch // self.schedule.reuse)
-        images, labels = draw_batch(
-            [data[i] for i in rng.integers(count, size=batch)], self.schedule.frames, size, rng, data.jitter
-        )
+        chosen = [data[int(i)] for i in rng.integers(data.count, size=batch)]
+        images, labels = draw_batch(chosen, self.schedule.frames, size, rng, data.jitter)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
             parts = self._losses(images, labels, self.schedule.before(rng))
         schedule = self.schedule
         weights = {"focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
         total = parts["dice"] + sum(weight * parts[name] for name, weight in weights.items())
-        self.descend(total, schedule.rate(progress), schedule.clip, schedule.averaging)
+        rate = schedule.rate(progress, self.step - self.warm_from)
+        self.descend(total, rate, schedule.clip, schedule.averaging)
         return {name: float(value.detach()) for name, value in parts.items()} | {"total": float(total.detach())}
 
     def _losses(self, images: torch.Tensor, labels: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
@@ -210,9 +275,13 @@ class Trainer(training.Trainer[PredNet, Data]):
         }
 
     @classmethod
-    def begin(cls, path: Path, schedule: Schedule, seed: int) -> Trainer:
-        """A trainer that starts from weights with a card; the card it writes tells of them."""
+    def begin(cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None) -> Trainer:
+        """A trainer that starts from weights with a card, grown to more channels where these are given; the card it writes tells
+        of them. Raises ValueError where they are fewer."""
         net, card = prednet.load(path)
+        if channels is not None:
+            torch.manual_seed(seed)
+            net = prednet.grown(net, replace(net.settings, channels=channels))
         trainer = cls(net.settings, schedule, seed)
         trainer.net.load_state_dict(net.state_dict())
         trainer.average.load_state_dict(net.state_dict())
@@ -275,7 +344,7 @@ def arguments() -> argparse.ArgumentParser:
     """The flags of `penumbra segmentation train`."""
     parser = Parser(
         prog="penumbra segmentation train",
-        description="Train the segmentation network on simulated sequences, or on your own frames and masks.",
+        description="Train the segmentation network on simulated sequences, on your own frames and masks, or both.",
         epilog=recordings.__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -284,15 +353,22 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--delay", action=argparse.BooleanOptionalAction, default=False, help="axonal delays between the layers")
     parser.add_argument("--cell", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations")
     parser.add_argument("--error-weight", type=float, help="of the prediction errors in the loss (default: 0.3; 0: without)")
+    parser.add_argument("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate (default: %(default)g)")
     parser.add_argument(
         "--start",
         type=Path,
         nargs="?",
         const=inference.WEIGHTS,
-        help="start from these weights (without a value: the committed ones), of their size, instead of random ones",
+        help="start from these weights (without a value: the committed ones), grown to --size, instead of random ones",
     )
     parser.add_argument("--data", type=Path, help="your own frames and masks, in the forms below, instead of simulated sequences")
-    parser.add_argument("--cache", type=Path, default=Path("segmentation-data"), help="folder of rendered sequences (some GB)")
+    parser.add_argument(
+        "--simulated",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="with --data: of the sequences, so that nothing is forgotten",
+    )
     parser.add_argument(
         "--out", type=Path, help="the weights, their card beside them (default: the committed ones; with --data segmentation.npz)"
     )
@@ -305,23 +381,24 @@ def arguments() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Train, then write weights and card."""
     options = arguments().parse_args(argv)
-    schedule = Schedule()
+    schedule = Schedule(peak_rate=options.rate)
     if options.error_weight is not None:
         schedule = replace(schedule, error_weight=options.error_weight)
-    if options.resume and options.checkpoint.is_file():
-        trainer = Trainer.restore(options.checkpoint, schedule)
+    if checkpoint := training.begun(options):
+        trainer = Trainer.restore(checkpoint, schedule)
     elif options.start:
-        trainer = Trainer.begin(options.start, schedule, options.seed)
+        trainer = Trainer.begin(options.start, schedule, options.seed, tuple(options.size) if options.size else None)
     else:
         channels = tuple(options.size or Settings.channels)
         kernels = (*(3 for _ in channels[:-2]), 5, 5)
         trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.cell), schedule, options.seed)
+    simulated = Simulated(trainer.seed, options.held_out)
+    data: Data = simulated
     try:
-        data: Data = (
-            recordings.Recordings(options.data, trainer.seed)
-            if options.data
-            else Simulated(options.cache, trainer.seed, schedule.most, options.held_out)
-        )
+        if options.data:
+            data = recorded = recordings.Recordings(options.data, trainer.seed)
+            if options.simulated:
+                data = Mixed(recorded, simulated, options.simulated, trainer.seed)
     except recordings.DataError as error:
         print(f"penumbra segmentation train: {error}", file=sys.stderr)
         return 2

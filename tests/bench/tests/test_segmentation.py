@@ -34,12 +34,13 @@ def test_the_benchmark_writes_the_agreed_numbers(tmp_path, capsys):
 
 
 def test_the_ablation_trains_each_variant_as_long_and_scores_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(ablation, "SCHEDULE", replace(ablation.SCHEDULE, patches=((0.0, 32, 1),), seen=((0, 1.0),), most=3))
+    monkeypatch.setattr(ablation, "SCHEDULE", replace(ablation.SCHEDULE, patches=((0.0, 32, 1),), seen=((0, 1.0),)))
+    monkeypatch.setattr(ablation, "SEQUENCES", 3)
     monkeypatch.setattr(ablation, "HELD_OUT", 2)
     tiny = Settings(channels=(4, 4), kernels=(3, 3))
     small = {"hGRU": (tiny, 0.3), "ConvLSTM, no prediction loss": (replace(tiny, cell="convlstm"), 0.0)}
     monkeypatch.setattr(ablation, "VARIANTS", small)
-    flags = ["--steps", "2", "--seed", "5", "--cache", str(tmp_path / "cache"), "--json", str(tmp_path / "out.json")]
+    flags = ["--steps", "2", "--seed", "5", "--json", str(tmp_path / "out.json")]
     assert ablation.main(flags) == 0
     found = json.loads((tmp_path / "out.json").read_text())["variants"]
     assert [(one["variant"], one["steps"]) for one in found] == [(name, 2) for name in small]

@@ -120,7 +120,7 @@ def broken_size(folder, scene):
 
 def broken_values(folder, scene):
     write_pairs(folder, scene)
-    cv2.imwrite(str(folder / "0001_mask.png"), np.full((96, 96), 255, np.uint8))
+    cv2.imwrite(str(folder / "0001_mask.png"), np.full((96, 96), 7, np.uint8))
 
 
 def broken_colours(folder, scene):
@@ -165,7 +165,7 @@ def no_coco(folder, scene):
     ("spoil", "says"),
     [
         (broken_size, r"0001_mask.png: a mask of 96 x 96 as 0001.png expected, 96 x 50 came"),
-        (broken_values, r"0001_mask.png: classes 0 background, .* expected, 255 came at row 0, column 0"),
+        (broken_values, r"0001_mask.png: classes 0 background, .* expected, 7 came at row 0, column 0"),
         (broken_colours, r"0001_mask.png: one channel of class indices expected .* colours or a palette came"),
         (broken_picture, r"0002.png: a picture expected, this file cannot be read as one"),
         (without_masks, r"1 pictures and 0 masks came, no two of one name"),
@@ -202,7 +202,7 @@ def test_what_is_held_out_is_not_learned_from(tmp_path, scene):
     for name in "abcdefghijklmnopqrstu":
         write_pairs(tmp_path, scene, name, 1)
     data = recordings.Recordings(tmp_path, 3)
-    parts = [[data[i] for i in range(data.ensure(10**9))], data.calibration, data.held_out]
+    parts = [[data[i] for i in range(data.count)], data.calibration, data.held_out]
     names = [{piece._frames[0].picture for piece in part} for part in parts]
     assert [len(part) for part in names] == [17, 2, 2]
     assert len(set.union(*names)) == 21

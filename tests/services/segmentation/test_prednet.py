@@ -18,7 +18,7 @@ from services.segmentation.training import evaluate, loss, train
 from shared import training
 from shared.cell import description as cells
 from shared.contract import topics
-from shared.contract.labels import Label
+from shared.contract.labels import UNLABELLED, Label
 from shared.native import processor
 from shared.perception.lookout import Lookout, Window, corners_of, window_around
 from sim.sets import sequences, shots
@@ -107,6 +107,31 @@ def as_rows(tensor: torch.Tensor) -> np.ndarray:
     return tensor.permute(0, 2, 3, 1).contiguous().numpy()
 
 
+def test_what_is_unlabelled_is_neither_learned_nor_scored():
+    labels = torch.randint(0, len(Label), (1, 16, 16))
+    unknown = torch.rand(labels.shape) < 0.3
+    labels[unknown] = UNLABELLED
+    logits = torch.randn(1, len(Label), 16, 16, requires_grad=True)
+    losses = (loss.dice, loss.target_dice, loss.focal)
+    sum(each(logits, labels) for each in losses).backward()
+    assert logits.grad is not None
+    reached = logits.grad.abs().sum(1) > 0
+    assert not reached[unknown].any() and reached[~unknown].all()
+    with torch.no_grad():
+        other = torch.where(unknown[:, None], torch.randn_like(logits), logits)
+        assert all(torch.isclose(each(other, labels), each(logits, labels)) for each in losses)
+    nothing = torch.full_like(labels, UNLABELLED)
+    assert all(torch.isfinite(each(logits, nothing)) for each in (loss.target_dice, loss.focal))
+    known = sequences.Sequence(scene(6, 64), np.full((6, 64, 64), Label.HAND, np.uint8), np.zeros(6))
+    hidden = np.where(np.arange(64) < 32, np.uint8(Label.HAND), np.uint8(UNLABELLED))
+    half = sequences.Sequence(known.images, np.broadcast_to(hidden, known.labels.shape), known.hidden)
+    net = PredNet(SMALL)
+    net.head.weight.data[:] = 0.0
+    net.head.bias.data[:] = -9.0 * (torch.arange(len(net.head.bias)) // 4 != Label.HAND)  # four pixels a position
+    for each in (known, half):
+        assert evaluate.held_out(net, 0.0, [each])["iou_by_class"] == {"hand": 1.0}
+
+
 def test_state_shifted_with_the_window_is_the_state_of_the_shifted_window():
     net = PredNet(SMALL).eval()
     image = torch.rand(1, 3, 96, 96)
@@ -132,16 +157,12 @@ def test_sequences_are_a_function_of_seed_and_index_and_show_the_target():
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sequences")
-    data = train.Simulated(folder, 1, 24)
-    data.ensure(24, ahead=0)
-    yield data
-    data.close()
+def data():
+    return train.Simulated(1, learned=lambda seed, index: sequences.render(seed, index, TINY), most=24)
 
 
 def trained(data, steps: int, checkpoint, resume_at: int | None = None) -> train.Trainer:
-    schedule = train.Schedule(frames=2, patches=((0.0, 64, 2),), most=24)
+    schedule = train.Schedule(frames=2, patches=((0.0, 64, 2),))
     trainer = train.Trainer(SMALL, schedule, seed=1)
     if resume_at:
         for _ in range(resume_at):
@@ -159,6 +180,45 @@ def test_training_that_was_interrupted_ends_with_the_same_weights(data, tmp_path
         torch.testing.assert_close(a, b, msg=name)
 
 
+def test_a_compact_checkpoint_is_a_quarter_of_the_exact_one_and_goes_on_with_a_rate_that_rises_again(data, tmp_path):
+    trainer = train.Trainer(Settings(), train.Schedule(frames=2, patches=((0.0, 32, 1),), warm_up=3), seed=1)
+    for _ in range(4):
+        trainer.train_step(data, 0.1)
+    training.save(trainer, tmp_path / "exact", tmp_path / "compact")
+    assert (tmp_path / "compact").stat().st_size < 0.3 * (tmp_path / "exact").stat().st_size
+    options = argparse.Namespace(resume=True, checkpoint=tmp_path / "missing", compact=tmp_path / "compact")
+    place = training.begun(options)
+    assert place == tmp_path / "compact"
+    again = train.Trainer.restore(place, trainer.schedule)
+    for a, b in zip(trainer.net.parameters(), again.net.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)  # half precision
+    assert (again.step, again.warm_from) == (4, 4)
+    again.train_step(data, 0.1)
+    assert again.optimizer.param_groups[0]["lr"] == pytest.approx(again.schedule.peak_rate / 3.0)
+
+
+def test_the_rate_rises_once_stays_and_falls_at_the_end():
+    rates = [training.trapezoid(n / 1000, n, warm_up=100, cool_down=0.2) for n in range(1000)]
+    assert np.all(np.diff(rates[:100]) > 0.0) and set(rates[100:800]) == {1.0}
+    assert np.all(np.diff(rates[801:]) <= 0.0) and 0.0 < rates[-1] < 0.01
+
+
+def test_a_network_grown_from_another_gives_its_masks_and_learns_to_hear_of_its_new_channels():
+    net = PredNet(SMALL)
+    larger = prednet.grown(net, Settings((8, 4, 24), SMALL.kernels, SMALL.decoder_channels))
+    first, second = net.initial_state(1, 32, 32), larger.initial_state(1, 32, 32)
+    for _ in range(3):
+        image = torch.rand(1, 3, 32, 32)
+        logits, _, first = net(image, first)
+        more, errors, second = larger(image, second)
+        torch.testing.assert_close(more, logits, rtol=1e-4, atol=1e-5)
+    (loss.focal(more, torch.randint(0, len(Label), (1, 32, 32))) + loss.prediction_error(errors)).backward()
+    grad = larger.predict[0].weight.grad
+    assert grad is not None and (grad[:, 4:].abs().sum((0, 2, 3)) > 0).all()
+    with pytest.raises(ValueError, match=r"expected at least the channels \(4, 4, 8\)"):
+        prednet.grown(net, Settings((4, 2, 8), SMALL.kernels, SMALL.decoder_channels))
+
+
 def test_training_may_start_from_weights_and_its_card_tells_of_them(tmp_path):
     net = PredNet(SMALL)
     prednet.save(tmp_path / "old.npz", net, {"seed": 7, "date": "2026-01-01", "settings": {"minutes": 3.0}})
@@ -171,7 +231,7 @@ def test_training_may_start_from_weights_and_its_card_tells_of_them(tmp_path):
 
 
 def test_training_lowers_the_loss(data):
-    trainer = train.Trainer(SMALL, train.Schedule(frames=2, patches=((0.0, 64, 4),), most=24), seed=1)
+    trainer = train.Trainer(SMALL, train.Schedule(frames=2, patches=((0.0, 64, 4),), warm_up=10), seed=1)
     losses = [trainer.train_step(data, 0.15)["focal"] for _ in range(40)]
     assert np.mean(losses[-8:]) < 0.8 * np.mean(losses[:4])
 

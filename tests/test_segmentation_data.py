@@ -1,0 +1,124 @@
+"""What the segmentation learns from beside the simulation's usual looks: posed hands, real cameras, photographs."""
+
+import cv2
+import numpy as np
+import pytest
+
+from services.segmentation.inference import TARGET_LABELS
+from services.segmentation.training import photographs, recordings, train
+from shared.cell import description as cells
+from shared.contract.labels import UNLABELLED, Label
+from sim.picture import limb, looks
+from sim.sets import sequences
+
+NAMES = ["null", "bag", "coat", "jeans", "skin", "gloves", *(name for name in photographs.SLEEVED if name != "coat")]
+NAMES += ["purse", "wallet", *photographs.WORN, "hair", "hat", "scarf"]
+
+
+def test_a_posed_hand_is_as_large_as_the_stiff_one_and_its_forearm_is_the_same():
+    body = cells.load("table").body
+    rng = np.random.default_rng(0)
+    reach = []
+    for _ in range(20):
+        mesh = limb.mesh(body, rng)
+        assert set(mesh.labels) == {Label.FOREARM, Label.HAND} and mesh.faces.max() < len(mesh.vertices)
+        hand = mesh.vertices[np.unique(mesh.faces[mesh.labels == Label.HAND])]
+        reach.append(np.linalg.norm(hand - (body.forearm_length / 2.0, 0.0, 0.0), axis=1).max() / body.hand_length)
+    assert 0.6 < min(reach) < 0.9 < max(reach) < 1.15  # fists and stretched hands
+
+
+def test_sequences_as_real_cameras_show_them_have_arms_of_all_sizes():
+    real = sequences.Variety(frames=1, size=96, real=1.0)
+    shares = []
+    for index in range(40):
+        sequence = sequences.render(4, index, real)
+        shares.append(np.isin(sequence.labels, TARGET_LABELS).mean())
+        assert sequence.images.shape == (1, 96, 96, 3) and sequence.labels.max() <= max(Label)
+    assert np.quantile(shares, 0.9) > 0.25 and np.median([share for share in shares if share > 0.0]) < 0.25
+
+
+def test_a_cheap_camera_changes_a_film_s_colours_and_not_its_size():
+    film = sequences.render(4, 1, sequences.Variety(frames=2, size=64)).images
+    changed = [np.abs(looks.filmed(film, np.random.default_rng(seed)).astype(float) - film).mean() for seed in range(12)]
+    assert looks.filmed(film, np.random.default_rng(0)).shape == film.shape and np.median(changed) > 2.0
+
+
+def person() -> tuple[np.ndarray, photographs.Pose]:
+    """A person with a coat's body, two bare arms that hang down beside it, and a bag at the right hand, 200 x 120 pixels."""
+    parts = np.full((200, 120), NAMES.index("null"), np.uint8)
+    parts[40:130, 40:80] = NAMES.index("coat")
+    parts[130:200, 45:75] = NAMES.index("jeans")
+    parts[45:140, 20:30] = parts[45:140, 90:100] = parts[15:38, 50:70] = NAMES.index("skin")
+    parts[140:165, 15:35] = NAMES.index("bag")
+    points = np.full((33, 2), 60.0)
+    points[0] = 60.0, 25.0
+    places = {11: (95, 45), 13: (95, 85), 15: (95, 122), 17: (94, 135), 19: (96, 135)}
+    places |= {first + 1: (120 - x, y) for first, (x, y) in places.items()}
+    places |= {23: (70, 130), 25: (70, 165), 27: (70, 199), 24: (50, 130), 26: (50, 165), 28: (50, 199)}
+    for index, place in places.items():
+        points[index] = place
+    return parts, photographs.Pose(points, np.ones(33), 1.0)
+
+
+def test_skin_is_forearm_or_hand_by_the_landmarks_and_what_nobody_knows_is_unlabelled():
+    parts, pose = person()
+    labels = photographs.masks(parts, NAMES, pose)
+    for column in (25, 95):
+        assert labels[60, column] == Label.UPPER_ARM
+        assert labels[105, column] == Label.FOREARM
+        assert labels[132, column] == Label.HAND
+    assert labels[25, 60] == Label.TORSO and labels[60, 60] == Label.TORSO and labels[180, 60] == Label.TORSO
+    assert labels[10, 10] == Label.BACKGROUND and labels[142, 17] == Label.OCCLUDER
+    assert labels[105, 20] == UNLABELLED, "the contour is coarse"
+    unsure = photographs.Pose(pose.points, np.where(np.arange(33) == 13, 0.1, 1.0), 1.0)
+    labels = photographs.masks(parts, NAMES, unsure)
+    assert labels[105, 95] == UNLABELLED and labels[105, 25] == Label.FOREARM
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name in ("images", "masks"):
+        (tmp_path / name).mkdir()
+    rng = np.random.default_rng(0)
+    for index in range(6):
+        mask = np.full((80, 96), Label.BACKGROUND, np.uint8)
+        mask[20:60, 30:60] = Label.FOREARM
+        mask[:10] = UNLABELLED
+        cv2.imwrite(str(tmp_path / "masks" / f"{index}.png"), mask)
+        cv2.imwrite(str(tmp_path / "images" / f"{index}.png"), rng.integers(0, 255, (80, 96, 3), dtype=np.uint8))
+    return tmp_path
+
+
+def test_photographs_are_turned_moved_and_seen_nearer_with_their_labels_and_unlabelled_outside(folder):
+    recorded = recordings.Recordings(folder, 1)
+    films = [train.moved(recorded[0], 3, 64, np.random.default_rng(seed)) for seed in range(8)]
+    assert all(film.shape == (3, 64, 64, 4) for film in films)
+    values = set(np.unique([film[..., 3] for film in films]))
+    assert values == {Label.BACKGROUND, Label.FOREARM, UNLABELLED}
+    assert any((film[0, ..., 3] != film[2, ..., 3]).any() for film in films)
+
+
+def test_what_is_pasted_lies_in_front_with_its_labels():
+    below = np.zeros((2, 32, 32, 4), np.uint8)
+    over = np.full((2, 32, 32, 4), 200, np.uint8)
+    over[..., 3] = Label.BACKGROUND
+    over[:, :, :8, 3], over[:, :, 8:16, 3] = Label.ROBOT, Label.OCCLUDER
+    out = train.pasted(below, over, np.random.default_rng(0))
+    assert (out[:, :, :8, 3] == Label.ROBOT).all() and (out[:, :, 8:16, 3] == Label.OCCLUDER).all()
+    assert (out[:, :, :13, :3] == 200).all() and not out[:, :, 20:].any() and not below.any()
+
+
+def test_recordings_and_simulated_sequences_are_mixed_by_their_share_and_both_are_scored(folder):
+    tiny = sequences.Variety(frames=5, size=train.VARIETY.size)
+
+    def learned(seed, index):
+        sequence = sequences.render(seed, 0, tiny)
+        return sequences.Sequence(sequence.images, np.full_like(sequence.labels, Label.TORSO), sequence.hidden)
+
+    simulated = train.Simulated(1, 2, learned, lambda seed, index: sequences.render(seed, index, tiny), most=1)
+    data = train.Mixed(recordings.Recordings(folder, 1), simulated, 0.5, 1)
+    simulated.count = train.ENDLESS
+    share = np.mean([(data[index][..., 3] == Label.TORSO).all() for index in range(30)])
+    assert 0.2 < share < 0.8  # 30 draws of a half
+    assert len(list(data.held_out)) == 3
+    assert {"seed", "folder", "sequences", "simulated"} <= data.sources[1].keys()
