@@ -51,6 +51,13 @@ def above_zero(text: str) -> float:
     return _number(text, lambda value: 0 < value < math.inf, "a number above 0,")
 
 
+def natural(text: str) -> int:
+    """Type of a flag: how many, none included."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a number from 0, got {text!r}")
+    return int(text)
+
+
 def positive(text: str) -> int:
     """Type of a flag: how many, at least 1."""
     if not text.isdecimal() or int(text) < 1:

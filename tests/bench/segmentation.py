@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from services.flags import Parser, positive
+from services.flags import Parser, natural, positive
 from services.segmentation import inference
 from services.segmentation.training import evaluate
 from services.segmentation.training.evaluate import WARM_UP, FrameScore
@@ -124,7 +124,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(prog="penumbra bench segmentation", description=__doc__)
     parser.add_argument("--seed", type=int, default=1, help="draws the scenes (default: 1)")
     parser.add_argument("--frames", type=positive, default=1650, help="frames of the rows (default: 1650)")
-    parser.add_argument("--films", type=positive, default=6, help="films of 10 s with full occlusions (default: 6)")
+    parser.add_argument("--films", type=natural, default=6, help="films of 10 s with full occlusions (default: 6)")
     parser.add_argument("--weights", type=Path, default=inference.WEIGHTS, help="the network (default: the committed one)")
     parser.add_argument("--json", type=Path, help="write the numbers to this file")
     options = parser.parse_args(argv)

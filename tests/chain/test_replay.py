@@ -16,8 +16,11 @@ SEED = 11
 
 
 def play() -> list[Heard]:
+    """The minute with masks in single precision: processors round bfloat16 differently, and some have none."""
     table = description.load("table")
-    return Replay(table).run(record(table, SEED, 60.0))
+    with pytest.MonkeyPatch.context() as context:
+        context.setenv("ONEDNN_MAX_CPU_ISA", "AVX2")
+        return Replay(table).run(record(table, SEED, 60.0))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +37,7 @@ def test_segmentation_gives_the_reference_s_masks(played, reference):
     ours, theirs = np.array(played["mask"]), np.array(reference["mask"])
     assert ours.shape == theirs.shape
     off = np.abs(ours - theirs).sum(axis=1) / theirs.sum(axis=1)
-    assert np.median(off) < 0.005  # another processor rounds bfloat16 otherwise
+    assert np.median(off) < 0.005
 
 
 @pytest.mark.parametrize(("sense", "tolerance_m"), [("vision", 0.005), ("haptic", 0.001), ("fused", 0.003)])

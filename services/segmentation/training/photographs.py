@@ -21,8 +21,8 @@ import scipy.io
 from numpy.typing import NDArray
 from rich.progress import track
 
-from services.segmentation.inference import TARGET_LABELS
-from shared.contract.labels import UNLABELLED, Label
+from services.flags import Parser
+from shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 
 SLEEVED = (
     "blazer",
@@ -189,7 +189,7 @@ def _distance(ends: NDArray[np.float64], height: int, width: int) -> NDArray[np.
 
 def arguments() -> argparse.ArgumentParser:
     """The flags of `penumbra segmentation photographs`."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="penumbra segmentation photographs",
         description="Make frames and masks for `penumbra segmentation train --data` from labelled street photographs.",
         epilog=__doc__,

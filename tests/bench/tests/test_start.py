@@ -19,9 +19,11 @@ def test_a_start_tells_when_each_process_showed_itself_and_when_the_pose_was_tra
 
 
 def test_a_start_that_does_not_come_to_a_pose_fails_with_the_launchers_last_words(tmp_path):
-    (tmp_path / "services").mkdir()
-    (tmp_path / "services" / "__init__.py").write_text("")
-    (tmp_path / "services" / "cli.py").write_text("print('no licence')")
+    command = tmp_path / "services" / "command"
+    command.mkdir(parents=True)
+    for package in (command.parent, command):
+        (package / "__init__.py").write_text("")
+    (command / "cli.py").write_text("print('no licence')")
     with pytest.raises(start.Failed, match="the launcher of cell table ended: no licence"):
         start.start(tmp_path, "table", 1, tmp_path)
 
@@ -29,7 +31,7 @@ def test_a_start_that_does_not_come_to_a_pose_fails_with_the_launchers_last_word
 def test_a_fresh_copy_holds_the_sources_and_nothing_that_is_compiled():
     with start.fresh() as folder:
         names = {name for _, folders, files in os.walk(folder / "checkout") for name in (*folders, *files)}
-        assert {"pyproject.toml", "kernel.py", "prednet.npz", "start.py"} <= names
+        assert {"pyproject.toml", "filter.py", "prednet.npz", "start.py"} <= names
         assert not {name for name in names if name == "__pycache__" or name.endswith((".nbi", ".nbc", ".pyc"))}
         assert not list((folder / "home").iterdir())
     assert not folder.exists()

@@ -226,4 +226,4 @@ def test_the_papers_observer_takes_its_two_senses_whatever_the_table_has() -> No
     service.arguments(parser)
     node = Node(service.NAME, table)
     service.start(node, parser.parse_args(["--observer", "paper"]), senses=THREE)
-    assert {sense for sense in node.report["forearm"]() if sense != "state"} == {"vision", "haptic"}
+    assert {sense for sense in node.report().report["forearm"] if sense != "state"} == {"vision", "haptic"}

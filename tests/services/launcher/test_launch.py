@@ -21,13 +21,14 @@ from shared.cell import description as cells
 from shared.contract import topics
 from shared.contract.messages import Truth
 from shared.contract.processes import PROCESSES
+from shared.contract.report import Report, TopicReport
 from shared.runtime import bus
 from shared.runtime.node import Node
 from tests.support.live import connect, free_port, service_of, wait_for
 from tests.support.nodes import pose
 
 CELL = cells.load("table")
-ROOT = Path(launch.__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 ALWAYS_CRASHES = "import sys; sys.exit('out of luck')"
 REFUSES = "import sys; print('cell table has no camera: it has front', file=sys.stderr); sys.exit(2)"
 SLEEPS = "import time; print('up', flush=True); time.sleep(600)"
@@ -310,7 +311,8 @@ def test_replicas_that_publish_a_stream_by_turns_are_shown_with_the_rate_of_both
     with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
         watch = display.Watch(node)
         key = topics.FUSED.at(cell="table", target="forearm")
-        watch.health = {name: {"topics": {}, "published": {key: {"rate_hz": 100.0}}} for name in ("a", "b")}
+        published = {key: TopicReport(rate_hz=100.0)}
+        watch.health = {name: Report("fusion", name, "ok", published=published) for name in ("a", "b")}
         (row,) = (row for row in watch.topic_rows() if row.name == "fused")
     assert row.rate_hz == 200.0
 
@@ -318,7 +320,7 @@ def test_replicas_that_publish_a_stream_by_turns_are_shown_with_the_rate_of_both
 def test_what_a_process_does_while_it_starts_is_shown():
     process = Supervised("fusion", [])
     process.state = "running"
-    row = process.row({"status": "starting", "reasons": ["compiling 12 of 40"]})
+    row = process.row(Report("fusion", "a", "starting", ["compiling 12 of 40"]))
     assert (row.state, row.note) == ("starting", "compiling 12 of 40")
 
 

@@ -1,6 +1,5 @@
 """PoseCNN: votes, losses, patches, training, weights, and the service on a recording."""
 
-import argparse
 import functools
 import json
 
@@ -338,20 +337,8 @@ def test_the_service_refuses_a_frame_of_another_size():
 
 @pytest.mark.parametrize(("vision", "there"), [("procnet", {"segmentation", "search"}), ("posecnn", {"posecnn"})])
 def test_up_starts_one_way_to_see(vision, there):
-    options = argparse.Namespace(
-        replicas=[],
-        vision=vision,
-        cell="table",
-        secure=None,
-        connect=None,
-        port=1,
-        log_level="info",
-        log_format="text",
-        seed=None,
-        observer=None,
-        method=None,
-    )
-    started = {process.name.partition(" ")[0] for process in launch.fleet(TABLE, options, "tcp/127.0.0.1:1").processes}
+    options = launch.parser().parse_args(["--vision", vision, "--port", "1"])
+    started = {process.service for process in launch.fleet(TABLE, options).processes}
     assert started == there | {"router", "emulator", "haptics", "fusion"}
 
 

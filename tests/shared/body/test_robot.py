@@ -160,9 +160,9 @@ def test_a_cell_whose_robot_lacks_what_it_names_is_refused_with_the_line(tmp_pat
 def test_a_robot_costs_little_to_read():
     """Half a second with pybullet; CPU time of a process of its own, which has nothing else to do."""
     code = """import resource
-from shared import cell
+from shared.cell import description
 from shared.body.robot import RobotModel
-arm = cell.load("arm")
+arm = description.load("arm")
 begin = resource.getrusage(resource.RUSAGE_SELF)
 RobotModel(arm.robots["panda"], arm.folder).meshes
 end = resource.getrusage(resource.RUSAGE_SELF)

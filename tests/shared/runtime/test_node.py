@@ -312,7 +312,7 @@ def test_a_process_logs_json_when_asked_to(flags, environment):
 
 SAYS_ALL_SORTS = """
 import logging, threading, warnings
-from shared import logs
+from shared.runtime import logs
 logs.configure("info", "json", "worker")
 logging.getLogger("library").warning("of a library")
 warnings.warn("of Python")
