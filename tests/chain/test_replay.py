@@ -7,7 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.segmentation.inference import load_segmenter
 from shared.cell import description
+from shared.contract.labels import Label
+from shared.contract.topics import FRAME
+from shared.perception.lookout import whole_frame
 from sim.world.world import record
 from tests.support.replay import Heard, Replay, digest
 
@@ -23,6 +27,16 @@ def play() -> list[Heard]:
         return Replay(table).run(record(table, SEED, 60.0))
 
 
+def masks() -> list[list[int]]:
+    """Pixels of every class in the masks of ten seconds, one mask a second. Whole frames in single precision: what a mask shows
+    changes the window of the next one, so that in the chain the rounding of one processor becomes pixels of another."""
+    table = description.load("table")
+    window, segmenter = whole_frame(table.cameras["front"]), load_segmenter(precision="f32")
+    frames = [message for topic, _, message in record(table, SEED, 10.0) if topic is FRAME]
+    found = [np.bincount(segmenter(frame.image, window, frame.stamp_ns).ravel(), minlength=len(Label)) for frame in frames]
+    return [counts.tolist() for counts in found[::20]]
+
+
 @pytest.fixture(scope="module")
 def played() -> dict[str, list]:
     return digest(play())
@@ -33,11 +47,11 @@ def reference() -> dict[str, list]:
     return json.loads(REFERENCE.read_text())
 
 
-def test_segmentation_gives_the_reference_s_masks(played, reference):
-    ours, theirs = np.array(played["mask"]), np.array(reference["mask"])
+def test_segmentation_gives_the_reference_s_masks(reference):
+    ours, theirs = np.array(masks()), np.array(reference["mask"])
     assert ours.shape == theirs.shape
-    off = np.abs(ours - theirs).sum(axis=1) / theirs.sum(axis=1)
-    assert np.median(off) < 0.005
+    found = theirs[:, 1:].sum(axis=1)  # all but the background
+    assert (np.abs(ours - theirs).sum(axis=1) / found).max() < 0.01
 
 
 @pytest.mark.parametrize(("sense", "tolerance_m"), [("vision", 0.005), ("haptic", 0.001), ("fused", 0.003)])

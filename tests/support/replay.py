@@ -194,26 +194,23 @@ class ReplayNode(ServiceNode):
 
 
 def digest(heard: list[Heard], period_s: float = 1.0) -> dict[str, list[Any]]:
-    """What each service said, thinned to one message a period: mask areas, positions and axes of poses, and states."""
-    out: dict[str, list[Any]] = {topic.name: [] for topic in (topics.MASK, topics.VISION, topics.HAPTIC, topics.FUSED)}
+    """What each service said of the pose, thinned to one message a period: states and positions."""
+    out: dict[str, list[Any]] = {topic.name: [] for topic in (topics.VISION, topics.HAPTIC, topics.FUSED)}
     due = dict.fromkeys(out, 0)
     for item in heard:
         name = item.topic.name
         if name not in out or item.time_ns < due[name]:
             continue
         due[name] = item.time_ns + round(period_s * 1e9)
-        if item.topic is topics.MASK:
-            out[name].append(np.bincount(item.message.labels.ravel(), minlength=7).tolist())
-        else:
-            out[name].append([item.message.state, *np.round(item.message.position, 5).tolist()])
+        out[name].append([item.message.state, *np.round(item.message.position, 5).tolist()])
     return out
 
 
 def main() -> None:
     """`python -m tests.support.replay`: writes the reference of tests/chain/test_replay.py again."""
-    from tests.chain.test_replay import REFERENCE, play
+    from tests.chain.test_replay import REFERENCE, masks, play
 
-    REFERENCE.write_text(json.dumps(digest(play()), indent=None).replace("], [", "],\n  [") + "\n")
+    REFERENCE.write_text(json.dumps({"mask": masks(), **digest(play())}, indent=None).replace("], [", "],\n  [") + "\n")
 
 
 if __name__ == "__main__":
