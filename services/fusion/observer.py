@@ -1,6 +1,6 @@
 """The default observer: takes poses of any rank, late and in any order, and answers with the pose at any moment.
 
-The arithmetic, the going back and the replaying are in `kernel.py`, compiled: a call does it for as many targets as it is given.
+The arithmetic, the going back and the replaying are in `filter.py`, compiled: a call does it for as many targets as it is given.
 """
 
 from __future__ import annotations

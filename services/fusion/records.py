@@ -1,4 +1,4 @@
-"""The records that the default observer's filter, `kernel.py`, works on: settings, a measurement, a state, an estimate.
+"""The records that the default observer's filter, `filter.py`, works on: settings, a measurement, a state, an estimate.
 
 What there is of every sense is a record in an array (n,) of its own, in the order of the table of senses, so that the compiled
 filter serves any number of them.
@@ -110,10 +110,10 @@ SENSE_ESTIMATE = np.dtype([("believed_ns", "i8"), ("weight", "f8")])
 
 
 class History(NamedTuple):
-    """The histories of targets (t,), each a ring of c entries, with n senses; see `kernel.py`.
+    """The histories of targets (t,), each a ring of c entries, with n senses; see `filter.py`.
 
     measurements (t, c) : MEASUREMENT. states (t, c) : STATE. senses (t, c, n) : SENSE_STATE. P (t, c, size, size) : covariances
-    of the errors of position, rotation, their velocities, and the bias of each sense. rings (t, 2) : see `kernel.py`.
+    of the errors of position, rotation, their velocities, and the bias of each sense. rings (t, 2) : see `filter.py`.
     """
 
     measurements: NDArray[np.void]

@@ -1,4 +1,4 @@
-"""Settings of the default observer, whose filter is in `kernel.py`, and how they are handed to it."""
+"""Settings of the default observer, whose filter is in `filter.py`, and how they are handed to it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The network's shape and weights, as they are stored: what the running service, which knows no torch, has of it.
 
-`prednet.py` is the same network in torch, to be trained; `compiled.py` the same in OpenVINO, to be run.
+`prednet.py` is the same network in torch, to be trained; `openvino_step.py` runs it in OpenVINO.
 """
 
 from __future__ import annotations

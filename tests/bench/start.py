@@ -108,7 +108,7 @@ class Listener:
 def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
     """Starts the cell from the checkout in `folder`, and ends it when all of it has shown itself. Raises Failed."""
     port = free_port()
-    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment = {name: value for name, value in os.environ.items() if name != "PENUMBRA_CACHE"}
     environment |= {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(home)}
     command = [sys.executable, "-m", "services.command.cli", "up", "--cell", cell, "--seed", str(seed), "--port", str(port)]
     with tempfile.TemporaryFile("w+") as log:
