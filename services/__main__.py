@@ -2,6 +2,6 @@
 
 import sys
 
-from services.command.cli import main
+from penumbra.services.command.cli import main
 
 sys.exit(main())

@@ -1,67 +1,102 @@
-"""The flags that all commands share."""
+"""The command line's parts: commands, flags and the types of their values. click parses, helps and completes."""
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NoReturn
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
-from shared.runtime import bus, logs
+import click
+from click.shell_completion import CompletionItem
+
+from penumbra.shared.contract.processes import PROCESSES
+from penumbra.shared.runtime import logs
 
 if TYPE_CHECKING:
-    from shared.runtime.metrics import Reports
+    from penumbra.shared.runtime.metrics import Reports
+
+Options = SimpleNamespace
+"""The values of a command's flags and arguments, by their names."""
+CELLS = Path(__file__).parents[1] / "shared" / "cell" / "built_in"
+ROUTER = "tcp/127.0.0.1:7447"
+"""Where a router is looked for, as help says; `shared.runtime.connection` has it too, beside what takes long to import."""
+COMMAND_LINE = click.core.ParameterSource.COMMANDLINE
+WIDTH = 100
+"""Columns of help on a wide terminal."""
 
 
-class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line that says what to do, and which takes no abbreviated flags: they would hide mistakes."""
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **{"allow_abbrev": False, **kwargs})
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+# ---- types of values
 
 
-def parser(command: str, about: str) -> Parser:
-    """A parser for `penumbra COMMAND` with the cell, the bus and the log."""
-    out = Parser(prog=f"penumbra {command}", description=about)
-    add_cell(out)
-    bus.add_arguments(out)
-    add_log(out)
-    return out
+class Checked(click.ParamType):
+    """A type made of a function that returns the value of a text, or raises ValueError saying what was expected."""
+
+    def __init__(self, convert: Callable[[str], Any]):
+        self.name = convert.__name__.strip("_")
+        self._convert = convert
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if not isinstance(value, str):  # a default
+            return value
+        try:
+            return self._convert(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+
+
+class Choice(click.Choice):
+    """One of a few words."""
+
+    def get_invalid_choice_message(self, value: Any, ctx: click.Context | None) -> str:
+        return f"expected {any_of(self.choices)}, got {value!r}{meant(str(value), self.choices)}"
+
+
+def integer(text: str) -> int:
+    """Type of a flag: a whole number."""
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"expected a whole number, got {text!r}") from None
+
+
+def number(text: str) -> float:
+    """Type of a flag: a finite number."""
+    return _number(text, math.isfinite, "a number")
 
 
 def port(text: str) -> int:
     """Type of a flag: a TCP port."""
     if not text.isdecimal() or not 0 < int(text) < 65536:
-        raise argparse.ArgumentTypeError(f"expected a port from 1 to 65535, got {text!r}")
+        raise ValueError(f"expected a port from 1 to 65535, got {text!r}")
     return int(text)
 
 
 def seconds(text: str) -> float:
     """Type of a flag: a time [s] above 0, or inf."""
-    return _number(text, lambda value: value > 0, "a time above 0, in seconds,")
+    return _number(text, lambda value: value > 0, "a time above 0, in seconds")
 
 
 def above_zero(text: str) -> float:
     """Type of a flag: a finite number above 0."""
-    return _number(text, lambda value: 0 < value < math.inf, "a number above 0,")
+    return _number(text, lambda value: 0 < value < math.inf, "a number above 0")
 
 
 def natural(text: str) -> int:
-    """Type of a flag: how many, none included."""
+    """Type of a flag: a count, which may be 0."""
     if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a number from 0, got {text!r}")
+        raise ValueError(f"expected a whole number from 0, got {text!r}")
     return int(text)
 
 
 def positive(text: str) -> int:
-    """Type of a flag: how many, at least 1."""
+    """Type of a flag: a count of at least 1."""
     if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a number from 1, got {text!r}")
+        raise ValueError(f"expected a whole number from 1, got {text!r}")
     return int(text)
 
 
@@ -71,69 +106,422 @@ def _number(text: str, is_good: Callable[[float], bool], what: str) -> float:
     except ValueError:
         value = math.nan
     if not is_good(value):  # of nan no comparison is true
-        raise argparse.ArgumentTypeError(f"expected {what} got {text!r}")
+        raise ValueError(f"expected {what}, got {text!r}")
     return value
 
 
-def add_cell(out: argparse.ArgumentParser) -> None:
-    default = os.environ.get("PENUMBRA_CELL", "table")
-    out.add_argument(
-        "--cell", default=default, metavar="CELL", help="table, arm or a YAML file (default: $PENUMBRA_CELL or table)"
-    )
-
-
-def add_log(out: argparse.ArgumentParser) -> None:
-    group = out.add_argument_group("log")
-    group.add_argument("--log-level", choices=logs.LEVELS, default="info")
-    group.add_argument(
-        "--log-format",
-        type=_log_format,
-        default=os.environ.get("PENUMBRA_LOG_FORMAT") or "text",
-        metavar="{text,json}",
-        help="json: one object a line (default: $PENUMBRA_LOG_FORMAT or text)",
-    )
-
-
-def _log_format(text: str) -> str:
-    if text not in logs.FORMATS:
-        raise argparse.ArgumentTypeError(f"{' or '.join(logs.FORMATS)} expected, {text!r} came; $PENUMBRA_LOG_FORMAT too")
-    return text
-
-
-def add_metrics(out: argparse.ArgumentParser) -> None:
-    out.add_argument(
-        "--metrics-port",
-        type=_metrics_port,
-        default=os.environ.get("PENUMBRA_METRICS_PORT") or None,
-        metavar="[ADDRESS:]PORT",
-        help="serve metrics in Prometheus' format there, without ADDRESS on loopback (default: $PENUMBRA_METRICS_PORT or none)",
-    )
-
-
-def _metrics_port(text: str) -> tuple[str, int]:
-    address, _, number = text.rpartition(":")
+def _address(text: str) -> tuple[str, int]:
+    address, _, digits = text.rpartition(":")
     try:
-        return address or "127.0.0.1", port(number)
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(
-            f"a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, expected, {text!r} came"
-        ) from None
+        return address or "127.0.0.1", port(digits)
+    except ValueError:
+        raise ValueError(f"expected a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, got {text!r}") from None
+
+
+TYPES: dict[Any, click.ParamType] = {
+    int: Checked(integer),
+    float: Checked(number),
+    Path: click.Path(path_type=Path),
+    str: click.STRING,
+}
+
+
+# ---- flags and arguments
+
+
+class Option(click.Option):
+    """A flag, as in `Option("--seed", type=int, default=1, help=...)`.
+
+    `type`: int, float, Path, str or a function that raises ValueError; `choices`: the words that it may be; `takes`: how many
+    words it takes, `one`, `many` (all that follow, up to the next flag), `rest` (all that follow, flags too) or `maybe` (one
+    of its type, or none, which stands for `without`); `section`: the heading under which help shows it.
+    """
+
+    def __init__(
+        self,
+        *names: str,
+        type: Any = None,
+        choices: Iterable[Any] = (),
+        takes: Literal["one", "many", "rest", "maybe"] = "one",
+        without: str = "",
+        section: str = "Options",
+        **kwargs: Any,
+    ):
+        self.takes, self.without, self.section = takes, without, section
+        choices = tuple(choices)
+        if not kwargs.get("is_flag") and not (any("/" in name for name in names)):
+            kwargs["type"] = Choice(choices) if choices else TYPES.get(type or str) or Checked(type)
+        if takes in ("many", "rest"):
+            kwargs["multiple"] = True
+        super().__init__(names, **kwargs)
+
+
+class Argument(click.Argument):
+    """A word without a flag; `help` describes it."""
+
+    def __init__(self, name: str, *, help: str, type: Any = None, choices: Iterable[Any] = (), **kwargs: Any):
+        choices = tuple(choices)
+        kind = Choice(choices) if choices else TYPES.get(type or str) or Checked(type)
+        super().__init__([name], type=kind, help=help, **kwargs)
+
+
+def spread(params: Iterable[click.Parameter], args: Sequence[str]) -> list[str]:
+    """The words of a command line with every flag that takes several words repeated for each: click knows none of these."""
+    takes = {name: param for param in params if isinstance(param, Option) and param.takes != "one" for name in param.opts}
+    out: list[str] = []
+    rest = list(args)
+    while rest:
+        word = rest.pop(0)
+        flag = takes.get(word)
+        if flag is None:
+            out.append(word)
+        elif flag.takes == "maybe":
+            out.append(f"{word}={rest.pop(0) if rest and _is_value(flag, rest[0]) else flag.without}")
+        else:
+            values = []
+            while rest and (flag.takes == "rest" or not _is_flag(rest[0])):
+                values.append(rest.pop(0))
+            # without a word, a flag that has a meaning for that stands for it; for the others click misses the word
+            out += [f"{word}={value}" for value in values] or ([f"{word}={flag.without}"] if flag.without else [word])
+    return out
+
+
+def _is_value(flag: Option, word: str) -> bool:
+    """Whether a word belongs to the flag before it, which needs none. A bad number does: it is refused there."""
+    if _is_flag(word) or _is_number(word):
+        return _is_number(word)
+    try:
+        flag.type.convert(word, flag, None)
+    except click.BadParameter:
+        return False
+    return True
+
+
+def _is_flag(word: str) -> bool:
+    return len(word) > 1 and word[0] == "-" and not _is_number(word)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+# ---- commands
+
+
+class _Words(click.Command):
+    """What commands and groups have in common: words that are spread, help with sections and an example."""
+
+    example: str
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.meta["words"] = list(args)
+        return super().parse_args(ctx, spread(self.get_params(ctx), args))
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            if not isinstance(param, Argument) and (record := param.get_help_record(ctx)) is not None:
+                sections.setdefault(getattr(param, "section", "Options"), []).append(record)
+        for title, rows in sections.items():
+            with formatter.section(title):
+                formatter.write_dl(rows)
+        if isinstance(self, click.Group):
+            self.format_commands(ctx, formatter)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        if self.example:
+            with formatter.section("Example"):
+                for line in self.example.splitlines():
+                    formatter.write(f"{' ' * formatter.current_indent}{line}\n")
+
+
+class Command(_Words):
+    """A command of `penumbra`. Called with a list of words it runs, and returns its exit code; words that it cannot use end the
+    process with exit code 2."""
+
+    def __init__(self, name: str, example: str, **kwargs: Any):
+        super().__init__(name, context_settings=SETTINGS, **kwargs)
+        self.example = example
+
+    def __call__(self, argv: Sequence[str] | None = None) -> int:  # type: ignore[override]
+        try:
+            return execute(self, f"penumbra {self.name}", sys.argv[1:] if argv is None else argv)
+        except click.ClickException as error:
+            sys.stderr.write(f"{explain(error)}\n")
+            raise SystemExit(2) from None
+
+
+SETTINGS: dict[str, Any] = {"show_default": True, "max_content_width": WIDTH, "help_option_names": ["-h", "--help"]}
+
+
+class Group(_Words, click.Group):
+    """A command that is followed by another one; `follows`: what that is called."""
+
+    follows = "command"
+
+    def __init__(self, name: str, example: str, **kwargs: Any):
+        super().__init__(name, context_settings=SETTINGS, **kwargs)
+        self.example = example
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if not args and not self.invoke_without_command and not ctx.resilient_parsing:
+            ctx.fail(f"expected a {self.follows}, got none; choose one of {', '.join(self.list_commands(ctx))}")
+        return super().parse_args(ctx, args)
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+        name, known = args[0], self.list_commands(ctx)
+        if name not in known and not ctx.resilient_parsing:
+            choose = f"; choose one of {', '.join(known)}" if known else ""
+            ctx.fail(f"expected a {self.follows}, got {name!r}{meant(name, known) or choose}")
+        return super().resolve_command(ctx, args)
+
+
+def command(
+    name: str, about: str, *params: click.Parameter, example: str
+) -> Callable[[Callable[[Options], int | None]], Command]:
+    """Makes the command `penumbra NAME` of a function of its options that returns the exit code, None for 0.
+
+    about: what help says; line breaks within a paragraph do not matter; example: a command line that works, or several lines.
+    """
+
+    def make(function: Callable[[Options], int | None]) -> Command:
+        def callback(**values: Any) -> int:
+            return function(Options(**values)) or 0
+
+        return Command(name, example, callback=callback, params=list(params), help=_kept(about))
+
+    return make
+
+
+def _kept(about: str) -> str:
+    """A text for help whose paragraphs with indented lines keep their line breaks: click fills the others."""
+    paragraphs = about.strip().split("\n\n")
+    return "\n\n".join(f"\b\n{text}" if "\n " in f"\n{text}" else text for text in paragraphs)
+
+
+def execute(command: click.Command, prog: str, argv: Sequence[str]) -> int:
+    """Runs a command with these words, and returns its exit code. Raises click.ClickException for words that it cannot use."""
+    try:
+        with command.make_context(prog, list(argv)) as ctx:
+            return int(command.invoke(ctx) or 0)
+    except click.exceptions.Exit as ended:  # --help, --version
+        return ended.exit_code
+
+
+def parse(params: Iterable[click.Parameter], argv: Sequence[str] = ()) -> Options:
+    """The options that these words give to the flags."""
+    return Options(**Command("", "", params=list(params)).make_context("penumbra", list(argv)).params)
+
+
+def is_given(name: str) -> bool:
+    """Whether a flag of the command that runs stands on its command line."""
+    return click.get_current_context().get_parameter_source(name) is COMMAND_LINE
+
+
+def words() -> list[str]:
+    """The words that followed the name of the command that runs."""
+    return list(click.get_current_context().meta["words"])
+
+
+def refuse(text: str) -> NoReturn:
+    """Ends the command that runs with exit code 2 and a line that says what was expected."""
+    raise click.UsageError(text, click.get_current_context(silent=True))
+
+
+# ---- what is said of a wrong command line
+
+
+def explain(error: click.ClickException) -> str:
+    """One line: the command, what was expected, and where help is."""
+    path = error.ctx.command_path if isinstance(error, click.UsageError) and error.ctx else "penumbra"
+    return f"{path}: {_reason(error)} (see {path} --help)"
+
+
+def _reason(error: click.ClickException) -> str:
+    match error:
+        case click.NoSuchOption():
+            known = [name for param in error.ctx.command.get_params(error.ctx) for name in param.opts] if error.ctx else []
+            return f"no option {error.option_name}{meant(error.option_name, known)}"
+        case click.MissingParameter() if error.param is not None:
+            hint = error.param.get_error_hint(error.ctx) if error.ctx else error.param.name or ""
+            return f"expected {hint.strip(chr(39))}, got nothing"
+        case click.BadParameter() if isinstance(error.param, click.Option):
+            name = max(error.param.opts, key=len)
+            variable = error.param.envvar
+            value = os.environ.get(variable, "") if isinstance(variable, str) else ""
+            return f"{name}: {error.message}" + (f" in ${variable}" if value and repr(value) in error.message else "")
+        case click.BadParameter() if error.param is not None:
+            return f"{error.param.human_readable_name}: {error.message}"
+    text = error.format_message().rstrip(".")
+    return text[:1].lower() + text[1:]
+
+
+def any_of(words: Iterable[str]) -> str:
+    """`a`, `a or b`, `a, b or c`."""
+    *most, last = words
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def meant(word: str, known: Iterable[str]) -> str:
+    """`; did you mean X?`, where a word is like one that is known."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+# ---- flags that commands share
+
+
+def complete_cell(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """The built-in cells, and the shell's own completion of files for a cell file."""
+    names = [path.stem for path in sorted(CELLS.glob("*.yaml")) if path.stem.startswith(incomplete)]
+    return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+
+
+def complete_part(part: str) -> Callable[[click.Context, click.Parameter, str], list[CompletionItem]]:
+    """Completes the names of a part of the cell that --cell names, such as `targets`."""
+
+    def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        import yaml
+
+        cell = str(ctx.params.get("cell") or os.environ.get("PENUMBRA_CELL") or "table")
+        path = CELLS / f"{cell}.yaml"
+        try:
+            names = yaml.safe_load((path if path.is_file() else Path(cell)).read_text())[part]
+        except (OSError, yaml.YAMLError, KeyError, TypeError):
+            return []  # a completion has no place to complain
+        return [CompletionItem(str(name)) for name in names if str(name).startswith(incomplete)]
+
+    return complete
+
+
+def complete_service(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """The names of the services."""
+    return [CompletionItem(process.name) for process in PROCESSES if process.name.startswith(incomplete)]
+
+
+CELL = Option(
+    "--cell",
+    envvar="PENUMBRA_CELL",
+    show_envvar=True,
+    default="table",
+    metavar="CELL",
+    shell_complete=complete_cell,
+    help="table, arm or a YAML file",
+)
+SECURE = Option(
+    "--secure",
+    type=Path,
+    envvar="PENUMBRA_SECURE",
+    show_envvar=True,
+    metavar="FOLDER",
+    section="Bus",
+    help="certificates of `penumbra certs`: TLS, and every process limited to its topics",
+)
+BUS = (
+    Option(
+        "-m",
+        "--mode",
+        choices=("client", "peer", "router"),
+        section="Bus",
+        show_default="client; of router: router",
+        help="Zenoh mode",
+    ),
+    Option(
+        "-e",
+        "--connect",
+        multiple=True,
+        metavar="ENDPOINT",
+        section="Bus",
+        show_default=f"$PENUMBRA_CONNECT or {ROUTER}, with --secure tls/",
+        help="router to reach; may be repeated",
+    ),
+    Option("-l", "--listen", multiple=True, metavar="ENDPOINT", section="Bus", help="endpoint to listen on; may be repeated"),
+    Option("-c", "--config", type=Path, metavar="FILE", section="Bus", help="Zenoh configuration (JSON5)"),
+    SECURE,
+)
+LOG = (
+    Option("--log-level", choices=logs.LEVELS, default="info", section="Log", help="the least important lines to write"),
+    Option(
+        "--log-format",
+        choices=logs.FORMATS,
+        envvar="PENUMBRA_LOG_FORMAT",
+        show_envvar=True,
+        default="text",
+        section="Log",
+        help="json: one object a line",
+    ),
+)
+METRICS = Option(
+    "--metrics-port",
+    type=_address,
+    envvar="PENUMBRA_METRICS_PORT",
+    show_envvar=True,
+    metavar="[ADDRESS:]PORT",
+    help="serve metrics in Prometheus' format there; without ADDRESS on loopback",
+)
+JSON = Option("--json", is_flag=True, help="print JSON")
+COMMON = (CELL, *BUS, *LOG)
+"""Flags of every command that goes onto the bus."""
 
 
 @contextmanager
-def metrics(parser: argparse.ArgumentParser, where: tuple[str, int] | None, reports: Reports) -> Iterator[None]:
-    """Within it the metrics of `reports()` are served where `add_metrics` was told to; nothing where it was not."""
+def metrics(where: tuple[str, int] | None, reports: Reports) -> Iterator[None]:
+    """Within it the metrics of `reports()` are served where METRICS said; nothing where it was not given."""
     if where is None:
         yield
         return
-    from shared.runtime import metrics
+    from penumbra.shared.runtime import metrics
 
     try:
         server = metrics.serve(*where, reports)
     except OSError as error:
-        parser.error(f"--metrics-port {where[0]}:{where[1]} cannot be opened ({error.strerror or error}): give another one")
+        refuse(f"--metrics-port {where[0]}:{where[1]} cannot be opened ({error.strerror or error}): give another one")
     try:
         yield
     finally:
         server.shutdown()
         server.server_close()
+
+
+def training(name: str, minutes: float) -> tuple[Option, ...]:
+    """The flags of every training; minutes: how long it takes where nothing else is asked for."""
+    return (
+        Option("--minutes", type=above_zero, default=minutes, callback=_one_of("steps"), help="of the processor's time to train"),
+        Option(
+            "--steps",
+            type=positive,
+            callback=_one_of("minutes"),
+            help="train for so many steps instead: the same result on every run of one machine",
+        ),
+        Option("--seed", type=int, default=0, help="of data, initial weights and batches"),
+        Option("--checkpoint", type=Path, default=Path(f"{name}.checkpoint"), help="written every few minutes"),
+        Option(
+            "--compact",
+            type=Path,
+            metavar="FILE",
+            help="a checkpoint of a quarter of the size, written as often: to keep with the sources",
+        ),
+        Option(
+            "--resume",
+            is_flag=True,
+            help="continue from the checkpoint if there is one, else from the compact one if there is",
+        ),
+    )
+
+
+def _one_of(other: str) -> Callable[[click.Context, click.Parameter, Any], Any]:
+    """Refuses a flag beside another one that stands for the same."""
+
+    def check(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
+        names = sorted((str(param.name), other))
+        if all(ctx.get_parameter_source(name) is COMMAND_LINE for name in names):
+            ctx.fail(f"expected --{' or --'.join(names)}, got both")
+        return value
+
+    return check

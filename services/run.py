@@ -10,35 +10,31 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Sequence
 from functools import partial
+
+from penumbra.services import flags
+from penumbra.shared.contract.processes import Process
 
 SWITCH_S = 0.0005
 """A reader thread waits at most this long for a computing one; Python's 5 ms would be half of the skin's period."""
 
 
-def serve(name: str, argv: list[str]) -> int:
-    """Runs one service until SIGINT or SIGTERM; returns its exit code."""
+def serve(process: Process, options: flags.Options, argv: Sequence[str]) -> int:
+    """Runs one service until SIGINT or SIGTERM; returns its exit code. argv: the words that gave the options."""
     die_with_parent()
-    entitle(" ".join(["penumbra", name, *argv]))
+    entitle(" ".join(["penumbra", process.name, *argv]))
     sys.setswitchinterval(SWITCH_S)
-    from services import flags
-    from shared import native
-    from shared.cell import description
-    from shared.contract import processes
-    from shared.runtime import bus, logs
-    from shared.runtime.node import Node
+    from penumbra.shared import native
+    from penumbra.shared.cell import description
+    from penumbra.shared.runtime import bus, logs
+    from penumbra.shared.runtime.node import Node
 
-    process = processes.find(name)
-    assert process is not None, f"{name} is not in the table of processes"
     module = importlib.import_module(process.module)
-    parser = flags.parser(name, module.__doc__ or process.about)
-    flags.add_metrics(parser)
-    module.arguments(parser)
-    options = parser.parse_args(argv)
     options.mode = options.mode or getattr(module, "MODE", None)
-    logs.configure(options.log_level, options.log_format, name, ends_with_thread=True)
+    logs.configure(options.log_level, options.log_format, process.name, ends_with_thread=True)
     node = Node(module.NAME, description.load(options.cell), bus.connection(options))
-    with flags.metrics(parser, options.metrics_port, lambda: [node.report()]):
+    with flags.metrics(options.metrics_port, lambda: [node.report()]):
         native.prepare(partial(node.progress, "compiling"))
         module.start(node, options)
         node.run()

@@ -1,4 +1,4 @@
-"""How networks are trained: a trainer with checkpoints, the loop of so many steps, or minutes over all runs, and its flags.
+"""How networks are trained: a trainer with checkpoints, the loop of so many steps, or minutes over all runs.
 
 A training may last days, in the background of other work: time counts as the processor's, so that a process that is stopped
 (SIGSTOP) or waits loses nothing, checkpoints are replaced whole, and beside the exact checkpoint a compact one can be written,
@@ -7,7 +7,6 @@ small enough to travel with the sources from one machine to the next.
 
 from __future__ import annotations
 
-import argparse
 import copy
 import math
 import signal
@@ -15,6 +14,7 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 import numpy as np
@@ -124,7 +124,8 @@ def recoloured(picture: NDArray[np.float32], rng: np.random.Generator, amount: f
     grey = picture.mean(axis=-1, keepdims=True)
     picture = grey + np.float32(saturation) * (picture - grey)
     mean = picture.mean()
-    return np.clip((mean + np.float32(contrast) * (picture - mean)) * gain, 0.0, 1.0, dtype=np.float32)
+    changed: NDArray[np.float32] = np.clip((mean + np.float32(contrast) * (picture - mean)) * gain, 0.0, 1.0, dtype=np.float32)
+    return changed
 
 
 def trapezoid(progress: float, steps: int, warm_up: int, cool_down: float) -> float:
@@ -134,37 +135,22 @@ def trapezoid(progress: float, steps: int, warm_up: int, cool_down: float) -> fl
     return min((steps + 1) / warm_up, 1.0) * max(min((1.0 - progress) / cool_down, 1.0), 0.005)
 
 
-def add_arguments(parser: argparse.ArgumentParser, name: str, minutes: float) -> None:
-    """The flags of every training; minutes: how long it takes where nothing else is asked for."""
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--minutes", type=float, default=minutes, help="of the processor's time to train (default: %(default)g)")
-    length.add_argument("--steps", type=int, help="train for so many steps instead: the same result on every run of one machine")
-    parser.add_argument("--seed", type=int, default=0, help="of data, initial weights and batches")
-    parser.add_argument("--checkpoint", type=Path, default=Path(f"{name}.checkpoint"), help="written every few minutes")
-    parser.add_argument(
-        "--compact", type=Path, help="a checkpoint of a quarter of the size, written as often: to keep with the sources"
-    )
-    parser.add_argument(
-        "--resume", action="store_true", help="go on from the checkpoint if there is one, else from the compact one if there is"
-    )
-
-
-def begun(options: argparse.Namespace) -> Path | None:
+def begun(options: SimpleNamespace) -> Path | None:
     """The checkpoint to go on from, None where none is asked for or there is none."""
     places = (options.checkpoint, options.compact) if options.resume else ()
     return next((path for path in places if path is not None and path.is_file()), None)
 
 
-def complete(trainer: Trainer[Any, D], data: D, options: argparse.Namespace) -> bool:
-    """Trains as the flags of `add_arguments` ask, on one thread, and closes the data. False where Ctrl-C or SIGTERM ended it: the
-    checkpoint is written then, and the user told how to go on."""
+def complete(trainer: Trainer[Any, D], data: D, options: SimpleNamespace) -> bool:
+    """Trains as the flags of `services.flags.training` ask, on one thread, and closes the data. False where Ctrl-C or SIGTERM
+    ended it: the checkpoint is written then, and the user told how to go on."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     torch.set_num_threads(1)
     try:
         run(trainer, data, options.steps, options.minutes, options.checkpoint, options.compact)
     except KeyboardInterrupt:
         save(trainer, options.checkpoint, options.compact)
-        print(f"stopped at step {trainer.step}: go on with --resume --checkpoint {options.checkpoint}")
+        print(f"stopped at step {trainer.step}: continue with --resume --checkpoint {options.checkpoint}")
         return False
     finally:
         data.close()

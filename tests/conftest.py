@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from shared.runtime import bus
-from tests.support.live import Running, free_port, hold_in_reach, penumbra_up
+from penumbra.shared.runtime import bus
+from penumbra.tests.support.live import Running, free_port, hold_in_reach, penumbra_up
 
 collect_ignore = [] if importlib.util.find_spec("pybullet") else ["test_pybullet.py", "test_dynamics.py"]
 """What only pybullet can answer; it has wheels up to CPython 3.11."""
@@ -30,7 +30,7 @@ def logs_as_before() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def running() -> Running:
+def running() -> Iterator[Running]:
     """The whole chain on the table cell, held still in sight and in reach: what happens to the pose is the test's doing."""
     with penumbra_up("table", 5) as running:
         hold_in_reach(running)

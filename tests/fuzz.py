@@ -1,4 +1,4 @@
-"""Random inputs for everything that reads what others have made: `python -m tests.fuzz --inputs 1000000`.
+"""Random inputs for everything that reads what others have made: `python -m penumbra.tests.fuzz --inputs 1000000`.
 
 A decoder answers, or refuses with the one error that it documents, in a text of bounded length; whatever else happens is a fault,
 which hypothesis makes small and prints. Processor time per input and memory are bounded too.
@@ -6,27 +6,28 @@ which hypothesis makes small and prints. Processor time per input and memory are
 
 from __future__ import annotations
 
-import dataclasses
 import resource
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from rich.progress import Progress
 
-from services.flags import Parser
-from services.skin import decode as skin_decode
-from shared.cell import description as cells
-from shared.contract import messages
-from shared.skin import board
-from tests.support.inputs import KINDS, SPOILERS, damaged
-from tests.support.nodes import pose
+from penumbra.services import flags
+from penumbra.services.skin import decode as skin_decode
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages
+from penumbra.shared.skin import board
+from penumbra.tests.support.inputs import KINDS, SPOILERS, damaged
+from penumbra.tests.support.nodes import pose
 
 BATCH = 1000
 """Inputs of one run of hypothesis, which remembers all of a run."""
@@ -54,7 +55,7 @@ targets: {forearm: {mesh: "body:forearm", labels: [forearm, hand], home: {positi
 def _good(kind: type[messages.Message]) -> bytes:
     """One small message of a kind."""
     now = pose(10**18)
-    fields: dict[str, Any] = vars(now) | {
+    fields: dict[str, Any] = msgspec.structs.asdict(now) | {
         "sample_stamp_ns": now.stamp_ns,
         "information": now.covariance,
         "state": "in_range" if kind is messages.HapticPose else "tracking",
@@ -66,7 +67,7 @@ def _good(kind: type[messages.Message]) -> bytes:
     fields |= {"x0": 0, "y0": 0, "scale": 1, "period_ns": 10**6, "overlap": 0.9, "hidden": 0.1, "gap": 0.05}
     if kind is messages.Joints:
         fields["position"] = np.zeros(7)
-    return messages.encode(kind(**{field.name: fields[field.name] for field in dataclasses.fields(kind)}))
+    return messages.encode(kind(**{name: fields[name] for name in kind.__struct_fields__}))
 
 
 def check_message(kind: type[messages.Message], payload: bytes) -> None:
@@ -109,7 +110,7 @@ def _packets() -> st.SearchStrategy[bytes]:
     return st.binary(max_size=300) | st.sampled_from(good).flatmap(damaged)
 
 
-def targets(folder: Path) -> dict[str, Callable[[Any], None]]:
+def targets(folder: Path) -> dict[str, Callable[[], None]]:
     """Functions of hypothesis by name, each of which tries one input. folder: for cell files."""
     good = {kind: _good(kind) for kind in KINDS}
     payloads = st.sampled_from(list(good)).flatmap(lambda kind: st.tuples(st.just(kind), damaged(good[kind])))
@@ -143,17 +144,20 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
-def main(argv: list[str]) -> int:
-    parser = Parser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("--inputs", type=int, default=100_000, help="of all decoders together (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args(argv)
+@flags.command(
+    "fuzz",
+    __doc__ or "",
+    flags.Option("--inputs", type=int, default=100000, help="of all decoders together"),
+    flags.Option("--seed", type=int, default=1),
+    example="python -m penumbra.tests.fuzz --inputs 10000",
+)
+def main(options: flags.Options) -> int:
     before = memory_mb()
     with tempfile.TemporaryDirectory() as folder, Progress() as progress:
         for name, share in SHARE.items():
             inputs = max(1, round(share * options.inputs))
             bar = progress.add_task(name, total=inputs)
-            run(name, inputs, options.seed, Path(folder), lambda count, bar=bar: progress.advance(bar, count))
+            run(name, inputs, options.seed, Path(folder), partial(progress.advance, bar))
     grown = memory_mb() - before
     print(f"{options.inputs} inputs: every one answered or refused; memory grew by {grown:.0f} MB (at most {MOST_MB:.0f})")
     return int(grown > MOST_MB)

@@ -28,7 +28,7 @@ def test_only_the_emulator_and_what_learns_know_the_simulated_world():
         imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import | ast.ImportFrom)]
         names = {alias.name for node in imports if isinstance(node, ast.Import) for alias in node.names}
         names |= {node.module for node in imports if isinstance(node, ast.ImportFrom) and node.module}
-        if any(name.split(".")[0] == "sim" for name in names):
+        if any(name.startswith("penumbra.sim") for name in names):
             place = path.relative_to(ROOT / "services")
             assert place.parts[0] == "emulator" or "training" in place.parts or place.as_posix() in LEARNING, path
 
@@ -53,13 +53,14 @@ def test_only_the_robots_bodies_know_pybullet():
     ],
 )
 def test_a_service_imports_only_what_it_needs_to_start(service, heavy):
-    code = f"import sys, json, services.{service}.service; print(json.dumps(list(sys.modules)))"
+    code = f"import sys, json, penumbra.services.{service}.service; print(json.dumps(list(sys.modules)))"
     out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert not heavy & set(json.loads(out.splitlines()[-1]))
 
 
 def test_every_package_says_in_its_init_what_it_is_for():
-    for folder in ("shared", "sim", "services", *(p.parent.relative_to(ROOT) for p in (ROOT / "services").glob("*/__init__.py"))):
+    folders = [Path("shared"), Path("sim"), Path("services")]
+    for folder in (*folders, *(p.parent.relative_to(ROOT) for p in (ROOT / "services").glob("*/__init__.py"))):
         text = (ROOT / folder / "__init__.py").read_text()
         assert text.startswith('"""'), f"{folder}/__init__.py has no docstring"
 

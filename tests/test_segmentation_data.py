@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from services.segmentation.inference import TARGET_LABELS
-from services.segmentation.training import photographs, recordings, train
-from shared.cell import description as cells
-from shared.contract.labels import UNLABELLED, Label
-from sim.picture import limb, looks
-from sim.sets import sequences
+from penumbra.services.segmentation.inference import TARGET_LABELS
+from penumbra.services.segmentation.training import photographs, recordings, train
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import UNLABELLED, Label
+from penumbra.sim.picture import limb, looks
+from penumbra.sim.sets import sequences
 
 NAMES = ["null", "bag", "coat", "jeans", "skin", "gloves", *(name for name in photographs.SLEEVED if name != "coat")]
 NAMES += ["purse", "wallet", *photographs.WORN, "hair", "hat", "scarf"]

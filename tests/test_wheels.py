@@ -4,6 +4,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from packaging.markers import default_environment
@@ -17,7 +18,7 @@ APART = {"torch"}
 
 def wanted(requirements: list[str], python: str) -> set[str]:
     """What a list asks for under a Python, without the project's own extras. pip would judge markers by the Python it runs on."""
-    here = {**default_environment(), "python_version": python, "python_full_version": f"{python}.0", "extra": ""}
+    here: dict[str, Any] = {**default_environment(), "python_version": python, "python_full_version": f"{python}.0", "extra": ""}
     foreign = [each for each in map(Requirement, requirements) if each.name not in {PROJECT["name"], *APART}]
     return {f"{each.name}{each.specifier}" for each in foreign if not each.marker or each.marker.evaluate(here)}
 

@@ -13,9 +13,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from services import flags
-from shared.contract import access
-from shared.runtime import bus
+from penumbra.services import flags
+from penumbra.shared.contract import access
+from penumbra.shared.runtime import bus
 
 CA_DAYS = 3650
 DAYS = 825
@@ -26,21 +26,24 @@ LOCAL = ("localhost", "127.0.0.1", "::1", "router")
 """Names that a router always has: this machine's, and the one that Compose gives it."""
 
 
-def main(argv: list[str]) -> int:
-    """`penumbra certs [--out FOLDER] [--hosts NAME ...] [--force]`"""
-    parser = flags.Parser(
-        prog="penumbra certs",
-        description="Makes a certificate authority and a certificate for each of "
-        f"{', '.join(access.HOLDERS)}. Each process needs ca.pem and its own two files, no more: keep ca-key.pem off the robots.",
-    )
-    parser.add_argument("--out", type=Path, default=Path("certs"), metavar="FOLDER", help="where to (default: %(default)s)")
-    parser.add_argument("--hosts", nargs="+", default=[], metavar="NAME",
-                        help=f"names and addresses at which routers are reached, besides {', '.join(LOCAL)}")  # fmt: skip
-    parser.add_argument("--force", action="store_true", help="replace what is there: old certificates are worth nothing then")
-    options = parser.parse_args(argv)
+@flags.command(
+    "certs",
+    f"Makes a certificate authority and a certificate for each of {', '.join(access.HOLDERS)}. Each process needs ca.pem and its "
+    "two files, no more: keep ca-key.pem off the robots.",
+    flags.Option("--out", type=Path, default=Path("certs"), metavar="FOLDER", help="where to"),
+    flags.Option(
+        "--hosts",
+        takes="many",
+        metavar="NAME ...",
+        help=f"names and addresses at which routers are reached, besides {', '.join(LOCAL)}",
+    ),
+    flags.Option("--force", is_flag=True, help="replace existing certificates, which then become invalid"),
+    example="penumbra certs --out certs --hosts cell-7.example 192.168.0.7",
+)
+def main(options: flags.Options) -> None:
+    """Writes the certificates."""
     make(options.out, options.hosts, options.force)
     print(f"{options.out}: {len(access.HOLDERS)} certificates for {DAYS} days: penumbra up --secure {options.out}")
-    return 0
 
 
 def make(folder: Path, hosts: Sequence[str] = (), force: bool = False, names: Iterable[str] = access.HOLDERS) -> None:
@@ -132,7 +135,7 @@ def _alternative(host: str) -> x509.GeneralName:
             raise ValueError
         return x509.DNSName(host)
     except ValueError:
-        raise bus.BusError(f"--hosts {host!r}: a host's name or IP address expected, without protocol and port") from None
+        raise bus.BusError(f"--hosts: expected a host's name or IP address without protocol and port, got {host!r}") from None
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -5,19 +5,32 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from shared.contract import processes
-from shared.contract.processes import PROCESSES, Process
-from shared.runtime.logs import FULL
+import click
+
+from penumbra.services import flags
+from penumbra.shared.contract import processes
+from penumbra.shared.contract.processes import PROCESSES, Process, Tool
+from penumbra.shared.runtime.logs import FULL
+
+COMPLETE = "_PENUMBRA_COMPLETE"
+"""The variable by which a shell asks for completions."""
+EXIT_CODES = {
+    0: "done",
+    1: "failed: something that was checked or started is not well; the lines before say what",
+    2: "cannot be done as asked: a flag, the cell, the router or the installation; nothing was started",
+    3: "the pose is lost (pose)",
+    130: "ended by Ctrl-C",
+}
 
 
 @dataclass(frozen=True)
-class Command:
-    """A command that is no service. `about`: the line of `penumbra --help`; `function`: `MODULE:FUNCTION`, called with the
-    arguments that follow; `extra`: what it needs of `pip install -e '.[EXTRA]'`."""
+class Entry:
+    """A command that is no service. `about`: the line of `penumbra --help`; `function`: `MODULE:NAME` of its `flags.Command` or
+    group; `extra`: what it needs of `pip install -e '.[EXTRA]'`."""
 
     about: str
     function: str
@@ -25,44 +38,60 @@ class Command:
 
 
 STEERING = {
-    "up": Command("start every process of a cell with a router, and show what they do", "services.launcher.up:main"),
-    "restart": Command(
+    "up": Entry("start every process of a cell with a router, and show what they do", "penumbra.services.launcher.up:main"),
+    "down": Entry("end a cell that runs on this machine", "penumbra.services.command.machine:down"),
+    "restart": Entry(
         "restart services of the running `penumbra up`, one after another, without losing the pose",
-        "services.command.steer:restart",
+        "penumbra.services.command.steer:restart",
     ),
-    "scale": Command("change the number of replicas of a service of the running `penumbra up`", "services.command.steer:scale"),
+    "scale": Entry("change the number of replicas of a service", "penumbra.services.command.steer:scale"),
 }
 LOOKING = {
-    "pose": Command("print the current pose", "services.command.look:pose"),
-    "topics": Command("list the topics, and with --hz what really arrives", "services.command.look:list_topics"),
-    "sim": Command("steer the emulator: occlude, motion, pause, resume, speed, skin, state", "services.command.look:sim"),
-    "snapshot": Command("write a picture of the cell and its pose", "services.command.snapshot:main"),
-    "bench": Command("run a benchmark", "services.command.cli:bench", extra="test"),
-    "certs": Command("make certificates for a cell on a network", "services.command.certs:main", extra="certs"),
-    "doctor": Command("check this machine and say how to mend it", "services.command.doctor:main"),
+    "pose": Entry("print the current pose", "penumbra.services.command.look:pose"),
+    "ps": Entry("show the cells of this machine and their processes", "penumbra.services.command.machine:ps"),
+    "logs": Entry("print what the processes of a detached cell have logged", "penumbra.services.command.machine:logs"),
+    "ls": Entry("list routers and the cells on them", "penumbra.services.command.look:list_cells"),
+    "topics": Entry("list the topics, and with --hz what really arrives", "penumbra.services.command.look:list_topics"),
+    "sim": Entry(
+        "steer the emulator: occlude, motion, pause, resume, speed, skin, board, state", "penumbra.services.command.look:sim"
+    ),
+    "snapshot": Entry("write a picture of the cell and its pose", "penumbra.services.command.snapshot:main"),
+    "check": Entry("check a cell file before anything starts", "penumbra.services.command.check:main"),
+    "doctor": Entry("check this machine and report how to fix what is wrong", "penumbra.services.command.doctor:main"),
 }
-COMMANDS: dict[str, Command | Process] = {
-    **STEERING,
-    **{process.name: process for process in PROCESSES},
-    **LOOKING,
+TOOLS = {
+    "certs": Entry("make certificates for a cell on a network", "penumbra.services.command.certs:main", extra="certs"),
+    "bench": Entry("run a benchmark", "penumbra.services.command.cli:bench", extra="test"),
+    "completion": Entry("print the completion of bash, zsh or fish", "penumbra.services.command.cli:completion"),
+    "help": Entry("show the help of a command", "penumbra.services.command.cli:show_help"),
 }
+SECTIONS: dict[str, dict[str, Any]] = {
+    "A cell": STEERING,
+    "What it does": LOOKING,
+    "Its processes, each by itself": {process.name: process for process in PROCESSES},
+    "Others": TOOLS,
+}
+COMMANDS: dict[str, Entry | Process] = {name: entry for entries in SECTIONS.values() for name, entry in entries.items()}
 """Everything that `penumbra` can be followed by, in the order of its help. Processes come from their table."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs `penumbra ARGV...` and returns the exit code: 0 well, 1 failed, 2 asked for something that is not there."""
+    """Runs `penumbra ARGV...` and returns the exit code, one of EXIT_CODES."""
     argv = sys.argv[1:] if argv is None else argv
-    is_help = not argv or argv[0] in ("-h", "--help", "help")
-    command, rest = ("help", []) if is_help else (argv[0], argv[1:])
-    if not is_help and command not in COMMANDS:
-        print(f"penumbra: no command {command!r}: one of {', '.join(COMMANDS)} expected", file=sys.stderr)
-        return 2
+    if COMPLETE in os.environ:
+        from click.shell_completion import shell_complete
+
+        return shell_complete(PENUMBRA, {}, "penumbra", COMPLETE, os.environ[COMPLETE])
+    command = argv[0].strip("-") if argv else "help"
     try:
-        code = _help(bool(argv)) if is_help else _run(command, rest)
+        code = flags.execute(PENUMBRA, "penumbra", argv or ["--help"])
         sys.stdout.flush()
-        return code
+        return code if argv else 2
+    except click.ClickException as error:
+        print(flags.explain(error), file=sys.stderr)
+        return 2
     except ImportError as error:
-        return _explain_import(command, rest, error)
+        return _explain_import(command, argv[1:], error)
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # `penumbra topics | head`
@@ -80,16 +109,163 @@ def main(argv: list[str] | None = None) -> int:
         return 2
 
 
-def _run(command: str, argv: list[str]) -> int:
-    tool = processes.tool(command, argv[0]) if argv else None
-    found = tool or COMMANDS[command]
-    if isinstance(found, Process):
-        from services import run
+# ---- groups, which import a command when it is asked for
 
-        return run.serve(command, argv)
-    module, _, function = found.function.partition(":")
-    call: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
-    return call(argv[1:] if tool else argv) or 0
+
+def load(function: str) -> click.Command:
+    """The command that `MODULE:NAME` names."""
+    module, _, name = function.partition(":")
+    found: click.Command = getattr(importlib.import_module(module), name)
+    return found
+
+
+class Penumbra(flags.Group):
+    """The command itself."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        entry = COMMANDS.get(name)
+        if isinstance(entry, Process):
+            return Service(entry)
+        return load(entry.function) if entry else None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        for title, entries in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, _about(entry)) for name, entry in entries.items()])
+        with formatter.section("Exit codes"):
+            formatter.write_dl([(str(code), meaning) for code, meaning in EXIT_CODES.items()])
+
+
+def _about(entry: Entry | Process) -> str:
+    tools = [tool.name for tool in entry.tools] if isinstance(entry, Process) else []
+    return f"{entry.about} (also: {', '.join(tools)})" if tools else entry.about
+
+
+class Service(flags.Group):
+    """`penumbra NAME`: runs a service, or one of the tools beside it. The module of the service, which may take long to import,
+    is imported only where the service itself is asked for."""
+
+    def __init__(self, process: Process):
+        super().__init__(process.name, f"penumbra {process.name}", invoke_without_command=True, callback=self._serve)
+        self._process = process
+        self._tools: dict[str, Tool] = {tool.name: tool for tool in process.tools}
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.meta["is_tool"] = bool(args) and args[0] in self._tools
+        if not ctx.meta["is_tool"]:
+            module = importlib.import_module(self._process.module)
+            package = importlib.import_module(module.__name__.rpartition(".")[0])
+            self.help = (package.__doc__ or self._process.about).partition("\n\n")[0]
+            self.example = getattr(module, "EXAMPLE", self.example)
+            self.params = [*module.FLAGS, flags.METRICS, *flags.COMMON]
+        return super().parse_args(ctx, args)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self._tools)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        return load(self._tools[name].function) if name in self._tools else None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        if self._tools:
+            with formatter.section("Tools"):
+                formatter.write_dl([(tool.name, tool.about) for tool in self._tools.values()])
+
+    def _serve(self, **values: Any) -> int:
+        ctx = click.get_current_context()
+        if ctx.meta["is_tool"]:
+            return 0
+        from penumbra.services import run
+
+        return run.serve(self._process, flags.Options(**values), flags.words())
+
+
+class Bench(flags.Group):
+    """`penumbra bench NAME`: the modules of the folder of benchmarks."""
+
+    follows = "benchmark"
+    FOLDER = Path(__file__).parents[2] / "tests" / "bench"
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(path.stem for path in self.FOLDER.glob("*.py") if path.stem != "__init__")
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        return load(f"penumbra.tests.bench.{name}:main") if name in self.list_commands(ctx) else None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Benchmarks"):
+            formatter.write_dl([(name, self._first_line(name)) for name in self.list_commands(ctx)])
+
+    def _first_line(self, name: str) -> str:
+        """Of the module's docstring, without importing what takes seconds."""
+        with (self.FOLDER / f"{name}.py").open() as file:
+            return file.readline().strip().strip('"').partition(": ")[2]
+
+
+PENUMBRA = Penumbra(
+    "penumbra",
+    "penumbra up --cell table        # and in another terminal:\npenumbra pose --wait",
+    help="Tracks a person's forearm beside a robot, also while something hides it: camera and capacitive skin, fused.",
+    params=[
+        click.Option(
+            ["--version"],
+            is_flag=True,
+            is_eager=True,
+            expose_value=False,
+            callback=lambda ctx, param, value: _show_version(ctx) if value and not ctx.resilient_parsing else None,
+            help="Show the version and exit.",
+        )
+    ],
+)
+bench = Bench(
+    "bench",
+    "penumbra bench live --seconds 30 --json live.json",
+    help="Runs a benchmark. Here --json FILE writes the numbers to a file.",
+)
+
+
+def _show_version(ctx: click.Context) -> None:
+    import importlib.metadata
+
+    try:
+        print(f"penumbra {importlib.metadata.version('penumbra')}")
+    except importlib.metadata.PackageNotFoundError:
+        print("penumbra, not installed: pip install -e '.[all]'")
+    ctx.exit()
+
+
+@flags.command(
+    "completion",
+    "Prints the script that lets a shell complete commands, flags, cells, targets and services.",
+    flags.Argument("shell", choices=("bash", "zsh", "fish"), help="the shell that reads it"),
+    example='eval "$(penumbra completion bash)"                                            # in ~/.bashrc\n'
+    'eval "$(penumbra completion zsh)"                                             # in ~/.zshrc\n'
+    "penumbra completion fish > ~/.config/fish/completions/penumbra.fish",
+)
+def completion(options: flags.Options) -> None:
+    """The script is click's."""
+    from click.shell_completion import get_completion_class
+
+    kind = get_completion_class(options.shell)
+    assert kind is not None, options.shell
+    print(kind(PENUMBRA, {}, "penumbra", COMPLETE).source())
+
+
+@flags.command(
+    "help",
+    "Shows the help of a command.",
+    flags.Argument("command", nargs=-1, help="a command, and what follows it"),
+    example="penumbra help pose\npenumbra help search refine",
+)
+def show_help(options: flags.Options) -> int:
+    """As `penumbra COMMAND --help` does."""
+    return flags.execute(PENUMBRA, "penumbra", [*options.command, "--help"])
+
+
+# ---- what is said of errors
 
 
 def _discard_output() -> None:
@@ -97,29 +273,8 @@ def _discard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def bench(argv: list[str]) -> int:
-    """`penumbra bench NAME`"""
-    folder = Path(__file__).parents[2] / "tests" / "bench"
-    names = sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
-    if not argv or argv[0] not in names:
-        print(f"penumbra bench: one of {', '.join(names) or '(none installed)'} expected", file=sys.stderr)
-        return 2
-    return importlib.import_module(f"tests.bench.{argv[0]}").main(argv[1:]) or 0
-
-
-def _help(is_asked: bool) -> int:
-    print(_usage())
-    return 0 if is_asked else 2
-
-
-def _usage() -> str:
-    width = max(map(len, COMMANDS))
-    rows = "\n".join(f"  {name:{width}}  {command.about}" for name, command in COMMANDS.items())
-    return f"usage: penumbra COMMAND [--help] ...\n\nTracks a forearm beside a robot, also while something hides it.\n\n{rows}"
-
-
 def _complain(command: str, line: str) -> None:
-    from shared.runtime import logs
+    from penumbra.shared.runtime import logs
 
     if logs.is_json():
         logs.get(command).error(line)
@@ -128,9 +283,9 @@ def _complain(command: str, line: str) -> None:
 
 
 def _is_ours(error: Exception) -> bool:
-    """Whether the text of an error already says what was expected, what came and what to do."""
-    from shared.cell.description import CellError
-    from shared.runtime.bus import BusError, Refused
+    """Whether the text of an error already says what was expected, what was received and what to do."""
+    from penumbra.shared.cell.description import CellError
+    from penumbra.shared.runtime.bus import BusError, Refused
 
     return isinstance(error, BusError | Refused | CellError | FileNotFoundError)
 
@@ -138,9 +293,9 @@ def _is_ours(error: Exception) -> bool:
 def _explain_import(command: str, argv: list[str], error: ImportError) -> int:
     """Names the extra that installs what is missing; an error in our own code is not explained away."""
     name = (error.name or "").partition(".")[0]
-    if not name or (name in ("services", "shared", "sim") and error.name != f"services.{command}"):
+    if not name or (name == "penumbra" and error.name != f"penumbra.services.{command}"):
         raise error
-    if error.name == f"services.{command}":
+    if error.name == f"penumbra.services.{command}":
         print(f"penumbra {command}: not part of this installation", file=sys.stderr)
         return 2
     tool = processes.tool(command, argv[0]) if argv else None

@@ -11,18 +11,18 @@ import re
 import shutil
 import threading
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.markup import escape
 
-from services import flags
-from services.command import health
-from shared.cell import description as cells
-from shared.contract.processes import PROCESSES
-from shared.runtime import bus
+from penumbra.services import flags
+from penumbra.services.command import check
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.processes import PROCESSES
+from penumbra.shared.runtime import bus, running
 
 ROOT = Path(__file__).parents[2]
 SHM_BYTES = 128 << 20
@@ -40,23 +40,33 @@ class Finding:
     mend: str = ""
 
 
-def main(argv: list[str]) -> int:
+@flags.command(
+    "doctor",
+    "Checks this machine and reports how to fix what is wrong. The exit code is 1 where something failed.",
+    flags.Option("--skin", is_flag=True, help="look at the pads of the running cell instead, by their voltages"),
+    flags.Option("--seconds", type=flags.above_zero, default=6.0, help="with --skin: how long to listen, 2 to 3600"),
+    flags.JSON,
+    *flags.COMMON,
+    example="penumbra doctor\npenumbra doctor --skin --seconds 10",
+)
+def main(options: flags.Options) -> int:
     """Prints every finding; 1 if any failed."""
-    parser = flags.parser("doctor", "Looks at this machine and says how to mend what is wrong.")
-    parser.add_argument("--skin", action="store_true", help="look at the pads of the running cell instead, by their voltages")
-    listening = "of --skin: how long to listen (default: %(default)s)"
-    parser.add_argument("--seconds", type=flags.above_zero, default=6.0, help=listening)
-    parser.add_argument("--json", action="store_true", help="of --skin: print what was found as JSON")
-    options = parser.parse_args(argv)
     if options.skin:
-        from services.skin import doctor
+        from penumbra.services.skin import doctor
 
         if not 2.0 <= options.seconds <= 3600.0:
-            parser.error(f"--seconds: 2 to 3600 expected, {options.seconds:g} came")
+            flags.refuse(f"--seconds: expected 2 to 3600, got {options.seconds:g}")
         return doctor.main(cells.load(options.cell), bus.connection(options), options.seconds, options.json)
+    if flags.is_given("seconds"):
+        flags.refuse("expected --skin beside --seconds, got --seconds alone")
+    found: Iterable[Finding] = findings(options.cell, bus.connection(options))
+    if options.json:
+        found = list(found)
+        print(json.dumps([asdict(finding) for finding in found]))
+        return int(any(finding.status == "fail" for finding in found))
     console = Console(highlight=False, soft_wrap=True)
     failed = False
-    for finding in findings(options.cell, bus.connection(options)):
+    for finding in found:
         mend = f" -> {finding.mend}" if finding.mend else ""
         console.print(f"[{STYLES[finding.status]}]{finding.status:4}[/] {escape(finding.text + mend)}")
         failed |= finding.status == "fail"
@@ -145,14 +155,18 @@ def _shared_memory(folder: Path = Path("/dev/shm")) -> Finding:
 
 
 def _cell(cell: str) -> Iterator[Finding]:
+    """What `penumbra check` finds."""
     try:
-        found = cells.load(cell)
+        path = cells.source(cell)
     except cells.CellError as error:
-        for line in str(error).splitlines():
-            yield Finding("fail", line, "mend that line of the cell file")
+        yield Finding("fail", str(error))
         return
-    parts = f"{len(found.cameras)} cameras, {len(found.robots)} robots, {len(found.pads)} pads, {len(found.targets)} targets"
-    yield Finding("ok", f"cell {found.name}: {parts}")
+    found, faults = check.examine(path)
+    for fault in faults:
+        yield Finding("warn" if fault.is_warning else "fail", str(fault))
+    if found is not None:
+        parts = f"{len(found.cameras)} cameras, {len(found.robots)} robots, {len(found.pads)} pads, {len(found.targets)} targets"
+        yield Finding("ok", f"cell {found.name}: {parts}")
 
 
 def _weights() -> Iterator[Finding]:
@@ -193,7 +207,7 @@ def _processes(cell: str, connection: bus.Connection) -> Iterator[Finding]:
     except cells.CellError:  # told above
         return
     with bus.open_session(connection, threading.Event(), lambda: None, 0.0) as session:
-        instances = health.ask(session, name)
+        instances = running.ask(session, name)
     if not instances:
         yield Finding("warn", f"no process of cell {name} runs there", f"penumbra up --cell {cell}")
     for instance in instances:

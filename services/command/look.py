@@ -2,62 +2,97 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import string
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import zenoh
+from click.shell_completion import CompletionItem
 
-from services import flags
-from services.command import health
-from shared.cell import description as cells
-from shared.contract import access, topics
-from shared.contract.report import TopicReport
-from shared.runtime import bus
+from penumbra.services import flags
+from penumbra.services.launcher import runs
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import access, topics
+from penumbra.shared.contract.report import TopicReport
+from penumbra.shared.runtime import bus, running
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 PATIENCE_S = 1.0
 """How long a command waits for the router before it says that there is none."""
 WATCH_S = 0.1
+LOST = 3
+"""Exit code of a lost pose."""
+ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "state")
 
 
-def pose(argv: list[str]) -> int:
-    """`penumbra pose [TARGET] [--watch] [--json]`"""
-    parser = flags.parser("pose", "Prints the current fused pose of a target.")
-    parser.add_argument("target", nargs="?", help="a target of the cell (default: its first)")
-    parser.add_argument("--watch", action="store_true", help="print it again and again, until Ctrl-C")
-    parser.add_argument("--json", action="store_true", help="print the answer as it is on the bus, one line a pose")
-    options = parser.parse_args(argv)
+@flags.command(
+    "pose",
+    "Prints the current fused pose of a target. The exit code is 3 where the pose is lost.",
+    flags.Argument(
+        "target", required=False, shell_complete=flags.complete_part("targets"), help="of the cell; its first where none is named"
+    ),
+    flags.Option("--watch", is_flag=True, help="print it again and again, until Ctrl-C"),
+    flags.Option(
+        "--wait",
+        type=flags.seconds,
+        takes="maybe",
+        without="inf",
+        metavar="[SECONDS]",
+        help="wait until the target is tracked, at most so long",
+    ),
+    flags.Option("--json", is_flag=True, help="print the answer as it is on the bus, one line a pose"),
+    *flags.COMMON,
+    example="penumbra pose --wait 30\npenumbra pose forearm --json",
+)
+def pose(options: flags.Options) -> int:
+    """0, or 3 where the pose is lost."""
+    if options.watch and options.wait is not None:
+        flags.refuse("expected --watch or --wait, got both")
     cell = cells.load(options.cell)
     target = cell.one("targets", options.target)
-    key = topics.current_pose(cell.name, target)
-
-    def show(session: zenoh.Session) -> None:
-        answers = bus.ask(session, key, "format=json")
-        if not answers:
-            raise bus.BusError(f"nobody knows the pose of {target} in cell {cell.name}: is `penumbra fusion` running?")
-        text = answers[0].decode()
-        if not options.json:
-            text = _describe(json.loads(text))
-            if options.watch and sys.stdout.isatty():
-                text = "\x1b[H\x1b[J" + text
-        print(text, flush=True)
-
-    with open_session(bus.connection(options)) as session:
+    patience_s = PATIENCE_S if options.wait is None else options.wait
+    deadline = time.monotonic() + (options.wait or 0.0)
+    with open_session(bus.connection(options), patience_s) as session:
         while True:
             try:
-                show(session)
+                found = _ask_pose(session, cell.name, target)
             except bus.BusError as error:
-                if not options.watch:
+                if not options.watch and time.monotonic() >= deadline:
                     raise
-                print(error, file=sys.stderr)
-            if not options.watch:
-                return 0
+                if options.watch:
+                    print(error, file=sys.stderr)
+            else:
+                is_over = options.wait is None or found["state"] == "tracking" or time.monotonic() >= deadline
+                if is_over:
+                    _print_pose(found, options)
+                if is_over and not options.watch:
+                    return LOST if found["state"] == "lost" else 0
             time.sleep(WATCH_S)
+
+
+def _ask_pose(session: zenoh.Session, cell: str, target: str) -> dict[str, Any]:
+    answers = bus.ask(session, topics.current_pose(cell, target), "format=json")
+    if not answers:
+        raise bus.BusError(f"no answer for the pose of {target} in cell {cell}: {running.whats_there(session, cell, 'fusion')}")
+    found: dict[str, Any] = json.loads(answers[0])
+    return found
+
+
+def _print_pose(found: dict[str, Any], options: flags.Options) -> None:
+    text = json.dumps(found) if options.json else _describe(found)
+    if options.watch and not options.json and sys.stdout.isatty():
+        text = "\x1b[H\x1b[J" + text
+    print(text, flush=True)
 
 
 def _describe(pose: dict[str, Any]) -> str:
@@ -73,7 +108,7 @@ def _describe(pose: dict[str, Any]) -> str:
         "position": _row(pose["position"], 100, "8.2f", "cm", max(spread[:3])),
         "roll pitch yaw": _row(pose["rpy"], math.degrees(1), "8.1f", "deg", max(spread[3:])),
         "velocity": _row(pose["velocity"][:3], 100, "8.1f", "cm/s"),
-        "senses": ", ".join(senses) or "none heard",
+        "senses": ", ".join(senses) or "none received",
     }
     return "\n".join(f"{name:15} {text}" for name, text in rows.items())
 
@@ -83,31 +118,77 @@ def _row(values: list[float], scale: float, spec: str, unit: str, spread: float 
     return f"{text} {unit}" + ("" if spread is None else f"  +- {spread * scale:.2g} {unit}")
 
 
-def list_topics(argv: list[str], known: Sequence[topics.Topic] = topics.TOPICS) -> int:
-    """`penumbra topics [--hz]` of the topics that are known."""
-    from rich.console import Console
+@flags.command(
+    "topics",
+    "Lists the cell's topics, and with --hz what really arrives.",
+    flags.Option("--hz", is_flag=True, help="measure what arrives, and print it with the state of the processes"),
+    flags.Option("--seconds", type=flags.above_zero, default=3.0, help="with --hz: how long to listen"),
+    flags.JSON,
+    *flags.COMMON,
+    example="penumbra topics --hz --seconds 5",
+)
+def list_topics(options: flags.Options) -> None:
+    """Prints the table of topics, or what arrives."""
+    if flags.is_given("seconds") and not options.hz:
+        flags.refuse("expected --hz beside --seconds, got --seconds alone")
+    show_topics(options)
+
+
+def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.TOPICS) -> None:
+    """Prints the topics that are known, or what arrives of them."""
+    cell = cells.load(options.cell)
+    if options.hz:
+        received, instances = listen(cell, bus.connection(options), options.seconds, known)
+        if options.json:
+            print(json.dumps({"topics": received, "processes": instances}, default=asdict))
+        else:
+            _show_traffic(received, instances, known)
+        return
+    rows = [(key, topic) for topic in known for key in keys(topic, cell)]
+    if options.json:
+        print(json.dumps([_described(key, topic) for key, topic in rows]))
+        return
     from rich.markup import escape
     from rich.table import Table
 
-    parser = flags.parser("topics", "Lists the table of topics, and with --hz what really arrives.")
-    parser.add_argument("--hz", action="store_true", help="listen to everything; print what arrives and how the processes fare")
-    parser.add_argument("--seconds", type=flags.above_zero, default=3.0, help="how long to listen (default: %(default)s)")
-    options = parser.parse_args(argv)
-    cell = cells.load(options.cell)
-    console = Console(width=None if sys.stdout.isatty() else 200)
-    if not options.hz:
-        table = Table("topic", "key", "message", "Hz", "slow link", "quality of service", "priority", "stale after", "from",
-                      "what", box=None)  # fmt: skip
-        for topic in known:
-            key = topic.key.replace("{cell}", cell.name)
-            table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", f"{topic.slow_hz:g}",
-                          topic.qos.name.lower().replace("_", " "), topic.priority.name.lower(), f"{topic.stale_s:g} s",
-                          " or ".join(topic.publishers), escape(topic.about))  # fmt: skip
-        console.print(table)
-        return 0
-    report, instances = listen(cell, bus.connection(options), options.seconds, known)
+    table = Table("topic", "key", "message", "Hz", "slow link", "quality of service", "priority", "stale after", "from", "what",
+                  box=None)  # fmt: skip
+    for key, topic in rows:
+        table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", f"{topic.slow_hz:g}",
+                      topic.qos.name.lower().replace("_", " "), topic.priority.name.lower(), f"{topic.stale_s:g} s",
+                      " or ".join(topic.publishers), escape(topic.about))  # fmt: skip
+    _console().print(table)
+
+
+def keys(topic: topics.Topic, cell: cells.Cell) -> list[str]:
+    """The keys of a topic in a cell; none where the cell has no such part."""
+    names = [name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell"]
+    parts = itertools.product(*(getattr(cell, f"{name}s") for name in names))
+    return [topic.at(cell=cell.name, **dict(zip(names, part, strict=True))) for part in parts]
+
+
+def _described(key: str, topic: topics.Topic) -> dict[str, Any]:
+    return {
+        "topic": topic.name,
+        "key": key,
+        "message": topic.message.__name__,
+        "rate_hz": topic.rate_hz,
+        "slow_hz": topic.slow_hz,
+        "qos": topic.qos.name.lower(),
+        "priority": topic.priority.name.lower(),
+        "stale_s": topic.stale_s,
+        "publishers": topic.publishers,
+        "about": topic.about,
+    }
+
+
+def _show_traffic(received: dict[str, TopicReport], instances: list[running.Instance], known: Sequence[topics.Topic]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = _console()
     table = Table("key", "Hz", "expected", "delay ms", "dropped", "bad", box=None)
-    for key, row in report.items():
+    for key, row in received.items():
         expected = bus.topic_of(key, known)
         if row.count or row.bad or "*" not in key:
             delay = "-" if row.delay_s is None else f"{1e3 * row.delay_s:.1f}"
@@ -121,14 +202,20 @@ def list_topics(argv: list[str], known: Sequence[topics.Topic] = topics.TOPICS) 
         table.add_row(instance.service, instance.instance, instance.status, escape("; ".join(instance.reasons)))
     console.print()
     console.print(table)
-    return 0
+
+
+def _console() -> Console:
+    """As wide as the terminal; in a file or pipe so wide that no row breaks."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else 200)
 
 
 def listen(
-    cell: cells.Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic] = topics.TOPICS
-) -> tuple[dict[str, TopicReport], list[health.Instance]]:
+    cell: cells.Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic]
+) -> tuple[dict[str, TopicReport], list[running.Instance]]:
     """The counters of every key of the topics that are known after listening for a while, and how the cell's processes fare."""
-    from shared.runtime.node import Node
+    from penumbra.shared.runtime.node import Node
 
     node = Node("topics", cell, connection)
     for topic in known:
@@ -136,31 +223,77 @@ def listen(
     with node.open(PATIENCE_S):
         assert node.session is not None
         node.stopping.wait(seconds)
-        instances = [found for found in health.ask(node.session, cell.name) if found.instance != node.instance]
+        instances = [found for found in running.ask(node.session, cell.name) if found.instance != node.instance]
         return node.report().topics, instances
 
 
-def sim(argv: list[str]) -> int:
-    """`penumbra sim COMMAND [VALUE ...]`: what is possible is the emulator's to say."""
-    parser = flags.parser(
-        "sim",
-        "Steers the emulator: occlude LEVEL|auto, motion on|off, pause, resume, speed FACTOR, state, "
-        "skin PAD[/ELECTRODE] dead|saturated|drift|hum|gain|turned|mirrored|none [SIZE], "
-        "board PAD-NUMBER error|lost|short|missing|slip.",
-    )
-    parser.add_argument("command", help="occlude, motion, pause, resume, speed, skin, board or state")
-    parser.add_argument("value", nargs="*", help="of occlude, motion, speed, skin and board")
-    options = parser.parse_args(argv)
+@flags.command(
+    "ls",
+    "Lists routers and the cells on them: those of this machine's `penumbra up`, the one that --connect or $PENUMBRA_CONNECT "
+    "names (by default that of this machine), and those on the network whose Zenoh configuration enables scouting.",
+    flags.Option("--seconds", type=flags.above_zero, default=0.5, help="how long to wait for answers from the network"),
+    flags.JSON,
+    *flags.BUS,
+    example="penumbra ls\npenumbra ls --connect tcp/192.168.0.7:7447 --json",
+)
+def list_cells(options: flags.Options) -> None:
+    """Prints a row per router."""
+    asked = bus.connection(options)
+    found = dict.fromkeys(asked.connect or (asked.default,), asked)
+    found |= {at: replace(asked, connect=(at,), secure=Path(run.secure) if run.secure else None)
+              for run in runs.running() for at in run.connect}  # fmt: skip
+    scout = zenoh.scout(what="router", config=zenoh.Config())
+    time.sleep(options.seconds)
+    while (each := scout.try_recv()) is not None:
+        found |= {str(at): replace(asked, connect=(str(at),)) for at in each.locators if str(at) not in found}
+    scout.stop()
+    rows = []
+    for at, connection in found.items():
+        try:
+            with open_session(replace(connection, connect=(at,)), 0.0) as session:
+                rows.append({"router": at, "cells": running.cells_there(session), "why": ""})
+        except bus.BusError as error:
+            rows.append({"router": at, "cells": [], "why": str(error)})
+    if options.json:
+        print(json.dumps(rows))
+        return
+    for row in rows:
+        print(row["why"] or f"{row['router']}: {', '.join(row['cells']) or 'no cell'}")
+
+
+@flags.command(
+    "sim",
+    "Steers the emulator: occlude LEVEL|auto, motion on|off, pause, resume, speed FACTOR, state, "
+    "skin PAD[/ELECTRODE] dead|saturated|drift|hum|gain|turned|mirrored|none [SIZE], "
+    "board PAD-NUMBER error|lost|short|missing|slip.",
+    flags.Argument(
+        "action",
+        metavar="COMMAND",
+        help="occlude, motion, pause, resume, speed, skin, board or state",
+        shell_complete=lambda ctx, param, text: [CompletionItem(name) for name in ACTIONS if name.startswith(text)],
+    ),
+    flags.Argument("value", nargs=-1, help="of occlude, motion, speed, skin and board"),
+    flags.JSON,
+    *flags.COMMON,
+    example="penumbra sim occlude 0.8\npenumbra sim state --json",
+)
+def sim(options: flags.Options) -> None:
+    """Passes the command on: what is possible is decided by the emulator."""
     cell = cells.load(options.cell)
-    request = {"command": options.command} | ({"value": " ".join(options.value)} if options.value else {})
+    request = {"command": options.action} | ({"value": " ".join(options.value)} if options.value else {})
     with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:
         answers = bus.ask(session, topics.control(cell.name), payload=json.dumps(request).encode())
-    if not answers:
-        raise bus.BusError(f"no emulator in cell {cell.name}: start `penumbra emulator` or `penumbra up`")
-    print(answers[0].decode())
-    return 0
+        if not answers:
+            raise bus.BusError(f"no emulator in cell {cell.name}: {running.whats_there(session, cell.name, 'emulator')}")
+    state = json.loads(answers[0])
+    print(json.dumps(state) if options.json else "\n".join(f"{name:10} {_plain(value)}" for name, value in state.items()))
 
 
-def open_session(connection: bus.Connection) -> zenoh.Session:
+def _plain(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def open_session(connection: bus.Connection, patience_s: float = PATIENCE_S) -> zenoh.Session:
+    """A session with the router. Raises BusError where there is none after `patience_s`."""
     nothing: Callable[[], None] = lambda: None  # noqa: E731
-    return bus.open_session(connection, threading.Event(), nothing, PATIENCE_S)
+    return bus.open_session(connection, threading.Event(), nothing, patience_s)

@@ -15,16 +15,17 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from services import flags
-from services.command import look
-from shared.body import anatomy
-from shared.body.robot import robot_models
-from shared.cell import description as cells
-from shared.contract import messages, topics
-from shared.contract.labels import COLOURS, Label
-from shared.geometry import raster, rigid
-from shared.runtime import bus
-from shared.skin.layout import Skin, link_names
+from penumbra.services import flags
+from penumbra.services.command import look
+from penumbra.shared.body import anatomy
+from penumbra.shared.body.robot import robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.contract.labels import COLOURS, Label
+from penumbra.shared.geometry import raster, rigid
+from penumbra.shared.geometry.lens import Undistortion
+from penumbra.shared.runtime import bus
+from penumbra.shared.skin.layout import Skin, link_names
 
 PATIENCE_S = 5.0
 """How long to wait until every topic has been heard."""
@@ -35,24 +36,34 @@ FULL_SIGNAL = 0.6
 """Volts of the strongest electrode at which a pad is drawn full: an arm at 1 cm."""
 
 
-def main(argv: list[str]) -> int:
-    parser = flags.parser("snapshot", "Writes a picture of the cell: camera, mask, fused silhouette, pads lit by signal.")
-    parser.add_argument("out", type=Path, help="the picture to write (.png or .jpg)")
-    parser.add_argument("--camera", help="a camera of the cell (default: its first)")
-    parser.add_argument("--target", help="a target of the cell (default: its first)")
-    options = parser.parse_args(argv)
+def _picture(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise ValueError(f"expected a .png or .jpg, got {text!r}")
+    if not path.parent.is_dir():
+        raise ValueError(f"expected a file in a folder that exists, got {text!r}")
+    return path
+
+
+@flags.command(
+    "snapshot",
+    "Writes a picture of the cell: camera, mask, fused silhouette, pads lit by signal.",
+    flags.Argument("out", type=_picture, metavar="FILE", help="the picture to write (.png or .jpg)"),
+    flags.Option("--camera", shell_complete=flags.complete_part("cameras"), show_default="its first", help="of the cell"),
+    flags.Option("--target", shell_complete=flags.complete_part("targets"), show_default="its first", help="of the cell"),
+    *flags.COMMON,
+    example="penumbra snapshot cell.png --camera front",
+)
+def main(options: flags.Options) -> None:
+    """Writes the picture, and prints its size."""
     cell = cells.load(options.cell)
     camera, target = cell.one("cameras", options.camera), cell.one("targets", options.target)
-    if options.out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        parser.error(f"out: a .png or .jpg expected, {str(options.out)!r} came")
     with look.open_session(bus.connection(options)) as session:
         heard = listen(session, cell, camera, target)
     picture = draw(cell, camera, target, **heard)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwrite(str(options.out), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
         raise bus.BusError(f"{options.out} cannot be written: check the folder's permissions")
     print(f"{options.out}: {picture.shape[1]} x {picture.shape[0]}")
-    return 0
 
 
 def listen(session: zenoh.Session, cell: cells.Cell, camera: str, target: str) -> dict[str, Any]:
@@ -96,7 +107,8 @@ def listen(session: zenoh.Session, cell: cells.Cell, camera: str, target: str) -
             }
         time.sleep(0.01)
     raise bus.BusError(
-        f"no {missing} came within {PATIENCE_S:.0f} s on cell {cell.name}: is `penumbra up` running? See `penumbra topics --hz`"
+        f"cell {cell.name}: expected {missing} within {PATIENCE_S:.0f} s, got none; check `penumbra topics --hz`, or start "
+        "`penumbra up`"
     )
 
 
@@ -112,7 +124,7 @@ def draw(
 ) -> NDArray[np.uint8]:
     """The picture (h, w, 3) uint8 RGB. joints: by robot; volts: mean electrode amplitudes by pad."""
     camera = cell.cameras[camera_name]
-    picture = frame.image.copy()
+    picture = Undistortion(camera.lens)(frame.image).copy()
     _tint(picture, mask)
     _pads(picture, cell, camera, joints, volts)
     mesh = anatomy.target_mesh(cell.targets[target_name], cell)
@@ -123,7 +135,7 @@ def draw(
     cv2.drawContours(picture, outline, -1, LINES[pose.state], 2, cv2.LINE_AA)
     senses = ", ".join(f"{name} {100 * source.weight:.0f} %" for name, source in sorted(pose.sources.items()))
     deviation_cm = 100 * np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3]).max())
-    text = f"{cell.name}: {pose.state}, +-{deviation_cm:.1f} cm  ({senses or 'no sense heard'})"
+    text = f"{cell.name}: {pose.state}, +-{deviation_cm:.1f} cm  ({senses or 'no sense received'})"
     picture[:30] = (0.35 * picture[:30]).astype(np.uint8)
     cv2.putText(picture, text, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return picture

@@ -5,20 +5,20 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from sim.world.world import World
+from penumbra.sim.world.world import World
 
 if TYPE_CHECKING:
-    from services.emulator.serial_boards import SerialBoards
+    from penumbra.services.emulator.serial_boards import SerialBoards
 
 COMMANDS = {
     "occlude": "a share of the target's pixels to hide from 0 to 1, or auto",
     "motion": "on or off: target and robot move or stand still",
-    "pause": "everything stands still",
-    "resume": "everything goes on",
+    "pause": "stop the simulation",
+    "resume": "continue the simulation",
     "speed": "how fast target and robot move: above 0, at most 4, 1 is as in the cell file",
     "skin": "PAD[/ELECTRODE] FAULT [SIZE] or `all none`: dead, saturated, drift, hum, gain, turned, mirrored, none",
     "board": "PAD-NUMBER error, lost, short, missing or slip: a fault of a board that --serial serves, such as p0-1 lost",
-    "state": "what is in force now",
+    "state": "print the current settings",
 }
 """Every command, and what its value means."""
 
@@ -37,18 +37,18 @@ def control(world: World, payload: bytes, time_s: float, serial: SerialBoards | 
         raise ValueError(_expected(payload[:60].decode(errors="replace")))
     command, value = request["command"], request.get("value")
     if command in ("pause", "resume", "state") and value is not None:
-        raise ValueError(f"{command} takes no value, {value!r} came")
+        raise ValueError(f"{command}: expected no value, got {value!r}")
     if command == "occlude":
         world.occlude(None if value == "auto" else _number(command, value), time_s)
     elif command == "motion":
         if value not in ("on", "off"):
-            raise ValueError(f"motion: {COMMANDS[command]} expected, {value!r} came")
+            raise ValueError(f"motion: expected {COMMANDS[command]}, got {value!r}")
         world.set_motion(value == "on", time_s)
     elif command == "speed":
         world.set_speed(_number(command, value), time_s)
     elif command == "skin":
         if not isinstance(value, str):
-            raise ValueError(f"skin: {COMMANDS['skin']} expected, {value!r} came")
+            raise ValueError(f"skin: expected {COMMANDS['skin']}, got {value!r}")
         world.break_skin(value, time_s)
     elif command == "board":
         if serial is None:
@@ -67,9 +67,9 @@ def _number(command: str, value: Any) -> float:
             raise ValueError
         return float(value)
     except (TypeError, ValueError):
-        raise ValueError(f"{command}: {COMMANDS[command]} expected, {value!r} came") from None
+        raise ValueError(f"{command}: expected {COMMANDS[command]}, got {value!r}") from None
 
 
-def _expected(came: str) -> str:
+def _expected(got: str) -> str:
     possible = "\n".join(f"  {name:8} {about}" for name, about in COMMANDS.items())
-    return f'{{"command": NAME, "value": VALUE}} expected, {came!r} came. Commands:\n{possible}'
+    return f'expected {{"command": NAME, "value": VALUE}}, got {got!r}. Commands:\n{possible}'

@@ -29,15 +29,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from shared.cell import description as cells
-from shared.geometry.rigid import Array
-from shared.skin import board
-from shared.skin.layout import Skin
-from sim.skin.board import FAULTS, Board, Tank
-from sim.skin.faults import SkinFaults
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin import board
+from penumbra.shared.skin.layout import Skin
+from penumbra.sim.skin.board import FAULTS, Board, Tank
+from penumbra.sim.skin.faults import SkinFaults
 
 if TYPE_CHECKING:
-    from sim.world.world import World
+    from penumbra.sim.world.world import World
 
 IDLE_S = 0.05
 """How long the boards wait for bytes before they look whether they are to end."""
@@ -199,7 +199,7 @@ class SerialBoards:
         name, _, kind = words.partition(" ")
         if name not in self.devices or kind not in FAULTS:
             possible = f"one of {', '.join(self.devices)} and one of {', '.join(FAULTS)}"
-            raise ValueError(f"board: a board and its fault expected, {possible}, {words!r} came")
+            raise ValueError(f"board: expected a board and its fault, {possible}, got {words!r}")
         self._send(words)
 
     def serve(self, stopping: threading.Event) -> None:

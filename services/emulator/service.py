@@ -4,19 +4,19 @@ With --serial the voltages of pads go the way of the real skin: as bytes of thei
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from services.emulator.control import control
-from services.emulator.pacing import Pacer, Time
-from shared.contract import topics
-from shared.contract.topics import VOLTAGES
-from shared.runtime.node import Node
-from sim.world.world import TICK_NS, Sensors, Stream, World
+from penumbra.services import flags
+from penumbra.services.emulator.control import control
+from penumbra.services.emulator.pacing import Pacer, Time
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.topics import VOLTAGES
+from penumbra.shared.runtime.node import Node
+from penumbra.sim.world.world import TICK_NS, Sensors, Stream, World
 
 NAME = "emulator"
 
@@ -28,17 +28,28 @@ AGAIN_S = 0.001
 """A turn waits by itself; this only keeps one that fails from running hot."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """The service's own flags."""
-    parser.add_argument("--seed", type=int, default=0, help="draws motion, occlusion, colours and noise (default: 0)")
-    serial = "serve the boards of these pads (none named: of all) on pseudo-terminals instead of publishing their voltages"
-    parser.add_argument("--serial", nargs="*", metavar="PAD", help=serial)
-    folder = "where links to the pseudo-terminals are made, named p0-0 for the first board of pad p0"
-    parser.add_argument("--serial-folder", type=Path, metavar="DIR", help=folder)
-    parser.add_argument("--occlude", default="auto", metavar="LEVEL|auto", help="share of the target to hide (default: auto)")
+ALL_PADS = "*"
+FLAGS = (
+    flags.Option("--seed", type=int, default=0, help="draws motion, occlusion, colours and noise"),
+    flags.Option(
+        "--serial",
+        takes="many",
+        without=ALL_PADS,
+        metavar="[PAD ...]",
+        help="serve the boards of these pads (none named: of all) on pseudo-terminals instead of publishing their voltages",
+    ),
+    flags.Option(
+        "--serial-folder",
+        type=Path,
+        metavar="DIR",
+        help="where links to the pseudo-terminals are made, named p0-0 for the first board of pad p0",
+    ),
+    flags.Option("--occlude", default="auto", metavar="LEVEL|auto", help="share of the target to hide"),
+)
+EXAMPLE = "penumbra emulator --cell table --seed 7 --occlude 0.5"
 
 
-def start(node: Node, options: argparse.Namespace) -> None:
+def start(node: Node, options: flags.Options) -> None:
     """Threads: the skin's timer, one timer a camera and the answers share the world; motions and occluders have locks of their
     own, and commands replace what the timers read.
 
@@ -56,10 +67,10 @@ def start(node: Node, options: argparse.Namespace) -> None:
         return world_time.now_ns() * 1e-9
 
     serial = None
-    if options.serial is not None:
-        from services.emulator.serial_boards import SerialBoards  # its boards' model takes as long to import as all else
+    if options.serial:
+        from penumbra.services.emulator.serial_boards import SerialBoards  # its boards' model takes as long to import as all else
 
-        pads = options.serial or list(cell.pads)
+        pads = list(cell.pads) if ALL_PADS in options.serial else list(options.serial)
         serial = SerialBoards(world, pads, options.serial_folder, world_time.began_ns, TICK_NS * 1e-9, AHEAD_S)
         for name, device in serial.devices.items():
             node.log.info("board on a pseudo-terminal", board=name, device=device)

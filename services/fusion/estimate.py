@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fusion import so3
-from shared.contract.messages import MAX_FUTURE_S, FusedPose, Message, Source
-from shared.contract.senses import Measures
-from shared.geometry import rigid
-from shared.native import kernel
+from penumbra.shared.contract.messages import MAX_FUTURE_S, FusedPose, FusedState, Message, Source
+from penumbra.shared.contract.senses import Measures
+from penumbra.shared.geometry import rigid, so3
+from penumbra.shared.native import kernel
 
 Array = NDArray[np.floating[Any]]
 
-STATES = ("tracking", "coasting", "lost")
+STATES: tuple[FusedState, ...] = ("tracking", "coasting", "lost")
 TRACKING, COASTING, LOST = range(len(STATES))
 FATES = ("accepted", "gated", "late", "duplicate", "nothing", "future", "pose", "information")
 """What may become of a measurement: taken; too far from the prediction; older than the history; known already; observing nothing.
@@ -46,7 +45,7 @@ class Estimate:
     T: rigid.Array
     velocity: Array
     covariance: Array
-    state: str
+    state: FusedState
     sources: dict[str, Source]
 
     def message(self, stamp_ns: int, target: str, frame: str) -> FusedPose:
@@ -80,7 +79,7 @@ class Limits:
     lost_sigma: float = 0.15
     lost_age: float = 3.0
 
-    def state(self, age_s: float, covariance: Array) -> str:
+    def state(self, age_s: float, covariance: Array) -> FusedState:
         """tracking, coasting or lost, from the age of the newest measurement in use and the pose's covariance (6, 6)."""
         return STATES[int(state_of(age_s, np.ascontiguousarray(covariance), np.array(astuple(self))))]
 

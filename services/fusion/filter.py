@@ -37,9 +37,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from services.fusion import so3
-from services.fusion.estimate import ACCEPTED, DUPLICATE, GATED, LATE, LOST, NOTHING, fault, state_of
-from services.fusion.records import (
+from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, GATED, LATE, LOST, NOTHING, fault, state_of
+from penumbra.services.fusion.records import (
     ESTIMATE,
     MEASUREMENT,
     MODEL,
@@ -52,7 +51,8 @@ from services.fusion.records import (
     STATE,
     UNITS,
 )
-from shared.native import inner, kernel
+from penumbra.shared.geometry import so3
+from penumbra.shared.native import inner, kernel
 
 HASTE = 4.0
 """So many times as fast a measurement that is refused teaches that the limb is faster: while it is, all are refused."""

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fusion import filter
-from services.fusion.estimate import ACCEPTED, FUTURE, STATES, Array, Estimate, Log, latest, refusal, shaped
-from services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, SENSE_ESTIMATE, History, size
-from services.fusion.settings import Settings, model, sense_models
-from shared.contract.messages import FusedPose, Source
-from shared.contract.senses import SENSES, Sense
-from shared.geometry import rigid
+from penumbra.services.fusion import filter
+from penumbra.services.fusion.estimate import ACCEPTED, FUTURE, STATES, Array, Estimate, Log, latest, refusal, shaped
+from penumbra.services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, SENSE_ESTIMATE, History, size
+from penumbra.services.fusion.settings import Settings, model, sense_models
+from penumbra.shared.contract.messages import FusedPose, Source
+from penumbra.shared.contract.senses import SENSES, Sense
+from penumbra.shared.geometry import rigid
 
 
 class Bank:

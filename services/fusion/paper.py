@@ -34,9 +34,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.fusion.estimate import Array, Estimate, Limits, Log
-from shared.contract.messages import FusedPose, Source
-from shared.geometry import rigid
+from penumbra.services.fusion.estimate import Array, Estimate, Limits, Log
+from penumbra.shared.contract.messages import FusedPose, Source
+from penumbra.shared.geometry import rigid
 
 STEP_S = 0.01
 SENSES = {"vision": slice(0, 6), "haptic": slice(6, 12)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import threading
 import time
@@ -13,15 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from services.fusion import paper
-from services.fusion.estimate import Estimate, Refused, latest, measured
-from services.fusion.observer import Bank, ErrorStateObserver
-from services.fusion.paper import PaperObserver
-from shared.cell import description
-from shared.contract import messages, topics
-from shared.contract.senses import SENSES, Sense
-from shared.geometry import rigid
-from shared.runtime.node import ServiceNode
+from penumbra.services import flags
+from penumbra.services.fusion import paper
+from penumbra.services.fusion.estimate import Estimate, Refused, latest, measured
+from penumbra.services.fusion.observer import Bank, ErrorStateObserver
+from penumbra.services.fusion.paper import PaperObserver
+from penumbra.shared.cell import description
+from penumbra.shared.contract import messages, outline, topics
+from penumbra.shared.contract.senses import SENSES, Sense
+from penumbra.shared.geometry import rigid
+from penumbra.shared.runtime.node import ServiceNode
 
 NAME = "fusion"
 OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
@@ -32,15 +32,16 @@ SET_BACK_S = 0.05
 """A clock that goes back by more was set, by less it is kept together with others."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """The service's own flags."""
-    parser.add_argument(
+FLAGS = (
+    flags.Option(
         "--observer", choices=sorted(OBSERVERS), default="default", help="default: error-state filter; paper: the paper's"
-    )
-    parser.add_argument("--target", metavar="NAME", help="fuse this target only (default: all of the cell)")
+    ),
+    flags.Option("--target", metavar="NAME", show_default="all of the cell", help="fuse only this target"),
+)
+EXAMPLE = "penumbra fusion --cell table --observer paper"
 
 
-def start(node: ServiceNode, options: argparse.Namespace, senses: Sequence[Sense] = SENSES) -> None:
+def start(node: ServiceNode, options: flags.Options, senses: Sequence[Sense] = SENSES) -> None:
     """Wires one observer per target, and one timer for all. senses: whose measurements are taken; the paper's observer takes its
     two alone. Raises CellError for a target that the cell does not have.
 
@@ -51,6 +52,8 @@ def start(node: ServiceNode, options: argparse.Namespace, senses: Sequence[Sense
     if options.observer == "paper":
         senses = [sense for sense in senses if sense.name in paper.SENSES]
     group = Group(options.observer, [node.cell.targets[name] for name in names], node.now_ns, senses)
+    described = outline.of(node.cell).encode(), "application/json"
+    node.answer(topics.description(node.cell.name), lambda parameters, payload: described)
     fusions = [Fusion(node, name, group, observer, senses) for name, observer in zip(names, group.observers, strict=True)]
 
     def publish() -> None:

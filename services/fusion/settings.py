@@ -8,10 +8,10 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fusion.estimate import Array, Limits
-from services.fusion.records import MODEL, POSE, SENSE_MODEL
-from shared.chi_square import quantile
-from shared.contract.senses import Sense
+from penumbra.services.fusion.estimate import Array, Limits
+from penumbra.services.fusion.records import MODEL, POSE, SENSE_MODEL
+from penumbra.shared.chi_square import quantile
+from penumbra.shared.contract.senses import Sense
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry.rigid import Array
-from shared.skin.faults import Watch
-from shared.skin.layout import Skin
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin.faults import Watch
+from penumbra.shared.skin.layout import Skin
 
 NEVER = -(1 << 62)
 """The stamp [ns] of something that has not come yet: before every other stamp."""

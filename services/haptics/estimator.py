@@ -23,19 +23,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from services.haptics.paper_network import PoseNetwork, Relative, features
-from services.haptics.settings import HapticSettings
-from services.haptics.size_and_rest import PERSON_S, SIZE_GAP, SIZE_LASTING, Size, Tare
-from services.haptics.solve import LEVER, Prior, Reading, Solution, Solver, peak
-from services.haptics.starts import Limb, Starts
-from services.haptics.track import Home, Place, Track
-from services.haptics.trust import PadTrust, SmoothedMisfit
-from shared.geometry.rigid import Array
-from shared.geometry.surface import Surface
-from shared.skin.layout import Skin
-from shared.skin.response import Response
+from penumbra.services.haptics.paper_network import PoseNetwork, Relative, features
+from penumbra.services.haptics.settings import HapticSettings
+from penumbra.services.haptics.size_and_rest import PERSON_S, SIZE_GAP, SIZE_LASTING, Size, Tare
+from penumbra.services.haptics.solve import LEVER, Prior, Reading, Solution, Solver, peak
+from penumbra.services.haptics.starts import Limb, Starts
+from penumbra.services.haptics.track import Home, Place, Track
+from penumbra.services.haptics.trust import PadTrust, SmoothedMisfit
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin.layout import Skin
+from penumbra.shared.skin.response import Response
 
-FOREIGN = "what is felt is no limb: something else is near"
+FOREIGN = "the signals fit no limb: another object is near"
 """`HapticEstimate.why` of voltages that no limb explains."""
 
 
@@ -122,7 +122,7 @@ class Estimator:
         pads at T_world_pads (p, 4, 4); expected: T_world_target (4, 4) and covariance (6, 6) by all senses."""
         samples = np.asarray(samples)
         if not (samples > 0).any():
-            return self.nothing("no electrode can be believed")
+            return self.nothing("no electrode is free of faults")
         elapsed_s = self._predict(stamp_ns)
         is_expected = expected is not None and self._track.expect(*expected)
         reading = self._reading(amplitude, samples, T_world_pads, joints)

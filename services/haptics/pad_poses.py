@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.body.robot import RobotModel
-from shared.cell import description as cells
-from shared.geometry.rigid import Array
-from shared.perception.joint_history import JointHistory
-from shared.skin.layout import Skin, link_names
+from penumbra.shared.body.robot import RobotModel
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.joint_history import JointHistory
+from penumbra.shared.skin.layout import Skin, link_names
 
 STALE_NS = 100_000_000
 """Largest distance [ns] of a moment from the joint angles that are used for it. Chosen: at 1 rad/s a

@@ -15,9 +15,9 @@ import math
 
 import numpy as np
 
-from shared.geometry.rigid import Array
-from shared.native import inner, kernel
-from shared.skin.layout import Skin
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.native import inner, kernel
+from penumbra.shared.skin.layout import Skin
 
 LIMB_RADIUS = 0.045
 """r [m]: halfway between a wrist and an elbow."""

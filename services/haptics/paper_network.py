@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from services.haptics.paper_nearest import nearest_points
-from services.haptics.solve import peak
-from shared.cell import description as cells
-from shared.geometry.rigid import Array, perturb
-from shared.geometry.surface import Surface
-from shared.skin import response
-from shared.skin.layout import Skin
+from penumbra.services.haptics.paper_nearest import nearest_points
+from penumbra.services.haptics.solve import peak
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array, perturb
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin import response
+from penumbra.shared.skin.layout import Skin
 
 
 def features(
@@ -160,8 +160,8 @@ def load(path: Path, cell: cells.Cell, target: str) -> PoseNetwork:
         trained_for = str(data["fingerprint"])
         if trained_for != fingerprint(cell, target):
             raise ValueError(
-                f"{path}: weights for target {target} of this cell ({fingerprint(cell, target)}) expected, they belong to "
-                f"another description of it ({trained_for}): run `penumbra haptics train --cell {cell.name}`"
+                f"{path}: expected weights for target {target} of this cell ({fingerprint(cell, target)}), got weights for "
+                f"another description of it ({trained_for}); run `penumbra haptics train --cell {cell.name}`"
             )
         count = sum(name.startswith("weight") for name in data.files)
         weights = tuple(data[f"weight{i}"].astype(np.float32) for i in range(count))

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.haptics import paper_network
-from services.haptics.batches import Backlog, Collector, VoltageWindow
-from services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
-from services.haptics.pad_poses import PadPoses
-from shared.body.anatomy import target_mesh
-from shared.body.robot import robot_models
-from shared.cell.description import Cell
-from shared.contract.messages import FusedPose, HapticPose, Joints, Voltages
-from shared.contract.topics import FUSED, HAPTIC, JOINTS, VOLTAGES
-from shared.geometry.rigid import position_orientation
-from shared.geometry.surface import Surface
-from shared.perception.prediction import LONGEST_S, predict
-from shared.runtime.node import ServiceNode
-from shared.skin.layout import Near, Skin
-from shared.skin.response import Response
+from penumbra.services import flags
+from penumbra.services.haptics import paper_network
+from penumbra.services.haptics.batches import Backlog, Collector, VoltageWindow
+from penumbra.services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
+from penumbra.services.haptics.pad_poses import PadPoses
+from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.body.robot import robot_models
+from penumbra.shared.cell.description import Cell
+from penumbra.shared.contract.messages import FusedPose, HapticPose, Joints, Voltages
+from penumbra.shared.contract.topics import FUSED, HAPTIC, JOINTS, VOLTAGES
+from penumbra.shared.geometry.rigid import position_orientation
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.perception.prediction import LONGEST_S, predict
+from penumbra.shared.runtime.node import ServiceNode
+from penumbra.shared.skin.layout import Near, Skin
+from penumbra.shared.skin.response import Response
 
 NAME = "haptics"
 WEIGHTS = Path(__file__).parent / "weights"
@@ -35,14 +35,20 @@ LASTING_NS = 1_000_000_000
 """Time [ns] that a fault, or its end, must last before it is logged."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    method = "solve: least squares, started by the network; paper: the network alone (default: %(default)s)"
-    parser.add_argument("--method", choices=("solve", "paper"), default="solve", help=method)
-    parser.add_argument("--weights", type=Path, default=WEIGHTS, help="folder of CELL-TARGET.npz (default: the built-in ones)")
-    parser.add_argument("--window-ms", type=float, default=20.0, help="voltages averaged for one pose (default: %(default)s)")
+FLAGS = (
+    flags.Option(
+        "--method",
+        choices=("solve", "paper"),
+        default="solve",
+        help="solve: least squares, started by the network; paper: the network alone",
+    ),
+    flags.Option("--weights", type=Path, default=WEIGHTS, show_default="the built-in ones", help="folder of CELL-TARGET.npz"),
+    flags.Option("--window-ms", type=flags.above_zero, default=20.0, help="voltages averaged for one pose"),
+)
+EXAMPLE = "penumbra haptics --cell table --method paper"
 
 
-def start(node: ServiceNode, options: argparse.Namespace) -> None:
+def start(node: ServiceNode, options: flags.Options) -> None:
     """Subscribes; every window of voltages is solved for every target that this replica owns.
 
     Threads: the collector, the estimators and what they report belong to the reader of voltages; `poses` has a lock of its own,
@@ -54,7 +60,7 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
     collector = Collector(skin, length_ns=int(options.window_ms * 1e6))
     near = {name: found for name in cell.targets if len((found := Near.of(cell, name)).pads)}
     for name in cell.targets.keys() - near.keys():
-        node.log.info("never felt: no pad is where it may come", target=name)
+        node.log.info("never estimated: no pad is within its reach", target=name)
     estimators = {}
     for k, (name, found) in enumerate(near.items()):
         node.progress("preparing estimators", k, len(near))
@@ -100,7 +106,7 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
     node.subscribe(VOLTAGES, on_voltages, streams)
 
 
-def estimator(node: ServiceNode, options: argparse.Namespace, cell: Cell, target: str) -> Estimator:
+def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str) -> Estimator:
     """Ready to run on the pads of a cell: weights loaded where they fit it, code compiled."""
     path = options.weights / f"{cell.name}-{target}.npz"
     weights = None

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.haptics.solve import marginal
-from shared.geometry.rigid import Array
+from penumbra.services.haptics.solve import marginal
+from penumbra.shared.geometry.rigid import Array
 
 SIZE = np.array([0.0, -0.08])
 """Log length and log girth of an average limb, relative to the target's mesh."""

@@ -21,10 +21,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.geometry.rigid import Array, perturb, pose_error
-from shared.native import kernel
-from shared.skin.layout import Skin
-from shared.skin.response import Response
+from penumbra.shared.geometry import so3
+from penumbra.shared.geometry.rigid import Array, perturb, pose_error
+from penumbra.shared.native import inner, kernel
+from penumbra.shared.skin.layout import Skin
+from penumbra.shared.skin.response import ARRAYS, Response, derivatives, values
 
 NEAR_ERROR = 0.06
 """What the response gets wrong grows, where an electrode is nearly touched, by this share with the signal over NEAR_SIGNAL."""
@@ -34,7 +35,7 @@ COARSE_ERROR = 0.3
 """The same share in the first steps: so long each step moves all electrodes alike, near and far."""
 OUTLIER = 3.0
 """Residual, in standard deviations, from which an electrode loses weight as its square."""
-FARTHEST_STEP = np.array([0.06, 0.5, 0.25])
+FARTHEST_STEP = (0.06, 0.5, 0.25)
 """Longest step: position [m], rotation [rad], log size."""
 SAME_SLOPE = 0.3
 """After a step that changes no signal by a larger share the derivatives of the logs are still good for the next one."""
@@ -93,10 +94,6 @@ class Point:
     logs: Array
     rows: Array
 
-    def moved(self, step: Array) -> Point:
-        """The point a small step (8,) away, logs to first order."""
-        return Point(perturb(self.T, step[:6]), self.size + step[6:], self.logs + self.rows @ step, self.rows)
-
 
 @dataclass(frozen=True)
 class Solution:
@@ -123,32 +120,15 @@ class Solver:
 
     def solve(self, window: Reading, prior: Prior, T: Array, size: Array, coarse: int = 12, fine: int = 8) -> Solution:
         """The most probable pose and size near a start T (4, 4), size (2,), by at most so many steps on logs and on volts."""
-        here = self._point(window, T, size)
-        for steps, is_coarse in ((coarse, True), (fine, False)):
-            H, g, cost = self._posterior(window, prior, here, is_coarse)
-            for _ in range(steps):
-                step = np.asarray(np.linalg.solve(H, g), np.float64)
-                lengths = np.array([np.linalg.norm(step[:3]), np.linalg.norm(step[3:6]), np.abs(step[6:]).max()])
-                step *= min(1.0, float(np.min(FARTHEST_STEP / (lengths + 1e-12))))
-                gain = float(step @ g) - 0.5 * float(step @ H @ step)
-                if gain < CONVERGED:
-                    if not is_coarse:
-                        here = here.moved(step)
-                    break
-                for _ in range(4):
-                    near = not is_coarse and np.abs(here.rows @ step).max() < SAME_SLOPE
-                    there = self._point(window, perturb(here.T, step[:6]), here.size + step[6:], here.rows if near else None)
-                    H_there, g_there, cost_there = self._posterior(window, prior, there, is_coarse)
-                    if cost_there <= cost:
-                        break
-                    step *= 0.4
-                else:
-                    break
-                here, H, g, cost = there, H_there, g_there, cost_there
-        z = np.zeros(len(here.logs))
-        *_, cost = self._posterior(window, prior, here, False, z)
-        predicted = np.exp(here.logs)
-        return Solution(here.T, here.size, cost, _misfit(window, predicted, z), z, predicted, here)
+        n = len(self._scale)
+        at = Point(np.array(T, order="C"), np.array(size), np.empty(n), np.empty((n, 8)))
+        z = np.empty(n)
+        believed = np.ascontiguousarray(prior.T), np.ascontiguousarray(prior.information), prior.size, prior.size_information
+        pads = self.response.size, self._scale, self._pad_of, window.T_world_pads
+        found = at.T, at.size, at.logs, at.rows, z
+        cost = _descend(*self.response.arrays, *pads, *self._given(window), *believed, coarse, fine, *found)
+        predicted = np.exp(at.logs)
+        return Solution(at.T, at.size, cost, _misfit(window, predicted, z), z, predicted, at)
 
     def likelihood(self, window: Reading, solution: Solution, lasting: float = 1.0) -> tuple[Array, Array]:
         """Information (8, 8) and gradient (8,) of the voltages alone at a solution, by pose and size. lasting: the model's error
@@ -158,37 +138,8 @@ class Solver:
         _normal_equations(*self._given(window), at.logs, at.rows, False, lasting, H, g, z)
         return H, g
 
-    def _point(self, window: Reading, T: Array, size: Array, rows: Array | None = None) -> Point:
-        """What is predicted at a pose and size; derivatives that are not given cost six times as much as all else."""
-        T_world_pads = window.T_world_pads
-        R = T_world_pads[:, :3, :3]
-        T_pads_target = np.zeros((len(R), 4, 4))
-        T_pads_target[:, :3, :3] = R.transpose(0, 2, 1) @ T[:3, :3]
-        T_pads_target[:, :3, 3] = np.einsum("pij,pi->pj", R, T[:3, 3] - T_world_pads[:, :3, 3])
-        T_pads_target[:, 3, 3] = 1.0
-        if rows is not None:
-            return Point(T, size, np.log(self.response.change(T_pads_target, size)) + self._scale, rows)
-        logs, jacobian = self.response.logs(T_pads_target, size)
-        rows = np.empty_like(jacobian)
-        _to_world(T_world_pads, self._pad_of, jacobian, rows)
-        return Point(T, size, logs + self._scale, rows)
-
     def _given(self, window: Reading) -> tuple[Array, Array, Array, Array, Array]:
         return window.signal, window.variance, window.distrust, window.doubt, self.response.error
-
-    def _posterior(
-        self, window: Reading, prior: Prior, at: Point, coarse: bool, z: Array | None = None
-    ) -> tuple[Array, Array, float]:
-        H, g = np.zeros((8, 8)), np.zeros(8)
-        z = np.zeros(len(at.logs)) if z is None else z
-        cost = _normal_equations(*self._given(window), at.logs, at.rows, coarse, 1.0, H, g, z)
-        toward, toward_size = pose_error(prior.T, at.T), prior.size - at.size
-        pull, pull_size = prior.information @ toward, prior.size_information @ toward_size
-        H[:6, :6] += prior.information
-        H[6:, 6:] += prior.size_information
-        g[:6] += pull
-        g[6:] += pull_size
-        return H, g, cost + 0.5 * float(toward @ pull) + 0.5 * float(toward_size @ pull_size)
 
 
 def _misfit(window: Reading, predicted: Array, z: Array) -> float:
@@ -201,17 +152,162 @@ def _misfit(window: Reading, predicted: Array, z: Array) -> float:
     return float(np.minimum(z[felt] ** 2, OUTLIER**2).sum()) / max(int(felt.sum()) - KNOWN, 1)
 
 
-@kernel("f8[p, 4, 4], i8[n], f8[n, 8], out f8[n, 8]")
-def _to_world(T_world_pads, pad_of, jacobian, rows):  # type: ignore[no-untyped-def]
-    """Derivatives (n, 8) by a pose error along each pad's own axes, along the world's."""
-    for e in range(len(jacobian)):
-        k = pad_of[e]
+@kernel(
+    f"""{ARRAYS}, f8[2], f8[n], i8[n], f8[p, 4, 4], f8[n], f8[n], f8[n], f8[n], f8[n],
+    f8[4, 4], f8[6, 6], f8[2], f8[2, 2], i8, i8, out f8[4, 4], out f8[2], out f8[n], out f8[n, 8], out f8[n] -> f8"""
+)
+def _descend(  # type: ignore[no-untyped-def]
+    index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip, own_size, scale, pad_of, T_world_pads,
+    signal, variance, distrust, doubt, error, T_prior, information, size_prior, size_information, coarse, fine,
+    T, size, logs, rows, z,
+):  # fmt: skip
+    """The steps of `Solver.solve`, from the pose T and size that are given to those that are found, with the logs, derivatives
+    and residuals there; returns the cost."""
+    network = (index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip)
+    pads, given = (own_size, scale, pad_of, T_world_pads), (signal, variance, distrust, doubt, error)
+    prior = (T_prior, information, size_prior, size_information)
+    n = len(scale)
+    T_there, size_there, logs_there, rows_there = np.empty((4, 4)), np.empty(2), np.empty(n), np.empty((n, 8))
+    H, g, H_there, g_there, step = np.empty((8, 8)), np.empty(8), np.empty((8, 8)), np.empty(8), np.empty(8)
+    _predict(network, pads, T, size, True, logs, rows)
+    for stage in range(2):
+        is_coarse = stage == 0
+        cost = _posterior(given, prior, T, size, logs, rows, is_coarse, H, g, z)
+        for _ in range(coarse if is_coarse else fine):
+            _step(H, g, step)
+            gain = 0.0
+            for i in range(8):
+                gain += step[i] * g[i]
+                for j in range(8):
+                    gain -= 0.5 * step[i] * H[i, j] * step[j]
+            if gain < CONVERGED:
+                if not is_coarse:  # to first order
+                    for e in range(n):
+                        for i in range(8):
+                            logs[e] += rows[e, i] * step[i]
+                    _move(T, size, step, T_there, size_there)
+                    T[:], size[:] = T_there, size_there
+                break
+            improves = False
+            for _ in range(4):
+                largest = 0.0
+                for e in range(n):
+                    change = 0.0
+                    for i in range(8):
+                        change += rows[e, i] * step[i]
+                    largest = max(largest, abs(change))
+                has_rows = is_coarse or largest >= SAME_SLOPE
+                _move(T, size, step, T_there, size_there)
+                if not has_rows:
+                    rows_there[:] = rows
+                _predict(network, pads, T_there, size_there, has_rows, logs_there, rows_there)
+                cost_there = _posterior(given, prior, T_there, size_there, logs_there, rows_there, is_coarse, H_there, g_there, z)
+                improves = cost_there <= cost
+                if improves:
+                    break
+                for i in range(8):
+                    step[i] *= 0.4
+            if not improves:
+                break
+            T[:], size[:], logs[:], rows[:] = T_there, size_there, logs_there, rows_there
+            H[:], g[:], cost = H_there, g_there, cost_there
+    return _posterior(given, prior, T, size, logs, rows, False, H, g, z)
+
+
+@inner
+def _predict(network, pads, T, size, has_rows, logs, rows):  # type: ignore[no-untyped-def]
+    """The logs (n,) of the signals at a pose (4, 4) and size (2,), and with has_rows their derivatives (n, 8) along the world's
+    axes, which cost four times as much."""
+    index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip = network
+    own_size, scale, pad_of, T_world_pads = pads
+    T_pads_target = np.zeros((len(T_world_pads), 4, 4))
+    for k in range(len(T_world_pads)):
         for i in range(3):
-            rows[e, i], rows[e, 3 + i] = 0.0, 0.0
             for j in range(3):
-                rows[e, i] += T_world_pads[k, i, j] * jacobian[e, j]
-                rows[e, 3 + i] += T_world_pads[k, i, j] * jacobian[e, 3 + j]
-        rows[e, 6], rows[e, 7] = jacobian[e, 6], jacobian[e, 7]
+                T_pads_target[k, i, 3] += T_world_pads[k, j, i] * (T[j, 3] - T_world_pads[k, j, 3])
+                for m in range(3):
+                    T_pads_target[k, i, j] += T_world_pads[k, m, i] * T[m, j]
+    whole = own_size + size
+    if has_rows:
+        by_pads = np.empty_like(rows)
+        derivatives(index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip, T_pads_target, whole, logs, by_pads)
+        for e in range(len(logs)):
+            k = pad_of[e]
+            for i in range(3):
+                rows[e, i], rows[e, 3 + i] = 0.0, 0.0
+                for j in range(3):
+                    rows[e, i] += T_world_pads[k, i, j] * by_pads[e, j]
+                    rows[e, 3 + i] += T_world_pads[k, i, j] * by_pads[e, 3 + j]
+            rows[e, 6], rows[e, 7] = by_pads[e, 6], by_pads[e, 7]
+    else:
+        values(index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip, T_pads_target, whole, logs)
+    for e in range(len(logs)):
+        logs[e] += scale[e]
+
+
+@inner
+def _move(T, size, step, T_there, size_there):  # type: ignore[no-untyped-def]
+    """Writes the pose (4, 4) and size (2,) a step (8,) away, as `geometry.perturb` moves a pose."""
+    turn = np.empty((3, 3))
+    so3.exp(step[3:6], turn)
+    T_there[:] = T
+    so3.turn(turn, T_there, 0)
+    for i in range(3):
+        T_there[i, 3] = T[i, 3] + step[i]
+    size_there[0], size_there[1] = size[0] + step[6], size[1] + step[7]
+
+
+@inner
+def _step(H, g, step):  # type: ignore[no-untyped-def]
+    """Writes the step (8,) with H step = g, for a symmetric positive definite H (Cholesky without square roots), no longer than
+    FARTHEST_STEP."""
+    L, d = np.empty((8, 8)), np.empty(8)
+    for j in range(8):
+        d[j] = H[j, j]
+        for k in range(j):
+            d[j] -= L[j, k] * L[j, k] * d[k]
+        for i in range(j + 1, 8):
+            L[i, j] = H[i, j]
+            for k in range(j):
+                L[i, j] -= L[i, k] * L[j, k] * d[k]
+            L[i, j] /= d[j]
+    for i in range(8):
+        step[i] = g[i]
+        for k in range(i):
+            step[i] -= L[i, k] * step[k]
+    for i in range(8):
+        step[i] /= d[i]
+    for i in range(7, -1, -1):
+        for k in range(i + 1, 8):
+            step[i] -= L[k, i] * step[k]
+    position = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    rotation = math.sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
+    size = max(abs(step[6]), abs(step[7]))
+    share = max(1.0, position / FARTHEST_STEP[0], rotation / FARTHEST_STEP[1], size / FARTHEST_STEP[2])
+    for i in range(8):
+        step[i] /= share
+
+
+@inner
+def _posterior(given, prior, T, size, logs, rows, is_coarse, H, g, z):  # type: ignore[no-untyped-def]
+    """Writes the information (8, 8) and gradient (8,) of voltages and prior, and the residuals (n,); returns the cost."""
+    signal, variance, distrust, doubt, error = given
+    T_prior, information, size_prior, size_information = prior
+    H[:], g[:] = 0.0, 0.0
+    cost = _normal_equations(signal, variance, distrust, doubt, error, logs, rows, is_coarse, 1.0, H, g, z)
+    turn, toward = np.empty((3, 3)), np.empty(8)
+    so3.product_transposed(T_prior[:3, :3], T[:3, :3], turn)
+    so3.log(turn, toward[3:6])
+    for i in range(3):
+        toward[i] = T_prior[i, 3] - T[i, 3]
+    toward[6], toward[7] = size_prior[0] - size[0], size_prior[1] - size[1]
+    for first, part in ((0, information), (6, size_information)):
+        for i in range(len(part)):
+            for j in range(len(part)):
+                H[first + i, first + j] += part[i, j]
+                g[first + i] += part[i, j] * toward[first + j]
+                cost += 0.5 * toward[first + i] * part[i, j] * toward[first + j]
+    return cost
 
 
 @kernel("f8[n], f8[n], f8[n], f8[n], f8[n], f8[n], f8[n, 8], b1, f8, out f8[8, 8], out f8[8], out f8[n] -> f8")

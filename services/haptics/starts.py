@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from services.haptics.settings import HapticSettings
-from services.haptics.solve import Reading
-from shared.geometry.rigid import Array
-from shared.geometry.surface import Surface
-from shared.skin.layout import Skin
+from penumbra.services.haptics.settings import HapticSettings
+from penumbra.services.haptics.solve import Reading
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin.layout import Skin
 
 
 class Limb:

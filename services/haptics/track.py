@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from services.haptics.settings import HapticSettings
-from services.haptics.solve import marginal
-from shared.geometry.rigid import Array, perturb, pose_error
+from penumbra.services.haptics.settings import HapticSettings
+from penumbra.services.haptics.solve import marginal
+from penumbra.shared.geometry.rigid import Array, perturb, pose_error
 
 
 @dataclass(frozen=True)

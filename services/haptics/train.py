@@ -8,7 +8,6 @@ An interrupted run goes on with --resume, from a new pool of scenes.
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import itertools
 import json
@@ -22,19 +21,19 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from services.flags import Parser, positive
-from services.haptics.estimator import Estimator
-from services.haptics.paper_network import PoseNetwork, Regression, Relative, features, fingerprint
-from services.haptics.size_and_rest import SIZE, SIZE_SPREAD
-from shared import training
-from shared.body.anatomy import target_mesh
-from shared.body.robot import robot_models
-from shared.cell import description as cells
-from shared.geometry.rigid import Array, from_rpy, pose_error
-from shared.geometry.surface import Surface, nearest_points
-from shared.native import kernel
-from shared.skin.layout import Skin, link_names
-from shared.skin.response import Response
+from penumbra.services import flags
+from penumbra.services.haptics.estimator import Estimator
+from penumbra.services.haptics.paper_network import PoseNetwork, Regression, Relative, features, fingerprint
+from penumbra.services.haptics.size_and_rest import SIZE, SIZE_SPREAD
+from penumbra.shared import training
+from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.body.robot import robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array, from_rpy, pose_error
+from penumbra.shared.geometry.surface import Surface, nearest_points
+from penumbra.shared.native import kernel
+from penumbra.shared.skin.layout import Skin, link_names
+from penumbra.shared.skin.response import Response
 
 WEIGHTS = Path(__file__).parent / "weights"
 VALIDATION_SEED, REGRESSION_SEED = 1_000_000, 2_000_000
@@ -400,20 +399,18 @@ def export(trainer: Trainer, pool: Pool, out: Path, held_out: int) -> dict[str, 
     return card
 
 
-def arguments() -> argparse.ArgumentParser:
-    """The flags of `penumbra haptics train`."""
-    parser = Parser(prog="penumbra haptics train", description="Train the skin's pose network for a cell.")
-    training.add_arguments(parser, "haptics", 15.0)
-    parser.add_argument("--cell", default="table", help="built-in cell or YAML file (default: %(default)s)")
-    parser.add_argument("--target", help="the target's name (default: the first)")
-    parser.add_argument("--out", type=Path, help="weights file (default: the one that the service loads)")
-    parser.add_argument("--held-out", type=positive, default=4000, help="scenes for the card's score (default: %(default)s)")
-    return parser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Train, then write weights and card."""
-    options = arguments().parse_args(argv)
+@flags.command(
+    "haptics train",
+    "Trains the skin's pose network for a cell, and writes weights and card.",
+    *flags.training("haptics", 15.0),
+    flags.CELL,
+    flags.Option("--target", show_default="the cell's first", help="the target's name"),
+    flags.Option("--out", type=Path, show_default="the file that the service loads", help="weights file"),
+    flags.Option("--held-out", type=flags.positive, default=4000, help="scenes for the card's score"),
+    example="penumbra haptics train --cell mine.yaml --minutes 15",
+)
+def main(options: flags.Options) -> int:
+    """Trains, then writes weights and card."""
     cell = cells.load(options.cell)
     target = cell.one("targets", options.target)
     out = options.out or WEIGHTS / f"{cell.name}-{target}.npz"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.haptics.settings import HapticSettings
-from shared.geometry.rigid import Array
-from shared.skin.layout import Skin
+from penumbra.services.haptics.settings import HapticSettings
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin.layout import Skin
 
 
 class SmoothedMisfit:

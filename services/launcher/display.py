@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,17 +15,23 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from services.launcher.supervised import ProcessRow
-from shared.contract import report, topics
-from shared.contract.messages import BadMessage, FusedPose, Truth, decode
-from shared.contract.report import Report
-from shared.geometry import rigid
-from shared.runtime import bus
-from shared.runtime.node import Node
+from penumbra.services.launcher.supervised import ProcessRow
+from penumbra.shared.contract import report, topics
+from penumbra.shared.contract.messages import BadMessage, FusedPose, Truth, decode
+from penumbra.shared.contract.report import Report
+from penumbra.shared.geometry import rigid
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
 
 ANSWER_S = 2.0
 """How long an instance may take to say how it is."""
-STYLES = {"running": "green", "starting": "yellow", "degraded": "yellow"}
+STYLES = {"running": "green", "starting": "yellow", "degraded": "yellow", "tracking": "green", "coasting": "yellow"}
+PASSING = {"running", "degraded", "tracking", "coasting", "lost"}
+"""States between which a process or a pose may change for a moment."""
+LASTS_S = 1.5
+"""A change between passing states is shown when it has lasted so long."""
+WIDE = 70
+"""Columns from which every column of the tables is shown."""
 
 
 @dataclass
@@ -128,19 +134,99 @@ def accuracy(pose: FusedPose, truths: Iterable[Truth]) -> Accuracy:
     return Accuracy(pose, float(np.linalg.norm(T_true[:3, 3] - T[:3, 3])), rigid.axis_angle_error(T_true, T))
 
 
-def table(title: str, processes: list[ProcessRow], watch: Watch) -> Group:
-    """Everything at one look."""
-    left = Table("process", "state", "pid", "CPU %", "MB", "restarts", "", box=None)
-    for row in processes:
-        state = Text(row.state, STYLES.get(row.state, "red"))
-        numbers = (f"{100 * row.cpu:.0f}", f"{row.memory_mb:.0f}") if row.pid else ("", "")
-        left.add_row(row.name, state, str(row.pid or ""), *numbers, str(row.restarts), Text(row.note, overflow="ellipsis"))
-    right = Table("topic", "Hz", "expected", "delay ms", "dropped", "refused", box=None)
-    for line in watch.topic_rows():
-        expected = next(topic.rate_hz for topic in topics.TOPICS if topic.name == line.name)
-        delay = f"{1e3 * max(line.delays_s):.1f}" if line.delays_s else "-"
-        right.add_row(line.name, f"{line.rate_hz:.1f}", f"{expected:g}", delay, str(line.dropped), str(line.bad))
-    return Group(Text(title), left, Text(), right, Text(), Text(pose_line(watch.accuracy)))
+class Steady:
+    """States as they are shown: a change appears when it has lasted, so that what comes and goes does not flicker."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic):
+        self._clock = clock
+        self._shown: dict[str, str] = {}
+        self._since: dict[str, tuple[str, float]] = {}
+
+    def show(self, name: str, state: str) -> str:
+        """The state to show for a name. Words outside PASSING appear at once: such a process has ended or begun."""
+        now = self._clock()
+        shown = self._shown.setdefault(name, state)
+        if state == shown:
+            self._since.pop(name, None)
+            return shown
+        since = self._since.get(name)
+        if since is None or since[0] != state:
+            since = self._since[name] = (state, now)
+        if not {state, shown} <= PASSING or now - since[1] >= LASTS_S:
+            self._shown[name] = state
+            self._since.pop(name, None)
+        return self._shown[name]
+
+
+class Picture:
+    """What the screen shows: the pose first, then the processes, then the topics, cut to the size of the terminal."""
+
+    def __init__(self, hint: str, watch: Watch):
+        self._hint, self._watch = hint, watch
+        self._steady = Steady()
+
+    def draw(self, processes: list[ProcessRow], width: int, height: int) -> Group:
+        """At most `height` rows of `width` columns."""
+        head = [_line(f"{self._hint}   (in another terminal)", "dim"), *self._pose()]
+        is_wide = width >= WIDE
+        names = ("process", "state", "pid", "CPU %", "MB", "restarts", "") if is_wide else ("process", "state", "")
+        left = []
+        for row in processes:
+            state = self._steady.show(row.name, row.state)
+            numbers = (f"{100 * row.cpu:.0f}", f"{row.memory_mb:.0f}") if row.pid else ("", "")
+            middle = (str(row.pid or ""), *numbers, str(row.restarts)) if is_wide else ()
+            note = row.note if state != "running" or row.state in ("waiting", "failed") else ""
+            left.append([Text(row.name), Text(state, STYLES.get(state, "red")), *map(Text, middle), Text(note)])
+        columns = ("topic", "Hz", "expected", "delay ms", "dropped", "refused") if is_wide else ("topic", "Hz", "expected")
+        right = []
+        for line in self._watch.topic_rows():
+            expected = next(topic.rate_hz for topic in topics.TOPICS if topic.name == line.name)
+            delay = f"{1e3 * max(line.delays_s):.1f}" if line.delays_s else "-"
+            more = (delay, str(line.dropped), str(line.bad)) if is_wide else ()
+            right.append([*map(Text, (line.name, f"{line.rate_hz:.1f}", f"{expected:g}", *more))])
+        room = height - len(head) - len(left) - 3  # two headings, and the line on which the cursor stands
+        tables = [_table(names, left, width)]
+        if room > 0 and right:
+            tables.append(_table(columns, right[:room], width))
+        return Group(*head, *tables)
+
+    def _pose(self) -> list[Text]:
+        """Lines of less than 40 columns."""
+        found = self._watch.accuracy
+        if found is None:
+            return [_line("no pose yet", "yellow")]
+        pose = found.pose
+        state = self._steady.show("the pose", pose.state)
+        x, y, z = (round(100 * value, 1) + 0.0 for value in pose.position)  # no minus before a zero
+        roll, pitch, yaw = (round(math.degrees(value)) for value in rigid.rpy(pose.orientation))
+        senses = ", ".join(f"{name} {100 * source.weight:.0f} %" for name, source in sorted(pose.sources.items()))
+        lines = [
+            _line(f"{pose.target}: {state}", f"bold {STYLES.get(state, 'red')}"),
+            _line(f"x {x:.1f}  y {y:.1f}  z {z:.1f} cm"),
+            _line(f"roll {roll}  pitch {pitch}  yaw {yaw} deg"),
+            _line(f"from {senses or 'no sense'}"),
+        ]
+        if math.isfinite(found.position):
+            lines.append(_line(f"error {100 * found.position:.2f} cm, {math.degrees(found.axis):.1f} deg"))
+        return lines
+
+
+def _line(text: str, style: str = "") -> Text:
+    return Text(text, style, no_wrap=True, overflow="ellipsis")
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[Text]], width: int) -> Table:
+    """Names and numbers keep their width; the last column takes what is left of `width`, and is cut."""
+    table = Table(box=None, pad_edge=False)
+    left = width
+    for k, name in enumerate(columns):
+        needed = max([len(name), *(len(row[k]) for row in rows)])
+        needed = min(needed, left) if k == len(columns) - 1 else needed
+        left -= needed + 1
+        table.add_column(name, no_wrap=True, overflow="ellipsis", width=max(needed, 1))
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def pose_line(accuracy: Accuracy | None) -> str:
@@ -158,10 +244,10 @@ def pose_line(accuracy: Accuracy | None) -> str:
 
 
 def plain(processes: list[ProcessRow], watch: Watch) -> str:
-    """The same in a few words, for a log."""
+    """The same in one line, for a log."""
     states = ", ".join(f"{row.name} {row.state}" + (f" ({row.note})" if row.note else "") for row in processes)
     rates = ", ".join(f"{row.name} {row.rate_hz:.0f}" for row in watch.topic_rows() if row.rates)
-    return f"{time.strftime('%H:%M:%S')} {states}; Hz: {rates or 'nothing yet'}; {pose_line(watch.accuracy)}"
+    return f"{time.strftime('%H:%M:%S')} {pose_line(watch.accuracy)}; {states}; Hz: {rates or 'nothing yet'}"
 
 
 def summary(processes: list[ProcessRow], watch: Watch) -> str:

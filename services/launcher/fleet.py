@@ -10,12 +10,13 @@ import json
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
-from services.launcher.forkserver import ForkServer
-from services.launcher.supervised import Supervised, stop, wait
+from penumbra.services.launcher.forkserver import ForkServer
+from penumbra.services.launcher.supervised import Supervised, stop, wait
 
 READY_S = 120.0
 """How long a change waits for a process that it started: a first start compiles."""
@@ -46,8 +47,8 @@ class Kind:
             raise ValueError(f"{service}: expected 1, got {number}: all other processes meet there")
         most = MOST if self.beside else 1
         if not 0 <= number <= most:
-            why = "" if self.beside else ", because it stands for what there is but once"
-            raise ValueError(f"{service}={number}: 0 to {most} of {service} expected{why}")
+            why = "" if self.beside else ", because only one can run"
+            raise ValueError(f"{service}: expected 0 to {most}{why}, got {number}")
 
 
 @dataclass
@@ -66,10 +67,17 @@ class Change:
 
 class Fleet:
     """kinds: every service that may run; counts: how many of each, none where it is not named; forkserver: where a service that
-    died comes from, while there is one."""
+    died comes from, while there is one; write: takes a service and a
+    line of its standard error, by default the launcher\'s takes the line."""
 
-    def __init__(self, kinds: Mapping[str, Kind], counts: Mapping[str, int], forkserver: ForkServer | None = None):
-        self._kinds, self._forkserver = kinds, forkserver
+    def __init__(
+        self,
+        kinds: Mapping[str, Kind],
+        counts: Mapping[str, int],
+        forkserver: ForkServer | None = None,
+        write: Callable[[str, str], None] | None = None,
+    ):
+        self._kinds, self._forkserver, self._write = kinds, forkserver, write
         self._groups = {name: [self._make(name) for _ in range(counts.get(name, 0))] for name in kinds}
         self._lock = threading.Lock()
         self._changes: OrderedDict[str, Change] = OrderedDict()
@@ -129,17 +137,17 @@ class Fleet:
             asked = json.loads(payload)
             command, name = asked["command"], str(asked["id"])[:64]
         except (ValueError, TypeError, KeyError):
-            raise ValueError(f"JSON with command and id expected, {payload[:60]!r} came") from None
+            raise ValueError(f"expected JSON with command and id, got {payload[:60]!r}") from None
         with self._lock:
             if command == "state":
                 if name not in self._changes:
-                    raise ValueError(f"no change {name} was asked for here")
+                    raise ValueError(f"expected a change requested from this launcher, got {name}")
             elif command == "restart":
                 self._begin(name, self._restart(asked.get("services")))
             elif command == "scale":
                 self._begin(name, self._scale(asked.get("service"), asked.get("number")))
             else:
-                raise ValueError(f"restart, scale or state expected, {command!r:.60} came")
+                raise ValueError(f"expected restart, scale or state, got {command!r:.60}")
             return json.dumps(self._changes[name].report()).encode()
 
     def _under_way(self) -> Change | None:
@@ -161,14 +169,16 @@ class Fleet:
         strangers = [name for name in services if name not in running] if isinstance(services, list) else [services]
         if strangers:
             raise ValueError(
-                f"restart {strangers[0]!s:.60}: one of {', '.join(running) or 'no service'} expected: these run here"
+                f"restart: expected one of {', '.join(running) or 'no service'}, which run here, got {strangers[0]!s:.60}"
             )
         chosen = [name for name in running if name in services]
         return Change(f"restart of {', '.join(chosen) or 'nothing'}", self._one_after_another(chosen))
 
     def _scale(self, service: Any, number: Any) -> Change:
         if service not in self._kinds or not isinstance(number, int) or isinstance(number, bool):
-            raise ValueError(f"scale {service!s:.60}={number!s:.60}: NAME=NUMBER, NAME one of {', '.join(self._kinds)} expected")
+            raise ValueError(
+                f"scale: expected NAME=NUMBER with NAME one of {', '.join(self._kinds)}, got {service!s:.60}={number!s:.60}"
+            )
         self._kinds[service].check(service, number)
         return Change(f"scale {service} to {number}", self._to_number(service, number))
 
@@ -228,14 +238,15 @@ class Fleet:
         deadline = time.monotonic() + READY_S
         while not new.is_ready:
             if new.restarts or new.state in ("waiting", "failed"):
-                raise ChangeFailed(f"{new.name} does not start: {new.note}")
+                raise ChangeFailed(f"{new.name} did not start: {new.note}")
             if time.monotonic() > deadline:
                 raise ChangeFailed(f"{new.name} did not answer within {READY_S:.0f} s")
             yield f"waiting for {new.name} ({new.pid}) to serve"
 
     def _make(self, service: str) -> Supervised:
         kind = self._kinds[service]
-        return Supervised(service, kind.command, kind.restart, kind.environment, self._forkserver)
+        write = partial(self._write, service) if self._write else None
+        return Supervised(service, kind.command, kind.restart, kind.environment, self._forkserver, write)
 
     def _name(self) -> None:
         """One is called as its service, several are numbered."""

@@ -33,7 +33,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OMP_WAIT_POLICY": "passive",
@@ -41,7 +41,7 @@ ONE_THREAD = {
     "MKL_NUM_THREADS": "1",
 }
 """Every process is one worker: pools of threads that spin would take the cores from the others."""
-COMMON = ("shared.runtime.node", "services.flags", "services.run")
+COMMON = ("penumbra.shared.runtime.node", "penumbra.services.flags", "penumbra.services.run")
 """Imported before the first service is forked. What only some services need they import themselves, side by side."""
 ANSWER_S = 2.0
 """A fork takes some milliseconds, on a machine that is far too busy a second. A fork server that takes longer is ended, and the
@@ -60,9 +60,13 @@ def environment(own: Mapping[str, str] | None = None) -> dict[str, str]:
 
     They import this checkout or installation and nothing from the current folder, whatever it holds.
     """
+    return {**ONE_THREAD, **os.environ, **import_path(), "PENUMBRA_PARENT": str(os.getpid()), **(own or {})}
+
+
+def import_path() -> dict[str, str]:
+    """The environment with which Python imports this checkout or installation, and nothing from the current folder."""
     path = [str(ROOT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    ours = {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(path), "PENUMBRA_PARENT": str(os.getpid())}
-    return {**ONE_THREAD, **os.environ, **ours, **(own or {})}
+    return {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(path)}
 
 
 class Forked:
@@ -126,7 +130,7 @@ class ForkServer:
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._popen = subprocess.Popen(
-                [sys.executable, "-m", "services.launcher.forkserver", str(theirs.fileno()), *self._common],
+                [sys.executable, "-m", "penumbra.services.launcher.forkserver", str(theirs.fileno()), *self._common],
                 env=environment(),
                 stdin=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
@@ -206,7 +210,7 @@ def _import(modules: Sequence[str]) -> None:
     for module in modules:
         with contextlib.suppress(ImportError):  # its service says what is not installed
             importlib.import_module(module)
-    from shared import native
+    from penumbra.shared import native
 
     native.load()
     threads = os.listdir("/proc/self/task")
@@ -259,7 +263,7 @@ def _become(command: list[str], environment: dict[str, str], stderr: int, go: in
 
 
 if __name__ == "__main__":
-    from services.run import die_with_parent, entitle
+    from penumbra.services.run import die_with_parent, entitle
 
     die_with_parent()
     entitle("penumbra fork server")

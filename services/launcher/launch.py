@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import socket
@@ -14,17 +13,19 @@ from typing import Any, TextIO, cast
 from rich.console import Console
 from rich.live import Live
 
-from services import flags as arguments
-from services.launcher import display
-from services.launcher.fleet import Fleet, Kind
-from services.launcher.forkserver import ForkServer
-from services.launcher.supervised import ProcessRow
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.processes import LAUNCHER, PROCESSES, ROUTER, VISION, Process
-from shared.runtime import bus, logs
-from shared.runtime.hang import HANG_S
-from shared.runtime.node import Node
+from penumbra.services import flags
+from penumbra.services.command import check
+from penumbra.services.launcher import background, display, runs
+from penumbra.services.launcher.fleet import Fleet, Kind
+from penumbra.services.launcher.forkserver import ForkServer
+from penumbra.services.launcher.supervised import ProcessRow, Supervised
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.processes import LAUNCHER, PROCESSES, ROUTER, Process
+from penumbra.shared.runtime import bus, logs
+from penumbra.shared.runtime.connection import connect_by_environment
+from penumbra.shared.runtime.hang import HANG_S
+from penumbra.shared.runtime.node import Node
 
 PORT = 7447
 POLL_S = 0.05
@@ -40,10 +41,24 @@ SENSES = (topics.VISION, topics.HAPTIC)
 
 
 class Launcher:
-    """Runs the processes of a cell until it is told to stop, and changes them when it is asked to."""
+    """Runs the processes of a cell until it is told to stop, and changes them when it is asked to.
 
-    def __init__(self, node: Node, fleet: Fleet, console: Console):
+    keep_going: also when a process does not start. notify: takes a line of what the start waits for, in place of a screen.
+    hint: the command that the screen names.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        fleet: Fleet,
+        console: Console,
+        keep_going: bool = False,
+        notify: Callable[[str], None] | None = None,
+        hint: str = "penumbra pose",
+    ):
         self.node, self.fleet, self.console = node, fleet, console
+        self._keep_going, self._notify, self._hint = keep_going, notify, hint
+        self._first: list[Supervised] = []
         self.watch = display.Watch(node)
         node.tell("processes", self._processes)
         node.worry(self._worries)
@@ -56,29 +71,57 @@ class Launcher:
         Returns the exit code: 1 where a process had failed by then, or where no pose was tracked within `seconds` although a
         sense and the fusion ran here.
         """
-        title = f"Penumbra, cell {self.node.cell.name}: penumbra pose --cell {self.node.cell.name} in another terminal"
         deadline = time.monotonic() + seconds
         self.node.every(1.0, self._refresh, display.ANSWER_S + HANG_S)
         try:
             self.fleet.start()
-            if self.console.is_terminal:
+            self._first = self.fleet.processes
+            if self._notify is not None:
+                self._loop(deadline, REDRAW_S, self._tell_of_start)
+            elif self.console.is_terminal and not self.console.is_dumb_terminal:
+                picture = display.Picture(self._hint, self.watch)
                 with Live(console=self.console, auto_refresh=False) as screen:
                     self._loop(
-                        deadline, REDRAW_S, lambda: screen.update(display.table(title, self._rows(), self.watch), refresh=True)
+                        deadline, REDRAW_S, lambda: screen.update(picture.draw(self._rows(), *self.console.size), refresh=True)
                     )
             else:
-                self._loop(
-                    deadline, PLAIN_S, lambda: self.console.print(display.plain(self._rows(), self.watch), highlight=False)
-                )
+                self._loop(deadline, PLAIN_S, lambda: self._print(display.plain(self._rows(), self.watch)))
         finally:
-            rows, is_over = self._rows(), not self.node.stopping.is_set()
+            failed, rows = self._failed(), self._rows()
+            is_over = not failed and not self.node.stopping.is_set()
             self.node.stopping.set()  # it does not miss the router that it ends
             self.fleet.stop()
         lacks_pose = is_over and self._should_track() and not self.watch.has_tracked
-        self.console.print(display.summary(rows, self.watch), highlight=False)
+        self._print(display.summary(rows, self.watch))
+        if failed:
+            self._print(f"{', '.join(failed)} did not start, and the others were ended: penumbra up --keep-going lets them run")
         if lacks_pose:
-            self.console.print(f"no pose was tracked within {seconds:g} s", highlight=False)
+            self._print(f"no pose was tracked within {seconds:g} s")
         return int(lacks_pose or any(row.state in ("waiting", "failed") for row in rows))
+
+    def _print(self, text: str) -> None:
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def _failed(self) -> list[str]:
+        """The processes of the start without which the cell is not to run: they cannot begin, or have died each time."""
+        if self._keep_going:
+            return []
+        return [each.name for each in self._first if each.state == "failed" or (each.is_looping and not each.has_served)]
+
+    def _tell_of_start(self) -> None:
+        """Tells who waits for the start what it is at, until it is done."""
+        assert self._notify is not None, "only a launcher in the background reports its start"
+        rows = self._rows()
+        waiting = [f"{row.name} ({row.note.partition(';')[0] or row.state})" for row in rows if row.state != "running"]
+        cell = f"cell {self.node.cell.name}"
+        if self.watch.has_tracked:
+            self._notify(f"{background.UP}{cell} is tracking")
+        elif not self._should_track() and all(process.state == "running" for process in self.fleet.processes):
+            self._notify(f"{background.UP}{cell} runs")
+        else:
+            self._notify(f"waiting for {', '.join(waiting) or 'the first pose that is tracked'}")
+            return
+        self._notify = lambda text: None
 
     def _should_track(self) -> bool:
         """Whether a sense and what fuses it run here."""
@@ -90,6 +133,8 @@ class Launcher:
         while not self.node.stopping.is_set() and time.monotonic() < deadline:
             self.fleet.wait(POLL_S)
             self.fleet.watch()
+            if self._failed():
+                return
             if time.monotonic() >= due:
                 show()
                 due = time.monotonic() + period_s
@@ -107,12 +152,13 @@ class Launcher:
     def _tell_of_loops(self) -> None:
         looping = {process.name: process.note for process in self.fleet.processes if process.is_looping}
         for name in looping.keys() - self._looping:
-            self.node.log.error("a process dies again and again; the others go on", process=name, why=looping[name])
+            self.node.log.error("a process exits repeatedly; the others continue", process=name, why=looping[name])
         self._looping = set(looping)
 
     def _processes(self) -> dict[str, dict[str, Any]]:
         return {
             process.name: {
+                "pid": process.pid,
                 "state": process.state,
                 "is_running": process.state == "running",
                 "restarts": process.restarts,
@@ -132,7 +178,12 @@ class Launcher:
         return [launcher, *(process.row(local.get(process.pid or 0)) for process in self.fleet.processes)]
 
 
-def fleet(cell: cells.Cell, options: argparse.Namespace, forkserver: ForkServer | None = None) -> Fleet:
+def fleet(
+    cell: cells.Cell,
+    options: flags.Options,
+    forkserver: ForkServer | None = None,
+    write: Callable[[str, str], None] | None = None,
+) -> Fleet:
     """The processes that this cell needs, ready to start: the router among them, unless there is one already (--connect). Raises
     CellError for an unknown name or an impossible number."""
     own = {"PENUMBRA_METRICS_PORT": ""}  # the launcher's port covers all
@@ -143,23 +194,22 @@ def fleet(cell: cells.Cell, options: argparse.Namespace, forkserver: ForkServer 
         kinds[process.name] = Kind(_command(process, options), process.restart, own, process.beside, process.is_required)
         if process.is_needed(cell) and process.vision in (None, options.vision):
             counts[process.name] = process.replicas
-    for text in options.replicas:
-        name, _, number = text.partition("=")
-        if name not in kinds or not number.isdecimal():
-            raise cells.CellError(f"--replicas {text}: NAME=NUMBER with NAME one of {', '.join(kinds)} expected")
+    for name, number in options.replicas:
+        if name not in kinds:
+            raise cells.CellError(f"--replicas {name}={number}: expected one of {', '.join(kinds)}, got {name!r}")
         try:
-            kinds[name].check(name, int(number))
+            kinds[name].check(name, number)
         except ValueError as error:
             raise cells.CellError(f"--replicas {error}") from None
-        counts[name] = int(number)
+        counts[name] = number
     if forkserver is not None:
         forkserver.modules = [process.module for process in PROCESSES if counts.get(process.name)]
-    return Fleet(kinds, counts, forkserver)
+    return Fleet(kinds, counts, forkserver, write)
 
 
-def _command(process: Process, options: argparse.Namespace) -> list[str]:
+def _command(process: Process, options: flags.Options) -> list[str]:
     where = [("--listen", listening(options))] if process is ROUTER else [("--connect", at) for at in meeting_points(options)]
-    command = [sys.executable, "-m", "services.command.cli", process.name, "--cell", str(options.cell), *sum(where, ())]
+    command = [sys.executable, "-m", "penumbra", process.name, "--cell", str(options.cell), *sum(where, ())]
     command += ["--secure", str(options.secure)] if options.secure else []
     command += ["--log-level", options.log_level, "--log-format", options.log_format]
     for flag in process.flags:
@@ -168,15 +218,37 @@ def _command(process: Process, options: argparse.Namespace) -> list[str]:
     return command
 
 
-def listening(options: argparse.Namespace) -> str:
+def listening(options: flags.Options) -> str:
     """Where the launcher's router listens: on loopback, or, secured, on every network of this machine."""
     return f"tls/0.0.0.0:{options.port}" if options.secure else f"tcp/127.0.0.1:{options.port}"
 
 
-def meeting_points(options: argparse.Namespace) -> tuple[str, ...]:
+def meeting_points(options: flags.Options) -> tuple[str, ...]:
     """The endpoints at which all meet."""
     own = f"{'tls' if options.secure else 'tcp'}/127.0.0.1:{options.port}"
     return tuple(options.connect) or (own,)
+
+
+def pose_command(options: flags.Options) -> str:
+    """The command that prints the pose of this cell, in another terminal."""
+    words = ["penumbra pose"]
+    words += ["--cell", str(options.cell)] if options.cell != "table" else []
+    own = options.port == PORT and not options.connect
+    words += [] if own else [word for at in meeting_points(options) for word in ("--connect", at)]
+    words += ["--secure", str(options.secure)] if options.secure else []
+    return " ".join(words)
+
+
+def _notifier(descriptor: int | None) -> Callable[[str], None] | None:
+    """Writes lines to a pipe, as long as somebody reads them."""
+    if descriptor is None:
+        return None
+
+    def notify(line: str) -> None:
+        with contextlib.suppress(OSError):
+            os.write(descriptor, f"{line}\n".encode())
+
+    return notify
 
 
 def check_port(node: Node, port: int) -> None:
@@ -195,7 +267,7 @@ def wait_for_router(node: Node, fleet: Fleet, port: int) -> None:
     while not node.stopping.wait(LISTEN_S):
         fleet.watch()
         if router.state == "failed":
-            raise bus.BusError(f"the router does not start: {router.note}")
+            raise bus.BusError(f"the router did not start: {router.note}")
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 0.1):
             return
 
@@ -213,49 +285,16 @@ def check_alone(node: Node, fleet: Fleet) -> None:
         )
 
 
-def parser() -> arguments.Parser:
-    """The flags of `penumbra up`: its own, and those that the table of processes lets it pass on."""
-    out = arguments.Parser(
-        prog="penumbra up",
-        description="Starts every process of a cell around a router, and shows what they do. Exit code 0: well; 1: a process had "
-        "failed at the end, or no pose was tracked within --seconds; 2: it could not start.",
-    )
-    arguments.add_cell(out)
-    out.add_argument("--port", type=arguments.port, help=f"TCP port of the router (default: {PORT})")
-    where = "use a router that runs elsewhere, and start none; may be repeated (default: without --port, $PENUMBRA_CONNECT)"
-    out.add_argument("--connect", action="append", default=[], metavar="ENDPOINT", help=where)
-    out.add_argument("--seconds", type=arguments.seconds, default=float("inf"), help="stop after this time (default: at Ctrl-C)")
-    out.add_argument(
-        "--vision", choices=VISION, default=VISION[0], help="segmentation and search, or PoseCNN (default: %(default)s)"
-    )
-    for process in PROCESSES:
-        for flag in process.flags:
-            about = f"{flag.about} (see penumbra {process.name} --help)"
-            out.add_argument(f"--{flag.name}", type=flag.type, choices=flag.choices or None, help=about)
-    out.add_argument(
-        "--replicas",
-        action="append",
-        default=[],
-        metavar="NAME=N",
-        help="run N of a process; 0 leaves it out; `penumbra scale` changes it later",
-    )
-    bus.add_secure(out)
-    arguments.add_log(out)
-    arguments.add_metrics(out)
-    return out
-
-
-def main(argv: list[str], forkserver: ForkServer) -> int:
-    """`penumbra up`, with processes from a fork server that has been started."""
-    flags = parser()
-    options = flags.parse_args(argv)
+def run(options: flags.Options, forkserver: ForkServer) -> int:
+    """`penumbra up`, with processes from a fork server that has been started; returns the exit code."""
     if not options.connect and options.port is None:
-        options.connect = os.environ.get("PENUMBRA_CONNECT", "").split()
+        options.connect = connect_by_environment()
     options.port = options.port or PORT
     sys.stdout, sys.stderr = cast(TextIO, logs.Lossy(sys.stdout)), cast(TextIO, logs.Lossy(sys.stderr))
     logs.configure(options.log_level, options.log_format, LAUNCHER.name)
-    cell = cells.load(options.cell)
-    processes = fleet(cell, options, forkserver)
+    cell = check.refuse(options.cell)
+    logs_of = runs.logs_of(cell.name) if options.notify else None
+    processes = fleet(cell, options, forkserver, runs.Logs(logs_of).write if logs_of else None)
     node = Node(LAUNCHER.name, cell, bus.Connection(connect=meeting_points(options), secure=options.secure))
     with node.until_signal():
         try:
@@ -267,8 +306,11 @@ def main(argv: list[str], forkserver: ForkServer) -> int:
                 processes.start()
                 wait_for_router(node, processes, options.port)
                 node.open()
-            launcher = Launcher(node, processes, Console(width=None if sys.stdout.isatty() else 400))
-            with arguments.metrics(flags, options.metrics_port, lambda: launcher.watch.health.values()):
+            launcher = Launcher(node, processes, Console(), options.keep_going, _notifier(options.notify), pose_command(options))
+            with (
+                flags.metrics(options.metrics_port, lambda: launcher.watch.health.values()),
+                runs.recorded(cell.name, meeting_points(options), options.secure, logs_of),
+            ):
                 return launcher.run(options.seconds)
         except bus.BusError:
             if not node.stopping.is_set():  # else: told to stop before the router came

@@ -11,14 +11,14 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import psutil
 
-from services.launcher.forkserver import Forked, ForkServer, environment
-from shared.contract.report import Report
-from shared.runtime import logs
+from penumbra.services.launcher.forkserver import Forked, ForkServer, environment
+from penumbra.shared.contract.report import Report
+from penumbra.shared.runtime import logs
 
 BACKOFF_S = (0.2, 10.0)
 """Between the deaths of a process that does not become healthy: the first, doubled each time, and the longest."""
@@ -49,7 +49,8 @@ class Supervised:
     """One process that is started, watched and started again.
 
     state: starting, running, waiting (for its next start), failed (it will not be started again), stopping or stopped. is_ready:
-    it does its part for the others. forkserver: where it comes from, if that is possible.
+    it does its part for the others. has_served: it was ready at some time. forkserver: where it comes from, if that is possible.
+    write: takes the lines of its standard error; by default they go to the launcher's.
     """
 
     def __init__(
@@ -59,14 +60,16 @@ class Supervised:
         restart: str = "always",
         environment: dict[str, str] | None = None,
         forkserver: ForkServer | None = None,
+        write: Callable[[str], None] | None = None,
     ):
         self.service = self.name = name  # several of a service are numbered in their names
         self.command, self.restart = command, restart
         self.state, self.note, self.restarts = "stopped", "", 0
-        self.is_ready = False
+        self.is_ready = self.has_served = False
         self.popen: subprocess.Popen[str] | Forked | None = None
         self.cpu, self.memory_mb = 0.0, 0.0
         self._environment, self._forkserver = environment or {}, forkserver
+        self._write = write or _to_stderr
         self._orphans: set[int] = set()  # groups of processes that have ended, of which the launcher may have adopted children
         self.pidfd: int | None = None  # readable when it has ended
         self._delay_s = BACKOFF_S[0]
@@ -125,7 +128,7 @@ class Supervised:
         assert popen.stderr is not None
         for line in popen.stderr:
             self._last_words.append(line.rstrip())
-            sys.stderr.write(line)  # rich moves it above the live table
+            self._write(line)
         popen.stderr.close()
 
     def watch(self) -> None:
@@ -207,6 +210,7 @@ class Supervised:
         if not hangs or not self._heard:
             self._heard = time.monotonic()
         self.is_ready, self._hangs = is_ready, hangs
+        self.has_served |= is_ready
         if self.state == "starting":
             self.state = "running"
 
@@ -229,6 +233,10 @@ class Supervised:
         if state == "running" and health is not None and health.status != "ok":
             state, note = health.status, "; ".join([*([note] if note else []), *health.reasons])
         return ProcessRow(self.name, state, self.pid, self.cpu, self.memory_mb, self.restarts, note)
+
+
+def _to_stderr(line: str) -> None:
+    sys.stderr.write(line)  # rich moves it above the live table
 
 
 def wait(processes: Iterable[Supervised], seconds: float) -> None:

@@ -9,18 +9,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from services.posecnn import network, patch, voting
-from services.posecnn.network import REFERENCE_PX, STRIDE, Network
-from services.posecnn.uncertainty import Signs, Uncertainty
-from shared.body import anatomy
-from shared.body.anatomy import Mesh
-from shared.cell.description import Camera, Cell
-from shared.contract.labels import Label
-from shared.geometry import raster, rigid
-from shared.geometry.rigid import Array
-from shared.native import processor
-from shared.perception.lookout import Window
-from shared.perception.vision import State, VisionEstimate
+from penumbra.services.posecnn import network, patch, voting
+from penumbra.services.posecnn.network import REFERENCE_PX, STRIDE, Network
+from penumbra.services.posecnn.uncertainty import Signs, Uncertainty
+from penumbra.shared.body import anatomy
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell.description import Camera, Cell
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import raster, rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.native import processor
+from penumbra.shared.perception.lookout import Window
+from penumbra.shared.perception.vision import State, VisionEstimate
 
 WEIGHTS = Path(__file__).parent / "weights" / "posecnn.npz"
 SMALLEST = 24
@@ -101,8 +101,8 @@ class PoseCNN:
         Raises ValueError for an image that is not of the camera's size.
         """
         if image.shape[:2] != (self._camera.height, self._camera.width):
-            expected, came = f"{self._camera.width} x {self._camera.height}", f"{image.shape[1]} x {image.shape[0]}"
-            raise ValueError(f"image: {expected} expected (the cell file), {came} came")
+            expected, got = f"{self._camera.width} x {self._camera.height}", f"{image.shape[1]} x {image.shape[0]}"
+            raise ValueError(f"image: expected {expected} (the cell file), got {got}")
         middle = np.array([window.x0 + window.right - 1, window.y0 + window.bottom - 1]) / 2.0
         side = float(max(window.right - window.x0, window.bottom - window.y0))
         looks = [(middle, side)]

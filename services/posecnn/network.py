@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from shared.contract.labels import Label
+from penumbra.shared.contract.labels import Label
 
 STRIDE = 2
 """Patch pixels a side of one position of the dense outputs."""
@@ -164,5 +164,5 @@ def load(path: Path) -> tuple[Network, dict[str, Any]]:
     try:
         net.load_state_dict(weights)
     except RuntimeError as error:
-        raise ValueError(f"{path}: weights of {network} expected as its card says: {error}") from None
+        raise ValueError(f"{path}: expected weights of {network}, as its card says: {error}") from None
     return net.eval(), card

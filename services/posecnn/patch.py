@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry.rigid import Array
+from penumbra.shared.geometry.rigid import Array
 
 SIDE = 128
 """Pixels a side."""

@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import torch
 
-from services.posecnn.estimator import WEIGHTS, PoseCNN, load
-from shared.contract.messages import Frame
-from shared.contract.topics import FRAME, FUSED, VISION
-from shared.perception.lookout import Lookout
-from shared.perception.prediction import predict
-from shared.runtime.node import ServiceNode
+from penumbra.services import flags
+from penumbra.services.posecnn.estimator import WEIGHTS, PoseCNN, load
+from penumbra.shared.contract.messages import Frame
+from penumbra.shared.contract.topics import FRAME, FUSED, VISION
+from penumbra.shared.geometry.lens import Undistortion
+from penumbra.shared.perception.lookout import Lookout
+from penumbra.shared.perception.prediction import predict
+from penumbra.shared.runtime.node import ServiceNode
 
 NAME = "posecnn"
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """The flags of this service."""
-    parser.add_argument("--camera", help="the camera whose frames are looked at (default: all of the cell)")
-    parser.add_argument("--target", help="estimate only this target (default: all)")
-    parser.add_argument("--weights", type=Path, default=WEIGHTS, help="the network, made by `penumbra posecnn train`")
+FLAGS = (
+    flags.Option("--camera", show_default="all of the cell", help="the camera whose frames are used"),
+    flags.Option("--target", show_default="all of the cell", help="estimate only this target"),
+    flags.Option(
+        "--weights",
+        type=Path,
+        default=WEIGHTS,
+        show_default="the built-in ones",
+        help="the network, made by `penumbra posecnn train`",
+    ),
+)
+EXAMPLE = "penumbra posecnn --cell table --camera front"
 
 
-def start(node: ServiceNode, options: argparse.Namespace) -> None:
+def start(node: ServiceNode, options: flags.Options) -> None:
     """Subscribes; every frame is searched for every target that its camera can see and this replica owns.
 
     Threads: the lookout and the estimators of a camera belong to the reader of its frames.
@@ -45,6 +53,7 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
         node.progress("preparing estimators", k, len(estimators))
         estimator.prepare()
     node.progress("preparing estimators", len(estimators), len(estimators))
+    undistort = {camera: Undistortion(cell.cameras[camera].lens) for camera in cameras}
     fused = node.latest(FUSED)
 
     def on_frame(frame: Frame, names: dict[str, str]) -> None:
@@ -53,11 +62,12 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
             if (pose := fused.get(target=target)) is not None:
                 lookouts[camera].hear(pose)
         window = lookouts[camera].look(frame.stamp_ns)
+        image = undistort[camera](frame.image)
         for (own, target), estimator in estimators.items():
             if own != camera or not node.owns(f"{camera}/{target}"):
                 continue
             T_prior, _ = predict(fused.get(target=target), frame.stamp_ns)
-            estimate = estimator.update(frame.image, window, T_prior)
+            estimate = estimator.update(image, window, T_prior)
             node.publish(VISION, estimate.message(frame.stamp_ns, target, camera, cell.frame), target=target)
 
     for camera in cameras:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.posecnn.patch import facing
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.services.posecnn.patch import facing
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 KINDS = ("depth", "lateral", "turn", "tilt", "roll")
 """Depth by the distance, lateral by the target's length, the others in radians."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry.rigid import Array
-from shared.native import kernel
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.native import kernel
 
 AGREES_RAD = 0.2
 """A ray that misses the centre by less than this angle agrees with it."""
@@ -41,7 +41,7 @@ def vote(pixels: Array, directions: Array, side: int, cell_px: float = 2.0) -> V
     Raises ValueError where there are no pixels.
     """
     if not len(pixels):
-        raise ValueError("vote: at least one pixel expected, none came")
+        raise ValueError("vote: expected at least one pixel, got none")
     margin = MARGIN * side
     cells = math.ceil((side + 2.0 * margin) / cell_px)
     counts = np.zeros((cells, cells), np.int32)

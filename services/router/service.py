@@ -2,52 +2,53 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 
 import psutil
 
-from shared.contract import topics
-from shared.runtime import bus
-from shared.runtime.node import Node
-from shared.runtime.slow_links import SlowLinks
+from penumbra.services import flags
+from penumbra.shared.contract import topics
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.shared.runtime.slow_links import SlowLinks
 
 NAME = "router"
 MODE = "router"
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """The service's own flags."""
-    group = parser.add_argument_group(
-        "several hosts",
-        "A router a host, linked: `--listen tcp/0.0.0.0:7447` on one, `--connect tcp/THAT-HOST:7447` on the others. Processes "
-        "connect to the router of their own host.",
-    )
-    group.add_argument(
+LINKS = "Several hosts"
+FLAGS = (
+    flags.Option(
         "--slow",
-        action="append",
-        default=[],
+        multiple=True,
         metavar="INTERFACE",
-        help="what leaves by this network interface (such as wlan0) takes a slow link: poses cross it, thinned out, and nothing "
-        "waits long; frames, masks and voltages stay here. May be repeated; the other end needs it too",
-    )
-    group.add_argument(
+        section=LINKS,
+        help="traffic through this network interface (such as wlan0) uses a slow link: poses cross it at a reduced rate, in "
+        "short queues; frames, masks and voltages do not. May be repeated; the other end needs it too",
+    ),
+    flags.Option(
         "--slow-hz",
-        action="append",
-        default=[],
+        multiple=True,
         metavar="TOPIC=HZ",
-        help="how often a slow link carries each stream of a topic, 0 for never (default: as `penumbra topics` says)",
-    )
+        section=LINKS,
+        show_default="as in `penumbra topics`",
+        help="rate per stream of a topic on a slow link, 0 for never",
+    ),
+)
+EXAMPLE = """\
+penumbra router                                     # of one host
+penumbra router --listen tcp/0.0.0.0:7447           # one of several hosts, and on each of the others:
+penumbra router --connect tcp/THAT-HOST:7447        # processes connect to the router of their host"""
 
 
-def start(node: Node, options: argparse.Namespace) -> None:
+def start(node: Node, options: flags.Options) -> None:
     """Nothing but the links: the session itself is the router. Raises BusError for an interface or a rate that cannot be."""
     rates_hz = {topic.name: topic.slow_hz for topic in topics.TOPICS} | dict(_rate(text) for text in options.slow_hz)
     known = psutil.net_if_addrs()
     if unknown := [name for name in options.slow if name not in known]:
-        raise bus.BusError(f"--slow {unknown[0]}: a network interface of this host expected: {', '.join(known)}")
+        raise bus.BusError(f"--slow: expected a network interface of this host ({', '.join(known)}), got {unknown[0]}")
     if options.slow_hz and not options.slow:
-        raise bus.BusError(f"--slow-hz {options.slow_hz[0]}: say with --slow INTERFACE which link is slow")
+        raise bus.BusError(f"--slow-hz: expected --slow INTERFACE beside it, got {options.slow_hz[0]} alone")
     if options.slow:
         keys = {key: rates_hz[topic.name] for topic in topics.TOPICS for key in node.keys(topic, {})}
         node.thin_out(SlowLinks(tuple(options.slow), keys))
@@ -61,5 +62,5 @@ def _rate(text: str) -> tuple[str, float]:
     except ValueError:
         rate_hz = math.nan
     if name not in names or not 0.0 <= rate_hz < math.inf:
-        raise bus.BusError(f"--slow-hz {text}: TOPIC=HZ expected, as in fused=20, with TOPIC one of {', '.join(names)}")
+        raise bus.BusError(f"--slow-hz: expected TOPIC=HZ, as in fused=20, with TOPIC one of {', '.join(names)}, got {text}")
     return name, rate_hz

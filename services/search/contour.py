@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.evidence import Intrinsics
-from shared.body.anatomy import Mesh
-from shared.geometry import raster, rigid
-from shared.native import inner, kernel
+from penumbra.services.search.evidence import COVERED, LEAST_KNOWN, TAPS, Evidence, Intrinsics, count_compared
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.geometry import raster, rigid
+from penumbra.shared.geometry.raster import draw_silhouette
+from penumbra.shared.native import inner, kernel
 
 Array = NDArray[np.float64]
 
-SPACING_PX = 3.0
-"""Distance of the sampled contour points: closer ones bring no new information."""
 NEAR = 0.05
 """Edges nearer to the camera than this are left out [m]."""
 BESIDE = 1.5
@@ -37,6 +37,18 @@ CREASE = 0.8
 """Facets that meet at a larger angle [rad] are a crease of the body, and not a sample of a round surface."""
 
 
+@dataclass(frozen=True)
+class Matched:
+    """A contour beside a mask: `points` (n, 8) of it (`_trace`), their offsets r (n,) [px] along the outward normal to the mask's
+    boundary and their `kind` (n,) (`_match`); `both`, `free`: see `evidence.compare`."""
+
+    points: Array
+    r: Array
+    kind: NDArray[np.uint8]
+    both: int
+    free: int
+
+
 class Model:
     """A triangle mesh prepared for contours. `edges` (n, 4): two vertices and two faces (-1: none) each."""
 
@@ -45,6 +57,8 @@ class Model:
         self.faces = np.ascontiguousarray(mesh.faces, np.int32)
         self.edges = _edges(self.faces)
         self.closed = bool((self.edges[:, 3] >= 0).all())
+        # what a pass writes into: as large for every pose, so that its kernel's arguments are checked once
+        self._memory = np.empty((MOST, 8)), np.empty(MOST), np.empty(MOST, np.uint8), np.empty(2, np.int64)
 
     def in_camera(self, T: Array) -> Array:
         """The vertices (n, 3) [m] in the camera's frame."""
@@ -52,30 +66,25 @@ class Model:
 
     def silhouette(self, T: Array, k: Intrinsics, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
         """The silhouette (h, w) in a window (x0, y0, w, h) of the image with intrinsics k."""
-        return self.silhouette_of(self.in_camera(T), k, window)
+        V = self.in_camera(T)
+        front = np.empty_like(self.faces)
+        return raster.silhouette(V, front[: _front(V, self.faces, self.closed, front)], (k.fx, k.fy, k.cx, k.cy), window)
 
     def outline(self, V: Array, k: Intrinsics, shape: tuple[int, ...], spacing: float) -> Array:
-        """Points of the outer contour (`trace`) in a window (h, w) of vertices (n, 3) [m] in the camera's frame."""
-        if V[:, 2].min() < NEAR:
-            return np.empty((0, 8))
-        h, w = shape
-        u, v = k.fx * V[:, 0] / V[:, 2] + k.cx, k.fy * V[:, 1] / V[:, 2] + k.cy
-        x0, y0 = max(int(u.min()) - 2, 0), max(int(v.min()) - 2, 0)
-        x1, y1 = min(int(u.max()) + 3, w), min(int(v.max()) + 3, h)
-        if x1 <= x0 or y1 <= y0:
-            return np.empty((0, 8))
-        half = (FINE - 1) / 2.0
-        finer = Intrinsics(k.fx * FINE, k.fy * FINE, k.cx * FINE + half, k.cy * FINE + half)
-        fine = self.silhouette_of(V, finer, (x0 * FINE, y0 * FINE, (x1 - x0) * FINE, (y1 - y0) * FINE))
-        return trace(V, self.faces, self.edges, k.fx, k.fy, k.cx, k.cy, fine, x0, y0, w, h, spacing)
+        """Points (n, 8) of the outer contour (`_trace`) in a window (h, w) of vertices (n, 3) [m] in the camera's frame."""
+        points = np.empty((MOST, 8))
+        intrinsics = np.array([k.fx, k.fy, k.cx, k.cy])
+        return points[: _outline(V, self.faces, self.edges, self.closed, intrinsics, *shape, spacing, points)]
 
-    def silhouette_of(self, V: Array, k: Intrinsics, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-        """The same of vertices (n, 3) [m] that are in the camera's frame already."""
-        faces = self.faces
-        if self.closed:  # the far side adds nothing
-            faces = np.empty_like(faces)
-            faces = faces[: _front(V, self.faces, faces)]
-        return raster.silhouette(V, faces, (k.fx, k.fy, k.cx, k.cy), window)
+    def matched(self, T: Array, evidence: Evidence, spacing: float, reach: float) -> Matched:
+        """The outer contour at a pose T_camera_target, compared with a mask's boundary within `reach` [px]."""
+        V, k = self.in_camera(T), evidence.intrinsics
+        found, intrinsics = self._memory, np.array([k.fx, k.fy, k.cx, k.cy])
+        mask = evidence.state, evidence.field, evidence.guarded, evidence.known
+        n = _matched(V, self.faces, self.edges, self.closed, intrinsics, *mask, spacing, reach, *found)
+        points, r, kind, counts = found
+        both, free = counts.tolist()
+        return Matched(points[:n].copy(), r[:n].copy(), kind[:n].copy(), both, free)
 
 
 def _edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -86,10 +95,14 @@ def _edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.array([(i, j, fs[0], fs[1] if len(fs) > 1 else -1) for (i, j), fs in found.items()], np.int32)
 
 
-@kernel("f8[v, 3], i4[n, 3], out i4[n, 3] -> i8")
-def _front(V, faces, out):
-    """Writes the faces that turn their outside to the camera, and returns their number."""
+@kernel("f8[v, 3], i4[n, 3], b1, out i4[n, 3] -> i8")
+def _front(V, faces, closed, out):
+    """Writes the faces that turn their outside to the camera, and returns their number; all of a mesh that is not closed, as the
+    far side of one that is adds nothing."""
     n = 0
+    if not closed:
+        out[:] = faces
+        return len(faces)
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ux, uy, uz = V[b, 0] - V[a, 0], V[b, 1] - V[a, 1], V[b, 2] - V[a, 2]
@@ -118,35 +131,63 @@ def _lean(V, edge, N, X, Y, Z):
     return -math.asin(away) / turn * width
 
 
-def trace(
-    V: Array,
-    faces: NDArray[np.int32],
-    edges: NDArray[np.int32],
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    fine: NDArray[np.bool_],
-    x0: int,
-    y0: int,
-    w: int,
-    h: int,
-    spacing: float,
-) -> Array:
-    """Points of the outer occluding contour: (n, 8) rows of X, Y, Z in the camera's frame [m], u, v, outward normal (2) and
-    the length of contour [px] that the point stands for. V (n, 3) [m]; fine: silhouette of the same pose with FINE x FINE pixels
-    on each of the window's, from pixel (x0, y0) on; w, h: size of the window.
+@inner
+def _contour(V, faces, front, edges, k, h, w, spacing, points):
+    """Writes the points (m, 8) of the outer contour in a window (h, w), as many as there is room for, and returns their number.
+    front (n, 3): of the faces (f, 3), those that may be seen."""
+    fx, fy, cx, cy = k
+    left, right, top, bottom = math.inf, -math.inf, math.inf, -math.inf
+    for i in range(len(V)):
+        if V[i, 2] < NEAR:
+            return 0
+        u, v = fx * V[i, 0] / V[i, 2] + cx, fy * V[i, 1] / V[i, 2] + cy
+        left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+    x0, y0 = max(int(max(left, -4.0)) - 2, 0), max(int(max(top, -4.0)) - 2, 0)
+    x1, y1 = int(min(right, float(w))) + 3, int(min(bottom, float(h))) + 3
+    x1, y1 = min(x1, w), min(y1, h)
+    if x1 <= x0 or y1 <= y0:
+        return 0
+    fine = np.zeros(((y1 - y0) * FINE, (x1 - x0) * FINE), np.bool_)
+    half = (FINE - 1) / 2.0
+    draw_silhouette(V, front, fx * FINE, fy * FINE, (cx - x0) * FINE + half, (cy - y0) * FINE + half, fine)
+    return _trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing, points)
 
-    Where two parts (thumb and palm) end within BESIDE of one another, the points are left out: the smallest motion decides which
-    of the two is the contour, so that neither predicts how it moves.
-    """
-    points = np.empty((MOST, 8))
-    return points[: _trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing, points)]
+
+@kernel("f8[v, 3], i4[n, 3], i4[e, 4], b1, f8[4], i8, i8, f8, out f8[m, 8] -> i8")
+def _outline(V, faces, edges, closed, k, h, w, spacing, points):
+    """See `Model.outline`."""
+    front = np.empty_like(faces)
+    front = front[: _front(V, faces, closed, front)]
+    return _contour(V, faces, front, edges, (k[0], k[1], k[2], k[3]), h, w, spacing, points)
+
+
+@kernel(
+    """f8[v, 3], i4[n, 3], i4[e, 4], b1, f8[4], u1[h, w], f4[h, w], u1[h, w], f4[a, b], f8, f8,
+    out f8[m, 8], out f8[m], out u1[m], out i8[2] -> i8"""
+)
+def _matched(V, faces, edges, closed, k, state, field, guarded, known, spacing, reach, points, r, kind, counts):
+    """A pass of a search over a mask: silhouette, contour and offsets in one call. Writes and returns what `Matched` holds."""
+    h, w = state.shape
+    front = np.empty_like(faces)
+    front = front[: _front(V, faces, closed, front)]
+    shown = np.zeros((h, w), np.bool_)
+    draw_silhouette(V, front, k[0], k[1], k[2], k[3], shown)
+    count_compared(state, shown, counts)
+    n = _contour(V, faces, front, edges, (k[0], k[1], k[2], k[3]), h, w, spacing, points)
+    _match(points[:n], field, guarded, shown, state, known, reach, r[:n], kind[:n])
+    return n
 
 
 @kernel("f8[v, 3], i4[n, 3], i4[e, 4], f8, f8, f8, f8, b1[a, b], i8, i8, i8, i8, f8, out f8[m, 8] -> i8")
 def _trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing, points):
-    """Writes the points (m, 8), as many as there is room for, and returns their number: see `trace`."""
+    """Writes points of the outer occluding contour (m, 8), as many as there is room for, and returns their number: rows of X, Y,
+    Z in the camera's frame [m], u, v, outward normal (2) and the length of contour [px] that the point stands for. V (v, 3) [m];
+    fine (a, b): silhouette of the same pose with FINE x FINE pixels on each of the window's, from pixel (x0, y0) on; w, h: size
+    of the window.
+
+    Where two parts (thumb and palm) end within BESIDE of one another, the points are left out: the smallest motion decides which
+    of the two is the contour, so that neither predicts how it moves.
+    """
     n_faces, n_vertices = len(faces), len(V)
     N = np.empty((n_faces, 4))  # unit normal and twice the area
     front = np.empty(n_faces, np.bool_)
@@ -260,27 +301,51 @@ DROPPED, MEASURED, BOUNDED = 0, 1, 2
 has to move at least that far."""
 
 
-def match(
-    points: Array, field: NDArray[np.float32], guarded: NDArray[np.uint8], own: NDArray[np.float32], reach: float
-) -> tuple[Array, NDArray[np.uint8]]:
-    """Offsets r (n,) [px] along the outward normal from each contour point to the mask's boundary, and their kinds (n,).
+@inner
+def _field_of(shown, state, known, u, v):
+    """The value at (u, v), between the pixels of the window, of the field of a mask that shows what a silhouette (h, w) shows
+    where something is known: as `evidence.gather` would smooth it, but of four pixels only."""
+    h, w = state.shape
+    x, y, most = int(math.floor(u)), int(math.floor(v)), len(TAPS) // 2
+    corner00, corner01, corner10, corner11 = 0.0, 0.0, 0.0, 0.0
+    for i in range(-most, most + 2):
+        row = min(max(y + i, 0), h - 1)
+        left, right = 0.0, 0.0
+        for j in range(-most, most + 2):
+            column = min(max(x + j, 0), w - 1)
+            if shown[row, column] and state[row, column] != COVERED:
+                left += TAPS[j + most] if j <= most else 0.0
+                right += TAPS[j + most - 1] if j > -most else 0.0
+        if i <= most:
+            corner00 += TAPS[i + most] * left
+            corner01 += TAPS[i + most] * right
+        if i > -most:
+            corner10 += TAPS[i + most - 1] * left
+            corner11 += TAPS[i + most - 1] * right
+    if known.size:
+        corner00 = corner00 / known[y, x] if known[y, x] > LEAST_KNOWN else 0.0
+        corner01 = corner01 / known[y, x + 1] if known[y, x + 1] > LEAST_KNOWN else 0.0
+        corner10 = corner10 / known[y + 1, x] if known[y + 1, x] > LEAST_KNOWN else 0.0
+        corner11 = corner11 / known[y + 1, x + 1] if known[y + 1, x + 1] > LEAST_KNOWN else 0.0
+    a, b = u - x, v - y
+    return (corner00 * (1.0 - a) + corner01 * a) * (1.0 - b) + (corner10 * (1.0 - a) + corner11 * a) * b
 
-    The boundary is where the mask's `field` (h, w) has the value that the silhouette's `own` field (h, w) has on the contour:
-    half on a straight one, less on a finger's, which blurring makes smaller.
+
+@inner
+def _match(points, field, guarded, shown, state, known, reach, r, kind):
+    """Writes the offsets r (n,) [px] along the outward normal from each contour point to the mask's boundary, and their kinds
+    (n,).
+
+    The boundary is where the mask's `field` (h, w) has the value that the silhouette's own has on the contour: half on a straight
+    one, less on a finger's, which blurring makes smaller.
     """
-    r, kind = np.zeros(len(points)), np.zeros(len(points), np.uint8)
-    _match(points, field, guarded, own, reach, r, kind)
-    return r, kind
-
-
-@kernel("f8[n, 8], f4[h, w], u1[h, w], f4[h, w], f8, out f8[n], out u1[n]")
-def _match(points, field, guarded, own, reach, r, kind):
     for i in range(len(points)):
         u, v, nx, ny = points[i, 3], points[i, 4], points[i, 5], points[i, 6]
+        r[i], kind[i] = 0.0, DROPPED
         before = _bilinear(field, u, v)
         if before < 0.0 or _nearest(guarded, u, v) != 0:
             continue
-        level = min(max(_bilinear(own, u, v), LEVELS[0]), LEVELS[1])
+        level = min(max(_field_of(shown, state, known, u, v), LEVELS[0]), LEVELS[1])
         way = 1.0 if before >= level else -1.0  # inside the mask: the boundary lies outwards
         r[i] = way * reach  # where no boundary is in reach: at least so far
         kind[i] = BOUNDED

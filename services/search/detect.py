@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterator
-from dataclasses import replace
 
 import cv2
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from services.search.contour import Model
-from services.search.evidence import TARGET, Evidence
-from shared.contract.labels import Label
-from shared.contract.messages import Mask
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.services.search.contour import Model
+from penumbra.services.search.evidence import TARGET, Evidence
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.contract.messages import Mask
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 SMALLEST_PX = 150
 """A region of fewer pixels has no shape to start from."""

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.cell.description import Camera
-from shared.contract.labels import Label
-from shared.native import kernel
+from penumbra.shared.cell.description import Camera
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.native import kernel
 
 FREE, TARGET, COVERED = 0, 1, 2
 """State of a pixel. COVERED: something stands in front, or nothing is known there. The limb's other parts cover too: the
@@ -19,6 +19,12 @@ upper arm's rounded end hides a few centimetres of the elbow, so that their bord
 
 SMOOTHING_PX = 1.0
 """Standard deviation of the blur that makes the boundary of a hard mask sub-pixel: about the stairs' own period."""
+TAPS = (0.000133831, 0.004431862, 0.053991128, 0.241971445, 0.398943469, 0.241971445, 0.053991128, 0.004431862, 0.000133831)
+"""Weights of that blur along a row and along a column, as OpenCV's."""
+LEAST_KNOWN = 1e-3
+"""Smoothed share of what is known below which a pixel shows nothing."""
+NOTHING_COVERED = np.empty((0, 0), np.float32)
+"""`Evidence.known` where everything is known."""
 INNER = 0.84
 """Smoothed share that a pixel's distance from a straight boundary raises it to: one such pixel a pixel of length."""
 GUARD_PX = 2
@@ -54,7 +60,7 @@ class Intrinsics:
 class Evidence:
     """`state` (h, w) uint8; `field` (h, w) float32, the smoothed share of the target in what is known, 0.5 on its boundary;
     `guarded` (h, w) uint8, 1 where COVERED is near; `hand` (h, w) uint8, 1 on the part of the target that lies towards +x;
-    `known` (h, w) float32, the smoothed share of what is known, None where all is; `seen_px`: pixels that show the target,
+    `known` (h, w) float32, the smoothed share of what is known, (0, 0) where all is; `seen_px`: pixels that show the target,
     and `boundary_px`: those on a boundary that is its own; `x0`, `y0`, `scale`: its window as in `messages.Mask`."""
 
     state: NDArray[np.uint8]
@@ -64,17 +70,10 @@ class Evidence:
     seen_px: int
     boundary_px: int
     intrinsics: Intrinsics
-    known: NDArray[np.float32] | None = None
+    known: NDArray[np.float32]
     x0: int = 0
     y0: int = 0
     scale: int = 1
-
-    def field_of(self, silhouette: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """The field (h, w) of a mask that shows what a silhouette (h, w) shows, where something is known."""
-        shown = np.empty(self.state.shape, np.float32)
-        _uncover(silhouette, self.state, shown)
-        shown = _blur(shown)
-        return shown if self.known is None else _share(shown, self.known)
 
     def measurements(self, correlation: float) -> float:
         """The number of independent measurements, with those that the six unknowns of a pose need."""
@@ -147,8 +146,10 @@ def gather(
     state = np.ascontiguousarray(state)
     target = (state == TARGET).astype(np.float32)
     covered = (state == COVERED).astype(np.uint8)
-    known = _blur((1 - covered).astype(np.float32)) if covered.any() else None
-    field = _blur(target) if known is None else _share(_blur(target), known)
+    known = _blur((1 - covered).astype(np.float32)) if covered.any() else NOTHING_COVERED
+    field = _blur(target)
+    if known.size:
+        field = np.divide(field, known, out=np.zeros_like(field), where=known > LEAST_KNOWN)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GUARD_PX + 1, 2 * GUARD_PX + 1))
     guarded = cv2.dilate(covered, disc, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     hand = ((labels == Label.HAND) & (state == TARGET)).astype(np.uint8)
@@ -169,28 +170,6 @@ def _boundary_px(state, field, guarded):
     return count
 
 
-@kernel("b1[h, w], u1[h, w], out f4[h, w]")
-def _uncover(silhouette, state, out):
-    """Writes 1 where a silhouette is not covered, and 0 elsewhere."""
-    for y in range(state.shape[0]):
-        for x in range(state.shape[1]):
-            out[y, x] = 1.0 if silhouette[y, x] and state[y, x] != COVERED else 0.0
-
-
-def _share(shown: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
-    out = np.empty_like(shown)
-    _divide(shown, known, out)
-    return out
-
-
-@kernel("f4[h, w], f4[h, w], out f4[h, w]")
-def _divide(shown, known, out):
-    """Writes shown / known, 0 where nothing is known."""
-    for y in range(shown.shape[0]):
-        for x in range(shown.shape[1]):
-            out[y, x] = shown[y, x] / known[y, x] if known[y, x] > 1e-3 else 0.0
-
-
 def _blur(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return cv2.GaussianBlur(image, (0, 0), SMOOTHING_PX, borderType=cv2.BORDER_REPLICATE).astype(np.float32, copy=False)
 
@@ -198,13 +177,14 @@ def _blur(image: NDArray[np.float32]) -> NDArray[np.float32]:
 def compare(state: NDArray[np.uint8], silhouette: NDArray[np.bool_]) -> tuple[int, int]:
     """Pixels of a silhouette (h, w) that show the target, and that are free, by a mask's states (h, w)."""
     counts = np.empty(2, np.int64)
-    _compare(state, silhouette, counts)
+    count_compared(state, silhouette, counts)
     both, free = counts.tolist()
     return both, free
 
 
 @kernel("u1[h, w], b1[h, w], out i8[2]")
-def _compare(state, silhouette, counts):
+def count_compared(state, silhouette, counts):
+    """Writes the two counts of `compare`."""
     both, free = 0, 0
     for y in range(state.shape[0]):
         a, b = 0, 0

@@ -1,7 +1,7 @@
 """The pose once more, on the image itself: a mask is as sharp as a network draws it, the picture is sharper.
 
 One pass, from a pose near the right one (contracting curve density: Hanek, Beetz 2004, doi:10.1023/B:VISI.0000036836.66311.97):
-  1. project the mesh's contour (`contour.trace`) and read the picture's colours along a short line across it at each point;
+  1. project the mesh's contour (`contour.Model.matched`) and read the picture's colours on a short line across it at each point;
   2. learn the colours on both sides: mean and covariance of what lies beyond the edge's blur, pooled along the contour;
   3. for every offset of the edge on the line, compare the colours with those of a blurred step between the two sides, and add
      what the mask says; this is the likelihood of the contour's offset, taken for a Gaussian;
@@ -12,18 +12,18 @@ What covers the target ends the lines, as it guards the mask's boundary.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.contour import MEASURED, Model, match, normal_equations
-from services.search.evidence import Evidence, Intrinsics, compare
-from services.search.mask_fit import Fit, Limits, marginal, with_prior
-from shared.geometry import rigid
-from shared.native import inner, kernel
+from penumbra.services.search.contour import MEASURED, Model, normal_equations
+from penumbra.services.search.evidence import Evidence, Intrinsics, compare
+from penumbra.services.search.mask_fit import Fit, Limits, marginal, with_prior
+from penumbra.shared.geometry import rigid
+from penumbra.shared.native import inner, kernel
 
 Array = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uin
         evidence,
         state=enlarged(evidence.state, cv2.INTER_NEAREST),
         field=enlarged(evidence.field, cv2.INTER_LINEAR),
-        known=None if evidence.known is None else enlarged(evidence.known, cv2.INTER_LINEAR),
+        known=enlarged(evidence.known, cv2.INTER_LINEAR) if evidence.known.size else evidence.known,
         guarded=enlarged(evidence.guarded, cv2.INTER_NEAREST),
         hand=enlarged(evidence.hand, cv2.INTER_NEAREST),
         seen_px=evidence.seen_px * scale**2,
@@ -115,7 +115,8 @@ def fit_image(
         if best.rms >= enough:
             best = min(best, _through(way, start), key=lambda one: one.rms)
     trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
-    T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits, trust * best.waves)
+    waves = trust * best.waves(settings.wave)
+    T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits, waves)
     k = evidence.intrinsics
     both, free = compare(evidence.state, model.silhouette(best.T, k, (0, 0, *evidence.state.shape[::-1])))
     return replace(
@@ -135,8 +136,8 @@ def fit_image(
 @dataclass(frozen=True)
 class _Pass:
     """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
-    square of the offsets left [px], the share of the roll that is believed, and the right sides (7, k) of
-    `ImageSettings.wave`."""
+    square of the offsets left [px] and the share of the roll that is believed. points (n, 8) of the contour, and their
+    equations: what gives the normal equations of their offsets (n,)."""
 
     T: Array
     moved: Array
@@ -145,7 +146,12 @@ class _Pass:
     length: float
     rms: float
     rolls: float
-    waves: Array
+    points: Array
+    equations: Callable[[Array], tuple[Array, Array, float, float, float, float, float]]
+
+    def waves(self, size: float) -> Array:
+        """The right sides (7, k) of `ImageSettings.wave` of this size [px]."""
+        return np.stack([self.equations(size * wave)[1] for wave in _waves(self.points, self.T)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -171,7 +177,7 @@ class _Picture:
             evidence,
             state=np.ascontiguousarray(evidence.state[: 2 * h : 2, : 2 * w : 2]),
             field=half(evidence.field).astype(np.float32, copy=False),
-            known=None if evidence.known is None else half(evidence.known).astype(np.float32, copy=False),
+            known=half(evidence.known).astype(np.float32, copy=False) if evidence.known.size else evidence.known,
             guarded=(half(evidence.guarded * np.uint8(4)) > 0).astype(np.uint8),
             intrinsics=Intrinsics(k.fx / 2.0, k.fy / 2.0, (k.cx - 0.5) / 2.0, (k.cy - 0.5) / 2.0),
         )
@@ -193,18 +199,18 @@ class _Picture:
 
     def _at(self, T: Array, moved: Array) -> _Pass:
         evidence, settings, k = self.evidence, self.settings, self.evidence.intrinsics
-        V = self.model.in_camera(T)
-        points = self.model.outline(V, k, evidence.state.shape, settings.spacing)
-        own = evidence.field_of(self.model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1])))
-        by_mask, mask_kind = match(points, evidence.field, evidence.guarded, own, LINE)
+        found = self.model.matched(T, evidence, settings.spacing, LINE)
+        points = found.points
         believed = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
-        r, sigma, kind = offsets(points, self.image, evidence.guarded, by_mask, mask_kind, *believed)
+        r, sigma, kind = offsets(points, self.image, evidence.guarded, found.r, found.kind, *believed)
         weight = points[:, 7] / (settings.correlation * (sigma**2 + settings.edge**2))
-        fixed = (kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False)
-        H, g, length, square, _, _, rolls = normal_equations(points, r - moved[6], *fixed)
-        waves = [normal_equations(points, settings.wave * wave, *fixed)[1] for wave in _waves(points, T)]
+
+        def equations(r: Array) -> tuple[Array, Array, float, float, float, float, float]:
+            return normal_equations(points, r, kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False)
+
+        H, g, length, square, _, _, rolls = equations(r - moved[6])
         rms = math.sqrt(square / length) if length > 0 else math.inf
-        return _Pass(T, moved, H, g, length, rms, rolls, np.stack(waves, axis=1))
+        return _Pass(T, moved, H, g, length, rms, rolls, points, equations)
 
 
 def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:

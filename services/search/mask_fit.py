@@ -21,10 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.contour import Model, match, normal_equations
-from services.search.evidence import Evidence, compare
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.services.search.contour import Model, normal_equations
+from penumbra.services.search.evidence import Evidence
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 SPACING_PX = 3.0
 """Distance of the sampled contour points: closer ones bring no new information."""
@@ -86,7 +86,7 @@ class Fit:
     """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
     `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
     `cost`: chi^2 of contour, dilation and prior together; `misfit`: the same per measurement, 1 to 3 where the pose
-    is right; `both`, `either`, `free`: see `compare`; `sharp`: whether the image has edges along the contour
+    is right; `both`, `either`, `free`: see `evidence.compare`; `sharp`: whether the image has edges along the contour
     (`image_fit.fit_image`)."""
 
     T: Array
@@ -128,18 +128,14 @@ class _Problem:
         self.model, self.evidence, self.noise, self.regular, self.converged = model, evidence, noise, regular, converged
 
     def at(self, T: Array, moved: Array, reach: float, huber: float) -> _Pass:
-        evidence, k = self.evidence, self.evidence.intrinsics
-        V = self.model.in_camera(T)
-        silhouette = self.model.silhouette_of(V, k, (0, 0, *evidence.state.shape[::-1]))
-        points = self.model.outline(V, k, evidence.state.shape, SPACING_PX)
-        offsets, kind = match(points, evidence.field, evidence.guarded, evidence.field_of(silhouette), reach)
-        r = offsets - moved[6]
-        H, g, _, _, counted, cost, _ = self.normal_equations(T, points, r, kind, huber, True)
-        both, free = compare(evidence.state, silhouette)
+        evidence = self.evidence
+        found = self.model.matched(T, evidence, SPACING_PX, reach)
+        r, both, free = found.r - moved[6], found.both, found.free
+        H, g, _, _, counted, cost, _ = self.normal_equations(T, found.points, r, found.kind, huber, True)
         # parts of the mask that no contour is near pull at nothing, but must not look cheap; nor may points pay by dropping out
         unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
         cost = cost * evidence.boundary_px / max(counted, 1.0) + unexplained + float(np.dot(moved, self.regular @ moved))
-        return _Pass(T, moved, points, r, kind, H, g, cost, (both, evidence.seen_px + free, free))
+        return _Pass(T, moved, found.points, r, found.kind, H, g, cost, (both, evidence.seen_px + free, free))
 
     def normal_equations(
         self, T: Array, points: Array, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.contour import Model
-from services.search.evidence import Intrinsics
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.services.search.contour import Model
+from penumbra.services.search.evidence import Intrinsics
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.evidence import Intrinsics
-from shared.body.robot import robot_models
-from shared.cell.description import Cell
-from shared.geometry import rigid
-from shared.geometry.raster import Raster
-from shared.geometry.rigid import Array
+from penumbra.services.search.evidence import Intrinsics
+from penumbra.shared.body.robot import robot_models
+from penumbra.shared.cell.description import Cell
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.raster import Raster
+from penumbra.shared.geometry.rigid import Array
 
 
 class RobotDepth:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
-
-from services.search.tracker import METHODS, Search
-from shared.contract.messages import Frame, Joints, Mask
-from shared.contract.topics import FRAME, FUSED, JOINTS, MASK, VISION
-from shared.perception.joint_history import JointHistory
-from shared.perception.lookout import Lookout
-from shared.perception.prediction import predict
-from shared.runtime.node import ServiceNode
+from penumbra.services import flags
+from penumbra.services.search.tracker import METHODS, Search
+from penumbra.shared.contract.messages import Frame, Joints, Mask
+from penumbra.shared.contract.topics import FRAME, FUSED, JOINTS, MASK, VISION
+from penumbra.shared.geometry.lens import Undistortion
+from penumbra.shared.perception.joint_history import JointHistory
+from penumbra.shared.perception.lookout import Lookout
+from penumbra.shared.perception.prediction import predict
+from penumbra.shared.runtime.node import ServiceNode
 
 NAME = "search"
 FRAMES_KEPT = 4
@@ -20,16 +20,15 @@ JOINTS_NEAR_NS = 200_000_000
 known of the robot is worse than one with a robot that has moved a little."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """The service's own flags."""
-    parser.add_argument(
-        "--method", choices=METHODS, default="default", help="default: contour least squares; paper: ascent on f_m"
-    )
-    parser.add_argument("--camera", help="search only the masks of this camera (default: of all)")
-    parser.add_argument("--target", help="search only this target (default: all)")
+FLAGS = (
+    flags.Option("--method", choices=METHODS, default="default", help="default: contour least squares; paper: ascent on f_m"),
+    flags.Option("--camera", show_default="all of the cell", help="search only the masks of this camera"),
+    flags.Option("--target", show_default="all of the cell", help="search only this target"),
+)
+EXAMPLE = "penumbra search --cell table --method paper"
 
 
-def start(node: ServiceNode, options: argparse.Namespace) -> None:
+def start(node: ServiceNode, options: flags.Options) -> None:
     """Subscribes; every mask is searched for every target that its camera can see and this replica owns.
 
     Threads: `history[robot]` belongs to the reader of that robot's joints, `frames[camera]` to the reader of that camera's
@@ -42,7 +41,7 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
     searches = {(c, t): Search(cell, c, t, options.method) for c in cameras for t in targets if t in seen[c]}
     for camera in cameras:
         if not seen[camera]:
-            node.log.warning("no target's home is in the picture: nothing is searched there", camera=camera)
+            node.log.warning("no target's home is in the image: no search in this camera", camera=camera)
     for k, search in enumerate(searches.values()):
         node.progress("preparing searches", k, len(searches))
         search.prepare()
@@ -50,6 +49,7 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
     history = {robot: JointHistory(JOINTS_NEAR_NS) for robot in cell.robots}
     fused = {target: node.latest(FUSED, target=target) for target in targets}
     frames: dict[str, tuple[Frame, ...]] = dict.fromkeys(cameras, ())
+    undistort = {camera: Undistortion(cell.cameras[camera].lens) for camera in cameras}
 
     def on_frame(message: Frame, names: dict[str, str]) -> None:
         known = frames[names["camera"]]
@@ -63,6 +63,9 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
 
     def on_mask(message: Mask, names: dict[str, str]) -> None:
         image = next((frame.image for frame in frames[names["camera"]] if frame.stamp_ns == message.stamp_ns), None)
+        if image is not None:
+            (h, w), scale = message.labels.shape, message.scale
+            image = undistort[names["camera"]](image, (message.x0, message.y0, message.x0 + w * scale, message.y0 + h * scale))
         joints = {robot: q for robot, h in history.items() if (q := h.at(message.stamp_ns)) is not None}
         for (camera, target), search in searches.items():
             if camera != names["camera"] or not node.owns(f"{camera}/{target}"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from shared.chi_square import quantile
+from penumbra.shared.chi_square import quantile
 
 ONE_IN_10 = quantile(0.9, 6)
 """Squared Mahalanobis distance that one in 10 right poses exceeds."""

@@ -8,19 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search import contour, detect, evidence, paper_search
-from services.search.evidence import TARGET, Evidence, Intrinsics
-from services.search.image_fit import fit_image
-from services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
-from services.search.robot_depth import RobotDepth
-from services.search.settings import SearchSettings
-from services.search.verdict import Findings, explains_mask, least_overlap, verdict
-from shared.body import anatomy
-from shared.cell.description import Cell
-from shared.contract.messages import Mask
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.perception.vision import State, VisionEstimate
+from penumbra.services.search import contour, detect, evidence, paper_search
+from penumbra.services.search.evidence import TARGET, Evidence, Intrinsics
+from penumbra.services.search.image_fit import fit_image
+from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
+from penumbra.services.search.robot_depth import RobotDepth
+from penumbra.services.search.settings import SearchSettings
+from penumbra.services.search.verdict import Findings, explains_mask, least_overlap, verdict
+from penumbra.shared.body import anatomy
+from penumbra.shared.cell.description import Cell
+from penumbra.shared.contract.messages import Mask
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.vision import State, VisionEstimate
 
 METHODS = ("default", "paper")
 """Values of `--method`: least squares on the contour, and the paper's ascent on f_m."""

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from services.search.settings import SearchSettings
-from shared.perception.vision import State
+from penumbra.services.search.settings import SearchSettings
+from penumbra.shared.perception.vision import State
 
 
 class Verdict(Enum):
     """The cases. `state`: what is published; `reason`: in words."""
 
     RIGHT = "tracking", "mask, and image where there is one, confirm the pose"
-    COVERED = "occluded", "too little shows, and most of the target is covered or outside the picture"
-    TOO_LITTLE = "lost", "too little shows, and nothing covers the rest"
+    COVERED = "occluded", "too little is visible, and most of the target is covered or outside the picture"
+    TOO_LITTLE = "lost", "too little is visible, and nothing covers the rest"
     ELSEWHERE = "lost", "mask and silhouette overlap too little"
     UNCONFIRMED = "lost", "the image shows no edges along the contour"
     MISSHAPEN = "lost", "the mask's boundary is not the contour's"

@@ -6,7 +6,6 @@ the next. Other pictures stand for themselves: each is shown SETTLE times, as th
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from services.flags import Parser
-from services.segmentation import inference
-from shared.contract.labels import COLOURS, TARGET_LABELS, Label
-from shared.perception.lookout import STEP, Window, whole_frame
+from penumbra.services import flags
+from penumbra.services.segmentation import inference
+from penumbra.shared.contract.labels import COLOURS, TARGET_LABELS, Label
+from penumbra.shared.perception.lookout import STEP, Window, whole_frame
 
 SETTLE = 4
 PERIOD_NS = 50_000_000
@@ -29,35 +28,33 @@ class FileError(ValueError):
     """A file that cannot be read or written. The text says which, what was expected and what to do."""
 
 
-def arguments() -> argparse.ArgumentParser:
-    """The flags of `penumbra segmentation infer`."""
-    parser = Parser(
-        prog="penumbra segmentation infer",
-        description="Write masks and overlays of pictures and films. For NAME.png: NAME_mask.png, one channel of class indices ("
-        + ", ".join(f"{label.value} {label.name.lower()}" for label in Label)
-        + "), and NAME_overlay.png; for a film NAME.mp4: a mask a frame in NAME_masks/ and NAME_overlay.mp4.",
-    )
-    parser.add_argument("files", type=Path, nargs="+", metavar="IMAGE|VIDEO")
-    parser.add_argument("--out", type=Path, default=Path("masks"), help="folder to write to (default: masks)")
-    parser.add_argument("--weights", type=Path, default=inference.WEIGHTS, help="the network (default: the committed one)")
-    parser.add_argument("--sequence", action="store_true", help="the pictures are frames of one film, in this order")
-    parser.add_argument(
+@flags.command(
+    "segmentation infer",
+    "Writes masks and overlays of pictures and films. For NAME.png: NAME_mask.png, one channel of class indices ("
+    + ", ".join(f"{label.value} {label.name.lower()}" for label in Label)
+    + "), and NAME_overlay.png; for a film NAME.mp4: a mask a frame in NAME_masks/ and NAME_overlay.mp4.",
+    flags.Argument("files", type=Path, nargs=-1, required=True, metavar="IMAGE|VIDEO...", help="what is looked at"),
+    flags.Option("--out", type=Path, default=Path("masks"), help="folder to write to"),
+    flags.Option("--weights", type=Path, default=inference.WEIGHTS, show_default="the committed one", help="the network"),
+    flags.Option("--sequence", is_flag=True, help="the pictures are frames of one film, in this order"),
+    flags.Option(
         "--scale",
-        type=int,
-        choices=(1, 2, 4, 8),
-        help="look at means of so many pixels a side (default: as the service at a whole frame, 2 at 640 x 480)",
-    )
-    return parser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Write the masks; returns 2 where a file cannot be read."""
-    options = arguments().parse_args(argv)
+        choices=("1", "2", "4", "8"),
+        show_default="as the service at a whole frame, 2 at 640 x 480",
+        help="average squares of so many pixels a side first",
+    ),
+    example="penumbra segmentation infer arm.png film.mp4 --out masks",
+)
+def main(options: flags.Options) -> int:
+    """Writes the masks; returns 2 where a file cannot be read."""
+    scale = int(options.scale) if options.scale else None
     try:
         names = [path.stem for path in options.files]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
-            raise FileError(f"files of different names expected, {twice} came twice: call it once for each, with an --out each")
+            raise FileError(
+                f"expected files of different names, got {twice} twice; run the command once per file, with an --out each"
+            )
         options.out.mkdir(parents=True, exist_ok=True)
         segmenter = inference.load_segmenter(options.weights)
         stamp_ns = 0
@@ -68,12 +65,12 @@ def main(argv: list[str] | None = None) -> int:
                     stamp_ns += 2 * round(inference.MAX_GAP_S * 1e9)  # so long that the last picture is forgotten
                 for _ in range(1 if options.sequence else SETTLE):
                     stamp_ns += PERIOD_NS
-                    mask = whole_mask(segmenter, image, options.scale, stamp_ns)
+                    mask = whole_mask(segmenter, image, scale, stamp_ns)
                 write(options.out / f"{path.stem}_mask.png", mask)
                 write(options.out / f"{path.stem}_overlay.png", overlay(image, mask)[..., ::-1])
             else:
                 stamp_ns += 2 * round(inference.MAX_GAP_S * 1e9)
-                stamp_ns = film(segmenter, path, options.out, options.scale, stamp_ns)
+                stamp_ns = film(segmenter, path, options.out, scale, stamp_ns)
     except (FileError, FileNotFoundError) as error:
         print(f"penumbra segmentation infer: {error}", file=sys.stderr)
         return 2
@@ -84,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
 def is_picture(path: Path) -> bool:
     """Whether a file is a picture; else it may be a film. Raises FileNotFoundError."""
     if not path.is_file():
-        raise FileNotFoundError(f"no file {path}: a picture or a film expected")
+        raise FileNotFoundError(f"{path}: expected a picture or a film, found no file")
     return bool(cv2.haveImageReader(str(path)))
 
 
@@ -92,7 +89,7 @@ def read(path: Path) -> NDArray[np.uint8]:
     """An RGB image (h, w, 3)."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
-        raise FileError(f"{path}: a picture expected, it begins as one but cannot be read: is it whole?")
+        raise FileError(f"{path}: expected a picture, got a file that begins as one but cannot be read; check that it is whole")
     return np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
 
 
@@ -115,7 +112,7 @@ def film(segmenter: inference.Segmenter, path: Path, out: Path, scale: int | Non
         write(folder / f"{index:06d}.png", mask)
         writer.write(np.ascontiguousarray(overlay(image, mask)[..., ::-1]))
     if writer is None:
-        raise FileError(f"{path}: a picture or a film expected, OpenCV reads no frame of it")
+        raise FileError(f"{path}: expected a picture or a film, got a file of which OpenCV reads no frame")
     writer.release()
     return stamp_ns
 
@@ -139,7 +136,7 @@ def whole_mask(segmenter: inference.Segmenter, image: NDArray[np.uint8], scale: 
         window = Window(0, 0, width // (STEP * scale) * STEP, height // (STEP * scale) * STEP, scale)
     if not (0 < window.right <= width and 0 < window.bottom <= height):
         least = STEP * window.scale
-        raise FileError(f"a picture of at least {least} x {least} pixels expected, {width} x {height} came")
+        raise FileError(f"expected a picture of at least {least} x {least} pixels, got {width} x {height}")
     labels = segmenter(image, window, stamp_ns)
     mask = np.full((height, width), Label.BACKGROUND, np.uint8)
     mask[: window.bottom, : window.right] = labels.repeat(window.scale, axis=0).repeat(window.scale, axis=1)

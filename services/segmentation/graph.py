@@ -15,7 +15,7 @@ import numpy as np
 import openvino
 from openvino import opset13 as op
 
-from services.segmentation.model import FOLD, Model
+from penumbra.services.segmentation.model import FOLD, Model
 
 CHANNELS_FIRST, CHANNELS_LAST = np.array([0, 3, 1, 2]), np.array([0, 2, 3, 1])
 

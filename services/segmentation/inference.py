@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.segmentation import model
-from services.segmentation.model import Model
-from services.segmentation.openvino_step import Compiled, Precision, State
-from services.segmentation.shift import shift_state
-from shared.contract.labels import TARGET_LABELS
-from shared.native import processor
-from shared.perception.lookout import Window
+from penumbra.services.segmentation import model
+from penumbra.services.segmentation.model import Model
+from penumbra.services.segmentation.openvino_step import Compiled, Precision, State
+from penumbra.services.segmentation.shift import shift_state
+from penumbra.shared.contract.labels import TARGET_LABELS
+from penumbra.shared.native import processor
+from penumbra.shared.perception.lookout import Window
 
 WEIGHTS = Path(__file__).parent / "weights" / "prednet.npz"
 MAX_GAP_S = 0.5
@@ -85,7 +85,7 @@ def classes(logits: NDArray[np.float32]) -> NDArray[np.uint8]:
 def cut(image: NDArray[np.uint8], window: Window) -> NDArray[np.float32]:
     """The window (height, width, 3) in [0, 1] of an RGB image (h, w, 3) uint8; at scales above 1 their means."""
     if min(window.x0, window.y0) < 0 or window.bottom > image.shape[0] or window.right > image.shape[1]:
-        raise ValueError(f"a window inside the image of {image.shape[1]} x {image.shape[0]} expected, {window} came")
+        raise ValueError(f"expected a window inside the image of {image.shape[1]} x {image.shape[0]}, got {window}")
     part = image[window.y0 : window.bottom, window.x0 : window.right]
     if window.scale == 1:
         return np.divide(part, np.float32(255.0), dtype=np.float32)

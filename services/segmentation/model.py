@@ -33,11 +33,11 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self.cell not in CELLS:
-            raise ValueError(f"cell: one of {', '.join(CELLS)} expected, {self.cell!r} came")
+            raise ValueError(f"cell: expected one of {', '.join(CELLS)}, got {self.cell!r}")
         if self.cell == "convlstm" and any(n % 2 for n in self.channels):
-            raise ValueError(f"even channels expected, a ConvLSTM halves them, {self.channels} came")
+            raise ValueError(f"expected even channels, which a ConvLSTM halves, got {self.channels}")
         if len(self.channels) != len(self.kernels) or len(self.channels) < 2:
-            raise ValueError(f"one kernel for each of at least 2 layers expected, got {self.channels} and {self.kernels}")
+            raise ValueError(f"expected one kernel per layer and at least 2 layers, got {self.channels} and {self.kernels}")
 
     @property
     def layer_strides(self) -> tuple[int, ...]:
@@ -57,7 +57,7 @@ class Settings:
     def state_sizes(self, height: int, width: int) -> tuple[tuple[int, int], ...]:
         """(height, width) of each tensor of the state for images of this size. Raises ValueError where the size does not fit."""
         if height % self.multiple or width % self.multiple or min(height, width) <= 0:
-            raise ValueError(f"image size: positive multiples of {self.multiple} expected, {width} x {height} came")
+            raise ValueError(f"image size: expected positive multiples of {self.multiple}, got {width} x {height}")
         return tuple((height // stride, width // stride) for stride in self.strides)
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from services.segmentation.model import Model
+from penumbra.services.segmentation.model import Model
 
 Precision = Literal["f32", "bf16"]
 State = tuple[NDArray[Any], ...]
@@ -35,14 +35,14 @@ class Compiled:
     def __init__(self, model: Model, precision: Precision):
         import openvino  # it starts a thread, and a process that will be forked must not have a second one
 
-        from services.segmentation import graph
+        from penumbra.services.segmentation import graph
 
         self._ov, self._graph = openvino, graph
         try:
             graph.step(model, model.settings.multiple, model.settings.multiple, precision)
         except (KeyError, RuntimeError) as error:
             raise ValueError(
-                f"weights of {model.settings} expected, got others ({error}): take those that belong to the card"
+                f"expected weights of {model.settings}, got others ({error}); use the weights that belong to the card"
             ) from None
         self._core, self._type = openvino.Core(), getattr(openvino.Type, precision)
         self._model, self._precision = model, precision

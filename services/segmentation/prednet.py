@@ -24,9 +24,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from services.segmentation import model
-from services.segmentation.model import FOLD, Model, Settings
-from shared.contract.labels import Label
+from penumbra.services.segmentation import model
+from penumbra.services.segmentation.model import FOLD, Model, Settings
+from penumbra.shared.contract.labels import Label
 
 State = tuple[Tensor, ...]
 """What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""
@@ -203,5 +203,5 @@ def load(path: Path) -> tuple[PredNet, dict[str, Any]]:
     try:
         net.load_state_dict({name: torch.from_numpy(value) for name, value in network.weights.items()})
     except RuntimeError as error:
-        raise ValueError(f"{path}: weights of {network.settings} expected as its card says: {error}") from None
+        raise ValueError(f"{path}: expected weights of {network.settings}, as its card says: {error}") from None
     return net.eval(), card

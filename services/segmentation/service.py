@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import threading
 from collections.abc import Iterable
 from pathlib import Path
 
-from services.segmentation.inference import WEIGHTS, Segmenter, load_segmenter
-from shared.cell.description import Camera
-from shared.contract.messages import Frame, Mask
-from shared.contract.topics import FRAME, FUSED, MASK
-from shared.perception.lookout import Lookout
-from shared.runtime.node import ServiceNode
+from penumbra.services import flags
+from penumbra.services.segmentation.inference import WEIGHTS, Segmenter, load_segmenter
+from penumbra.shared.cell.description import Camera
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.contract.messages import Frame, Mask
+from penumbra.shared.contract.topics import FRAME, FUSED, MASK
+from penumbra.shared.geometry.lens import Undistortion
+from penumbra.shared.perception.lookout import Lookout
+from penumbra.shared.runtime.node import ServiceNode
 
 NAME = "segmentation"
 FOLLOW_S = 0.2
@@ -21,13 +23,20 @@ AHEAD_S = 0.4
 """How far ahead: where targets go on as they move, what the network needs for a window is compiled by then."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """The flags of this service."""
-    parser.add_argument("--camera", help="the camera whose frames are segmented (default: all of the cell)")
-    parser.add_argument("--weights", type=Path, default=WEIGHTS, help="the network, made by `penumbra segmentation train`")
+FLAGS = (
+    flags.Option("--camera", show_default="all of the cell", help="the camera whose frames are segmented"),
+    flags.Option(
+        "--weights",
+        type=Path,
+        default=WEIGHTS,
+        show_default="the built-in ones",
+        help="the network, made by `penumbra segmentation train`",
+    ),
+)
+EXAMPLE = "penumbra segmentation --cell table --camera front"
 
 
-def start(node: ServiceNode, options: argparse.Namespace) -> None:
+def start(node: ServiceNode, options: flags.Options) -> None:
     """Segment the frames of the cell's cameras that this replica owns.
 
     Threads: the reader of a camera's frames and the timer `follow` share its lookout, under a lock, and its segmenter, of which
@@ -74,15 +83,19 @@ def start(node: ServiceNode, options: argparse.Namespace) -> None:
         is_ready(lookouts)
 
     def watch(name: str, camera: Camera, segmenter: Segmenter) -> None:
+        undistort = Undistortion(camera.lens)
+
         def on_frame(frame: Frame, _: dict[str, str]) -> None:
             if frame.image.shape[:2] != (camera.height, camera.width):
-                came = f"{frame.image.shape[1]} x {frame.image.shape[0]}"
-                raise ValueError(
-                    f"camera {name}: frames of {camera.width} x {camera.height} expected (the cell file), {came} came"
-                )
+                got = f"{frame.image.shape[1]} x {frame.image.shape[0]}"
+                raise ValueError(f"camera {name}: expected frames of {camera.width} x {camera.height} (the cell file), got {got}")
             with looking[name]:
                 window = informed(name).look(frame.stamp_ns)
-            labels = segmenter(frame.image, window, frame.stamp_ns)
+            image = undistort(frame.image, (window.x0, window.y0, window.right, window.bottom))
+            labels = segmenter(image, window, frame.stamp_ns)
+            if undistort.unseen is not None:  # nothing is known there, as behind an occluder
+                unseen = undistort.unseen[window.y0 : window.bottom : window.scale, window.x0 : window.right : window.scale]
+                labels[unseen] = Label.OCCLUDER
             mask = Mask(stamp_ns=frame.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=window.scale)
             node.publish(MASK, mask, camera=name)
 

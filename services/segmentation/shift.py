@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.segmentation.openvino_step import State
-from shared.perception.lookout import Window
+from penumbra.services.segmentation.openvino_step import State
+from penumbra.shared.perception.lookout import Window
 
 
 def shift_state(state: State, strides: Sequence[int], old: Window, new: Window) -> State:
@@ -17,7 +17,7 @@ def shift_state(state: State, strides: Sequence[int], old: Window, new: Window) 
     """
     unit = max(strides) * old.scale
     if old.scale != new.scale or (new.x0 - old.x0) % unit or (new.y0 - old.y0) % unit:
-        raise ValueError(f"windows of one scale, multiples of {unit} pixels apart, expected, {old} and {new} came")
+        raise ValueError(f"expected windows of one scale, multiples of {unit} pixels apart, got {old} and {new}")
     out = []
     for tensor, stride in zip(state, strides, strict=True):
         dx, dy = ((new.x0 - old.x0) // (old.scale * stride), (new.y0 - old.y0) // (old.scale * stride))

@@ -8,14 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from services.flags import Parser
-from shared.skin import board
+from penumbra.services import flags
+from penumbra.shared.skin import board
 
 
-def main(argv: list[str]) -> int:
+@flags.command(
+    "skin decode",
+    "Reads one reply packet in hex from standard input (spaces and line breaks do not matter) and prints it as JSON.",
+    example="penumbra skin decode < packet.hex",
+)
+def main(options: flags.Options) -> int:
     """Prints the reply's contents: 0, or 2 for a text that is no reply."""
-    about = "Reads one reply packet in hex from standard input (spaces and line breaks do not matter) and prints it as JSON."
-    Parser(prog="penumbra skin decode", description=about).parse_args(argv)
     try:
         print(json.dumps(describe(from_hex(sys.stdin.buffer.read()))))
     except board.PacketError as error:
@@ -29,10 +32,10 @@ def from_hex(text: bytes) -> bytes:
     digits = b"".join(text.split())
     stranger = next((at for at, digit in enumerate(digits) if digit not in b"0123456789abcdefABCDEF"), None)
     if stranger is not None:
-        came = digits[stranger : stranger + 1].decode("ascii", errors="backslashreplace")
-        raise board.PacketError(f"hex digits expected, {came!r} came as character {stranger + 1}")
+        got = digits[stranger : stranger + 1].decode("ascii", errors="backslashreplace")
+        raise board.PacketError(f"expected hex digits, got {got!r} as character {stranger + 1}")
     if len(digits) % 2:
-        raise board.PacketError(f"two hex digits for each byte expected, {len(digits)} digits came")
+        raise board.PacketError(f"expected two hex digits per byte, got {len(digits)} digits")
     return bytes.fromhex(digits.decode())
 
 

@@ -18,15 +18,15 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
-from shared.body.robot import robot_models
-from shared.cell import description as cells
-from shared.contract import report, topics
-from shared.contract.messages import FusedPose, Joints, Voltages
-from shared.geometry.rigid import Array, inverse, transform
-from shared.runtime import bus
-from shared.runtime.node import Node
-from shared.skin.faults import MENDS, MISFIT, Fault, Look, Watch, likely
-from shared.skin.layout import Skin, link_names
+from penumbra.shared.body.robot import robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import report, topics
+from penumbra.shared.contract.messages import FusedPose, Joints, Voltages
+from penumbra.shared.geometry.rigid import Array, inverse, transform
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.shared.skin.faults import MENDS, MISFIT, Fault, Look, Watch, likely
+from penumbra.shared.skin.layout import Skin, link_names
 
 PATIENCE_S = 1.0
 NEAR_NS = 15_000_000
@@ -72,7 +72,7 @@ class Examination:
         self._joints: dict[str, deque[Joints]] = {name: deque(maxlen=100) for name in cell.robots}
         self._lock = threading.Lock()
         try:
-            from shared.skin.response import Response
+            from penumbra.shared.skin.response import Response
 
             self._response: Response | None = Response(cell, self._target)
         except (cells.CellError, ImportError) as error:
@@ -85,7 +85,7 @@ class Examination:
             pad = self.pads[names["pad"]]
             if message.volts.shape[1] != len(pad.watch.names):
                 raise ValueError(
-                    f"{len(pad.watch.names)} electrodes of pad {names['pad']} expected, {message.volts.shape[1]} came"
+                    f"expected {len(pad.watch.names)} electrodes of pad {names['pad']}, got {message.volts.shape[1]}"
                 )
             before = pad.watch.look
             volts = message.volts.astype(np.float64)
@@ -148,19 +148,19 @@ class Examination:
         own = self.skin.of(self.skin.pads.index(name))
         out: dict[str, Any] = {"wrong": None, "mend": None, "misfit": misfit, "electrodes": {}}
         if not pad.looks:
-            out |= {"wrong": "silent: no voltages came", "mend": "start its driver: penumbra skin, or penumbra emulator"}
+            out |= {"wrong": "silent: no voltages received", "mend": "start its driver: penumbra skin, or penumbra emulator"}
             return out
         offsets = self._offsets(pad)
         found = self._suspect(name, pad, common)
         if found is not None and found.text is not None:
-            mend = "mount it as the cell file says, or turn its rpy there, or swap the channels of its electrodes"
+            mend = "mount it as in the cell file, or change its rpy there, or swap the channels of its electrodes"
             if "calibrated" in found.text or "reason" in found.text:
                 mend = f"calibrate it: penumbra skin calibrate --pad {name}; and compare its place with the cell file"
             text = f"{found.text} (residual of {found.misfit:.1f} variances, {found.left:.1f} if so)"
             out |= {"wrong": text, "mend": mend}
         elif found is None and misfit is not None and misfit > MISFIT and not pad.faults:
             text = f"does not fit the haptic pose: residual of {misfit:.1f} variances"
-            out |= {"wrong": text, "mend": "bring the limb within 5 to 10 cm of this pad and ask again"}
+            out |= {"wrong": text, "mend": "bring the limb within 5 to 10 cm of this pad and run this again"}
         last = pad.looks[-1]
         for k, electrode in enumerate(pad.watch.names):
             fault = pad.faults.get(electrode) or offsets.get(electrode)
@@ -185,7 +185,7 @@ class Examination:
             return {}
         offset = np.mean([measured - predicted for predicted, measured, *_ in empty], axis=0)
         return {
-            name: Fault("drift", f"drift: {1e3 * offset[k]:+.2g} mV while the pose says that nothing is near")
+            name: Fault("drift", f"drift: {1e3 * offset[k]:+.2g} mV with nothing near according to the pose")
             for k, name in enumerate(pad.watch.names)
             if abs(offset[k]) > OFFSET_V
         }
@@ -211,8 +211,8 @@ def examine(cell: cells.Cell, connection: bus.Connection, seconds: float, progre
         misfits = _misfits(node.query(topics.health(cell.name, "haptics")))
     if not any(pad.looks for pad in examination.pads.values()):
         raise bus.BusError(
-            f"no voltages of cell {cell.name} came within {seconds:g} s: start `penumbra up`, or `penumbra skin --port DEVICE` "
-            "for a real board"
+            f"cell {cell.name}: expected voltages within {seconds:g} s, got none; start `penumbra up`, or `penumbra skin --port "
+            "DEVICE` for a real board"
         )
     return examination.judge(misfits)
 
@@ -260,7 +260,7 @@ def main(cell: cells.Cell, connection: bus.Connection, seconds: float, as_json: 
     if elsewhere and not found["notes"]:
         console.print(
             f"[yellow]note[/] {', '.join(elsewhere)}: no limb with a known pose was within about 5 to 10 cm, or a fault is in "
-            "the way: how they are mounted and calibrated was not looked at"
+            "the way: their mounting and calibration were not checked"
         )
     for note in found["notes"]:
         console.print(f"[yellow]note[/] {escape(note)}")

@@ -23,9 +23,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry.rigid import Array
-from shared.skin import board
-from shared.skin.board import Command, Kind, PacketError
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin import board
+from penumbra.shared.skin.board import Command, Kind, PacketError
 
 Components = NDArray[np.complex128]
 
@@ -239,7 +239,9 @@ class Line:
             self._fault = "silent" if not answer else "garbled"
             self.count.faults[self._fault] += 1
             self.recover()
-        raise BoardSilent(f"a board that takes {hz:g} Hz expected, wrong answers came: is {self.port.name} another device?")
+        raise BoardSilent(
+            f"expected a board that accepts {hz:g} Hz, got wrong answers; check whether {self.port.name} is another device"
+        )
 
     # ---- place in the stream of commands
 
@@ -253,7 +255,9 @@ class Line:
                 self.port.send_break()
                 found = self._probe(pace_s, patience_s)
         if found is None:
-            raise BoardSilent(f"no answer on {self.port.name}, nor after a BREAK: is it the board's port, and has it power?")
+            raise BoardSilent(
+                f"no answer on {self.port.name}, nor after a BREAK; check that it is the board's port, and its power"
+            )
         if self._is_tuned and not _is_near(found, self.electrode_hz, self.samples_per_cycle, 1e-6):
             self.count.faults["reset"] += 1
             raise BoardSilent(f"the board on {self.port.name} has lost its frequency: was its power off?")
@@ -340,7 +344,7 @@ class PadReader:
         for name in electrodes:
             found = [(k, list(of[name])) for k, of in enumerate(channels) if name in of]
             if len(found) > 1:
-                raise ValueError(f"electrode {name}: one board that measures it expected, {len(found)} came: see `boards:`")
+                raise ValueError(f"electrode {name}: expected one board that measures it, got {len(found)}; see `boards:`")
             self._sources.append(found[0] if found else None)
 
     def read(self) -> Row | None:

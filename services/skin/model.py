@@ -21,14 +21,14 @@ from rich.progress import Progress
 from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull
 
-from services import flags
-from shared.body.anatomy import Mesh, target_mesh
-from shared.body.robot import robot_models
-from shared.cell import description as cells
-from shared.geometry import rigid
-from shared.geometry.surface import Surface
-from shared.skin.response import FEATURES, FOLDER, Network, Rest, features, fingerprint, networks, save
-from sim.skin.field import Body, PadField, Panels, limb, shell
+from penumbra.services import flags
+from penumbra.shared.body.anatomy import Mesh, target_mesh
+from penumbra.shared.body.robot import robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin.response import FEATURES, FOLDER, Network, Rest, features, fingerprint, networks, save
+from penumbra.sim.skin.field import Body, PadField, Panels, limb, shell
 
 Array = np.ndarray
 
@@ -333,20 +333,18 @@ def score(network: Network, data: Solved) -> dict[str, dict[str, float]]:
     return out
 
 
-def main(argv: list[str]) -> int:
-    """`penumbra skin model`"""
-    parser = flags.Parser(
-        prog="penumbra skin model", description="Fits the field model of a cell's pads to its boundary elements."
-    )
-    flags.add_cell(parser)
-    parser.add_argument("--target", help="the limb (default: the cell's first target)")
-    parser.add_argument("--seed", type=int, default=1, help="draws poses and the network's start (default: %(default)s)")
-    parser.add_argument(
-        "--poses", type=int, help=f"fields to solve for each mounting (default: {POSES}, with a link {POSES_BACKED})"
-    )
-    parser.add_argument("--steps", type=int, help=f"of the network's training (default: {STEPS}, with a link {STEPS_BACKED})")
-    parser.add_argument("--again", action="store_true", help="also fit mountings that have a network already")
-    options = parser.parse_args(argv)
+@flags.command(
+    "skin model",
+    "Fits the field model of a cell's pads to its boundary elements.",
+    flags.CELL,
+    flags.Option("--target", show_default="the cell's first", help="the limb"),
+    flags.Option("--seed", type=int, default=1, help="draws poses and the network's start"),
+    flags.Option("--poses", type=int, help=f"fields to solve for each mounting (default: {POSES}, with a link {POSES_BACKED})"),
+    flags.Option("--steps", type=int, help=f"of the network's training (default: {STEPS}, with a link {STEPS_BACKED})"),
+    flags.Option("--again", is_flag=True, help="also fit mountings that have a network already"),
+    example="penumbra skin model --cell mine.yaml",
+)
+def main(options: flags.Options) -> int:
     cell = cells.load(options.cell)
     if not cell.pads:
         raise cells.CellError(f"cell {cell.name} has no pads: nothing to fit")

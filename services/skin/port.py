@@ -12,7 +12,7 @@ from pathlib import Path
 
 import serial
 
-from shared.skin import board
+from penumbra.shared.skin import board
 
 BREAK_S = 1e-3
 """Fifty bytes long: a receiver takes a low line for a BREAK from one byte on."""
@@ -42,14 +42,14 @@ class SerialPort:
         except BlockingIOError:
             taken = 0
         if taken < len(data):
-            raise OSError(f"{self.name} takes no more bytes: is the board gone?")
+            raise OSError(f"{self.name} accepts no more bytes; check that the board is connected")
 
     def read(self, timeout_s: float) -> bytes:
         if timeout_s > 0.0 and not select.select([self._serial.fileno()], [], [], timeout_s)[0]:
             return b""
         data = os.read(self._serial.fileno(), CHUNK)
         if not data and timeout_s > 0.0:  # ready to be read, and nothing there
-            raise OSError(f"{self.name} is gone: was the board pulled out?")
+            raise OSError(f"{self.name} is gone; check that the board is connected")
         return data
 
     def send_break(self) -> None:

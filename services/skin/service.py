@@ -1,25 +1,26 @@
 """Reads the sensing boards of pads on serial ports and publishes the amplitudes of their electrodes.
 
-Three boards make one pad of five electrodes: give their ports in order with --port, or in the cell file under `boards:` of the
+Three boards make one pad of five electrodes: give their ports in order with --device, or in the cell file under `boards:` of the
 pad. The cell file also says which channels measure which electrode; without it two electrodes a board in the order of the pad
 type, on channels 0 to 2 and 3 to 5: c and r on the first board, l and t on the second, b on the third.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any
 
-from services.skin.driver import Batches, Line, PadReader
-from services.skin.port import SerialPort
-from shared.cell import description as cells
-from shared.contract.messages import Voltages
-from shared.contract.topics import VOLTAGES
-from shared.runtime.node import Node
-from shared.skin import board
+from penumbra.services import flags
+from penumbra.services.skin.driver import Batches, Line, PadReader
+from penumbra.services.skin.port import SerialPort
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.messages import Voltages
+from penumbra.shared.contract.topics import VOLTAGES
+from penumbra.shared.runtime.node import Node
+from penumbra.shared.skin import board
 
 NAME = "skin"
 BACKOFF_S = (0.2, 5.0)
@@ -28,49 +29,62 @@ TOLD_EVERY = 20
 """Attempts after which a board that is still missing is told of again."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """The service's own flags."""
-    ports = "a board's serial port; several times for a pad of several boards, in their order (default: those of the cell file)"
-    parser.add_argument("--port", action="append", metavar="DEVICE", help=ports)
-    parser.add_argument("--pad", metavar="NAME", help="the pad that --port belongs to (default: the cell's first)")
-    cycles = "cycles of the excitation in a reply: 128 give 231 a second, 32 give 298 with twice the noise (default: %(default)s)"
-    parser.add_argument("--cycles", type=int, default=128, metavar="N", help=cycles)
+FLAGS = (
+    flags.Option(
+        "--device",
+        multiple=True,
+        metavar="DEVICE",
+        show_default="those of the cell file",
+        help="a board's serial port; several times for a pad of several boards, in their order",
+    ),
+    flags.Option("--pad", metavar="NAME", show_default="the cell's first", help="the pad that --device belongs to"),
+    flags.Option(
+        "--cycles",
+        type=int,
+        default=128,
+        metavar="N",
+        help="cycles of the excitation in a reply: 128 give 231 a second, 32 give 298 with twice the noise",
+    ),
+)
+EXAMPLE = "penumbra skin --pad p0 --device /dev/ttyUSB0 --device /dev/ttyUSB1 --device /dev/ttyUSB2"
 
 
-def start(node: Node, options: argparse.Namespace) -> None:
+def start(node: Node, options: flags.Options) -> None:
     """Each pad has a thread of its own, to which its `Session` belongs: its boards are asked together. The health report, in
     another thread, only reads counters."""
     if not 0 < options.cycles <= 60_000:
-        raise cells.CellError(f"--cycles: 1 to 60000 expected, {options.cycles} came")
-    for pad, readers in pads(node.cell, options.port, options.pad).items():
+        raise cells.CellError(f"--cycles: expected 1 to 60000, got {options.cycles}")
+    for pad, readers in pads(node.cell, options.device, options.pad).items():
         session = Session(node, pad, readers, options.cycles)
         node.tell(pad, session.describe)
         node.every(BACKOFF_S[0], partial(Session.run, session), math.inf)
 
 
-def pads(cell: cells.Cell, ports: list[str] | None, pad: str | None) -> dict[str, tuple[cells.SensingBoard, ...]]:
+def pads(cell: cells.Cell, ports: Sequence[str], pad: str | None) -> dict[str, tuple[cells.SensingBoard, ...]]:
     """The pads to be read, each with its boards on their ports. Raises CellError where the two do not fit."""
-    if ports is None:
+    if not ports:
         named = {name: found for name, found in cell.pads.items() if pad in (None, name) and found.boards}
         if pad is not None:
             cell.one("pads", pad)
         for name, found in named.items():
             if any(reader.port is None for reader in found.boards):
-                raise cells.CellError(f"pads.{name}.boards: a port of every board expected: add it, or give --pad {name} --port")
+                raise cells.CellError(
+                    f"pads.{name}.boards: expected a port of every board; add it, or give --pad {name} --device"
+                )
         if not named:
             what = f"pad {pad} of cell {cell.name} has no boards" if pad else f"no pad of cell {cell.name} has boards"
-            raise cells.CellError(f"{what}: give --port DEVICE, or `boards:` in the cell file")
+            raise cells.CellError(f"{what}: give --device DEVICE, or `boards:` in the cell file")
         return {name: found.boards for name, found in named.items()}
     if twice := sorted({port for port in ports if ports.count(port) > 1}):
-        raise cells.CellError(f"--port: a port for each board expected, {', '.join(twice)} came twice")
+        raise cells.CellError(f"--device: expected a port per board, got {', '.join(twice)} twice")
     name = cell.one("pads", pad)
     kind = cell.pads[name].type
     readers = board.readers(cell.pads[name], cell.pad_types[kind])
     if len(ports) > len(readers):
         needs = "; ".join(", ".join(reader.channels) for reader in readers)
         raise cells.CellError(
-            f"pad {name} has {len(readers)} boards ({needs}), {len(ports)} ports came: give --port for each, in this order, "
-            "or change `boards:` of the pad in the cell file"
+            f"pad {name}: expected {len(readers)} ports, one per board ({needs}), got {len(ports)}; give --device for each, in "
+            "this order, or change `boards:` of the pad in the cell file"
         )
     return {name: tuple(reader.model_copy(update={"port": port}) for reader, port in zip(readers, ports, strict=False))}
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from shared.cell import description as cells
-from shared.contract.labels import Label
+from penumbra.shared.body.simplification import simplified
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+
+EXTENT = (0.02, 3.0)
+"""Smallest and largest length [m] of a limb."""
+MOST_FACES = 4000
+"""Number of triangles that a mesh of a user's is simplified to: finer ones are smaller than a pixel."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +29,9 @@ class Mesh:
     labels: NDArray[np.uint8]
 
 
-def loft(centres, half_y, half_z, segments: int) -> tuple[np.ndarray, np.ndarray]:
+def loft(
+    centres: NDArray[np.float64], half_y: NDArray[np.float64], half_z: NDArray[np.float64], segments: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """A closed tube through elliptical sections in the y-z plane: centres (k, 3), half axes (k,) [m]."""
     angle = np.arange(segments) * 2 * np.pi / segments
     ring = np.stack([np.zeros(segments), np.cos(angle), np.sin(angle)], axis=1)
@@ -40,7 +50,7 @@ def loft(centres, half_y, half_z, segments: int) -> tuple[np.ndarray, np.ndarray
     return vertices, np.concatenate(faces).astype(np.int32)
 
 
-def half_axes(circumference, flatness):
+def half_axes(circumference: ArrayLike, flatness: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Half axes (wide, thin) [m] of the ellipse with this circumference whose thin axis is `flatness` times the wide one
     (Ramanujan's first formula)."""
     k = np.asarray(flatness, float)
@@ -48,11 +58,11 @@ def half_axes(circumference, flatness):
     return wide, k * wide
 
 
-def _along_x(x, y, z) -> np.ndarray:
+def _along_x(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> NDArray[np.float64]:
     return np.stack(np.broadcast_arrays(np.asarray(x, float), y, z), axis=1)
 
 
-def _join(*parts: tuple[np.ndarray, np.ndarray, Label]) -> Mesh:
+def _join(*parts: tuple[NDArray[np.float64], NDArray[np.int32], Label]) -> Mesh:
     vertices, faces, labels, n = [], [], [], 0
     for v, f, label in parts:
         vertices.append(v)
@@ -121,19 +131,45 @@ def target_mesh(target: cells.Target, cell: cells.Cell) -> Mesh:
 def _mesh(target: cells.Target, cell: cells.Cell) -> Mesh:
     if target.mesh == "body:forearm":
         return forearm_mesh(cell.body)
-    if target.mesh.startswith("body:"):
-        raise cells.CellError(f"mesh {target.mesh!r}: body:forearm expected, or a mesh file beside the cell file")
+    vertices, faces = _few(cell.folder / target.mesh)
+    return Mesh(vertices, faces, np.full(len(faces), target.label_values[0], np.uint8))
+
+
+def _few(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """`read`, with at most MOST_FACES triangles; once per file and process."""
+    try:
+        return _simplified(path, path.stat().st_mtime_ns)
+    except OSError as error:
+        raise cells.CellError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+@functools.lru_cache(maxsize=8)
+def _simplified(path: Path, changed_ns: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    vertices, faces = read(path)
+    if len(faces) > MOST_FACES:
+        vertices, faces = simplified(vertices, faces, MOST_FACES)
+    return vertices, faces
+
+
+def read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Vertices (n, 3) [m] and faces (m, 3) of a limb's mesh file, as they are. Raises CellError."""
     import trimesh
 
-    path = cell.folder / target.mesh
     try:
         mesh = trimesh.load_mesh(path)
-    except Exception as error:
-        raise cells.CellError(f"{path}: a triangle mesh that trimesh reads expected (STL, OBJ, PLY, GLB): {error}") from None
-    if not len(getattr(mesh, "faces", ())):
-        raise cells.CellError(f"{path}: a triangle mesh expected, this one has no triangles")
-    extent = float(max(mesh.extents))
-    if not 0.02 < extent < 3.0:
-        raise cells.CellError(f"{path}: a limb in metres expected, this mesh is {extent:.3g} long: scale it to metres")
-    labels = np.full(len(mesh.faces), target.label_values[0], np.uint8)
-    return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32), labels)
+    except Exception:  # trimesh's readers raise whatever they meet, in words about themselves
+        what = f"expected a triangle mesh (STL, OBJ, PLY, GLB or OFF), got {path}, which cannot be read as {path.suffix or 'one'}"
+        raise cells.CellError(f"{what}; export it again") from None
+    vertices, faces = np.asarray(getattr(mesh, "vertices", ()), np.float64), np.asarray(getattr(mesh, "faces", ()), np.int32)
+    if not len(faces):
+        raise cells.CellError(f"expected a triangle mesh, got no triangles in {path}; export it again, as triangles")
+    if not np.isfinite(vertices[faces]).all():
+        raise cells.CellError(f"expected finite coordinates, got some in {path} that are not; export it again")
+    extent = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
+    if not EXTENT[0] < extent < EXTENT[1]:
+        units = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "km": 1e3}
+        fitting = next((unit for unit, metres in units.items() if EXTENT[0] < extent * metres < EXTENT[1]), None)
+        hint = f"if its unit is {fitting}, scale it by {units[fitting]:g}" if fitting else "scale it"
+        what = f"expected a limb of {EXTENT[0]} to {EXTENT[1]:g} m, got {extent:.3g} m in {path}; {hint} to metres"
+        raise cells.CellError(what)
+    return vertices, faces

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.body import urdf
-from shared.body.anatomy import Mesh
-from shared.cell import description as cells
-from shared.contract.labels import Label
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.shared.body import urdf
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 
 class RobotModel:
@@ -84,7 +84,7 @@ class RobotModel:
         """
         q = np.asarray(q, dtype=float)
         if q.shape[-1:] != (len(self.joints),):
-            raise ValueError(f"joint angles: {len(self.joints)} values ({', '.join(self.joints)}) expected, shape {q.shape} came")
+            raise ValueError(f"joint angles: expected {len(self.joints)} values ({', '.join(self.joints)}), got shape {q.shape}")
         padded = np.concatenate([q, np.zeros((*q.shape[:-1], 1))], axis=-1)[..., self._index]
         s = np.where(self._prismatic, padded, np.sin(padded))[..., None, None]
         c = np.where(self._prismatic, 0.0, 1.0 - np.cos(padded))[..., None, None]

@@ -17,8 +17,8 @@ from xml.parsers import expat
 
 import numpy as np
 
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 JointKind = Literal["fixed", "revolute", "continuous", "prismatic"]
 SolidKind = Literal["mesh", "box", "sphere", "cylinder", "capsule"]

@@ -1,48 +1,82 @@
 """One description of the cell: cameras, robots, pads, targets and frames, read from one YAML file.
 
-A user with another robot, mesh, camera or skin edits only that file. It is validated on load; a fault is told with its line.
+A user with another robot, mesh, camera or skin edits only that file. It is validated when it is loaded; a fault is reported with
+its line. `penumbra check` looks at what takes longer too: meshes, field models, networks, and what cameras and pads can reach.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from math import pi
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from shared.body import urdf
-from shared.contract.labels import Label
-from shared.geometry import rigid
+from penumbra.shared.body import urdf
+from penumbra.shared.cell import document
+from penumbra.shared.cell.document import Document
+from penumbra.shared.cell.faults import CellError as CellError  # every reader of a cell file catches it from here
+from penumbra.shared.cell.faults import Fault, Faulty, explain, meant, refuse
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.lens import COEFFICIENTS, Lens
 
 BUILT_IN = Path(__file__).parent / "built_in"
-MAX_BYTES = 1_000_000
-MAX_NODES = 200_000
-"""A file has at most so many bytes and values: a thousand calibrated pads."""
 FAULTS = 20
-"""Faults of a file that are told at once."""
+"""Maximum number of faults in the text of an error."""
+SAME = 1e-6
+"""Points nearer to each other than this [m] are one."""
 
-Vector3 = Annotated[tuple[float, float, float], Field(description="metres or radians")]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool):
+        got = "true" if value else "false"
+        raise Faulty([("", f"expected a number, got {got}; YAML reads yes, no, on and off as true and false")])
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_number)]
+Whole = Annotated[int, BeforeValidator(_number)]
+Metres = Annotated[Number, Field(ge=-1e4, le=1e4)]
+Radians = Annotated[Number, Field(ge=-6.3, le=6.3)]
+"""A turn and a little; what is larger is in degrees."""
+Vector3 = tuple[Metres, Metres, Metres]
+Angles3 = tuple[Radians, Radians, Radians]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Length = Annotated[Number, Field(gt=0, le=1)]
+"""A length on a pad [m]; what is larger is in millimetres."""
+Measure = Annotated[Number, Field(ge=0.02, le=3)]
+"""A measure of a person [m]."""
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 
 
-class CellError(ValueError):
-    """A cell file that cannot be used; the text names the file, the line, what was expected and what came."""
-
-
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, ignored_types=(cached_property,))
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, ignored_types=(cached_property,), protected_namespaces=()
+    )
+
+    def __eq__(self, other: object) -> bool:
+        """By the fields alone: pydantic compares cached arrays too, which have no truth value."""
+        return type(self) is type(other) and all(getattr(self, name) == getattr(other, name) for name in type(self).model_fields)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A copy with some fields changed. What is cached belongs to the old fields, so that the copy begins without it."""
+        copied = super().model_copy(update=update, deep=deep)
+        for name in vars(copied).keys() - type(self).model_fields.keys():
+            del copied.__dict__[name]
+        return copied
 
 
 class Placement(_Model):
-    """A pose in a parent frame: position [m] and roll, pitch, yaw [rad] about the parent's fixed axes."""
+    """A pose in a parent frame."""
 
-    position: Vector3 = (0.0, 0.0, 0.0)
-    rpy: Vector3 = (0.0, 0.0, 0.0)
+    position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="x, y, z in the parent frame [m]")
+    rpy: Angles3 = Field(default=(0.0, 0.0, 0.0), description="roll, pitch, yaw about the parent's fixed axes [rad]")
 
     @cached_property
     def transform(self) -> rigid.Array:
@@ -51,71 +85,95 @@ class Placement(_Model):
 
 
 class Camera(_Model):
-    """A pinhole camera: size and intrinsics in pixels, rate, and where it stands: `position` with `look_at` or `rpy`
-    (of the optical frame: x right, y down, z forward)."""
+    """A camera. Its optical frame has x to the right, y down and z forward; pixel centres are at integer coordinates. Pictures of
+    a lens with distortion are undistorted when they arrive; everything else uses the pinhole picture."""
 
-    width: Annotated[int, Field(ge=16, le=8192)]
-    height: Annotated[int, Field(ge=16, le=8192)]
-    fx: Positive
-    fy: Positive
-    cx: float
-    cy: float
-    rate_hz: Positive = 20.0
-    position: Vector3
-    look_at: Vector3 | None = None
-    rpy: Vector3 | None = None
+    width: Annotated[Whole, Field(ge=16, le=8192)] = Field(description="columns of a picture [px]")
+    height: Annotated[Whole, Field(ge=16, le=8192)] = Field(description="rows of a picture [px]")
+    fx: Positive = Field(description="focal length along the columns [px]")
+    fy: Positive = Field(description="focal length along the rows [px]")
+    cx: Number = Field(description="column of the principal point [px]")
+    cy: Number = Field(description="row of the principal point [px]")
+    k1: Number = Field(default=0.0, description="radial distortion, OpenCV's k1")
+    k2: Number = Field(default=0.0, description="radial distortion, OpenCV's k2")
+    p1: Number = Field(default=0.0, description="tangential distortion, OpenCV's p1")
+    p2: Number = Field(default=0.0, description="tangential distortion, OpenCV's p2")
+    k3: Number = Field(default=0.0, description="radial distortion, OpenCV's k3")
+    rate_hz: Annotated[Number, Field(gt=0, le=1000)] = Field(default=20.0, description="pictures per second [Hz]")
+    position: Vector3 = Field(description="where it stands in the world [m]")
+    look_at: Vector3 | None = Field(
+        default=None, description="the point in the middle of its view [m]; either this or rpy. Looking straight down, +y is up"
+    )
+    rpy: Angles3 | None = Field(default=None, description="roll, pitch, yaw of its optical frame [rad]; either this or look_at")
 
     @model_validator(mode="after")
-    def _one_direction(self) -> Camera:
+    def _possible(self) -> Camera:
+        faults = self.lens.faults()
         if (self.look_at is None) == (self.rpy is None):
-            raise ValueError("give either look_at or rpy, not both and not neither")
+            got = "neither" if self.rpy is None else "both"
+            faults.append(("rpy" if self.rpy else "", f"expected either look_at or rpy, got {got}; give one of them"))
+        elif self.look_at is not None and np.linalg.norm(np.subtract(self.look_at, self.position)) < SAME:
+            faults.append(("look_at", "expected a point in front of the camera, got its own position; give a point that it sees"))
+        refuse(faults)
         return self
 
     @cached_property
     def T_world_camera(self) -> rigid.Array:
-        if self.look_at is not None:
-            return rigid.look_at(self.position, self.look_at)
-        return rigid.from_rpy(self.position, self.rpy or (0.0, 0.0, 0.0))
+        if self.look_at is None:
+            return rigid.from_rpy(self.position, self.rpy or (0.0, 0.0, 0.0))
+        x, y, _ = np.subtract(self.look_at, self.position)
+        is_vertical = np.hypot(x, y) < SAME
+        return rigid.look_at(self.position, self.look_at, (0.0, 1.0, 0.0) if is_vertical else (0.0, 0.0, 1.0))
 
     @cached_property
     def K(self) -> rigid.Array:
         """The 3 x 3 intrinsic matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @cached_property
+    def lens(self) -> Lens:
+        """Its size, intrinsics and distortion."""
+        return Lens(**{name: getattr(self, name) for name in ("width", "height", "fx", "fy", "cx", "cy", *COEFFICIENTS)})
+
 
 class Robot(_Model):
-    """A robot: its URDF (a path beside the cell file, or the built-in `panda/panda.urdf`), base and moving joints."""
+    """A robot."""
 
-    urdf: str
-    base: Placement = Placement()
-    joints: tuple[str, ...]
+    urdf: str = Field(description="its URDF: a path beside the cell file, or the built-in panda/panda.urdf")
+    base: Placement = Field(default=Placement(), description="its base in the world")
+    joints: Annotated[tuple[str, ...], Field(min_length=1)] = Field(
+        description="the joints that move, in the order of the joint messages"
+    )
 
 
 class Nominal(_Model):
-    """An electrode's response law as designed, on its pad's gap d [m] to a forearm that lies across: a1 / (1 + a2 d^2) [V]."""
+    """An electrode's response as designed, on its pad's gap d [m] to a forearm that lies across: a1 / (1 + a2 d^2) [V]."""
 
-    a1: Positive
-    a2: Positive
+    a1: Positive = Field(description="amplitude at contact [V]")
+    a2: Positive = Field(description="decay with the gap [1/m^2]")
 
 
 class Electrode(_Model):
-    """One measurement electrode in the pad's frame (x right, y up, z out of the pad), around `centre` [m]: a `disc` of this
-    radius [m], or an `arc` between two radii [m], `half_angle` [degrees] to both sides of the direction `towards` [degrees
-    from x]. `law`: its response as designed."""
+    """A measurement electrode in its pad's frame (x right, y up, z out of the pad): a disc or an arc around its centre."""
 
-    centre: tuple[float, float] = (0.0, 0.0)
-    disc: Positive | None = None
-    arc: tuple[Positive, Positive] | None = None
-    towards: float = 0.0
-    half_angle: Annotated[float, Field(gt=0, le=180)] = 180.0
-    law: Nominal
+    centre: tuple[Metres, Metres] = Field(default=(0.0, 0.0), description="x, y of the disc's or arc's centre [m]")
+    disc: Length | None = Field(default=None, description="radius of a disc [m]; either this or arc")
+    arc: tuple[Length, Length] | None = Field(
+        default=None, description="inner and outer radius of an arc [m]; either this or disc"
+    )
+    towards: Annotated[Number, Field(ge=-360, le=360)] = Field(
+        default=0.0, description="direction of an arc's middle from x [degrees]"
+    )
+    half_angle: Annotated[Number, Field(gt=0, le=180)] = Field(default=180.0, description="of an arc, to both sides [degrees]")
+    law: Nominal = Field(description="its response as designed")
 
     @model_validator(mode="after")
     def _one_shape(self) -> Electrode:
         if (self.disc is None) == (self.arc is None):
-            raise ValueError("give either disc (a radius) or arc (two radii)")
+            got = "neither" if self.arc is None else "both"
+            refuse([("", f"expected either disc (a radius) or arc (two radii), got {got}; give one of them")])
         if self.arc is not None and self.arc[0] >= self.arc[1]:
-            raise ValueError(f"arc: the inner radius first, got {self.arc}")
+            refuse([("arc", f"expected the inner radius before a larger outer one, got {list(self.arc)}; exchange them")])
         return self
 
     @cached_property
@@ -130,31 +188,35 @@ class Electrode(_Model):
 
 
 class Board(_Model):
-    """A printed board with its electrodes on the front: size and the ground pour on its back (x, y) [m], thickness [m],
-    relative permittivity."""
+    """A printed board with its electrodes on the front and a ground pour on its back."""
 
-    size: tuple[Positive, Positive]
-    ground: tuple[Positive, Positive]
-    thickness: Positive
-    permittivity: Annotated[float, Field(ge=1.0)] = 4.5
+    size: tuple[Length, Length] = Field(description="along x and y [m]")
+    ground: tuple[Length, Length] = Field(description="the ground pour along x and y [m]")
+    thickness: Annotated[Number, Field(gt=0, le=0.1)] = Field(description="of the laminate [m]")
+    permittivity: Annotated[Number, Field(ge=1, le=100)] = Field(default=4.5, description="relative permittivity of the laminate")
 
 
 class Ring(_Model):
-    """The excitation ring: inner and outer radius [m] around `centre` [m]."""
+    """The excitation ring."""
 
-    radii: tuple[Positive, Positive]
-    centre: tuple[float, float] = (0.0, 0.0)
+    radii: tuple[Length, Length] = Field(description="inner and outer radius [m]")
+    centre: tuple[Metres, Metres] = Field(default=(0.0, 0.0), description="x, y of its centre [m]")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Ring:
+        if self.radii[0] >= self.radii[1]:
+            refuse([("radii", f"expected the inner radius before a larger outer one, got {list(self.radii)}; exchange them")])
+        return self
 
 
 class Chain(_Model):
-    """From a change of capacitance to an amplitude: excitation [V], its frequency [Hz], the amplifier's feedback resistance
-    [ohm], the converter's bits and reference [V]. The amplifier works around half of the reference, so amplitudes end there."""
+    """From a change of capacitance to an amplitude. The amplifier works around half of the reference, so amplitudes end there."""
 
-    excitation_V: Positive
-    frequency_hz: Positive
-    feedback_ohm: Positive
-    adc_bits: Annotated[int, Field(ge=1, le=24)] = 12
-    adc_reference: Positive = 3.3
+    excitation_V: Annotated[Number, Field(gt=0, le=1e4)] = Field(description="amplitude of the excitation [V]")
+    frequency_hz: Annotated[Number, Field(gt=0, le=1e9)] = Field(description="of the excitation [Hz]")
+    feedback_ohm: Annotated[Number, Field(gt=0, le=1e12)] = Field(description="the amplifier's feedback resistance [ohm]")
+    adc_bits: Annotated[Whole, Field(ge=1, le=24)] = Field(default=12, description="resolution of the converter [bit]")
+    adc_reference: Annotated[Number, Field(gt=0, le=100)] = Field(default=3.3, description="reference of the converter [V]")
 
     @cached_property
     def sensitivity(self) -> float:
@@ -163,34 +225,48 @@ class Chain(_Model):
 
 
 class Rest(_Model):
-    """An amplitude as designed, with nothing near: offset a3 [V]; whether it rises (1) or falls (-1) where something comes near;
-    variance of its noise [V^2] in a sample of one millisecond."""
+    """An amplitude as designed, with nothing near."""
 
-    a3: NotNegative
-    polarity: Literal[-1, 1] = 1
-    noise: NotNegative
+    a3: NotNegative = Field(description="offset [V]")
+    polarity: Literal[-1, 1] = Field(default=1, description="whether it rises (1) or falls (-1) where something comes near")
+    noise: NotNegative = Field(description="variance of the noise in a sample of one millisecond [V^2]")
 
 
 class Law(_Model):
     """An electrode's calibrated response, the paper's law (eq. sensor_approx): v = a3 + polarity * a1 / (1 + a2 d^2), d the gap
-    to the skin [m]; noise [V^2] is a variance."""
+    to the skin [m]."""
 
-    a1: Positive
-    a2: Positive
-    a3: NotNegative
-    polarity: Literal[-1, 1] = 1
-    noise: NotNegative
+    a1: Positive = Field(description="amplitude at contact [V]")
+    a2: Positive = Field(description="decay with the gap [1/m^2]")
+    a3: NotNegative = Field(description="offset [V]")
+    polarity: Literal[-1, 1] = Field(default=1, description="whether it rises (1) or falls (-1) where something comes near")
+    noise: NotNegative = Field(description="variance of the noise in a sample of one millisecond [V^2]")
 
 
 class PadType(_Model):
-    """A design of pads. `board` and `ring` belong to the field model; `range` [m]: how far it feels."""
+    """A design of pads."""
 
-    board: Board
-    ring: Ring
-    electrodes: Annotated[dict[Name, Electrode], Field(min_length=1)]
-    chain: Chain
-    rest: Rest
-    range: Positive = 0.15
+    board: Board = Field(description="the printed board, for the field model")
+    ring: Ring = Field(description="the excitation ring, for the field model")
+    electrodes: Annotated[dict[Name, Electrode], Field(min_length=1)] = Field(description="by name")
+    chain: Chain = Field(description="amplifier and converter")
+    rest: Rest = Field(description="the amplitude with nothing near")
+    range: Annotated[Number, Field(gt=0, le=2)] = Field(default=0.15, description="how far it senses [m]")
+
+    @model_validator(mode="after")
+    def _possible(self) -> PadType:
+        faults = []
+        half = np.asarray(self.board.size) / 2.0
+        for name, electrode in self.electrodes.items():
+            if np.any(np.abs(electrode.centroid) > half):
+                at = ", ".join(f"{value:.3g}" for value in electrode.centroid)
+                where = f"expected an electrode on its board, {half[0]:g} m to both sides along x and {half[1]:g} m along y"
+                faults.append((f"electrodes.{name}", f"{where}, got one around ({at}); give metres"))
+        if self.rest.a3 >= self.chain.adc_reference / 2.0:
+            most = self.chain.adc_reference / 2.0
+            faults.append(("rest.a3", f"expected an offset below half of adc_reference, {most:g} V, got {self.rest.a3:g}"))
+        refuse(faults)
+        return self
 
     def law(self, electrode: str) -> Law:
         """An electrode's law as designed."""
@@ -199,23 +275,43 @@ class PadType(_Model):
 
 
 class SensingBoard(_Model):
-    """A sensing board of a pad: the serial port that it is on, and which of its six channels measure which electrode."""
+    """A sensing board of a pad."""
 
-    port: str | None = None
-    channels: Annotated[dict[Name, tuple[Annotated[int, Field(ge=0, le=5)], ...]], Field(min_length=1)]
+    port: str | None = Field(default=None, description="its serial port; without it, `penumbra skin --port` names it")
+    channels: Annotated[dict[Name, tuple[Annotated[Whole, Field(ge=0, le=5)], ...]], Field(min_length=1)] = Field(
+        description="which of its six channels, 0 to 5, measure which electrode"
+    )
+
+    @model_validator(mode="after")
+    def _apart(self) -> SensingBoard:
+        owners: dict[int, str] = {}
+        faults = []
+        for name, channels in self.channels.items():
+            if not channels:
+                faults.append((f"channels.{name}", "expected one channel or more, got an empty list; add one, or leave it out"))
+            for channel in channels:
+                if channel in owners:
+                    what = f"expected each channel once, got {channel} again ({owners[channel]} has it)"
+                    faults.append((f"channels.{name}", f"{what}; give the channel that measures {name}"))
+                owners.setdefault(channel, name)
+        refuse(faults)
+        return self
 
 
 class Pad(_Model):
-    """A pad on `link` (`world`, or ROBOT/LINK), its frame's z axis pointing out of the skin. `backed`: whether the link is
-    grounded metal behind it that its field model includes. `calibration`: measured laws by electrode. `boards`: what reads it."""
+    """A pad. Its frame's z axis points out of the skin."""
 
-    type: str
-    link: str = "world"
-    position: Vector3
-    rpy: Vector3 = (0.0, 0.0, 0.0)
-    backed: bool = False
-    calibration: dict[Name, Law] = {}
-    boards: tuple[SensingBoard, ...] = ()
+    type: str = Field(description="its design, a key of pad_types")
+    link: str = Field(default="world", description="what it sits on: world, or ROBOT/LINK")
+    position: Vector3 = Field(description="x, y, z in the frame of the link [m]")
+    rpy: Angles3 = Field(default=(0.0, 0.0, 0.0), description="roll, pitch, yaw in the frame of the link [rad]")
+    backed: bool = Field(
+        default=False, description="whether the link is grounded metal behind it, which its field model includes"
+    )
+    calibration: dict[Name, Law] = Field(
+        default={}, description="measured laws by electrode, written by `penumbra skin calibrate`"
+    )
+    boards: tuple[SensingBoard, ...] = Field(default=(), description="the sensing boards that read it")
 
     @cached_property
     def T_link_pad(self) -> rigid.Array:
@@ -223,31 +319,47 @@ class Pad(_Model):
 
 
 class Spread(_Model):
-    """Standard deviations of a pose: position [m], rotation [rad]."""
+    """Standard deviations of a pose."""
 
-    position: Positive
-    rotation: Positive
+    position: Annotated[Number, Field(gt=0, le=5)] = Field(description="of the position along each axis [m]")
+    rotation: Annotated[Number, Field(gt=0, le=pi)] = Field(description="of the rotation about each axis [rad]")
 
 
 class Size(_Model):
-    """Factors by which a target's mesh is stretched along its x axis and across it."""
+    """Factors by which a target's mesh is stretched."""
 
-    length: Positive = 1.0
-    girth: Positive = 1.0
+    length: Annotated[Number, Field(ge=0.2, le=5)] = Field(default=1.0, description="along its x axis")
+    girth: Annotated[Number, Field(ge=0.2, le=5)] = Field(default=1.0, description="across its x axis")
 
 
 class Target(_Model):
-    """What is tracked. `mesh`: `body:forearm` (the parametric forearm with hand) or a mesh file beside the cell file, in
-    metres, its x axis along the limb. `size`: how much larger than the mesh the person at hand is, where that was measured; the
-    skin's field model follows without being fitted again. Not given: the camera takes the mesh for the person, the skin knows
-    only how people differ. `labels`: the mask classes that show it. `home`: where it is expected before anything is
-    known, with its spread."""
+    """What is tracked."""
 
-    mesh: str
-    size: Size | None = None
-    labels: tuple[Literal["robot", "torso", "upper_arm", "forearm", "hand", "occluder"], ...]
-    home: Placement
-    home_spread: Spread = Spread(position=0.15, rotation=0.4)
+    mesh: str = Field(
+        description="body:forearm, the parametric forearm with hand, or a mesh file beside the cell file, in metres, its x axis "
+        "along the limb"
+    )
+    size: Size | None = Field(
+        default=None,
+        description="the person's size relative to the mesh, where it was measured; without it the camera takes the mesh for the "
+        "person, and the skin assumes any person",
+    )
+    labels: Annotated[tuple[Literal["robot", "torso", "upper_arm", "forearm", "hand", "occluder"], ...], Field(min_length=1)] = (
+        Field(description="the mask classes that show it, of: robot, torso, upper_arm, forearm, hand, occluder")
+    )
+    home: Placement = Field(description="where it is expected before anything is known, in the world")
+    home_spread: Spread = Field(default=Spread(position=0.15, rotation=0.4), description="how well its home is known")
+
+    @model_validator(mode="after")
+    def _known(self) -> Target:
+        faults = []
+        if self.mesh.startswith("body:") and self.mesh != "body:forearm":
+            what = f"expected body:forearm, or a mesh file beside the cell file, got {self.mesh!r:.60}"
+            faults.append(("mesh", f"{what}; body:forearm is the only parametric body"))
+        if twice := sorted({label for label in self.labels if self.labels.count(label) > 1}):
+            faults.append(("labels", f"expected each class once, got {', '.join(twice)} several times; remove one"))
+        refuse(faults)
+        return self
 
     @cached_property
     def label_values(self) -> tuple[int, ...]:
@@ -255,115 +367,165 @@ class Target(_Model):
 
 
 class Body(_Model):
-    """The person's measures [m]; defaults: 50th percentile of men, ANSUR II (Gordon et al. 2014)."""
+    """The person's measures. Defaults: 50th percentile of men, ANSUR II (Gordon et al. 2014)."""
 
-    forearm_length: Positive = 0.267
-    hand_length: Positive = 0.193
-    hand_breadth: Positive = 0.088
-    forearm_circumference: Positive = 0.308
-    wrist_circumference: Positive = 0.176
-    upper_arm_length: Positive = 0.336
-    upper_arm_circumference: Positive = 0.358
-    chest_breadth: Positive = 0.289
-    chest_depth: Positive = 0.254
-    shoulder_height: Positive = 0.58
+    forearm_length: Measure = Field(default=0.267, description="elbow to wrist [m]")
+    hand_length: Measure = Field(default=0.193, description="wrist to tip of the middle finger [m]")
+    hand_breadth: Measure = Field(default=0.088, description="across the knuckles [m]")
+    forearm_circumference: Measure = Field(default=0.308, description="largest [m]")
+    wrist_circumference: Measure = Field(default=0.176, description="at the wrist [m]")
+    upper_arm_length: Measure = Field(default=0.336, description="shoulder to elbow [m]")
+    upper_arm_circumference: Measure = Field(default=0.358, description="largest [m]")
+    chest_breadth: Measure = Field(default=0.289, description="from side to side [m]")
+    chest_depth: Measure = Field(default=0.254, description="from front to back [m]")
+    shoulder_height: Measure = Field(default=0.58, description="shoulder above the seat [m]")
 
 
 class Motion(_Model):
-    """The region in which the emulator moves the target: bounds of position [m] and roll, pitch, yaw [rad]."""
+    """The region in which the emulator moves the target."""
 
-    low: Vector3
-    high: Vector3
-    rpy_low: Vector3
-    rpy_high: Vector3
-    speed: Positive = 0.25
+    low: Vector3 = Field(description="lower bounds of x, y, z [m]")
+    high: Vector3 = Field(description="upper bounds of x, y, z [m]")
+    rpy_low: Angles3 = Field(description="lower bounds of roll, pitch, yaw [rad]")
+    rpy_high: Angles3 = Field(description="upper bounds of roll, pitch, yaw [rad]")
+    speed: Annotated[Number, Field(gt=0, le=10)] = Field(default=0.25, description="mean speed of a reach [m/s]")
 
     @model_validator(mode="after")
     def _ordered(self) -> Motion:
-        for low, high, what in ((self.low, self.high, "low/high"), (self.rpy_low, self.rpy_high, "rpy_low/rpy_high")):
+        faults = []
+        for name in ("low", "rpy_low"):
+            upper = name.replace("low", "high")
+            low, high = getattr(self, name), getattr(self, upper)
             if any(a > b for a, b in zip(low, high, strict=True)):
-                raise ValueError(f"{what}: every lower bound must not exceed its upper bound, got {low} and {high}")
+                what = f"expected lower bounds that do not exceed {upper} {list(high)}, got {list(low)}"
+                faults.append((name, f"{what}; exchange them"))
+        refuse(faults)
         return self
 
 
 class Payload(_Model):
-    """What a robot carries: its mass [kg], as a point at `position` [m] in the frame of `link`."""
+    """What a robot carries: a point mass."""
 
-    mass: Positive
-    link: str
-    position: Vector3 = (0.0, 0.0, 0.0)
+    mass: Annotated[Number, Field(gt=0, le=1000)] = Field(description="of the load [kg]")
+    link: str = Field(description="the link that carries it")
+    position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="x, y, z in the frame of the link [m]")
 
 
 class Sim(_Model):
-    """What only the emulator needs. `shoulder`: where the person's right shoulder would be [m] if the arm were long enough;
-    `joints_low`, `joints_high`: the bounds of all robots' joints, one after the other; `payloads`: what robots carry; `table`:
-    length and breadth [m] of a table whose top is z = 0, around `table_middle`."""
+    """What only the emulator needs."""
 
-    motion: Motion
-    shoulder: Vector3
-    joints_low: tuple[float, ...] = ()
-    joints_high: tuple[float, ...] = ()
-    payloads: dict[Name, Payload] = {}
-    table: tuple[float, float] | None = None
-    table_middle: tuple[float, float] = (0.0, 0.0)
+    motion: Motion = Field(description="where and how fast the target moves")
+    shoulder: Vector3 = Field(description="where the person's right shoulder would be if the arm were long enough [m]")
+    joints_low: tuple[Number, ...] = Field(
+        default=(), description="lower bounds of all robots' joints, one after the other [rad or m]"
+    )
+    joints_high: tuple[Number, ...] = Field(
+        default=(), description="upper bounds of all robots' joints, one after the other [rad or m]"
+    )
+    payloads: dict[Name, Payload] = Field(default={}, description="what robots carry, by robot")
+    table: tuple[Positive, Positive] | None = Field(
+        default=None, description="length and breadth of a table whose top is z = 0 [m]"
+    )
+    table_middle: tuple[Metres, Metres] = Field(default=(0.0, 0.0), description="x, y of the table's middle [m]")
 
 
 class Cell(_Model):
-    name: Name
-    frame: Name = "world"
-    cameras: dict[Name, Camera] = {}
-    robots: dict[Name, Robot] = {}
-    pad_types: dict[Name, PadType] = {}
-    pads: dict[Name, Pad] = {}
-    targets: Annotated[dict[Name, Target], Field(min_length=1)]
-    body: Body = Body()
-    sim: Sim | None = None
-    folder: Path = Path(".")
+    """A work cell. Everything is in metres, radians and volts, in the world frame unless it says otherwise."""
+
+    name: Name = Field(description="of the cell; part of every topic's key")
+    frame: Name = Field(default="world", description="name of the world frame in messages")
+    cameras: dict[Name, Camera] = Field(default={}, description="by name")
+    robots: dict[Name, Robot] = Field(default={}, description="by name")
+    pad_types: dict[Name, PadType] = Field(default={}, description="designs of pads, by name")
+    pads: dict[Name, Pad] = Field(default={}, description="by name")
+    targets: Annotated[dict[Name, Target], Field(min_length=1)] = Field(description="what is tracked, by name")
+    body: Body = Field(default=Body(), description="the person's measures")
+    sim: Sim | None = Field(default=None, description="what only the emulator needs; a real cell may leave it out")
+    folder: Path = Field(default=Path("."), exclude=True)
 
     @model_validator(mode="after")
     def _references(self) -> Cell:
-        links = {"world"} | {f"{name}/" for name in self.robots}
-        for name, pad in self.pads.items():
-            if pad.type not in self.pad_types:
-                raise ValueError(f"pads.{name}.type: one of {sorted(self.pad_types)} expected, got {pad.type!r}")
-            electrodes = self.pad_types[pad.type].electrodes
-            named = {*pad.calibration, *(electrode for board in pad.boards for electrode in board.channels)}
-            if unknown := sorted(named - set(electrodes)):
-                raise ValueError(f"pads.{name}: electrodes {list(electrodes)} expected, got {', '.join(unknown)}")
-            if pad.backed and pad.link == "world":
-                raise ValueError(f"pads.{name}.backed: only a pad on a robot's link has the link behind it, this one is on world")
-            robot, slash, _ = pad.link.partition("/")
-            if robot + slash not in links:
-                raise ValueError(
-                    f"pads.{name}.link: world or ROBOT/LINK with ROBOT one of {sorted(self.robots)} expected, got {pad.link!r}"
-                )
-        for name, target in self.targets.items():
-            if not target.mesh.startswith("body:") and not is_file(self.folder / target.mesh):
-                raise ValueError(
-                    f"targets.{name}.mesh: no file {self.folder / target.mesh}: give body:forearm or a mesh beside the cell file"
-                )
-        self._check_robots()
+        faults = [*self._pad_faults(), *self._mesh_faults(), *self._robot_faults()]
+        refuse(faults)
         return self
 
-    def _check_robots(self) -> None:
-        """Raises ValueError for a URDF that cannot be read, and for joints, links of pads and payloads that its robot has not."""
+    def _pad_faults(self) -> list[tuple[str, str]]:
+        faults: list[tuple[str, str]] = []
+        places: dict[tuple[Any, ...], str] = {}
+        ports: dict[str, str] = {}
+        for name, pad in self.pads.items():
+            if pad.type not in self.pad_types:
+                what = f"expected one of {', '.join(self.pad_types) or 'pad_types'}, got {pad.type!r:.60}"
+                faults.append((f"pads.{name}.type", what + meant(pad.type, self.pad_types)))
+                continue
+            electrodes = list(self.pad_types[pad.type].electrodes)
+            for electrode in sorted(set(pad.calibration) - set(electrodes)):
+                what = f"expected one of the electrodes {', '.join(electrodes)}, got {electrode!r}{meant(electrode, electrodes)}"
+                faults.append((f"pads.{name}.calibration.{electrode}", what))
+            for k, board in enumerate(pad.boards):
+                for electrode in sorted(set(board.channels) - set(electrodes)):
+                    what = (
+                        f"expected one of the electrodes {', '.join(electrodes)}, got {electrode!r}{meant(electrode, electrodes)}"
+                    )
+                    faults.append((f"pads.{name}.boards.{k}.channels.{electrode}", what))
+                if board.port is not None and board.port in ports:
+                    what = f"expected a port for each board, got {board.port!r:.60} again ({ports[board.port]} has it)"
+                    faults.append((f"pads.{name}.boards.{k}.port", what))
+                ports.setdefault(board.port or "", f"pad {name}")
+            if pad.backed and pad.link == "world":
+                faults.append((f"pads.{name}.backed", "expected a pad on a robot's link, got one on world; leave backed out"))
+            place = (pad.link, pad.position)
+            if place in places:
+                what = f"expected a place of its own, got that of {places[place]}"
+                faults.append((f"pads.{name}.position", f"{what}; give another position or remove one of the pads"))
+            places.setdefault(place, name)
+        return faults
+
+    def _mesh_faults(self) -> list[tuple[str, str]]:
+        files = {name: self.folder / target.mesh for name, target in self.targets.items() if not target.mesh.startswith("body:")}
+        remedy = "give body:forearm or a mesh file beside the cell file"
+        missing = {name: path for name, path in files.items() if not is_file(path)}
+        return [(f"targets.{name}.mesh", f"expected a mesh, got no file {path}; {remedy}") for name, path in missing.items()]
+
+    def _robot_faults(self) -> list[tuple[str, str]]:
+        """Of URDFs that cannot be read, and of joints, limits, and links of pads and payloads that a robot does not have."""
+        faults: list[tuple[str, str]] = []
         links: dict[str, tuple[str, ...]] = {}
+        limits: list[tuple[str, float, float]] = []
         for name, robot in self.robots.items():
             try:
                 description = urdf.read(urdf_path(robot, self.folder))
             except (CellError, urdf.UrdfError) as error:
-                raise ValueError(f"robots.{name}.urdf: {error}") from None
-            if fault := description.fault(robot.joints):
-                raise ValueError(f"robots.{name}.joints: {fault}")
+                faults.append((f"robots.{name}.urdf", str(error)))
+                continue
             links[name] = tuple(link.name for link in description.links)
+            if fault := description.fault(robot.joints):
+                faults.append((f"robots.{name}.joints", fault))
+                continue
+            moving = {joint.name: joint for joint in description.joints}
+            limits += [(joint, moving[joint].lower, moving[joint].upper) for joint in robot.joints]
+        if self.sim is not None and not faults:
+            faults += _bound_faults(self.sim, limits)
         places = {f"pads.{name}.link": pad.link.partition("/") for name, pad in self.pads.items() if pad.link != "world"}
         for name, payload in (self.sim.payloads if self.sim else {}).items():
             if name not in self.robots:
-                raise ValueError(f"sim.payloads.{name}: expected one of {sorted(self.robots)}, got {name!r}")
-            places[f"sim.payloads.{name}.link"] = (name, "/", payload.link)
-        for place, (owner, _, link) in places.items():
-            if link not in links[owner]:
-                raise ValueError(f"{place}: robot {owner} has no link {link!r}: it has {', '.join(links[owner])}")
+                faults.append((f"sim.payloads.{name}", f"expected one of {', '.join(self.robots) or 'robots'}, got {name!r}"))
+            else:
+                places[f"sim.payloads.{name}.link"] = (name, "/", payload.link)
+        for place, (owner, slash, link) in places.items():
+            if owner not in self.robots or not slash:
+                known = ", ".join(self.robots) or "robots, of which this cell has none"
+                faults.append(
+                    (place, f"expected world, or ROBOT/LINK with ROBOT one of {known}, got {owner + slash + link!r:.60}")
+                )
+            elif owner in links and link not in links[owner]:
+                faults.append(
+                    (
+                        place,
+                        f"robot {owner} has no link {link!r:.60}: it has {', '.join(links[owner])}{meant(link, links[owner])}",
+                    )
+                )
+        return faults
 
     def one(self, kind: Literal["cameras", "robots", "pads", "targets"], name: str | None) -> str:
         """The name of a camera, robot, pad or target, checked; None means the first one. Raises CellError."""
@@ -373,6 +535,26 @@ class Cell(_Model):
         if name not in known:
             raise CellError(f"cell {self.name} has no {kind[:-1]} {name!r}: it has {', '.join(known) or 'none'}")
         return str(name)
+
+
+def _bound_faults(sim: Sim, limits: Sequence[tuple[str, float, float]]) -> list[tuple[str, str]]:
+    """Of the emulator's bounds of joints, given each one's name and limits in the URDF."""
+    wrong = [name for name in ("joints_low", "joints_high") if len(getattr(sim, name)) != len(limits)]
+    if wrong:
+        names = ", ".join(joint for joint, _, _ in limits) or "no robot moves"
+        what = f"expected {len(limits)} values, one for each joint ({names})"
+        return [(f"sim.{name}", f"{what}, got {len(getattr(sim, name))}; add or remove values") for name in wrong]
+    faults = []
+    for k, (joint, lower, upper) in enumerate(limits):
+        low, high = sim.joints_low[k], sim.joints_high[k]
+        if low > high:
+            what = f"expected a lower bound of {joint} that does not exceed the upper one, {high:g}, got {low:g}"
+            faults.append((f"sim.joints_low.{k}", f"{what}; exchange them"))
+        for side, value in (("low", low), ("high", high)):
+            if not lower <= value <= upper:
+                what = f"expected a bound of {joint} within its limits in the URDF, {lower:g} to {upper:g}, got {value:g}"
+                faults.append((f"sim.joints_{side}.{k}", what))
+    return faults
 
 
 def source(cell: str | Path) -> Path:
@@ -386,74 +568,42 @@ def source(cell: str | Path) -> Path:
     return path
 
 
+@dataclass(frozen=True)
+class Reading:
+    """What a cell file says: `cell` is None where it has faults."""
+
+    document: Document
+    cell: Cell | None
+    faults: tuple[Fault, ...]
+
+
+def read(cell: str | Path) -> Reading:
+    """A built-in name (`table`, `arm`) or a YAML file, with all faults that the file itself has. Raises CellError where there is
+    no such file, or none of YAML."""
+    path = source(cell)
+    found = document.read(path)
+    if not isinstance(found.data, Mapping):
+        got = "an empty file" if found.data is None else f"a {type(found.data).__name__}"
+        return Reading(found, None, (found.fault([], f"expected a map with name, cameras, pads and targets, got {got}"),))
+    faults = list(found.duplicates)
+    read_cell = None
+    try:
+        read_cell = Cell.model_validate({**found.data, "folder": path.parent})
+    except ValidationError as error:
+        faults += [found.fault(place, reason) for place, reason in explain(Cell, error.errors())]
+    if "folder" in found.data:
+        faults.append(found.fault("folder", "expected no such key, got folder; remove it"))
+    return Reading(found, None if faults else read_cell, tuple(sorted(faults, key=lambda fault: fault.line)))
+
+
 def load(cell: str | Path) -> Cell:
     """The cell of a built-in name (`table`, `arm`) or of a YAML file. Raises CellError with file, line and reason."""
-    path = source(cell)
-    data, tree = _read(path)
-    if not isinstance(data, dict):
-        raise CellError(f"{path}:1: a map with name, cameras, pads and targets expected, a {type(data).__name__} came")
-    try:
-        return Cell.model_validate({**data, "folder": path.parent})
-    except ValidationError as error:
-        faults = error.errors()
-        more = [f"{path}: and {len(faults) - FAULTS} faults more"] if len(faults) > FAULTS else []
-        raise CellError("\n".join([*(_explain(path, tree, e) for e in faults[:FAULTS]), *more])) from None
-
-
-def _read(path: Path) -> tuple[Any, yaml.Node | None]:
-    """What a YAML file holds, and the nodes that it comes from. Raises CellError where it is none, or more than a cell needs: a
-    short file may name lists of lists of lists that fill any memory."""
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise CellError(f"{path}: cannot be read: {error.strerror}") from None
-    try:
-        if len(text) > MAX_BYTES:
-            raise ValueError(f"at most {MAX_BYTES} bytes expected, more came")
-        loader = yaml.SafeLoader(text.decode())
-        tree = loader.get_single_node()
-        _count_nodes(tree, {})
-        return None if tree is None else loader.construct_document(tree), tree
-    except Exception as error:  # PyYAML has no end of kinds for what a scalar is not
-        raise CellError(f"{path}: not YAML: {error!s:.500}") from None
-
-
-def _count_nodes(node: yaml.Node | None, known: dict[int, int | None]) -> int:
-    """Nodes in a tree, those that are referred to counted each time. Raises ValueError for more than MAX_NODES, and where one
-    contains itself."""
-    if not isinstance(node, yaml.CollectionNode):
-        return 1
-    if id(node) not in known:
-        known[id(node)] = None
-        pairs = isinstance(node, yaml.MappingNode)
-        inner = [part for pair in node.value for part in pair] if pairs else node.value
-        known[id(node)] = 1 + sum(_count_nodes(part, known) for part in inner)
-    count = known[id(node)]
-    if count is None:
-        raise ValueError("a value that contains itself")
-    if count > MAX_NODES:
-        raise ValueError(f"at most {MAX_NODES} values expected, more came")
-    return count
-
-
-def _explain(path: Path, tree: yaml.Node | None, error: Any) -> str:
-    location = [str(part) for part in error["loc"]]
-    reason = error["msg"].removeprefix("Value error, ")
-    if not location and ": " in reason:  # a fault between parts names its place itself
-        location = reason.partition(": ")[0].split(".")
-        reason = reason.partition(": ")[2]
-    got = error.get("input")
-    if isinstance(got, str | int | float | bool) and "got" not in reason:
-        reason += f", got {_short(got)}"
-    return f"{path}:{_line(tree, location)}: {'.'.join(location):.200}: {reason:.500}"
-
-
-def _short(value: str | int | float) -> str:
-    """A value in an error; Python does not print very long integers at all."""
-    if isinstance(value, int) and value.bit_length() > 64:
-        return f"an integer of {value.bit_length()} bits"
-    return f"{value!r:.100}"
+    reading = read(cell)
+    if reading.cell is None:
+        more = len(reading.faults) - FAULTS
+        texts = [*map(str, reading.faults[:FAULTS]), *([f"{reading.document.path}: and {more} faults more"] if more > 0 else [])]
+        raise CellError("\n".join(texts))
+    return reading.cell
 
 
 def urdf_path(robot: Robot, folder: Path) -> Path:
@@ -470,22 +620,3 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):
         return False
-
-
-def _line(node: yaml.Node | None, location: list[str]) -> int:
-    """The line of the deepest node on the way to `location`."""
-    if node is None:
-        return 1
-    line = node.start_mark.line + 1
-    for part in location:
-        if isinstance(node, yaml.MappingNode):
-            match = next(((k, v) for k, v in node.value if k.value == part), None)
-            if match is None:
-                break
-            line, node = match[0].start_mark.line + 1, match[1]
-        elif isinstance(node, yaml.SequenceNode) and part.isdigit() and int(part) < len(node.value):
-            node = node.value[int(part)]
-            line = node.start_mark.line + 1
-        else:
-            break
-    return line

@@ -10,14 +10,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from shared.contract import processes, topics
-from shared.contract.topics import TOPICS, Topic
+from penumbra.shared.contract import processes, topics
+from penumbra.shared.contract.topics import TOPICS, Topic
 
 SERVICES = tuple(process.name for process in processes.REPORTING)
 """Processes that publish, answer and report their own health."""
 ROUTER, OPERATOR, VIEWER = processes.ROUTER.name, "operator", "viewer"
 """The meeting point, which passes on what other routers have let through, and people's commands."""
-HOLDERS = (*SERVICES, ROUTER, OPERATOR, VIEWER)
+DRIVER = "driver"
+"""A program that publishes from cameras, robots or skins of its own; it reads like a viewer."""
+HOLDERS = (*SERVICES, DRIVER, ROUTER, OPERATOR, VIEWER)
 
 ANSWERS = {
     process.name: [topics.QUERYABLES[name].format(cell="*", target="*") for name in process.answers]
@@ -32,7 +34,7 @@ def holder(service: str, is_router: bool) -> str:
     """Whose certificate a process shows: what is no service only looks."""
     if is_router:
         return ROUTER
-    return service if service in (*SERVICES, OPERATOR) else VIEWER
+    return service if service in (*SERVICES, DRIVER, OPERATOR) else VIEWER
 
 
 def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES) -> dict[str, Any]:
@@ -44,25 +46,28 @@ def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES)
     keys = [topic.at() for topic in table]
     rules = [
         # a router's own clients are filtered where they come in, so that all may be handed out
-        _rule("hear", EVERYTHING, ["penumbra/**"], "egress"),
+        _rule("receive", EVERYTHING, ["penumbra/**"], "egress"),
         _rule("pass on", EVERYTHING, ["penumbra/**"]),
         _rule("read", ["declare_subscriber"], keys),
         _rule("see who lives", ["liveliness_query", "declare_liveliness_subscriber"], [topics.alive("*")]),
-        _rule("ask", ["query"], [topics.current_pose("*", "*"), topics.health("*")]),
+        _rule("ask", ["query"], [topics.current_pose("*", "*"), topics.description(), topics.health("*")]),
         _rule("steer", ["query"], [topics.control("*"), topics.launcher("*")]),
     ]
-    reader = ["hear", "read", "see who lives", "ask"]
-    policies = {ROUTER: ["hear", "pass on"], OPERATOR: [*reader, "steer"], VIEWER: reader}
+    reader = ["receive", "read", "see who lives", "ask"]
+    policies = {ROUTER: ["receive", "pass on"], OPERATOR: [*reader, "steer"], VIEWER: reader}
+    for holder in (*services, DRIVER):
+        policies[holder] = list(reader)
+        if says := [topic.at() for topic in table if holder in topic.publishers]:
+            rules.append(_rule(f"{holder} publishes", ["put"], says))
+            policies[holder].append(f"{holder} publishes")
     for service in services:
         own = [
             _rule(f"{service} lives", ["liveliness_token"], [topics.alive("*", service)]),
             _rule(f"{service} answers", ["declare_queryable", "reply"],
                   [topics.health("*", service), *ANSWERS.get(service, ())]),
         ]  # fmt: skip
-        if says := [topic.at() for topic in table if service in topic.publishers]:
-            own.append(_rule(f"{service} publishes", ["put"], says))
         rules += own
-        policies[service] = [*reader, *(rule["id"] for rule in own)]
+        policies[service] += [rule["id"] for rule in own]
     return {
         "enabled": True,
         "default_permission": "deny",

@@ -1,7 +1,7 @@
 """The one table of processes. Launcher, command line, access rules, doctor and metrics are derived from it; import contracts,
 Dockerfile and compose file are tested against it.
 
-To add a service, add a row here and a folder `services/NAME` whose `service.py` has NAME, `arguments` and `start`.
+To add a service, add a row here and a folder `services/NAME` whose `service.py` has NAME, FLAGS and `start`.
 """
 
 from __future__ import annotations
@@ -10,15 +10,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from shared.cell.description import Cell
+    from penumbra.shared.cell.description import Cell
 
 
 @dataclass(frozen=True)
 class Tool:
-    """A command beside a service, such as `penumbra segmentation train`. `function`: `MODULE:FUNCTION`, called with the arguments
-    that follow; `extra`: what it needs of `pip install -e '.[EXTRA]'`."""
+    """A command beside a service, such as `penumbra segmentation train`. `about`: its line in the service's help; `function`:
+    `MODULE:NAME` of its `services.flags.Command`; `extra`: what it needs of `pip install -e '.[EXTRA]'`."""
 
     name: str
+    about: str
     function: str
     extra: str
 
@@ -84,7 +85,7 @@ class Process:
     @property
     def module(self) -> str:
         """The module that wires it to the bus."""
-        return f"services.{self.name}.service"
+        return f"penumbra.services.{self.name}.service"
 
     def is_needed(self, cell: Cell) -> bool:
         """Whether the cell has what this process works on."""
@@ -111,59 +112,89 @@ PROCESSES = (
     ),
     Process(
         "segmentation",
-        "frames to masks (`segmentation infer`: of files; `segmentation train`: learn the network again)",
+        "frames to masks",
         extra="segmentation",
         needs="cameras",
         vision="procnet",
         tools=(
-            Tool("train", "services.segmentation.training.train:main", extra="segmentation,train"),
-            Tool("infer", "services.segmentation.files:main", extra="segmentation"),
-            Tool("photographs", "services.segmentation.training.photographs:main", extra="segmentation"),
+            Tool(
+                "train",
+                "train the network",
+                "penumbra.services.segmentation.training.train:main",
+                extra="segmentation,train",
+            ),
+            Tool("infer", "masks of pictures and films", "penumbra.services.segmentation.files:main", extra="segmentation"),
+            Tool(
+                "photographs",
+                "frames and masks for the training from labelled photographs",
+                "penumbra.services.segmentation.training.photographs:main",
+                extra="segmentation",
+            ),
         ),
         trained_by="train",
     ),
     Process(
         "search",
-        "masks to the camera's pose (`search refine`, `search track`: of any rigid mesh on mask files)",
+        "masks to the camera's pose",
         extra="search",
         needs="cameras",
         vision="procnet",
         flags=(Flag("method", "of the search", choices=("default", "paper")),),
         tools=(
-            Tool("refine", "services.search.objects.tools:refine", extra="search"),
-            Tool("track", "services.search.objects.tools:track", extra="search"),
+            Tool(
+                "refine",
+                "one pose of any rigid mesh on a mask file",
+                "penumbra.services.search.objects.tools:refine",
+                extra="search",
+            ),
+            Tool(
+                "track",
+                "any rigid mesh through a sequence of mask files",
+                "penumbra.services.search.objects.tools:track",
+                extra="search",
+            ),
         ),
     ),
     Process(
         "posecnn",
-        "frames to the camera's pose, in place of segmentation and search (`posecnn train`: learn the network again)",
+        "frames to the camera's pose, in place of segmentation and search",
         extra="posecnn",
         needs="cameras",
         vision="posecnn",
-        tools=(Tool("train", "services.posecnn.training.train:main", extra="posecnn,train"),),
+        tools=(Tool("train", "train the network", "penumbra.services.posecnn.training.train:main", extra="posecnn,train"),),
         trained_by="train",
     ),
     Process(
         "skin",
-        "sensing boards on serial ports to voltages (`skin decode`, `calibrate`, `characterise`, `model`: see each --help)",
+        "sensing boards on serial ports to voltages",
         extra="skin",
         needs="pads",
         replicas=0,  # belongs to a machine with boards, which name their ports
         beside=False,
         tools=(
-            Tool("decode", "services.skin.decode:main", extra="skin"),
-            Tool("calibrate", "services.skin.calibration.calibrate:main", extra="skin"),
-            Tool("characterise", "services.skin.calibration.characterise:main", extra="skin,emulator"),
-            Tool("model", "services.skin.model:main", extra="train"),
+            Tool("decode", "one reply of a board, in hex, as JSON", "penumbra.services.skin.decode:main", extra="skin"),
+            Tool(
+                "calibrate",
+                "the response of every electrode, from a recording or by hand",
+                "penumbra.services.skin.calibration.calibrate:main",
+                extra="skin",
+            ),
+            Tool(
+                "characterise",
+                "noise, reach and response of a pad: tables and pictures",
+                "penumbra.services.skin.calibration.characterise:main",
+                extra="skin,emulator",
+            ),
+            Tool("model", "fit the field model of a cell's pads", "penumbra.services.skin.model:main", extra="train"),
         ),
         in_compose=False,
     ),
     Process(
         "haptics",
-        "voltages to the skin's pose (`haptics train`: learn the network again)",
+        "voltages to the skin's pose",
         extra="haptics",
         needs="pads",
-        tools=(Tool("train", "services.haptics.train:main", extra="haptics,train"),),
+        tools=(Tool("train", "train the network", "penumbra.services.haptics.train:main", extra="haptics,train"),),
         trained_by="train",
     ),
     Process(
@@ -172,7 +203,7 @@ PROCESSES = (
         extra="fusion",
         replicas=2,  # the pose must not pause where one of them dies
         flags=(Flag("observer", "of the fusion", choices=("default", "paper")),),
-        answers=("current_pose",),
+        answers=("current_pose", "description"),
         metrics=(
             Metric(
                 "fused_state",

@@ -5,12 +5,11 @@ Fusion knows nothing else of its senses. A new sense is a row here, a topic with
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from enum import Enum
 
-from shared.contract import topics
-from shared.contract.topics import Topic
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.topics import Topic
 
 
 class Measures(Enum):
@@ -68,7 +67,7 @@ class Sense:
     def __post_init__(self) -> None:
         if "{target}" not in self.topic.key:
             raise TypeError(f"sense {self.name}: expected a topic with {{target}} in its key, got {self.topic.key}")
-        known = {field.name for field in dataclasses.fields(self.topic.message)}
+        known = set(self.topic.message.__struct_fields__)
         wanted = {"target", "frame", *self.measures.value, *({"state"} if self.usable else ()), *({self.part} - {None})}
         if missing := sorted(wanted - known):
             raise TypeError(

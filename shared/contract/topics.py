@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Literal
 
-from shared.contract import messages
+from penumbra.shared.contract import messages
 
 if TYPE_CHECKING:
-    from shared.cell.description import Cell
+    from penumbra.shared.cell.description import Cell
 
 
 class QoS(Enum):
@@ -31,9 +31,9 @@ class Priority(Enum):
 class Topic:
     """`key` with its {names} to fill in; nominal `rate_hz`; `depth`: samples that a reader keeps while busy;
     `stale_s`: the age after which a reader calls the topic stale; `publishers`: the processes (`shared.contract.processes`) that
-    may publish it; `slow_hz`: how often a slow link carries a key's messages, 0 for never (`penumbra router --slow`);
-    `by_camera`: whether all cameras' messages go by one key, each at the rate of its camera; `needs`: the part of a cell without
-    which nobody publishes it, where that is not in its key."""
+    may publish it, and `driver` for a user's program with a sensor (`penumbra.client`); `slow_hz`: how often a slow link carries
+    a key's messages, 0 for never (`penumbra router --slow`); `by_camera`: whether all cameras' messages go by one key, each at
+    the rate of its camera; `needs`: the part of a cell without which nobody publishes it, where that is not in its key."""
 
     name: str
     key: str
@@ -64,12 +64,12 @@ class Topic:
         return self.key.format(**{name: names.get(name, "*") for name in wanted})
 
 
-FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, ("emulator",), "one RGB image",
-              Priority.IMAGE, 0)  # fmt: skip
-JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, ("emulator",),
+FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, ("emulator", "driver"),
+              "one RGB image", Priority.IMAGE, 0)  # fmt: skip
+JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, ("emulator", "driver"),
                "joint angles [rad]", Priority.SIGNAL, 20)  # fmt: skip
-VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1, ("emulator", "skin"),
-                 "electrode amplitudes [V], 1 kHz in batches", Priority.SIGNAL, 0)  # fmt: skip
+VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1,
+                 ("emulator", "skin", "driver"), "electrode amplitudes [V], 1 kHz in batches", Priority.SIGNAL, 0)  # fmt: skip
 TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 50, 16, 0.2, ("emulator",),
               "what the emulator knows", Priority.SIGNAL, 5)  # fmt: skip
 MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, ("segmentation",),
@@ -86,6 +86,7 @@ TOPICS = (FRAME, JOINTS, VOLTAGES, TRUTH, MASK, VISION, HAPTIC, FUSED)
 
 QUERYABLES = {
     "current_pose": "penumbra/{cell}/target/{target}/pose",
+    "description": "penumbra/{cell}/description",
     "control": "penumbra/{cell}/sim/control",
     "launcher": "penumbra/{cell}/launcher/control",
 }
@@ -95,6 +96,11 @@ QUERYABLES = {
 def current_pose(cell: str, target: str) -> str:
     """Queryable: the current fused pose, MessagePack of FusedPose, or JSON with `?format=json`."""
     return QUERYABLES["current_pose"].format(cell=cell, target=target)
+
+
+def description(cell: str = "*") -> str:
+    """Queryable: what is in the cell, JSON of `shared.contract.outline.Outline`, for programs that do not have the cell file."""
+    return QUERYABLES["description"].format(cell=cell)
 
 
 def control(cell: str) -> str:

@@ -7,11 +7,12 @@ them (top-left rule, on a grid of 1/256 pixel). Triangles are clipped at the nea
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.native import inner, kernel
+from penumbra.shared.native import inner, kernel
 
 NEAR = 0.02
 """Nothing closer to the camera than this [m] is drawn."""
@@ -39,7 +40,14 @@ class Raster:
         self._drawn = 0
 
     def draw(
-        self, vertices: NDArray, faces: NDArray[np.int32], fx: float, fy: float, cx: float, cy: float, ids: ArrayLike
+        self,
+        vertices: NDArray[np.floating[Any]],
+        faces: NDArray[np.int32],
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        ids: ArrayLike,
     ) -> None:
         """Draws vertices (n, 3) [m] in the camera's frame, faces (m, 3), with one id for all or one per face (m,)."""
         ids = np.ascontiguousarray(np.broadcast_to(np.asarray(ids, np.uint8), len(faces)))
@@ -49,7 +57,10 @@ class Raster:
 
 
 def silhouette(
-    vertices: NDArray, faces: NDArray[np.int32], intrinsics: tuple[float, float, float, float], window: tuple[int, int, int, int]
+    vertices: NDArray[np.floating[Any]],
+    faces: NDArray[np.int32],
+    intrinsics: tuple[float, float, float, float],
+    window: tuple[int, int, int, int],
 ) -> NDArray[np.bool_]:
     """The pixels (h, w) that a mesh covers in a window (x0, y0, w, h) of an image with intrinsics (fx, fy, cx, cy).
 
@@ -58,12 +69,12 @@ def silhouette(
     fx, fy, cx, cy = intrinsics
     x0, y0, w, h = window
     out = np.zeros((h, w), np.bool_)
-    _silhouette(np.ascontiguousarray(vertices, np.float64), faces, fx, fy, cx - x0, cy - y0, out)
+    draw_silhouette(np.ascontiguousarray(vertices, np.float64), faces, fx, fy, cx - x0, cy - y0, out)
     return out
 
 
 @inner
-def _project(x, y, z, fx, fy, cx, cy):
+def _project(x, y, z, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
     """Sub-pixel integer coordinates of a point."""
     u = min(max(fx * x / z + cx, -_FAR_PX), _FAR_PX)
     v = min(max(fy * y / z + cy, -_FAR_PX), _FAR_PX)
@@ -71,7 +82,7 @@ def _project(x, y, z, fx, fy, cx, cy):
 
 
 @inner
-def _clip(triangle, clipped):
+def _clip(triangle, clipped):  # type: ignore[no-untyped-def]
     """Cuts a triangle (3, 3) at the near plane into `clipped` (4, 3); returns the number of corners left (0, 3 or 4)."""
     n = 0
     for i in range(3):
@@ -89,7 +100,7 @@ def _clip(triangle, clipped):
 
 
 @inner
-def _span(y, ax, ay, bx, by, qx, qy, first, last):
+def _span(y, ax, ay, bx, by, qx, qy, first, last):  # type: ignore[no-untyped-def]
     """The pixels [first, last] of row y (sub-pixel units) that lie inside the counter-clockwise triangle, top-left rule."""
     for e in range(3):
         if e == 0:
@@ -114,7 +125,8 @@ def _span(y, ax, ay, bx, by, qx, qy, first, last):
 
 
 @kernel("f8[n, 3], i4[m, 3], f8, f8, f8, f8, out b1[h, w]")
-def _silhouette(V, faces, fx, fy, cx, cy, out):
+def draw_silhouette(V, faces, fx, fy, cx, cy, out):  # type: ignore[no-untyped-def]
+    """Marks the pixels that a mesh covers in out (h, w), where nothing is marked yet: see `silhouette`."""
     h, w = out.shape
     n = len(V)
     P = np.empty((n, 2), np.int64)
@@ -137,7 +149,7 @@ def _silhouette(V, faces, fx, fy, cx, cy, out):
 
 
 @inner
-def _fill(ax, ay, bx, by, qx, qy, w, h, out):
+def _fill(ax, ay, bx, by, qx, qy, w, h, out):  # type: ignore[no-untyped-def]
     area = (bx - ax) * (qy - ay) - (by - ay) * (qx - ax)
     if area == 0:
         return
@@ -154,7 +166,7 @@ def _fill(ax, ay, bx, by, qx, qy, w, h, out):
 
 
 @kernel("f8[n, 3], i4[m, 3], f8, f8, f8, f8, u1[m], i8, out f4[h, w], out u1[h, w], out i4[h, w]")
-def _draw(V, faces, fx, fy, cx, cy, ids, start, depth, out_ids, out_triangles):
+def _draw(V, faces, fx, fy, cx, cy, ids, start, depth, out_ids, out_triangles):  # type: ignore[no-untyped-def]
     n = len(V)
     P = np.empty((n, 2), np.int64)
     for i in range(n):
@@ -184,7 +196,7 @@ def _draw(V, faces, fx, fy, cx, cy, ids, start, depth, out_ids, out_triangles):
 
 
 @inner
-def _draw_triangle(ax, ay, az, bx, by, bz, qx, qy, qz, value, index, depth, out_ids, out_triangles):
+def _draw_triangle(ax, ay, az, bx, by, bz, qx, qy, qz, value, index, depth, out_ids, out_triangles):  # type: ignore[no-untyped-def]
     """A triangle of three points in the image (sub-pixel units) with their depths [m]."""
     h, w = depth.shape
     area = (bx - ax) * (qy - ay) - (by - ay) * (qx - ax)

@@ -106,7 +106,7 @@ def _from_quaternion(orientation: ArrayLike) -> Array:
     x, y, z, w = np.asarray(orientation, float).tolist()
     square = x * x + y * y + z * z + w * w
     if not square > 0.0:
-        raise ValueError(f"orientation: a unit quaternion (x, y, z, w) expected, ({x}, {y}, {z}, {w}) came")
+        raise ValueError(f"orientation: expected a unit quaternion (x, y, z, w), got ({x}, {y}, {z}, {w})")
     s = 2.0 / square
     return np.array(
         [

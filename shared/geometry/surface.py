@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.native import inner, kernel
+from penumbra.shared.native import inner, kernel
 
 Array = NDArray[np.float64]
 
@@ -26,9 +26,9 @@ class Surface:
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces = np.ascontiguousarray(faces, dtype=np.int64)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-            raise ValueError(f"a mesh of (n, 3) vertices and (m, 3) faces expected, came {vertices.shape} and {faces.shape}")
+            raise ValueError(f"expected a mesh of (n, 3) vertices and (m, 3) faces, got {vertices.shape} and {faces.shape}")
         if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
-            raise ValueError(f"finite vertices and face indices below {len(vertices)} expected in the mesh: repair it")
+            raise ValueError(f"expected finite vertices and face indices below {len(vertices)} in the mesh; repair it")
         # Corners that were stored twice (one per face) are one corner to the pseudonormals.
         _, first, inverse = np.unique(np.round(vertices, 9), axis=0, return_index=True, return_inverse=True)
         vertices, faces = vertices[first], inverse.reshape(-1)[faces]

@@ -6,10 +6,11 @@
     @kernel("f8[n, 3], f8[3], out f8[n] -> i8")        # called from Python
     def nearest(points, origin, distances): ...
 
-`python -m shared.native.build` compiles every kernel with numba and links them into one library per processor, `lib/*.so`, which
-is part of the repository. A symbol's name holds the `fingerprint` of the sources that it was compiled from, so compiled code that
-no longer belongs to its sources is not found, and is never called. What the library lacks (a kernel was edited; there is no
-library for this machine) is compiled at run time, where numba is installed, and kept in `jit.folder()` under that fingerprint.
+`python -m penumbra.shared.native.build` compiles every kernel with numba and links them into one library per processor,
+`lib/*.so`, which is part of the repository. A symbol's name holds the `fingerprint` of the sources that it was compiled from,
+so compiled code that no longer belongs to its sources is not found, and is never called. What the library lacks (a kernel was
+edited; there is no library for this machine) is compiled at run time, where numba is installed, and kept in `jit.folder()`
+under that fingerprint.
 
 What runs is chosen by the environment variable PENUMBRA_NATIVE: `library` (default; see above), `jit` (never the libraries) or
 `python` (the functions themselves, interpreted: slow, but debuggers and tracebacks work).
@@ -32,8 +33,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.native.fingerprint import fingerprint
-from shared.native.signature import Signature
+from penumbra.shared.native.fingerprint import fingerprint
+from penumbra.shared.native.signature import Signature
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Progress = Callable[[int, int], None]
@@ -42,6 +43,9 @@ Progress = Callable[[int, int], None]
 WAYS = ("library", "jit", "python")
 KERNELS: dict[str, Kernel] = {}
 """All kernels of the modules imported so far, by name."""
+KNOWN_SHAPES = 1000
+"""Number of different shapes of its arguments that a kernel remembers as fitting: checking costs ten times as much as looking
+them up, and the number of points of a contour changes in every pass of a search."""
 _DATA = object.__basicsize__
 """Where a numpy array holds the address of its data: the first field after an object's header (`PyArrayObject` of numpy's C
 interface). Reading it there costs a tenth of asking for `array.ctypes.data`; `_check_layout` compares the two."""
@@ -82,7 +86,7 @@ class Kernel:
         self._arrays = tuple((each.dtype, each.flags) if each.is_array else None for each in signature.parameters)
         slots = [each.format for each in signature.parameters]
         self._pack = struct.Struct("=q" + "".join(slots) + "q" * bool(signature.result)).pack
-        self._shapes: list[tuple[int, ...]] = []
+        self._shapes: set[tuple[tuple[int, ...], ...]] = set()
         self._code: Callable[[bytes], int] | None = None
         KERNELS[self.name] = self
 
@@ -112,9 +116,12 @@ class Kernel:
                 shapes.append(shape)
                 values.append(id(value))
                 values += shape
-            if shapes != self._shapes:
+            fitting = tuple(shapes)
+            if fitting not in self._shapes:
                 self._check(arguments)
-                self._shapes = shapes
+                if len(self._shapes) >= KNOWN_SHAPES:
+                    self._shapes.clear()
+                self._shapes.add(fitting)
             if self.signature.result is None:
                 failed, result = self._code(self._pack(*values)), None  # type: ignore[misc]
             else:
@@ -191,7 +198,7 @@ def _in_library(kernel: Kernel) -> Callable[[bytes], int] | None:
     except AttributeError:
         return None
     code.argtypes, code.restype = (ctypes.c_char_p,), ctypes.c_int
-    return code  # type: ignore[no-any-return]
+    return code
 
 
 def _compiled(kernels: list[Kernel], progress: Progress | None = None) -> list[Callable[[bytes], int]]:
@@ -200,7 +207,7 @@ def _compiled(kernels: list[Kernel], progress: Progress | None = None) -> list[C
         return []
     _check_layout()
     try:
-        from shared.native import jit
+        from penumbra.shared.native import jit
     except ImportError as error:
         raise ImportError(
             f"{kernels[0].name}: expected compiled code for this source and this machine in shared/native/lib, found none, and "
@@ -211,7 +218,7 @@ def _compiled(kernels: list[Kernel], progress: Progress | None = None) -> list[C
 
 @functools.cache
 def _library() -> ctypes.CDLL | None:
-    from shared.native.machine import library
+    from penumbra.shared.native.machine import library
 
     path = library()
     if path is None:

@@ -1,4 +1,4 @@
-"""Compiles all kernels for all processors: `python -m shared.native.build [--check]`.
+"""Compiles all kernels for all processors: `python -m penumbra.shared.native.build [--check]`.
 
 Writes lib/*.so, which are committed, and lib/manifest.json: which versions of the compilers made them, from which sources, and
 what came out. The same sources and versions give the same bytes, so anyone can compare: `--check` builds again, writes nothing,
@@ -8,7 +8,6 @@ linker for each architecture (Debian's binutils-x86-64-linux-gnu and binutils-aa
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import importlib
 import json
@@ -20,15 +19,16 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import click
 from rich.progress import track
 
-from shared.native import KERNELS
-from shared.native.machine import FOLDER
+from penumbra.shared.native import KERNELS
+from penumbra.shared.native.machine import FOLDER
 
-ROOT = Path(__file__).parents[2]
-FLOORS = ("shared", "sim", "services")
+ROOT = Path(__file__).parents[3]
+FLOORS = ("penumbra/shared", "penumbra/sim", "penumbra/services")
 MANIFEST = "manifest.json"
-AGAIN = "run python -m shared.native.build"
+AGAIN = "run python -m penumbra.shared.native.build"
 _LINK = ["-shared", "--strip-all", "--build-id=none", "--hash-style=gnu", "-znoexecstack", "-zrelro", "-znow"]
 
 
@@ -42,7 +42,7 @@ def import_kernels() -> None:
 
 def build(folder: Path) -> dict[str, Any]:
     """Builds all libraries in a folder, and returns the manifest."""
-    from shared.native.compiler import TARGETS, compiled, lower
+    from penumbra.shared.native.compiler import TARGETS, compiled, lower
 
     kernels = [KERNELS[name] for name in sorted(KERNELS)]
     lowered = [lower(each) for each in track(kernels, "numba", disable=not sys.stderr.isatty())]
@@ -64,7 +64,7 @@ def link(code: bytes, architecture: str, library: Path) -> None:
 
 def versions() -> dict[str, str]:
     """Of what the libraries' bytes depend on, beside the sources."""
-    from shared.native.compiler import VERSIONS
+    from penumbra.shared.native.compiler import VERSIONS
 
     linker = subprocess.run([_linker("x86_64"), "--version"], check=True, capture_output=True, text=True).stdout.splitlines()[0]
     return {"python": ".".join(platform.python_version_tuple()[:2]), **VERSIONS, "linker": linker}
@@ -74,18 +74,18 @@ def _linker(architecture: str) -> str:
     return f"{architecture}-linux-gnu-ld"
 
 
-def main() -> int:
+@click.command(help=__doc__, context_settings={"max_content_width": 100})
+@click.option("--check", is_flag=True, help="build, and compare with what is there")
+def main(check: bool) -> int:
+    """Returns 1 where `check` finds a difference."""
     if os.environ.get("PYTHONHASHSEED") != "0":  # the order of sets decides on the order of some instructions
-        command = [sys.executable, "-m", "shared.native.build", *sys.argv[1:]]
+        command = [sys.executable, "-m", "penumbra.shared.native.build", *sys.argv[1:]]
         os.execve(sys.executable, command, {**os.environ, "PYTHONHASHSEED": "0"})
-    parser = argparse.ArgumentParser(prog="python -m shared.native.build", description=__doc__, allow_abbrev=False)
-    parser.add_argument("--check", action="store_true", help="build, and compare with what is there")
-    options = parser.parse_args()
     import_kernels()
     with tempfile.TemporaryDirectory() as folder:
-        manifest = build(Path(folder) if options.check else FOLDER)
+        manifest = build(Path(folder) if check else FOLDER)
     text = json.dumps(manifest, indent=2) + "\n"
-    if not options.check:
+    if not check:
         (FOLDER / MANIFEST).write_text(text)
         print(f"{len(manifest['kernels'])} kernels for {', '.join(manifest['libraries'])} in {FOLDER}")
     elif (FOLDER / MANIFEST).read_text() != text:
@@ -95,4 +95,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(standalone_mode=False))

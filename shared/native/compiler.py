@@ -22,9 +22,9 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import cpu_target
 from numba.np import numpy_support
 
-from shared.native import Kernel
-from shared.native.fingerprint import is_native, plain, used
-from shared.native.signature import Parameter
+from penumbra.shared.native import Kernel
+from penumbra.shared.native.fingerprint import is_native, plain, used
+from penumbra.shared.native.signature import Parameter
 
 VERSIONS = {"llvmlite": llvmlite.__version__, "numba": numba.__version__}
 
@@ -159,7 +159,7 @@ def compiled(kernels: Sequence[Kernel], target: Target, lowered: Sequence[str] |
     return machine.emit_object(module)  # type: ignore[no-any-return]
 
 
-@global_compiler_lock
+@global_compiler_lock  # type: ignore[untyped-decorator]  # numba has no types for it
 def lower(kernel: Kernel) -> str:
     """A kernel and its entry in LLVM's language, not optimised, for no processor in particular."""
     with _without_optimisation():

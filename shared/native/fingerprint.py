@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from shared.native import Kernel
+    from penumbra.shared.native import Kernel
 
 FORMAT = "1"
 """Of the code around a kernel (`compiler.entry`): a change there makes all that was compiled before unknown."""

@@ -14,8 +14,8 @@ from pathlib import Path
 import llvmlite
 import llvmlite.binding as llvm
 
-from shared.native import Kernel, Progress
-from shared.native.fingerprint import FORMAT
+from penumbra.shared.native import Kernel, Progress
+from penumbra.shared.native.fingerprint import FORMAT
 
 NUMBA = version("numba")
 _ENGINES: list[llvm.ExecutionEngine] = []
@@ -51,7 +51,7 @@ def _kept(kernel: Kernel, file: Path) -> bytes:
     with _alone(file):
         with contextlib.suppress(OSError):  # another process was faster
             return file.read_bytes()
-        from shared.native.compiler import Target, compiled  # numba takes a second to import
+        from penumbra.shared.native.compiler import Target, compiled  # numba takes a second to import
 
         features = llvm.get_host_cpu_features().flatten()
         code = compiled([kernel], Target(llvm.get_process_triple(), llvm.get_host_cpu_name(), features))

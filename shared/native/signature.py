@@ -49,22 +49,26 @@ class Parameter:
             return None if isinstance(value, kinds) and not isinstance(value, complex) else f"{value!r}"
         if not isinstance(value, np.ndarray):
             return f"{type(value).__name__}"
-        found = f"an array {value.dtype} {value.shape}"
         if value.dtype != self.dtype or value.ndim != len(self.sizes):
-            return found
+            return _described(value)
         for expected, size in zip(self.sizes, value.shape, strict=True):
             if isinstance(expected, int):
                 if size != expected:
-                    return found
+                    return _described(value)
             else:
                 known, where = sizes.setdefault(expected, (size, name))
                 if known != size:
-                    return f"{found}, with {expected} = {known} from {where}"
+                    return f"{_described(value)}, with {expected} = {known} from {where}"
         if not value.flags.c_contiguous or not value.flags.aligned:
-            return f"{found} that is not contiguous (or not aligned); do np.ascontiguousarray"
+            return f"{_described(value)} that is not contiguous (or not aligned); do np.ascontiguousarray"
         if self.is_out and not value.flags.writeable:
-            return f"{found} that is read-only"
+            return f"{_described(value)} that is read-only"
         return None
+
+
+def _described(value: np.ndarray[Any, Any]) -> str:
+    """Only written for a fault: shapes are checked in every pass of a search, and numpy spells a dtype slowly."""
+    return f"an array {value.dtype} {value.shape}"
 
 
 class Signature:

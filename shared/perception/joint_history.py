@@ -6,7 +6,7 @@ import threading
 from bisect import bisect_left
 from collections import deque
 
-from shared.geometry.rigid import Array
+from penumbra.shared.geometry.rigid import Array
 
 
 class JointHistory:

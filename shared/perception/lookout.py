@@ -8,12 +8,12 @@ from typing import Protocol
 
 import numpy as np
 
-from shared.body import anatomy
-from shared.cell.description import Camera, Cell
-from shared.contract.messages import FusedPose
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.perception.prediction import predict
+from penumbra.shared.body import anatomy
+from penumbra.shared.cell.description import Camera, Cell
+from penumbra.shared.contract.messages import FusedPose
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.prediction import predict
 
 STEP = 8
 """Windows lie and measure in multiples of this many of their own pixels: the stride of the network's coarsest layer."""

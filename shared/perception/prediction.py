@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.contract.messages import FusedPose
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.shared.contract.messages import FusedPose
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 LONGEST_S = 0.5
 """A fused pose further away in time than this predicts nothing."""

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.contract.messages import VisionPose
-from shared.geometry import rigid
+from penumbra.shared.contract.messages import VisionPose
+from penumbra.shared.geometry import rigid
 
 State = Literal["tracking", "occluded", "lost"]
 

@@ -1,28 +1,28 @@
 """The bus: one Zenoh session per process, queries, and which topic a key belongs to.
 
-`shared.runtime.connection` has the flags and the configuration, `shared.runtime.reader` what reads a subscription,
+`shared.runtime.connection` has the configuration, `shared.runtime.reader` what reads a subscription,
 `shared.runtime.traffic` what it counts.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable
 
 import zenoh
 
-from shared.contract.topics import TOPICS, Topic
-from shared.runtime import memory
-from shared.runtime.connection import (
+from penumbra.shared.contract.topics import TOPICS, Topic
+from penumbra.shared.runtime import diagnosis, memory
+from penumbra.shared.runtime.connection import (
     DEFAULT_ENDPOINT,
     POOL_BYTES,
     SECURE_ENDPOINT,
     BusError,
     Connection,
-    add_arguments,
-    add_secure,
     configuration,
     connection,
     mode,
@@ -36,8 +36,6 @@ __all__ = [
     "BusError",
     "Connection",
     "Refused",
-    "add_arguments",
-    "add_secure",
     "ask",
     "configuration",
     "connection",
@@ -46,6 +44,13 @@ __all__ = [
     "taken",
     "topic_of",
 ]
+
+
+RUNTIME_VARIABLE = "ZENOH_RUNTIME"
+RUNTIME = "(rx: (handover: app), app: (worker_threads: 2))"
+"""Zenoh's threads in a client: what waits for the socket also reads the messages. By default it wakes another thread for that,
+and a third one that finds nothing to do. A router keeps the default, by which a reader that waits for room on one link does not
+hold up the others."""
 
 
 class Refused(ValueError):
@@ -75,17 +80,29 @@ def open_session(
     told = False
     while True:
         try:
-            return zenoh.open(config)
+            return _open(config)
         except zenoh.ZError as error:
             if "Address already in use" in str(error):
                 raise taken(", ".join(connection.listen) or connection.default) from None
             if "Unable to connect" not in str(error):
                 raise BusError(f"the Zenoh session does not open: {short(error)}") from None
         if stopping.is_set() or time.monotonic() > deadline:
-            raise BusError(f"no router {connection.whereabouts}: start `penumbra router` or `penumbra up`, or give --connect")
+            raise BusError(diagnosis.no_router(connection))
         if not told:
             waiting()
             told = True
+
+
+def _open(config: zenoh.Config) -> zenoh.Session:
+    """A session, in a client with the threads of RUNTIME. Zenoh reads them when the first session of a process opens; a process
+    that is started later, which may be a router, inherits nothing."""
+    if json.loads(config.get_json("mode")) != "client" or RUNTIME_VARIABLE in os.environ:
+        return zenoh.open(config)
+    os.environ[RUNTIME_VARIABLE] = RUNTIME
+    try:
+        return zenoh.open(config)
+    finally:
+        del os.environ[RUNTIME_VARIABLE]
 
 
 def ask(

@@ -1,18 +1,18 @@
-"""How a process connects to the bus: its flags, and the Zenoh configuration that they make, with TLS where it is asked for."""
+"""How a process connects to the bus: the Zenoh configuration of a connection, with TLS where it is asked for."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import zenoh
 
-from shared.contract import access
-from shared.runtime.slow_links import SlowLinks
+from penumbra.shared.contract import access
+from penumbra.shared.runtime.slow_links import SlowLinks
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 SECURE_ENDPOINT = "tls/127.0.0.1:7447"
@@ -65,33 +65,23 @@ class Connection:
         return f"at {self.where}" + (f" with a certificate of the same CA as in {self.secure}" if self.secure else "")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The Zenoh flags that every process takes."""
-    group = parser.add_argument_group("bus")
-    group.add_argument("-m", "--mode", choices=("client", "peer", "router"), help="Zenoh mode (default: client; router: router)")
-    group.add_argument("-e", "--connect", action="append", default=[], metavar="ENDPOINT",
-                       help=f"router to reach; may be repeated (default: $PENUMBRA_CONNECT or {DEFAULT_ENDPOINT}, "
-                       f"with --secure {SECURE_ENDPOINT})")  # fmt: skip
-    group.add_argument("-l", "--listen", action="append", default=[], metavar="ENDPOINT", help="endpoint to listen on")
-    group.add_argument("-c", "--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5)")
-    add_secure(group)
-
-
-def add_secure(group: argparse._ActionsContainer) -> None:
-    """The one switch between a bus for this machine and one for a network."""
-    default = os.environ.get("PENUMBRA_SECURE")
-    group.add_argument(
-        "--secure", type=Path, default=Path(default) if default else None, metavar="FOLDER",
-        help="certificates of `penumbra certs`: TLS, and each may say only what is its own (default: $PENUMBRA_SECURE or off)",
-    )  # fmt: skip
-
-
-def connection(options: argparse.Namespace) -> Connection:
-    """The connection that the flags of `add_arguments` and the environment ask for."""
+def connection(options: SimpleNamespace) -> Connection:
+    """The connection that the flags of `services.flags.BUS` and the environment ask for."""
     connect = tuple(options.connect)
     if not connect and options.config is None and options.mode in (None, "client"):
-        connect = tuple(os.environ.get("PENUMBRA_CONNECT", "").split())
+        connect = connect_by_environment()
     return Connection(options.mode, connect, tuple(options.listen), options.config, options.secure)
+
+
+def connect_by_environment() -> tuple[str, ...]:
+    """The endpoints of $PENUMBRA_CONNECT; none where it is not set."""
+    return tuple(os.environ.get("PENUMBRA_CONNECT", "").split())
+
+
+def secure_by_environment() -> Path | None:
+    """The folder of $PENUMBRA_SECURE; None where it is not set."""
+    folder = os.environ.get("PENUMBRA_SECURE")
+    return Path(folder) if folder else None
 
 
 def mode(connection: Connection) -> str:
@@ -104,7 +94,7 @@ def configuration(connection: Connection) -> zenoh.Config:
     try:
         config = zenoh.Config.from_file(str(connection.config)) if connection.config else zenoh.Config()
     except zenoh.ZError as error:
-        raise BusError(f"--config {connection.config}: a Zenoh configuration (JSON5) expected: {short(error)}") from None
+        raise BusError(f"--config {connection.config}: expected a Zenoh configuration (JSON5): {short(error)}") from None
 
     def is_set(key: str) -> bool:
         return connection.config is not None and config.get_json(key) not in ("null", "[]")
@@ -138,7 +128,7 @@ def configuration(connection: Connection) -> zenoh.Config:
         protocols = SECURE_PROTOCOLS if connection.secure else PROTOCOLS
         if endpoint.partition("/")[0] not in protocols:  # Zenoh would try it for ever
             raise BusError(
-                f"endpoint {endpoint!r}: PROTOCOL/ADDRESS expected, as in {connection.default}; "
+                f"endpoint: expected PROTOCOL/ADDRESS, as in {connection.default}, got {endpoint!r}; "
                 f"protocols{' with --secure' if connection.secure else ''}: {', '.join(protocols)}"
             )
     if connection.secure is not None:
@@ -152,14 +142,14 @@ def configuration(connection: Connection) -> zenoh.Config:
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
-            raise BusError(f"{key}: {json.dumps(value)} is nothing that Zenoh takes: {short(error)}") from None
+            raise BusError(f"{key}: expected what Zenoh accepts, got {json.dumps(value)}: {short(error)}") from None
     return config
 
 
 def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
     """Zenoh's settings for mutual TLS, and in a router for who may say what."""
     if mode == "peer":
-        raise BusError("--secure with --mode peer: client or router expected: only a router looks at who says what")
+        raise BusError("--mode: expected client or router with --secure, got peer; only a router checks who publishes what")
     files = {name: folder / f"{name}.pem" for name in ("ca", holder, f"{holder}-key")}
     for path in files.values():
         try:
@@ -167,8 +157,8 @@ def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
         except OSError as error:
             names = ", ".join(file.name for file in files.values())
             raise BusError(
-                f"--secure {folder}: {names} expected, {path.name} cannot be read ({error.strerror}): make them with "
-                f"`penumbra certs --out {folder}`, or copy them from where they were made"
+                f"--secure {folder}: expected {names}, got no readable {path.name} ({error.strerror}); make them with `penumbra "
+                f"certs --out {folder}`, or copy them from where they were made"
             ) from None
     tls = {
         "root_ca_certificate": str(files["ca"]),

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable
 
 import zenoh
 
-from shared.runtime.hang import HANG_S, Turn
-from shared.runtime.logs import Log
-from shared.runtime.replicas import Clock, Pace, Replicas
-from shared.runtime.traffic import Traffic
+from penumbra.shared.runtime.hang import HANG_S, Turn
+from penumbra.shared.runtime.logs import Log
+from penumbra.shared.runtime.replicas import Clock, Pace, Replicas
+from penumbra.shared.runtime.traffic import Traffic
 
 LOOK_S = 0.2
 """Between two looks whether this replica is fit for its part."""
@@ -65,7 +65,7 @@ class Fitness:
     def hangs(self) -> str:
         """What hangs, in words; empty where nothing does."""
         is_watched = time.monotonic() - self._looked_s < UNWATCHED_S
-        return self._hang if is_watched else f"nobody has looked after this process for {UNWATCHED_S:g} s"
+        return self._hang if is_watched else f"the watchdog itself has been blocked for {UNWATCHED_S:g} s"
 
     def faults(self) -> list[str]:
         """Why this replica is unfit, in words."""

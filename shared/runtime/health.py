@@ -11,7 +11,7 @@ import threading
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 
-from shared.runtime.traffic import Traffic
+from penumbra.shared.runtime.traffic import Traffic
 
 STATUSES = ("ok", "starting", "degraded", "down")
 LATELY_S = 30.0
@@ -77,7 +77,7 @@ def judge(
         elif why:
             starting.append(f"waiting for {which}: {why}")
         else:
-            degraded.append(f"nothing heard on {which} yet")
+            degraded.append(f"nothing received on {which} yet")
     for key in sorted({key for key, _ in grown if key}):
         kinds = ", ".join(f"{n} {kind}" for (where, kind), n in sorted(grown.items()) if where == key)
         degraded.append(f"refused on {_short(key)} in the last {LATELY_S:.0f} s: {kinds}")

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 
 import zenoh
 
-from shared.runtime import bus
-from shared.runtime.logs import Log
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.logs import Log
 
 CLOSE_S = 0.8
 """Closing a session on a bad network may take much longer; a process that ends does not wait for that."""

@@ -21,7 +21,7 @@ LEVELS = ("debug", "info", "warning", "error")
 FORMATS = ("text", "json")
 
 
-class Log(logging.LoggerAdapter):
+class Log(logging.LoggerAdapter[logging.Logger]):
     """A standard logger that also takes fields: `log.info("calibrated", pad="p0", gain=1.02)`."""
 
     def process(self, msg: Any, kwargs: MutableMapping[str, Any]) -> tuple[Any, MutableMapping[str, Any]]:

@@ -12,10 +12,10 @@ from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from shared.contract import processes
-from shared.contract.report import Report, TopicReport
-from shared.runtime import bus
-from shared.runtime.health import STATUSES
+from penumbra.shared.contract import processes
+from penumbra.shared.contract.report import Report, TopicReport
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.health import STATUSES
 
 WHO = ("cell", "service", "instance", "host")
 """The labels of every metric."""
@@ -94,7 +94,7 @@ def _traffic(families: _Families, way: str, who: tuple[str, ...], key: str, traf
     families.gauge("stale", "1 for an input that is missing", who, traffic.stale, **labels)
     if traffic.dropped is not None:
         families.counter(
-            "dropped_messages", "messages that the publisher sent and that never came", who, traffic.dropped, **labels
+            "dropped_messages", "messages that the publisher sent and that were never received", who, traffic.dropped, **labels
         )
     for kind, count in traffic.bad.items():
         families.counter("refused_messages", "messages refused by kind", who, count, **labels, kind=kind)

@@ -36,22 +36,22 @@ from typing import Any, Protocol
 import psutil
 import zenoh
 
-from shared.cell import description as cell
-from shared.contract import topics
-from shared.contract.messages import VERSION, Message
-from shared.contract.report import Report
-from shared.contract.topics import Topic
-from shared.runtime import bus, health, logs
-from shared.runtime.fitness import Fitness
-from shared.runtime.hang import HANG_S
-from shared.runtime.link import CLOSE_S, Link
-from shared.runtime.logs import Log
-from shared.runtime.progress import Progress, Waiting
-from shared.runtime.queries import Answer, Queries
-from shared.runtime.reader import Latest
-from shared.runtime.replicas import Replicas
-from shared.runtime.slow_links import SlowLinks
-from shared.runtime.streams import Handler, Streams
+from penumbra.shared.cell import description as cell
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.messages import VERSION, Message
+from penumbra.shared.contract.report import Report
+from penumbra.shared.contract.topics import Topic
+from penumbra.shared.runtime import bus, health, logs
+from penumbra.shared.runtime.fitness import Fitness
+from penumbra.shared.runtime.hang import HANG_S
+from penumbra.shared.runtime.link import CLOSE_S, Link
+from penumbra.shared.runtime.logs import Log
+from penumbra.shared.runtime.progress import Progress, Waiting
+from penumbra.shared.runtime.queries import Answer, Queries
+from penumbra.shared.runtime.reader import Latest
+from penumbra.shared.runtime.replicas import Replicas
+from penumbra.shared.runtime.slow_links import SlowLinks
+from penumbra.shared.runtime.streams import Handler, Streams
 
 __all__ = ["CLOSE_S", "LatestMessages", "Node", "ServiceNode"]
 
@@ -179,7 +179,7 @@ class Node:
 
     def _watch_fitness(self) -> None:
         received = self._streams.received
-        self._fitness.watch(self.stopping, lambda: list(received.values()), self._come_alive, self._streams.drain)
+        self._fitness.watch(self.stopping, lambda: list(received.values()), self._come_alive, self._streams.look)
 
     def _come_alive(self) -> None:
         """The last step: who is alive can be asked, is listening, and owns streams. Beside living replicas a service warms up
@@ -286,7 +286,7 @@ class Node:
 
         def answer(parameters: dict[str, str], payload: bytes) -> bytes | tuple[bytes, str]:
             if not self.replicas.has_joined and self.replicas.others:
-                raise ValueError(f"{self.service} {self.instance} has no part now: ask the others")
+                raise ValueError(f"{self.service} {self.instance} serves nothing now; ask another replica")
             return function(parameters, payload)
 
         self._queries.answer(key, answer)

@@ -7,10 +7,10 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 
-from shared.contract import report
-from shared.runtime import bus
-from shared.runtime.logs import Log
-from shared.runtime.traffic import Traffic
+from penumbra.shared.contract import report
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.logs import Log
+from penumbra.shared.runtime.traffic import Traffic
 
 LOG_S = 2.0
 """Between two lines of the log about one task."""

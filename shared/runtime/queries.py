@@ -7,8 +7,8 @@ from typing import Any, cast
 
 import zenoh
 
-from shared.runtime import bus
-from shared.runtime.link import Link
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.link import Link
 
 QUERY_DEPTH = 32
 """Queries on a key that may wait to be answered."""
@@ -33,7 +33,7 @@ class Queries:
         def run() -> None:
             while True:
                 try:
-                    query = cast(zenoh.Query, queryable.recv())
+                    query = queryable.recv()
                 except zenoh.ZError:
                     return
                 with query:

@@ -14,7 +14,7 @@ from typing import Protocol
 
 import zenoh
 
-from shared.runtime.traffic import Traffic
+from penumbra.shared.runtime.traffic import Traffic
 
 CLOCK_S = 1.0
 """Over which messages are counted to tell whether a process has another time than all others."""
@@ -166,7 +166,7 @@ class Clock:
             good = sum(each.count for each in traffic)
             odd = sum(each.bad.get("past", 0) + each.bad.get("future", 0) for each in traffic)
             is_off = odd - self._odd >= CLOCK_MESSAGES and good == self._good
-            self.fault = "everything that comes is of another time: check the clock of this host" if is_off else ""
+            self.fault = "all received messages have stamps of another time: check the clock of this host" if is_off else ""
             self._since_s, self._good, self._odd = now_s, good, odd
         return self.fault
 
@@ -181,7 +181,7 @@ class Pace:
     def judge(self, late_s: float, period_s: float) -> str:
         """The fault now, empty where there is none. late_s: how much later than after period_s it looks again."""
         self._lost += PACE_SHARE * (late_s / (late_s + period_s) - self._lost)
-        return f"this process stands still for {self._lost:.0%} of the time" if self._lost > PACE_LOST else ""
+        return f"this process is stalled for {self._lost:.0%} of the time" if self._lost > PACE_LOST else ""
 
 
 def _weight(instance: str, stream: str) -> bytes:

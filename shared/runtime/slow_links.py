@@ -13,8 +13,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import psutil
-
 BATCH = 4096
 """Bytes that are sent in one piece, which nothing overtakes: a sixteenth of a second at 64 kB/s."""
 SEND_BUFFER = 8192
@@ -42,6 +40,8 @@ class SlowLinks:
 
     def bounded(self, endpoints: Iterable[str], is_listening: bool) -> tuple[str, ...]:
         """Endpoints, to listen on or to connect to, with a small send buffer where they lie on these interfaces."""
+        import psutil  # slow to import, and few have a slow link
+
         known = psutil.net_if_addrs()
         own = {address.address for name in self.interfaces for address in known.get(name, ())}
         return tuple(

@@ -5,22 +5,24 @@ from __future__ import annotations
 import itertools
 import math
 import string
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, cast
 
 import zenoh
 
-from shared.cell import description as cell
-from shared.contract.messages import BadMessage, Message, encode
-from shared.contract.topics import QoS, Topic
-from shared.runtime.fitness import LOOK_S
-from shared.runtime.guard import NUMBERS, Guard
-from shared.runtime.hang import Turn
-from shared.runtime.link import Link
-from shared.runtime.logs import Log
-from shared.runtime.reader import Inbox, Latest, Reader, Stream
-from shared.runtime.replicas import Replicas, Share
-from shared.runtime.traffic import Traffic
+from penumbra.shared.cell import description as cell
+from penumbra.shared.contract.messages import BadMessage, Message
+from penumbra.shared.contract.topics import Topic
+from penumbra.shared.runtime.fitness import LOOK_S
+from penumbra.shared.runtime.guard import Guard
+from penumbra.shared.runtime.hang import Turn
+from penumbra.shared.runtime.link import Link
+from penumbra.shared.runtime.logs import Log
+from penumbra.shared.runtime.reader import Inbox, Latest, Reader, Stream
+from penumbra.shared.runtime.replicas import Replicas, Share
+from penumbra.shared.runtime.sender import Sender
+from penumbra.shared.runtime.traffic import Traffic
 
 Handler = Callable[[Any, dict[str, str]], None]
 
@@ -28,15 +30,8 @@ Handler = Callable[[Any, dict[str, str]], None]
 class _Publisher(NamedTuple):
     """What publishing on one key needs, looked up once."""
 
-    publisher: zenoh.Publisher
+    sender: Sender
     traffic: Traffic
-    source: zenoh.EntityGlobalId
-    numbers: itertools.count[int]
-    ready: list[zenoh.SourceInfo]
-
-    def number(self) -> zenoh.SourceInfo:
-        """The sender and number of the next message."""
-        return zenoh.SourceInfo(self.source, next(self.numbers) % NUMBERS)
 
 
 class Streams:
@@ -73,20 +68,13 @@ class Streams:
         found = self._publishers.get(identity)
         if found is None:
             found = self._publishers.setdefault(identity, self._declare_publisher(session, topic, names))
-        payload = encode(message)
         try:
-            source_info = found.ready.pop()  # made after the last message: this one is on its way the sooner
-        except IndexError:  # another thread publishes on this key, too
-            source_info = found.number()
-        try:
-            found.publisher.put(payload, source_info=source_info)
+            found.sender.send(message)
         except zenoh.ZError:
             if self._link.session is not None:  # else: closed meanwhile
                 raise
             return
         found.traffic.took(message.stamp_ns, self._now_ns())
-        if not found.ready:
-            found.ready.append(found.number())
 
     def subscribe(self, topic: Topic, handler: Handler, owned: Sequence[str], from_others: bool, names: dict[str, str]) -> None:
         """As `Node.subscribe`; owned: the streams that this replica must own one of."""
@@ -120,6 +108,13 @@ class Streams:
         for latest in self._latest:
             latest.drain()
 
+    def look(self) -> None:
+        """Takes in what `latest` keeps, and how often messages come and go. One thread looks, every LOOK_S."""
+        self.drain()
+        now_s = time.monotonic()
+        for traffic in (*self.received.values(), *self.published.values()):
+            traffic.rate.look(traffic.count, now_s)
+
     def _inbox(self, topic: Topic, from_others: bool, names: dict[str, str], depth: Callable[[int], int]) -> Inbox | None:
         """What a reader of a topic needs, with counters of its own; None where the cell has no such part. depth: of the ring, by
         the number of keys."""
@@ -144,12 +139,7 @@ class Streams:
         if missing:
             raise ValueError(f"publishing {topic.name} needs {', '.join(f'{name}=' for name in missing)}")
         (key,) = self.keys(topic, names)
-        publisher = session.declare_publisher(
-            key,
-            congestion_control=zenoh.CongestionControl.BLOCK if topic.qos is QoS.NEVER_DROP else zenoh.CongestionControl.DROP,
-            priority=getattr(zenoh.Priority, topic.priority.value),
-        )
-        return _Publisher(publisher, self.published.setdefault(key, Traffic(topic.stale_s)), publisher.id, itertools.count(), [])
+        return _Publisher(Sender(session, topic, key), self.published.setdefault(key, Traffic(topic.stale_s)))
 
     def rate_hz(self, topic: Topic, names: dict[str, str]) -> float:
         """How often a key's publisher sends: as the table says, but for what follows the cameras' own rates."""

@@ -3,36 +3,36 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass, field
 
-from shared.contract.report import TopicReport
+from penumbra.shared.contract.report import TopicReport
 
 RATE_WINDOW_S = 3.0
 """Time over which a rate is averaged."""
 
 
 class Rate:
-    """Events per second over about the last RATE_WINDOW_S, at a constant cost per event: an exponentially weighted count,
-    divided by the weight that the time since the first event can have."""
+    """Events per second over about the last RATE_WINDOW_S, from a count that is looked at now and then, so that an event costs
+    nothing: the exponentially weighted mean of what each time between two looks had, divided by the weight that the time since
+    the first event can have. `hz` is that of the last look."""
 
     def __init__(self) -> None:
-        self._first = self._last = math.nan
-        self._weight = 0.0
+        self._first_s = self._last_s = math.nan
+        self._count = 0
+        self._mean_hz = 0.0
+        self.hz = 0.0
 
-    def add(self, now_s: float) -> None:
-        if math.isnan(self._first):
-            self._first = self._last = now_s  # one event has no rate: it only starts the clock
-            return
-        self._weight = self._weight * math.exp((self._last - now_s) / RATE_WINDOW_S) + 1.0
-        self._last = now_s
-
-    def hz(self, now_s: float) -> float:
-        elapsed = now_s - self._first
-        if not elapsed > 0:
-            return 0.0
-        weight = self._weight * math.exp((self._last - now_s) / RATE_WINDOW_S)
-        return weight / (RATE_WINDOW_S * -math.expm1(-elapsed / RATE_WINDOW_S))
+    def look(self, count: int, now_s: float) -> None:
+        """Takes the count of events so far. `now_s` must not run backwards."""
+        if count and math.isnan(self._first_s):  # what came before this look came within an unknown time
+            self._first_s = self._last_s = now_s
+            self._count = count
+        elif now_s > self._last_s:
+            since_s = now_s - self._last_s
+            share = -math.expm1(-since_s / RATE_WINDOW_S)
+            self._mean_hz += share * ((count - self._count) / since_s - self._mean_hz)
+            self.hz = self._mean_hz / -math.expm1((self._first_s - now_s) / RATE_WINDOW_S)
+            self._last_s, self._count = now_s, count
 
 
 @dataclass
@@ -52,14 +52,12 @@ class Traffic:
     is_read: bool = True
     rate: Rate = field(default_factory=Rate)
 
-    def took(self, stamp_ns: int, now_ns: int | None, now_s: float | None = None) -> None:
-        """Counts a good message. now_ns: when it came by the clock of stamps, None where that is not known. now_s: the same by a
-        steady clock, now where it is left out."""
+    def took(self, stamp_ns: int, now_ns: int | None) -> None:
+        """Counts a good message. now_ns: when it came by the clock of stamps, None where that is not known."""
         self.count += 1
         self.stamp_ns = stamp_ns
         if now_ns is not None:
             self.delay_s = (now_ns - stamp_ns) * 1e-9
-        self.rate.add(time.monotonic() if now_s is None else now_s)
 
     def missed(self, count: int | None) -> None:
         """Counts messages that did not come; None where the publisher does not number them."""
@@ -79,7 +77,7 @@ class Traffic:
         age = self.age_s(now_ns)
         return TopicReport(
             count=self.count,
-            rate_hz=round(self.rate.hz(time.monotonic()), 2),
+            rate_hz=round(self.rate.hz, 2),
             age_s=None if age is None else round(age, 4),
             delay_s=None if math.isnan(self.delay_s) else round(self.delay_s, 5),
             dropped=self.dropped,

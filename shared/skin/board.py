@@ -17,8 +17,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.cell import description as cells
-from shared.geometry.rigid import Array
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array
 
 BAUD = 500_000
 BYTE_S = 10 / BAUD
@@ -79,13 +79,13 @@ class Command:
         try:
             return _COMMAND.pack(self.kind, self.measures, self.electrode_hz, self.sample_hz)
         except (struct.error, OverflowError):
-            raise PacketError(f"a 32-bit kind, measures from 0 to 2^32 - 1 and frequencies expected, {self} came") from None
+            raise PacketError(f"expected a 32-bit kind, measures from 0 to 2^32 - 1 and frequencies, got {self}") from None
 
     @staticmethod
     def unpack(data: bytes) -> Command:
         """Raises PacketError for another size than 16 bytes."""
         if len(data) != COMMAND_BYTES:
-            raise PacketError(f"a command or its echo of {COMMAND_BYTES} bytes expected, {len(data)} came")
+            raise PacketError(f"expected a command or its echo of {COMMAND_BYTES} bytes, got {len(data)}")
         return Command(*_COMMAND.unpack(data))
 
     def is_answered(self, samples_per_cycle: int) -> bool:
@@ -98,16 +98,16 @@ class Command:
 def send_measures(measures: int) -> bytes:
     """Asks for the sums over so many cycles, as `cycles` rounds them. Raises PacketError for a number never answered."""
     if not 0 < measures <= MOST_MEASURES:
-        raise PacketError(f"measures: 1 to {MOST_MEASURES} cycles expected, {measures} came: a board never answers that")
+        raise PacketError(f"measures: expected 1 to {MOST_MEASURES} cycles, got {measures}, which a board never answers")
     return Command(Kind.SEND_MEASURES, measures).pack()
 
 
 def set_frequency(electrode_hz: float, samples_per_cycle: int) -> bytes:
     """SET_FREQ_2. Raises PacketError for what would stop the firmware."""
     if samples_per_cycle not in SAMPLES_PER_CYCLE:
-        raise PacketError(f"samples_per_cycle: 2 to 9 expected, {samples_per_cycle} came: above 9 the firmware stops")
+        raise PacketError(f"samples_per_cycle: expected 2 to 9, got {samples_per_cycle}; above 9 the firmware stops")
     if not 0.0 < electrode_hz * samples_per_cycle < CLOCK_HZ:
-        raise PacketError(f"electrode_hz: above 0 and below {CLOCK_HZ / samples_per_cycle:g} Hz expected, {electrode_hz:g} came")
+        raise PacketError(f"electrode_hz: expected above 0 and below {CLOCK_HZ / samples_per_cycle:g} Hz, got {electrode_hz:g}")
     return Command(Kind.SET_FREQ_2, UNUSED, electrode_hz, float(samples_per_cycle)).pack()
 
 
@@ -161,7 +161,9 @@ class Reply:
         """
         if not self.counts.all():
             empty = ", ".join(map(str, np.flatnonzero(self.counts == 0)))
-            raise PacketError(f"at least one cycle in every channel expected, none came in channel {empty}: ask again")
+            raise PacketError(
+                f"expected at least one cycle in every channel, got none in channel {empty}; request the cycles again"
+            )
         mean = self.sums / self.counts[:, None]
         return mean.mean(axis=1), mean @ _waves(self.samples_per_cycle)
 
@@ -175,17 +177,17 @@ class Reply:
 def _waves(samples_per_cycle: int) -> NDArray[np.complex128]:
     """(samples_per_cycle,): 2 / n exp(-2 pi i k / n); at two samples the wave is its own conjugate and counts once."""
     n = samples_per_cycle
-    waves = (1.0 if n == 2 else 2.0) / n * np.exp(-2j * np.pi * np.arange(n) / n)
-    return waves.real.round(15) + 1j * waves.imag.round(15)
+    waves: NDArray[np.complex128] = (1.0 if n == 2 else 2.0) / n * np.exp(-2j * np.pi * np.arange(n) / n)
+    return waves.round(15)
 
 
 def encode(counts: ArrayLike, sums: ArrayLike) -> bytes:
     """The reply of counts (6,) and sums (6, samples_per_cycle). Raises PacketError for what does not fit into one."""
     n, s = np.asarray(counts), np.asarray(sums)
     if n.shape != (CHANNELS,) or s.ndim != 2 or len(s) != CHANNELS or s.shape[1] not in SAMPLES_PER_CYCLE:
-        raise PacketError(f"counts (6,) and sums (6, 2 to 9) expected, {n.shape} and {s.shape} came")
+        raise PacketError(f"expected counts (6,) and sums (6, 2 to 9), got {n.shape} and {s.shape}")
     if n.min() < 0 or n.max() > 0xFFFF or s.min() < 0 or s.max() > 0xFFFF_FFFF:
-        raise PacketError(f"counts of 16 bits and sums of 32 bits expected, up to {n.max()} and {s.max()} came")
+        raise PacketError(f"expected counts of 16 bits and sums of 32 bits, got up to {n.max()} and {s.max()}")
     return _HEAD.pack(s.shape[1], *map(int, n)) + s.astype("<u4").tobytes()
 
 
@@ -196,13 +198,13 @@ def decode(data: bytes) -> Reply:
         counts = np.array(_HEAD.unpack_from(data)[1:], dtype=np.int64)
         return Reply(counts, np.frombuffer(data, "<u4", offset=HEAD_BYTES).reshape(CHANNELS, spc).astype(np.int64))
     sizes = {reply_bytes(n): n for n in SAMPLES_PER_CYCLE}
-    came = "1 byte" if len(data) == 1 else f"{len(data)} bytes"
+    got = "1 byte" if len(data) == 1 else f"{len(data)} bytes"
     if len(data) in sizes:
         fit = f"{reply_bytes(spc)} bytes fit" if spc in SAMPLES_PER_CYCLE else "a board takes 2 to 9"
-        raise PacketError(f"{came} hold {sizes[len(data)]} samples a cycle, but the first byte says {spc}: {fit}")
+        raise PacketError(f"{got} hold {sizes[len(data)]} samples a cycle, but the first byte says {spc}: {fit}")
     fit = f", and by its first byte this one has {reply_bytes(spc)}" if spc in SAMPLES_PER_CYCLE else ""
     listed = f"{', '.join(map(str, list(sizes)[:-1]))} or {max(sizes)}"
-    raise PacketError(f"a reply of {listed} bytes (16 + 24 for each of 2 to 9 samples a cycle) expected{fit}, {came} came")
+    raise PacketError(f"expected a reply of {listed} bytes (16 + 24 n for n = 2 to 9 samples a cycle){fit}, got {got}")
 
 
 def readers(pad: cells.Pad, pad_type: cells.PadType) -> tuple[cells.SensingBoard, ...]:

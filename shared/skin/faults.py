@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry.rigid import Array
-from shared.skin.layout import Skin
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin.layout import Skin
 
 Kind = Literal["saturated", "dead", "noisy", "hum", "drift"]
 
@@ -53,7 +53,7 @@ MENDS: dict[Kind, str] = {
     "dead": "check the electrode's wire and connector, and which channel the cell file gives it",
     "noisy": "check connectors and shield, or calibrate again",
     "hum": "shield the wires, move them away from mains cables, and connect the board's ground",
-    "drift": "let the boards warm up and take the offsets again with nothing near: penumbra skin calibrate",
+    "drift": "let the boards warm up and measure the offsets again with nothing near: penumbra skin calibrate",
 }
 
 
@@ -87,7 +87,7 @@ class Watch:
         self._a3, self._polarity, self._noise = skin.a3[own], skin.polarity[own], skin.noise[own]
         self._lsb, self._end = skin.lsb[own], skin.full_scale[own]
         reach = skin.peak[own] / skin.a2[own]
-        self._even = reach.mean() / reach
+        self._even: Array = reach.mean() / reach
         self.look: Look | None = None
         self._rows: list[Array] = []
         self._count = self._due_ns = 0
@@ -137,7 +137,7 @@ class Watch:
                 text = f"saturated: it reads {high[k]:.3f} V, amplitudes end at {self._end[k]:.3f} V"
                 self._quick[int(k)] = Fault("saturated", text)
             else:
-                self._quick[int(k)] = Fault("dead", f"dead: {BLOCK} samples stand at {high[k]:.3f} V without any noise")
+                self._quick[int(k)] = Fault("dead", f"dead: {BLOCK} samples at {high[k]:.3f} V without noise")
 
     def _see(self, volts: Array, period_s: float) -> Look:
         level = volts.mean(axis=0)
@@ -163,26 +163,27 @@ class Watch:
         for k in range(len(self.names)):
             mv, design = 1e3 * np.sqrt(look.noise[k]), 1e3 * np.sqrt(self._noise[k])
             if quiet[k]:
-                out[k] = Fault("dead", f"dead: noise of {mv:.2g} mV, {design:.2g} mV expected")
+                out[k] = Fault("dead", f"dead: expected noise of {design:.2g} mV, got {mv:.2g} mV")
             elif hums[k]:
                 out[k] = Fault("hum", f"hum: {1e3 * look.hum[k]:.2g} mV at {look.hum_hz[k]:g} Hz")
             elif noisy[k]:
-                out[k] = Fault("noisy", f"noisy: {mv:.2g} mV, {design:.2g} mV expected")
+                out[k] = Fault("noisy", f"noisy: expected noise of {design:.2g} mV, got {mv:.2g} mV")
             elif self._odd[k] >= LASTS:
-                where = "below zero" if look.signal[k] < 0 else "and the others of the pad feel nothing like it"
+                where = "below zero" if look.signal[k] < 0 else "and the pad's other electrodes show no such signal"
                 out[k] = Fault("drift", f"drift: its signal is {1e3 * look.signal[k]:+.2g} mV, {where}")
         return out
 
     def _drifts(self, signal: Array) -> NDArray[np.bool_]:
         """Signals (e,) [V] that no body gives: below zero, or of one electrode alone."""
         even = signal * self._even  # as large as each other's where a body is far
-        below = signal < -BELOW_V
+        below: NDArray[np.bool_] = signal < -BELOW_V
         if len(signal) < 3:
             return below
         order = np.sort(even)
         others = np.where(even == order[-1], order[-2], order[-1])  # the largest of the others
         factor = np.where(signal < FAR_V, *ALONE)
-        return below | (even > factor * np.maximum(others, 0.0) + ALONE_V)
+        alone: NDArray[np.bool_] = even > factor * np.maximum(others, 0.0) + ALONE_V
+        return below | alone
 
 
 @lru_cache(maxsize=1)
@@ -262,7 +263,7 @@ def likely(predicted: Array, measured: Array, noise: Array, pose_error: Array, c
     Raises ValueError for other shapes or none.
     """
     if predicted.shape != measured.shape or predicted.ndim != 2 or not len(predicted):
-        raise ValueError(f"signals (k, e) of the same shape expected, {predicted.shape} and {measured.shape} came")
+        raise ValueError(f"expected signals (k, e) of the same shape, got {predicted.shape} and {measured.shape}")
     own = np.hypot(MODEL_ERROR, CONTRAST * pose_error)[:, None] * np.maximum(np.abs(predicted), np.abs(measured))
     spread = noise + own**2
 
@@ -271,7 +272,7 @@ def likely(predicted: Array, measured: Array, noise: Array, pose_error: Array, c
         left = measured - model
         alike = pose_error[:, None] * model / spread
         removed = np.sum(alike * left, axis=1) ** 2 / (1.0 + np.sum(alike * pose_error[:, None] * model, axis=1))
-        return float(np.mean(np.sum(left**2 / spread, axis=1) - removed)) / predicted.shape[1]
+        return float(np.mean(np.sum(left**2 / spread, axis=1) - removed) / predicted.shape[1])
 
     weighted = predicted / spread
     gain = max(float(np.sum(weighted * measured) / max(np.sum(weighted * predicted), 1e-30)), 1e-3)

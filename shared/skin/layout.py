@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.body import anatomy
-from shared.cell import description as cells
-from shared.geometry.rigid import Array
+from penumbra.shared.body import anatomy
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array
 
 GAIN_GAPS = (0.02, 0.05, 0.10)
 """Gaps [m] at which a calibrated law is compared with the designed one."""
@@ -46,26 +46,28 @@ class Skin:
             raise ValueError(f"cell {cell.name} has no pads: the skin needs at least one under `pads:`")
         self.pads = tuple(cell.pads)
         self.links = tuple(pad.link for pad in cell.pads.values())
-        self.T_link_pads = np.array([pad.T_link_pad for pad in cell.pads.values()])
+        self.T_link_pads: Array = np.array([pad.T_link_pad for pad in cell.pads.values()])
         types = [cell.pad_types[pad.type] for pad in cell.pads.values()]
         counts = [len(kind.electrodes) for kind in types]
         self.first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.pad_of = np.repeat(np.arange(len(types)), counts)
-        self.centroids = np.concatenate([electrode_positions(kind) for kind in types])
+        self.centroids: Array = np.concatenate([electrode_positions(kind) for kind in types])
         self.names = tuple(f"{name}/{e}" for name, kind in zip(cell.pads, types, strict=True) for e in kind.electrodes)
         laws = [
             pad.calibration.get(electrode) or kind.law(electrode)
             for pad, kind in zip(cell.pads.values(), types, strict=True)
             for electrode in kind.electrodes
         ]
-        self.peak, self.a2, self.a3, self.polarity, self.noise = (
-            np.array([float(getattr(law, name)) for law in laws]) for name in ("a1", "a2", "a3", "polarity", "noise")
-        )
+        self.peak: Array = np.array([law.a1 for law in laws])
+        self.a2: Array = np.array([law.a2 for law in laws])
+        self.a3: Array = np.array([law.a3 for law in laws])
+        self.polarity: Array = np.array([float(law.polarity) for law in laws])
+        self.noise: Array = np.array([law.noise for law in laws])
         designed = [e.law for kind in types for e in kind.electrodes.values()]
         a1, a2, gaps = np.array([e.a1 for e in designed]), np.array([e.a2 for e in designed]), np.array(GAIN_GAPS)[:, None]
         ratio = self.peak / (1.0 + self.a2 * gaps**2) / (a1 / (1.0 + a2 * gaps**2))
-        self.gain = np.exp(np.log(ratio).mean(axis=0))  # a1 alone trades off with a2
-        self.sensitivity = np.repeat([kind.chain.sensitivity for kind in types], counts)
+        self.gain: Array = np.exp(np.log(ratio).mean(axis=0))  # a1 alone trades off with a2
+        self.sensitivity: Array = np.repeat([kind.chain.sensitivity for kind in types], counts)
         self.full_scale = np.repeat([kind.chain.adc_reference / 2.0 for kind in types], counts)
         self.lsb = np.repeat([kind.chain.adc_reference / (2.0**kind.chain.adc_bits - 1.0) for kind in types], counts)
         self.range = np.array([kind.range for kind in types])
@@ -82,21 +84,22 @@ class Skin:
         links = {"world": np.eye(4), **(links or {})}
         missing = sorted(set(self.links) - set(links))
         if missing:
-            raise ValueError(f"poses of the links {missing} expected: pads sit on them; came {sorted(links)}")
+            raise ValueError(f"expected the poses of the links {missing}, which carry pads, got {sorted(links)}")
         return np.stack([links[link] for link in self.links]) @ self.T_link_pads
 
     def positions(self, T_world_pads: Array) -> Array:
         """Electrode centroids (n, 3) [m] in the world."""
         T = T_world_pads[self.pad_of]
-        return np.einsum("nij,nj->ni", T[:, :3, :3], self.centroids) + T[:, :3, 3]
+        turned: Array = np.einsum("nij,nj->ni", T[:, :3, :3], self.centroids)
+        return turned + T[:, :3, 3]
 
     def signal(self, amplitude: ArrayLike) -> Array:
         """What the skin adds to an electrode's amplitude (..., n): polarity * (v - a3) [V], positive near a person."""
-        return self.polarity * (np.asarray(amplitude) - self.a3)
+        return self.polarity * (np.asarray(amplitude, float) - self.a3)
 
     def amplitude(self, change: ArrayLike) -> Array:
         """Noise-free amplitudes (..., n) [V] for changes of capacitance (..., n) [fF], up to full scale."""
-        analog = self.a3 + self.polarity * self.gain * self.sensitivity * np.asarray(change)
+        analog: Array = self.a3 + self.polarity * self.gain * self.sensitivity * np.asarray(change)
         return np.clip(analog, 0.0, self.full_scale)
 
     def volts(self, gaps: ArrayLike) -> Array:

@@ -11,6 +11,7 @@ The limb's size is two logarithms, of the factors by which it is longer and thic
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
@@ -21,9 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.body import urdf
-from shared.cell import description as cells
-from shared.native import inner, kernel
+from penumbra.shared.body import urdf
+from penumbra.shared.cell import description as cells
+from penumbra.shared.native import inner, kernel
 
 Array = NDArray[np.float64]
 
@@ -38,14 +39,20 @@ LANES = 16
 """Sums over the limb's skin are as many partial sums: two or more vectors on every processor."""
 ROUND = 0.02
 """The side from which the limb is seen fades out this near [m] to its axis, where it has no meaning."""
-STEPS = np.array([3e-4, 3e-4, 3e-4, 2e-3, 2e-3, 2e-3, 5e-3, 5e-3])
-"""Steps [m, rad, -] of the features' numerical derivatives: single precision carries them."""
+SUMS = 20
+"""Sums over the limb's skin that the features are made of: see `_sums`."""
+SLOPES = 8
+"""What a response is differentiated by: the pose error along the pad's axes, and the two sizes."""
+_X, _Y, _Z, _FACING, _AREA, _SEEN, _NEAR, _ROOT, _RIGHT, _LEFT, _TOP, _BOTTOM = (LANES * row for row in range(12))
+_MOVED, _ROWS = 12 * LANES, 12 + 4 * SLOPES
+"""Where `_sums` keeps what it knows of LANES pieces: from _MOVED on the derivatives of x, y, z and facing."""
 
 
 @dataclass(frozen=True)
 class Rest:
     """What the other links of the robot change at a mounting's electrodes: coefficients (e, terms) of a second-degree polynomial
-    for the logarithm [fF], in joint angles that run from -1 to 1 within middle -+ half (j,) [rad]."""
+    for the logarithm [fF], in joint angles that run from -1 to 1 within middle -+ half (j,) [rad]; of several mountings with one
+    dimension more in front."""
 
     coefficients: Array
     middle: Array
@@ -53,13 +60,24 @@ class Rest:
 
     def change(self, joints: ArrayLike) -> Array:
         """Changes (..., e) [fF] at joint angles (..., j); beyond the range as at its end."""
-        return np.exp(self.terms(np.asarray(joints)) @ self.coefficients.T)
+        exponents: Array = np.einsum("...t,...et->...e", self.terms(np.asarray(joints)), self.coefficients)
+        return np.exp(exponents)
 
     def terms(self, joints: Array) -> Array:
         """The polynomial's terms (..., terms)."""
         z = np.clip((joints - self.middle) / self.half, -1.0, 1.0)
-        i, k = np.triu_indices(z.shape[-1])
+        i, k = _pairs(z.shape[-1])
         return np.concatenate([np.ones((*z.shape[:-1], 1)), z, z[..., i] * z[..., k]], axis=-1)
+
+
+REST = ("coefficients", "middle", "half")
+"""The fields of `Rest`."""
+
+
+@functools.cache
+def _pairs(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The indices of all pairs of n numbers."""
+    return np.triu_indices(n)
 
 
 @dataclass(frozen=True)
@@ -104,7 +122,8 @@ class Network:
 
 class Response:
     """The networks of all pads of a cell for one of its targets; every pad has e electrodes, in the order of
-    `shared.skin.layout.Skin`. error (n,): standard deviation of what they get wrong, as a share of the change.
+    `shared.skin.layout.Skin`. size (2,): logs of the target's own length and girth, beside the mesh's. error (n,): standard
+    deviation of what the networks get wrong, as a share of the change.
 
     Raises CellError where a pad's mounting has no network, or pads differ in their number of electrodes.
     """
@@ -122,37 +141,42 @@ class Response:
         own = [known[each] for each in different]
         sizes = {len(each.skip) for each in own}
         if len(sizes) > 1:
-            raise cells.CellError(f"cell {cell.name}: pads with equally many electrodes expected, {sorted(sizes)} came")
+            raise cells.CellError(f"cell {cell.name}: expected pads with equally many electrodes, got {sorted(sizes)}")
         self.electrodes = sizes.pop()
         size = cell.targets[target].size or cells.Size()
-        self._size = np.log([size.length, size.girth])
-        self._rest = [known[each].rest for each in prints]
+        self.size = np.log([size.length, size.girth])
+        rests = {pad: rest for pad, each in enumerate(prints) if (rest := known[each].rest) is not None}
+        self._moved = np.array(list(rests), np.int64)  # the pads before links
+        self._rest = Rest(*(np.stack([getattr(rest, name) for rest in rests.values()]) for name in REST)) if rests else None
         self.error = np.repeat([known[each].error for each in prints], self.electrodes)
         self.index = np.array([different.index(each) for each in prints])
         points, ends = np.stack([_whole(each.points) for each in own]), np.stack([each.ends for each in own])
         mean, scale = np.stack([each.mean for each in own]), np.stack([each.scale for each in own])
         first, second, third = (_stack([each.weights[i] for each in own]) for i in range(3))
         biases = tuple(_stack([each.biases[i] for each in own]) for i in range(3))
-        self.arrays = (self.index, points, ends, mean, scale, first, biases[0], second, biases[1], third,
-                       biases[2], np.stack([each.skip for each in own]))  # fmt: skip
+        inputs = (np.ascontiguousarray(weights.transpose(0, 2, 1)) for weights in (first, second))  # rows are inputs
+        self.arrays = (self.index, points, ends, mean, scale, next(inputs), biases[0], next(inputs), biases[1], third,
+                       biases[2], np.stack([each.skip for each in own]).astype(np.float32))  # fmt: skip
 
     def change(self, T_pads_target: Array, size: ArrayLike = (0.0, 0.0)) -> Array:
         """Changes (n,) [fF] by the limb at T_pads_target (p, 4, 4), with its size (2,): log length, log girth."""
         out = np.empty(len(self.index) * self.electrodes)
-        values(*self.arrays, np.ascontiguousarray(T_pads_target), self._size + size, out)
+        values(*self.arrays, np.ascontiguousarray(T_pads_target), self.size + size, out)
         return np.exp(out)
 
     def rest(self, joints: ArrayLike) -> Array:
         """Changes (n,) [fF] by the robot's other links at all joint angles (j,) of the cell: there also without a limb."""
-        none = np.zeros(self.electrodes)
-        return np.concatenate([none if each is None else each.change(joints) for each in self._rest])
+        out = np.zeros((len(self.index), self.electrodes))
+        if self._rest is not None:
+            out[self._moved] = self._rest.change(joints)
+        return out.reshape(-1)
 
     def logs(self, T_pads_target: Array, size: ArrayLike = (0.0, 0.0)) -> tuple[Array, Array]:
         """Log changes (n,) and their derivatives (n, 8) by the target's pose, as `geometry.perturb` moves it but along the axes
         of each electrode's own pad, and by the two sizes."""
         out = np.empty(len(self.index) * self.electrodes)
         jacobian = np.empty((len(out), 8))
-        derivatives(*self.arrays, np.ascontiguousarray(T_pads_target), self._size + size, out, jacobian)
+        derivatives(*self.arrays, np.ascontiguousarray(T_pads_target), self.size + size, out, jacobian)
         return out, jacobian
 
 
@@ -182,7 +206,9 @@ def networks(cell: cells.Cell) -> dict[str, Network]:
                 try:
                     out[str(data["fingerprint"])] = Network.of(data)
                 except (KeyError, ValueError) as error:
-                    raise cells.CellError(f"{path}: a network of penumbra skin model expected ({error}): fit it again") from None
+                    raise cells.CellError(
+                        f"{path}: expected a network of `penumbra skin model` ({error}); fit it again"
+                    ) from None
     return out
 
 
@@ -210,10 +236,11 @@ def _whole(points: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.ascontiguousarray(np.concatenate([points, more], axis=1))
 
 
-def _stack(arrays: list[Array]) -> Array:
+def _stack(arrays: list[Array]) -> NDArray[np.float32]:
     """Arrays in one, smaller ones filled up with zeros: a unit without weights changes nothing."""
     shape = np.max([each.shape for each in arrays], axis=0)
-    return np.stack([np.pad(each, [(0, n - k) for n, k in zip(shape, each.shape, strict=True)]) for each in arrays])
+    padded = [np.pad(each, [(0, n - k) for n, k in zip(shape, each.shape, strict=True)]) for each in arrays]
+    return np.stack(padded).astype(np.float32)
 
 
 def _digest(data: bytes) -> str:
@@ -221,88 +248,160 @@ def _digest(data: bytes) -> str:
 
 
 @inner
-def _sums(px, py, pz, nx, ny, nz, area, R, t, along, across, core, out):  # type: ignore[no-untyped-def]
-    """Sums over the skin before a pad, into out: for each of three powers of nearness the weight and its first moments along the
-    pad's axes (12), for the middle one the second moments xx, yy, xy, zz, and from 32 on the weight as seen from right, left, top
-    and bottom of the pad. All in single precision, in one loop."""
-    lanes = np.zeros((20, LANES), np.float32)  # sums of every LANES-th piece: vectors add up alike on all processors
-    twice, square = np.float32(2.0 * RIM), np.float32(RIM * RIM)
-    half, one = np.float32(0.5), np.float32(1.0)
+def _sums(points, R, t, along, across, has_slopes, out):  # type: ignore[no-untyped-def]
+    """Sums over the skin before a pad, in single precision, into row 0 of out (1 + SLOPES, SUMS): for each of three powers of
+    nearness the weight and its first moments along the pad's axes (12); for the middle one the second moments xx, yy, xy, zz; and
+    the weight as seen from right, left, top and bottom of the pad. With has_slopes their derivatives go into the other rows."""
+    px, py, pz, nx, ny, nz, area = points[0], points[1], points[2], points[3], points[4], points[5], points[6]
+    rows = 1 + SLOPES if has_slopes else 1
+    lanes = np.zeros(rows * SUMS * LANES, np.float32)  # of every LANES-th piece: vectors add up alike on all processors
+    work = np.zeros(_ROWS * LANES, np.float32)  # one array, or the compiler suspects that one overwrites another
+    half, one, two, three = np.float32(0.5), np.float32(1.0), np.float32(2.0), np.float32(3.0)
+    twice, square, core = np.float32(2.0 * RIM), np.float32(RIM * RIM), np.float32(CORE * CORE)
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
     t0, t1, t2 = t[0], t[1], t[2]
+    for k in range(3):
+        for i in range(LANES):
+            work[_MOVED + (4 * k + k) * LANES + i] = one
     for block in range(px.shape[0] // LANES):
-        for lane in range(LANES):
-            k = LANES * block + lane
+        for i in range(LANES):
+            k = LANES * block + i
             a, b, c = px[k] * along, py[k] * across, pz[k] * across
             x = r00 * a + r01 * b + r02 * c + t0
             y = r10 * a + r11 * b + r12 * c + t1
             z = r20 * a + r21 * b + r22 * c + t2
-            lx, ly, lz = r00 * x + r10 * y + r20 * z, r01 * x + r11 * y + r21 * z, r02 * x + r12 * y + r22 * z
-            facing = lx * nx[k] + ly * ny[k] + lz * nz[k]
+            ux = r00 * nx[k] + r01 * ny[k] + r02 * nz[k]
+            uy = r10 * nx[k] + r11 * ny[k] + r12 * nz[k]
+            uz = r20 * nx[k] + r21 * ny[k] + r22 * nz[k]
+            facing = x * ux + y * uy + z * uz
             far = x * x + y * y + z * z + core
             near = one / far
-            seen = area[k] * (half - half * facing * math.sqrt(near))
+            root = math.sqrt(near)
+            rim = far + square
+            work[_X + i], work[_Y + i], work[_Z + i], work[_FACING + i], work[_AREA + i] = x, y, z, facing, area[k]
+            work[_SEEN + i], work[_NEAR + i], work[_ROOT + i] = area[k] * (half - half * facing * root), near, root
+            work[_RIGHT + i], work[_LEFT + i] = one / (rim - twice * x), one / (rim + twice * x)
+            work[_TOP + i], work[_BOTTOM + i] = one / (rim - twice * y), one / (rim + twice * y)
+        for i in range(LANES):
+            x, y, z, near, seen = work[_X + i], work[_Y + i], work[_Z + i], work[_NEAR + i], work[_SEEN + i]
+            right, left, top, bottom = work[_RIGHT + i], work[_LEFT + i], work[_TOP + i], work[_BOTTOM + i]
             w0 = seen * near * near
             w1 = w0 * near
             w2 = w1 * near * near
-            rim = far + square
-            right, left = one / (rim - twice * x), one / (rim + twice * x)
-            top, bottom = one / (rim - twice * y), one / (rim + twice * y)
-            lanes[0, lane] += w0
-            lanes[1, lane] += w0 * x
-            lanes[2, lane] += w0 * y
-            lanes[3, lane] += w0 * z
-            lanes[4, lane] += w1
-            lanes[5, lane] += w1 * x
-            lanes[6, lane] += w1 * y
-            lanes[7, lane] += w1 * z
-            lanes[8, lane] += w2
-            lanes[9, lane] += w2 * x
-            lanes[10, lane] += w2 * y
-            lanes[11, lane] += w2 * z
-            lanes[12, lane] += w1 * x * x
-            lanes[13, lane] += w1 * y * y
-            lanes[14, lane] += w1 * x * y
-            lanes[15, lane] += w1 * z * z
-            lanes[16, lane] += seen * right * right * right
-            lanes[17, lane] += seen * left * left * left
-            lanes[18, lane] += seen * top * top * top
-            lanes[19, lane] += seen * bottom * bottom * bottom
-    for i in range(20):
-        total = np.float32(0.0)
-        for lane in range(LANES):
-            total += lanes[i, lane]
-        out[i if i < 16 else 16 + i] = total
+            lanes[i] += w0
+            lanes[LANES + i] += w0 * x
+            lanes[2 * LANES + i] += w0 * y
+            lanes[3 * LANES + i] += w0 * z
+            lanes[4 * LANES + i] += w1
+            lanes[5 * LANES + i] += w1 * x
+            lanes[6 * LANES + i] += w1 * y
+            lanes[7 * LANES + i] += w1 * z
+            lanes[8 * LANES + i] += w2
+            lanes[9 * LANES + i] += w2 * x
+            lanes[10 * LANES + i] += w2 * y
+            lanes[11 * LANES + i] += w2 * z
+            lanes[12 * LANES + i] += w1 * x * x
+            lanes[13 * LANES + i] += w1 * y * y
+            lanes[14 * LANES + i] += w1 * x * y
+            lanes[15 * LANES + i] += w1 * z * z
+            lanes[16 * LANES + i] += seen * right * right * right
+            lanes[17 * LANES + i] += seen * left * left * left
+            lanes[18 * LANES + i] += seen * top * top * top
+            lanes[19 * LANES + i] += seen * bottom * bottom * bottom
+        if not has_slopes:
+            continue
+        for i in range(LANES):
+            k = LANES * block + i
+            a, b, c = px[k] * along, py[k] * across, pz[k] * across
+            ux = r00 * nx[k] + r01 * ny[k] + r02 * nz[k]
+            uy = r10 * nx[k] + r11 * ny[k] + r12 * nz[k]
+            uz = r20 * nx[k] + r21 * ny[k] + r22 * nz[k]
+            qx, qy, qz = work[_X + i] - t0, work[_Y + i] - t1, work[_Z + i] - t2
+            at = _MOVED + i
+            work[at + 3 * LANES], work[at + 7 * LANES], work[at + 11 * LANES] = ux, uy, uz
+            work[at + 13 * LANES], work[at + 14 * LANES], work[at + 15 * LANES] = -qz, qy, uy * t2 - uz * t1
+            work[at + 16 * LANES], work[at + 18 * LANES], work[at + 19 * LANES] = qz, -qx, uz * t0 - ux * t2
+            work[at + 20 * LANES], work[at + 21 * LANES], work[at + 23 * LANES] = -qy, qx, ux * t1 - uy * t0
+            work[at + 24 * LANES], work[at + 25 * LANES], work[at + 26 * LANES] = r00 * a, r10 * a, r20 * a
+            work[at + 27 * LANES] = a * nx[k]
+            work[at + 28 * LANES], work[at + 29 * LANES] = r01 * b + r02 * c, r11 * b + r12 * c
+            work[at + 30 * LANES], work[at + 31 * LANES] = r21 * b + r22 * c, b * ny[k] + c * nz[k]
+        for p in range(SLOPES):
+            by, own = _MOVED + 4 * p * LANES, (1 + p) * SUMS * LANES
+            for i in range(LANES):
+                x, y, z, near, seen = work[_X + i], work[_Y + i], work[_Z + i], work[_NEAR + i], work[_SEEN + i]
+                right, left, top, bottom = work[_RIGHT + i], work[_LEFT + i], work[_TOP + i], work[_BOTTOM + i]
+                dx, dy, dz, turn = work[by + i], work[by + LANES + i], work[by + 2 * LANES + i], work[by + 3 * LANES + i]
+                d_far = two * (x * dx + y * dy + z * dz)
+                share = -near * d_far  # the relative change of the nearness
+                d_seen = -half * work[_AREA + i] * work[_ROOT + i] * (turn + half * work[_FACING + i] * share)
+                w0, d0 = seen * near * near, (d_seen + two * seen * share) * near * near
+                w1, d1 = w0 * near, (d_seen + three * seen * share) * near * near * near
+                cube = near * near * near
+                w2, d2 = w1 * near * near, (d_seen + (two + three) * seen * share) * cube * near * near
+                lanes[own + i] += d0
+                lanes[own + LANES + i] += d0 * x + w0 * dx
+                lanes[own + 2 * LANES + i] += d0 * y + w0 * dy
+                lanes[own + 3 * LANES + i] += d0 * z + w0 * dz
+                lanes[own + 4 * LANES + i] += d1
+                lanes[own + 5 * LANES + i] += d1 * x + w1 * dx
+                lanes[own + 6 * LANES + i] += d1 * y + w1 * dy
+                lanes[own + 7 * LANES + i] += d1 * z + w1 * dz
+                lanes[own + 8 * LANES + i] += d2
+                lanes[own + 9 * LANES + i] += d2 * x + w2 * dx
+                lanes[own + 10 * LANES + i] += d2 * y + w2 * dy
+                lanes[own + 11 * LANES + i] += d2 * z + w2 * dz
+                lanes[own + 12 * LANES + i] += (d1 * x + two * w1 * dx) * x
+                lanes[own + 13 * LANES + i] += (d1 * y + two * w1 * dy) * y
+                lanes[own + 14 * LANES + i] += d1 * x * y + w1 * (dx * y + x * dy)
+                lanes[own + 15 * LANES + i] += (d1 * z + two * w1 * dz) * z
+                lanes[own + 16 * LANES + i] += (d_seen - three * seen * right * (d_far - twice * dx)) * right * right * right
+                lanes[own + 17 * LANES + i] += (d_seen - three * seen * left * (d_far + twice * dx)) * left * left * left
+                lanes[own + 18 * LANES + i] += (d_seen - three * seen * top * (d_far - twice * dy)) * top * top * top
+                lanes[own + 19 * LANES + i] += (d_seen - three * seen * bottom * (d_far + twice * dy)) * bottom * bottom * bottom
+    for row in range(rows):
+        for i in range(SUMS):
+            total = np.float32(0.0)
+            for lane in range(LANES):
+                total += lanes[(row * SUMS + i) * LANES + lane]
+            out[row, i] = total
 
 
-@kernel("f4[7, k], f8[2], f8[3, 3], f8[3], f8[2], out f8[36]")
-def _features(points, ends, R, t, size, out):  # type: ignore[no-untyped-def]
-    length, girth = math.exp(size[0]), math.exp(size[1])
-    along, across, core = np.float32(length), np.float32(girth), np.float32(CORE * CORE)
+@inner
+def _described(points, ends, R, t, size, has_slopes, sums, out, by):  # type: ignore[no-untyped-def]
+    """The input of a network, out (FEATURES,), for a limb at R (3, 3), t (3,) before a pad, of this size (2,); with has_slopes
+    its derivatives by (FEATURES, SLOPES). sums (1 + SLOPES, SUMS): memory."""
+    along = math.exp(size[0])
     single = R.astype(np.float32), t.astype(np.float32)
-    rows = (
-        points[0],
-        points[1],
-        points[2],
-        points[3],
-        points[4],
-        points[5],
-        points[6],
-    )  # each contiguous, or nothing is vectorised
-    _sums(*rows, *single, along, across, core, out)
-    xx, yy, xy, zz = out[12], out[13], out[14], out[15]
+    _sums(points, *single, np.float32(along), np.float32(math.exp(size[1])), has_slopes, sums)
+    s = sums[0]
     for first in (0, 4, 8):
-        weight = out[first]
-        x, y, z = out[first + 1] / weight, out[first + 2] / weight, out[first + 3] / weight
-        if first == 4:
-            spread = (xx + yy + zz) / weight
-            out[12], out[13] = (xx / weight - x * x) / spread, (yy / weight - y * y) / spread
-            out[14], out[15] = (xy / weight - x * y) / spread, (zz / weight - z * z) / spread
-        away = math.sqrt(x * x + y * y + z * z) + CORE
+        weight = s[first]
+        x, y, z = s[first + 1] / weight, s[first + 2] / weight, s[first + 3] / weight
+        far = math.sqrt(x * x + y * y + z * z)
+        away = far + CORE
         out[first] = math.log(weight)
         out[first + 1], out[first + 2], out[first + 3] = x / away, y / away, z / away
+        spread = (s[12] + s[13] + s[15]) / weight
+        if first == 4:
+            out[12], out[13] = (s[12] / weight - x * x) / spread, (s[13] / weight - y * y) / spread
+            out[14], out[15] = (s[14] / weight - x * y) / spread, (s[15] / weight - z * z) / spread
+        for p in range(SLOPES if has_slopes else 0):
+            d = sums[1 + p]
+            d_log = d[first] / weight
+            dx, dy, dz = d[first + 1] / weight - x * d_log, d[first + 2] / weight - y * d_log, d[first + 3] / weight - z * d_log
+            d_away = (x * dx + y * dy + z * dz) / (far + 1e-12) / away
+            by[first, p] = d_log
+            by[first + 1, p], by[first + 2, p] = (dx - x * d_away) / away, (dy - y * d_away) / away
+            by[first + 3, p] = (dz - z * d_away) / away
+            if first == 4:
+                d_spread = ((d[12] + d[13] + d[15]) / weight - spread * d_log) / spread
+                by[12, p] = ((d[12] - s[12] * d_log) / weight - 2.0 * x * dx) / spread - out[12] * d_spread
+                by[13, p] = ((d[13] - s[13] * d_log) / weight - 2.0 * y * dy) / spread - out[13] * d_spread
+                by[14, p] = ((d[14] - s[14] * d_log) / weight - x * dy - y * dx) / spread - out[14] * d_spread
+                by[15, p] = ((d[15] - s[15] * d_log) / weight - 2.0 * z * dz) / spread - out[15] * d_spread
     out[16], out[17] = size[0], size[1]
     out[18], out[19] = out[4] * out[7], out[4] * out[0]
     for row in range(3):  # the limb's axis, and its way round, in the pad's frame
@@ -312,116 +411,153 @@ def _features(points, ends, R, t, size, out):  # type: ignore[no-untyped-def]
     x = -(R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2])
     y = -(R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2])
     z = -(R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2])
-    low, high = ends[0] * length, ends[1] * length
+    low, high = ends[0] * along, ends[1] * along
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     out[26] = math.tanh((x - middle) / half)
     away = math.sqrt(y * y + z * z + ROUND * ROUND)
-    c, s = y / away, z / away
-    out[27], out[28] = c, s
-    out[29], out[30] = c * c - s * s, 2.0 * c * s
+    cosine, sine = y / away, z / away
+    out[27], out[28] = cosine, sine
+    out[29], out[30] = cosine * cosine - sine * sine, 2.0 * cosine * sine
     out[31] = out[4] * out[26]
-    for side in range(32, 36):
-        out[side] = math.log(out[side]) - out[4]
+    for side in range(4):
+        out[32 + side] = math.log(s[16 + side]) - out[4]
+    if not has_slopes:
+        return
+    for p in range(SLOPES):
+        for i in range(16, 32):
+            by[i, p] = 0.0
+        dx, dy, dz = 0.0, 0.0, 0.0
+        if p < 3:
+            dx, dy, dz = -R[p, 0], -R[p, 1], -R[p, 2]
+        elif p < 6:  # a turn about axis p - 3 of the pad: rows a and b mix
+            a, b = (p - 2) % 3, (p - 1) % 3
+            by[20 + a, p], by[20 + b, p] = -R[b, 0], R[a, 0]
+            by[23 + a, p], by[23 + b, p] = -R[b, 1], R[a, 1]
+            dx = R[b, 0] * t[a] - R[a, 0] * t[b]
+            dy = R[b, 1] * t[a] - R[a, 1] * t[b]
+            dz = R[b, 2] * t[a] - R[a, 2] * t[b]
+        else:
+            by[10 + p, p] = 1.0
+            dx = -x if p == 6 else 0.0  # the limb's middle and half length grow alike
+        by[26, p] = (1.0 - out[26] * out[26]) * dx / half
+        d_away = cosine * dy + sine * dz
+        d_cosine, d_sine = (dy - cosine * d_away) / away, (dz - sine * d_away) / away
+        by[27, p], by[28, p] = d_cosine, d_sine
+        by[29, p], by[30, p] = 2.0 * (cosine * d_cosine - sine * d_sine), 2.0 * (d_cosine * sine + cosine * d_sine)
+        by[18, p] = by[4, p] * out[7] + out[4] * by[7, p]
+        by[19, p] = by[4, p] * out[0] + out[4] * by[0, p]
+        by[31, p] = by[4, p] * out[26] + out[4] * by[26, p]
+        for side in range(4):
+            by[32 + side, p] = sums[1 + p, 16 + side] / s[16 + side] - by[4, p]
+
+
+@kernel("f4[7, k], f8[2], f8[3, 3], f8[3], f8[2], out f8[36]")
+def _features(points, ends, R, t, size, out):  # type: ignore[no-untyped-def]
+    _described(points, ends, R, t, size, False, np.empty((1, SUMS)), out, np.empty((0, 0)))
+
+
+@inner
+def _tanh(x):  # type: ignore[no-untyped-def]
+    """tanh in single precision to a few units in the last place, of numbers and without a call, so that it runs on vectors: the
+    rational approximation that Eigen uses (`generic_fast_tanh_float`)."""
+    x = min(max(x, np.float32(-7.905311)), np.float32(7.905311))
+    square = x * x
+    top = np.float32(-2.7607684e-16) * square + np.float32(2.0001879e-13)
+    top = top * square + np.float32(-8.604672e-11)
+    top = top * square + np.float32(5.1222973e-08)
+    top = top * square + np.float32(1.4857224e-05)
+    top = top * square + np.float32(6.3726195e-04)
+    top = top * square + np.float32(4.8935246e-03)
+    bottom = np.float32(1.1982584e-06) * square + np.float32(1.1853471e-04)
+    bottom = bottom * square + np.float32(2.2684346e-03)
+    bottom = bottom * square + np.float32(4.8935253e-03)
+    return x * top / bottom
+
+
+@inner
+def _layer(weights, bias, x, is_bent, out):  # type: ignore[no-untyped-def]
+    """A layer's output (n,), bias + x weights, through tanh where is_bent, for an input (m,) and weights (m, n), four rows of
+    them at a time. All in single precision, as the weights were learnt."""
+    for j in range(len(out)):
+        out[j] = bias[j]
+    m = len(x)
+    for i in range(0, m - m % 4, 4):
+        x0, x1, x2, x3 = x[i], x[i + 1], x[i + 2], x[i + 3]
+        w0, w1, w2, w3 = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
+        for j in range(len(out)):
+            out[j] += x0 * w0[j] + x1 * w1[j] + x2 * w2[j] + x3 * w3[j]
+    for i in range(m - m % 4, m):
+        for j in range(len(out)):
+            out[j] += x[i] * weights[i, j]
+    if is_bent:
+        for j in range(len(out)):
+            out[j] = _tanh(out[j])
 
 
 @inner(fastmath=True)
 def _dot(a, b):  # type: ignore[no-untyped-def]
     """The scalar product of two vectors (n,)."""
-    total = 0.0
+    total = np.float32(0.0)
     for i in range(len(a)):
         total += a[i] * b[i]
     return total
 
 
 @inner
-def _back(gradients, slopes, weights, out):  # type: ignore[no-untyped-def]
-    """Adds (gradients * slopes) @ weights to out (e, m), for gradients (e, n), slopes (n,) and weights (n, m), four rows of the
-    weights at a time."""
-    n = len(weights)
-    for i in range(0, n - n % 4, 4):
-        for row in range(len(out)):
-            f0, f1 = gradients[row, i] * slopes[i], gradients[row, i + 1] * slopes[i + 1]
-            f2, f3 = gradients[row, i + 2] * slopes[i + 2], gradients[row, i + 3] * slopes[i + 3]
-            for j in range(out.shape[1]):
-                out[row, j] += f0 * weights[i, j] + f1 * weights[i + 1, j] + f2 * weights[i + 2, j] + f3 * weights[i + 3, j]
-    for i in range(n - n % 4, n):
-        for row in range(len(out)):
-            f0 = gradients[row, i] * slopes[i]
-            for j in range(out.shape[1]):
-                out[row, j] += f0 * weights[i, j]
-
-
-@inner
-def _layer(weights, bias, x, out):  # type: ignore[no-untyped-def]
-    """A layer's output (n,) for an input (m,): tanh(weights x + bias)."""
+def _outputs(last, bias, skip, second, x, out):  # type: ignore[no-untyped-def]
+    """The network's output (e,): last (e, n) on its second layer (n,), skip (e, FEATURES) on its input."""
     for i in range(len(out)):
-        out[i] = math.tanh(_dot(weights[i], x) + bias[i])
+        out[i] = _dot(last[i], second) + bias[i] + _dot(skip[i], x)
 
 
-@inner
-def _changes(w2, b2, skip, second, x, out):  # type: ignore[no-untyped-def]
-    """The network's output (e,) for its second layer's and the skip's input."""
-    for i in range(len(out)):
-        out[i] = _dot(w2[i], second) + b2[i] + _dot(skip[i], x)
-
-
-_ARRAYS = """i8[p], f4[m, 7, k], f8[m, 2], f8[m, 36], f8[m, 36],
-    f8[m, a, 36], f8[m, a], f8[m, b, a], f8[m, b], f8[m, e, b], f8[m, e], f8[m, e, 36]"""
+ARRAYS = """i8[p], f4[m, 7, k], f8[m, 2], f8[m, 36], f8[m, 36],
+    f4[m, 36, a], f4[m, a], f4[m, a, b], f4[m, b], f4[m, e, b], f4[m, e], f4[m, e, 36]"""
 """`Response.arrays`, for the kernels' signatures: m networks of p pads, with a and b units in their layers and e electrodes."""
 
 
-@kernel(f"{_ARRAYS}, f8[p, 4, 4], f8[2], out f8[n]")
+@kernel(f"{ARRAYS}, f8[p, 4, 4], f8[2], out f8[n]")
 def values(index, points, ends, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, size, out):  # type: ignore[no-untyped-def]
     """Log changes of all electrodes, into out (n,). Arguments: `Response.arrays`, T_pads_target (p, 4, 4), size (2,)."""
     e = skip.shape[1]
-    x, first, second = np.empty(FEATURES), np.empty(w0.shape[1]), np.empty(w1.shape[1])
+    exact, x = np.empty(FEATURES), np.empty(FEATURES, np.float32)
+    first, second = np.empty(w0.shape[2], np.float32), np.empty(w1.shape[2], np.float32)
+    sums, nothing = np.empty((1, SUMS)), np.empty((0, 0))
     for p in range(len(index)):
         m = index[p]
-        _features(points[m], ends[m], T[p, :3, :3], T[p, :3, 3], size, x)
+        _described(points[m], ends[m], T[p, :3, :3], T[p, :3, 3], size, False, sums, exact, nothing)
         for i in range(FEATURES):
-            x[i] = (x[i] - mean[m, i]) / scale[m, i]
-        _layer(w0[m], b0[m], x, first)
-        _layer(w1[m], b1[m], first, second)
-        _changes(w2[m], b2[m], skip[m], second, x, out[p * e : (p + 1) * e])
+            x[i] = (exact[i] - mean[m, i]) / scale[m, i]
+        _layer(w0[m], b0[m], x, True, first)
+        _layer(w1[m], b1[m], first, True, second)
+        _outputs(w2[m], b2[m], skip[m], second, x, out[p * e : (p + 1) * e])
 
 
-@kernel(f"{_ARRAYS}, f8[p, 4, 4], f8[2], out f8[n], out f8[n, 8]")
+@kernel(f"{ARRAYS}, f8[p, 4, 4], f8[2], out f8[n], out f8[n, 8]")
 def derivatives(index, points, ends, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, size, out, jacobian):  # type: ignore[no-untyped-def]
     """The same with derivatives, into jacobian (n, 8): see `Response.logs`."""
     e = skip.shape[1]
-    x, high, low = np.empty(FEATURES), np.empty(FEATURES), np.empty(FEATURES)
-    first, second, ones = np.empty(w0.shape[1]), np.empty(w1.shape[1]), np.ones(FEATURES)
-    by, back, deep = np.empty((FEATURES, 8)), np.empty((e, FEATURES)), np.empty((e, w0.shape[1]))
-    R, t, other = np.empty((3, 3)), np.empty(3), np.empty(2)
+    exact, x, by = np.empty(FEATURES), np.empty(FEATURES, np.float32), np.empty((FEATURES, SLOPES))
+    first, second = np.empty(w0.shape[2], np.float32), np.empty(w1.shape[2], np.float32)
+    shallow, deep = np.empty((e, w0.shape[2]), np.float32), np.empty((e, w1.shape[2]), np.float32)  # slopes by the layers' sums
+    sums = np.empty((1 + SLOPES, SUMS))
     for p in range(len(index)):
         m = index[p]
-        _features(points[m], ends[m], T[p, :3, :3], T[p, :3, 3], size, x)
-        for k in range(8):
-            for side in (1, -1):
-                step = side * STEPS[k]
-                R[:], t[:], other[:] = T[p, :3, :3], T[p, :3, 3], size
-                if k < 3:
-                    t[k] += step
-                elif k < 6:  # a turn about axis k - 3 of the pad: rows a and b mix
-                    a, b = (k - 2) % 3, (k - 1) % 3
-                    for column in range(3):
-                        va, vb = T[p, a, column], T[p, b, column]
-                        R[a, column], R[b, column] = va - step * vb, vb + step * va
-                else:
-                    other[k - 6] += step
-                _features(points[m], ends[m], R, t, other, high if side > 0 else low)
-            for i in range(FEATURES):
-                by[i, k] = (high[i] - low[i]) / (2.0 * STEPS[k] * scale[m, i])
+        _described(points[m], ends[m], T[p, :3, :3], T[p, :3, 3], size, True, sums, exact, by)
         for i in range(FEATURES):
-            x[i] = (x[i] - mean[m, i]) / scale[m, i]
-        _layer(w0[m], b0[m], x, first)
-        _layer(w1[m], b1[m], first, second)
-        _changes(w2[m], b2[m], skip[m], second, x, out[p * e : (p + 1) * e])
-        deep[:], back[:], jacobian[p * e : (p + 1) * e] = 0.0, skip[m], 0.0
-        for i in range(len(second)):  # the slope of tanh
-            second[i] = 1.0 - second[i] * second[i]
-        for i in range(len(first)):
-            first[i] = 1.0 - first[i] * first[i]
-        _back(w2[m], second, w1[m], deep)
-        _back(deep, first, w0[m], back)
-        _back(back, ones, by, jacobian[p * e : (p + 1) * e])
+            x[i] = (exact[i] - mean[m, i]) / scale[m, i]
+        _layer(w0[m], b0[m], x, True, first)
+        _layer(w1[m], b1[m], first, True, second)
+        _outputs(w2[m], b2[m], skip[m], second, x, out[p * e : (p + 1) * e])
+        one = np.float32(1.0)
+        for electrode in range(e):
+            for j in range(deep.shape[1]):
+                deep[electrode, j] = w2[m, electrode, j] * (one - second[j] * second[j])  # the slope of tanh
+        for j in range(shallow.shape[1]):  # a row of weights is read once for all electrodes
+            for electrode in range(e):
+                shallow[electrode, j] = _dot(w1[m, j], deep[electrode]) * (one - first[j] * first[j])
+        jacobian[p * e : (p + 1) * e] = 0.0
+        for i in range(FEATURES):
+            for electrode in range(e):
+                slope = (_dot(w0[m, i], shallow[electrode]) + skip[m, electrode, i]) / scale[m, i]
+                for k in range(SLOPES):
+                    jacobian[p * e + electrode, k] += slope * by[i, k]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.contract.labels import Label
+from penumbra.shared.contract.labels import Label
 
 PLAIN, BLOTCHES, STRIPES, CHECKS, WOOD, PICTURE = range(6)
 TEXTURE_FIELDS = 20

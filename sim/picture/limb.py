@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shared.body import anatomy as bodies
-from shared.body.anatomy import Mesh
-from shared.cell import description as cells
-from shared.contract.labels import Label
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.shared.body import anatomy as bodies
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 PALM = 0.54
 """Length of the palm as a share of the hand's."""
@@ -53,7 +54,7 @@ def band(body: cells.Body, rng: np.random.Generator) -> Mesh:
     return Mesh(vertices, faces, np.full(len(faces), Label.FOREARM, np.uint8))
 
 
-def _hand(body: cells.Body, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+def _hand(body: cells.Body, rng: np.random.Generator) -> list[tuple[Array, NDArray[np.int32]]]:
     """Vertices and faces of palm, fingers and thumb; origin at the wrist, x towards the fingers, z dorsal, thumb on +y."""
     length, breadth = body.hand_length, body.hand_breadth
     wide_wrist, thin_wrist = bodies.half_axes(body.wrist_circumference, 0.68)
@@ -75,7 +76,7 @@ def _hand(body: cells.Body, rng: np.random.Generator) -> list[tuple[Array, Array
     return parts
 
 
-def _finger(root: Array, length: float, radius: float, bends: Array) -> list[tuple[Array, Array]]:
+def _finger(root: Array, length: float, radius: float, bends: Array) -> list[tuple[Array, NDArray[np.int32]]]:
     """The bones of a finger (4, 4) rooted in the hand, each bent by an angle [rad] towards the palm (-z)."""
     parts, T = [], root
     for bone, angle, width in zip(PHALANXES, bends, (1.0, 0.92, 0.82), strict=True):

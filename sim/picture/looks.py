@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.contract.labels import Label
-from sim.picture import appearance
-from sim.picture.appearance import BLOTCHES, CHECKS, PLAIN, STRIPES, Appearance, Colour, Look, Texture, hsv
+from penumbra.shared.contract.labels import Label
+from penumbra.sim.picture import appearance
+from penumbra.sim.picture.appearance import BLOTCHES, CHECKS, PLAIN, STRIPES, Appearance, Colour, Look, Texture, hsv
 
 BALANCE = 0.4
 """A channel is brighter or darker in the picture by up to this share because the white balance is wrong."""

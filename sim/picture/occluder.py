@@ -8,11 +8,11 @@ import threading
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.body.anatomy import Mesh
-from shared.cell import description as cells
-from shared.contract.labels import Label
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 BOX_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 """Corners (8, 3) of a cube with edges of length 1 around the origin."""

@@ -14,12 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.body.anatomy import Mesh
-from shared.cell import description as cells
-from shared.geometry import raster, rigid
-from shared.geometry.rigid import Array
-from shared.native import inner, kernel
-from sim.picture.appearance import CUFF, GLOSS, TEXTURE_FIELDS, Appearance, Look, noise_volume
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import raster, rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.native import inner, kernel
+from penumbra.sim.picture.appearance import CUFF, GLOSS, TEXTURE_FIELDS, Appearance, Look, noise_volume
+from penumbra.sim.picture.distortion import Distortion
 
 SHADOW_PX = 256
 CREASE = math.cos(math.radians(50.0))
@@ -66,13 +67,21 @@ class Picture:
 
 
 class Renderer:
-    """Renders scenes for one camera, or for a window of its image at a coarser scale (for training on crops).
+    """Renders scenes for one camera, or for a window of its image at a coarser scale (for training on crops). The image is the
+    pinhole's, or with `distortion`, whose window is rendered then, that of the camera's lens; labels are always the pinhole's.
 
     One picture after another: what a picture has in common with the last one (background, meshes, memory) is kept.
     """
 
-    def __init__(self, camera: cells.Camera, window: tuple[int, int, int, int] | None = None, scale: int = 1):
-        x0, y0, width, height = window or (0, 0, camera.width, camera.height)
+    def __init__(
+        self,
+        camera: cells.Camera,
+        window: tuple[int, int, int, int] | None = None,
+        scale: int = 1,
+        distortion: Distortion | None = None,
+    ):
+        self._distortion = distortion
+        x0, y0, width, height = window or (distortion.window if distortion else (0, 0, camera.width, camera.height))
         self._T_camera_world = rigid.inverse(camera.T_world_camera)
         self._k = (
             camera.fx / scale,
@@ -83,7 +92,8 @@ class Renderer:
         self._raster = raster.Raster(width // scale, height // scale)
         self._sky: tuple[object, NDArray[np.float32]] | None = None
         self._faces: tuple[list[Shape], _Faces] | None = None
-        self._image, self._blurred = (np.empty((*self._raster.ids.shape, 3), np.float32) for _ in range(2))
+        self._image = np.empty((*self._raster.ids.shape, 3), np.float32)
+        self._blurred = np.empty((camera.height, camera.width, 3), np.float32) if distortion else np.empty_like(self._image)
         self._shadow = raster.Raster(SHADOW_PX, SHADOW_PX)
 
     def render(self, bodies: list[Body], look: Look, rng: np.random.Generator) -> Picture:
@@ -120,7 +130,8 @@ class Renderer:
             image,
             labels,
         )
-        return Picture(_expose(image, self._blurred, look, rng), labels, view.ids.copy())
+        seen = self._distortion(image) if self._distortion else image
+        return Picture(_expose(seen, self._blurred, look, rng), labels, view.ids.copy())
 
     def _background(self, look: Look) -> NDArray[np.float32]:
         """What lies at infinity (h, w, 3) in the light of a look: the camera stands still, so it is made once."""

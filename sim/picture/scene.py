@@ -9,16 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.body.anatomy import Mesh
-from shared.cell import description as cells
-from shared.contract.labels import Label
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.skin.layout import electrode_positions
-from sim.picture import appearance
-from sim.picture.appearance import Appearance
-from sim.picture.occluder import box
-from sim.picture.renderer import Body, Renderer, Shape
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin.layout import electrode_positions
+from penumbra.sim.picture import appearance
+from penumbra.sim.picture.appearance import Appearance
+from penumbra.sim.picture.distortion import Distortion
+from penumbra.sim.picture.occluder import box
+from penumbra.sim.picture.renderer import Body, Renderer, Shape
 
 PLATE, PLATE_MARGIN, TABLE_THICK = 0.003, 0.02, 0.03
 """Thickness of a pad, how much wider it is than its electrodes, thickness of the table top [m]."""
@@ -26,8 +27,8 @@ PLATE, PLATE_MARGIN, TABLE_THICK = 0.003, 0.02, 0.03
 
 @dataclass(frozen=True)
 class View:
-    """A picture and its truth: `image` (h, w, 3) uint8 RGB, `labels` (h, w) uint8 classes, `hidden`: share of the target's pixels
-    in the picture that something covers."""
+    """A picture and its truth: `image` (h, w, 3) uint8 RGB as the camera's lens shows it, `labels` (h, w) uint8 classes of the
+    undistorted picture, `hidden`: share of the target's pixels in the picture that something covers."""
 
     image: NDArray[np.uint8]
     labels: NDArray[np.uint8]
@@ -40,7 +41,8 @@ class Cameras:
 
     def __init__(self, cell: cells.Cell, seed: int):
         self._cell, self._seed = cell, seed
-        self._renderers = {name: Renderer(camera) for name, camera in cell.cameras.items()}
+        self._distortions = {name: Distortion.of(camera) for name, camera in cell.cameras.items()}
+        self._renderers = {name: Renderer(cell.cameras[name], distortion=found) for name, found in self._distortions.items()}
         self._shapes: dict[str, Shape] = {}
         rng = np.random.default_rng([seed, 6])
         person = appearance.person(rng, tidy=True)
@@ -58,7 +60,9 @@ class Cameras:
         scene = [Body(self._shape(name, mesh), T, self._look(name)) for name, (mesh, T) in bodies.items()]
         rng = np.random.default_rng([self._seed, 7, list(self._renderers).index(camera), round(time_s * 1e6)])
         picture = renderer.render(scene, self._light, rng)
-        return View(picture.image, picture.labels, renderer.hidden_fraction(picture, scene, names.index("target")))
+        distortion = self._distortions[camera]
+        labels = distortion.pinhole(picture.labels) if distortion else picture.labels
+        return View(picture.image, labels, renderer.hidden_fraction(picture, scene, names.index("target")))
 
     def _shape(self, name: str, mesh: Mesh) -> Shape:
         if name not in self._shapes:

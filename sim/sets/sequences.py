@@ -14,17 +14,17 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from shared.body.anatomy import Mesh
-from shared.body.robot import RobotModel, robot_models
-from shared.cell import description as cells
-from shared.contract.labels import Label
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from sim.picture import appearance, limb, looks
-from sim.picture.appearance import Appearance
-from sim.picture.occluder import Panel, box
-from sim.picture.renderer import Body, Renderer, Shape
-from sim.world.person import Person, frame
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.body.robot import RobotModel, robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.sim.picture import appearance, limb, looks
+from penumbra.sim.picture.appearance import Appearance
+from penumbra.sim.picture.occluder import Panel, box
+from penumbra.sim.picture.renderer import Body, Renderer, Shape
+from penumbra.sim.world.person import Person, frame
 
 CELLS = ("table", "arm")
 PERIOD_S = 0.05

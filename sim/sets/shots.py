@@ -19,20 +19,20 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.body import anatomy
-from shared.body.anatomy import Mesh
-from shared.cell import description as cells
-from shared.contract.labels import Label
-from shared.geometry import raster, rigid
-from shared.geometry.rigid import Array
-from sim.picture import appearance
-from sim.picture.appearance import Appearance, Look, Texture
-from sim.picture.occluder import box
-from sim.picture.renderer import Body, Renderer, Shape
-from sim.sets import sequences
-from sim.sets.sequences import Thing
-from sim.world.motion import LimbMotion
-from sim.world.person import Person
+from penumbra.shared.body import anatomy
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import raster, rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.sim.picture import appearance
+from penumbra.sim.picture.appearance import Appearance, Look, Texture
+from penumbra.sim.picture.occluder import box
+from penumbra.sim.picture.renderer import Body, Renderer, Shape
+from penumbra.sim.sets import sequences
+from penumbra.sim.sets.sequences import Thing
+from penumbra.sim.world.motion import LimbMotion
+from penumbra.sim.world.person import Person
 
 Domain = Literal["wide", "easy"]
 """wide: all looks that the training draws. easy: bare skin before a plain light wall, a plain strong colour for the occluder."""
@@ -117,7 +117,7 @@ def clip(
     a little. `distance_m`: depth of the target's middle; images: whether they are painted, or only labelled (much faster);
     present: whether the person is there at all."""
     if not 0.0 <= hidden <= 1.0:
-        raise ValueError(f"hidden: a share from 0 to 1 expected, {hidden} came")
+        raise ValueError(f"hidden: expected a share from 0 to 1, got {hidden}")
     for attempt in itertools.count():
         rng = np.random.default_rng([seed, index, attempt])
         scene = _Scene(rng, index, (width, height), distance_m, domain, frames)

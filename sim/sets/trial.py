@@ -19,14 +19,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.body.anatomy import Mesh, target_mesh
-from shared.cell import description as cells
-from shared.contract.messages import Message
-from shared.contract.topics import Topic
-from shared.geometry import raster, rigid
-from shared.geometry.rigid import Array
-from sim.picture.occluder import AWAY
-from sim.world.world import World, stream
+from penumbra.shared.body.anatomy import Mesh, target_mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.messages import Message
+from penumbra.shared.contract.topics import Topic
+from penumbra.shared.geometry import raster, rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.sim.picture.occluder import AWAY
+from penumbra.sim.world.world import World, stream
 
 Reach = Literal["inside", "outside"]
 Distance = Literal["short", "medium", "long"]

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
-from shared.geometry.rigid import Array
-from shared.skin import board
-from shared.skin.board import Command, Kind
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin import board
+from penumbra.shared.skin.board import Command, Kind
 
 OVERHEAD_S = 0.48e-3
 """What the firmware takes for a request beside cycles and line: it makes 231 replies a second at 128 cycles, 298 at 32."""
@@ -106,7 +106,7 @@ class Board:
     def fault(self, kind: str) -> None:
         """Let one of FAULTS happen once. Raises ValueError for another."""
         if kind not in FAULTS:
-            raise ValueError(f"a fault of a board expected, one of {', '.join(FAULTS)}, {kind!r} came")
+            raise ValueError(f"expected a fault of a board, one of {', '.join(FAULTS)}, got {kind!r}")
         self._due[kind] += 1
 
     def receive(self, data: bytes, time_s: float) -> None:

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from shared.body.anatomy import target_mesh
-from shared.cell import description as cells
-from shared.contract.labels import Label
-from shared.geometry.rigid import Array, inverse
-from shared.geometry.surface import Surface
-from sim.skin.field import PadField, limb
+from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry.rigid import Array, inverse
+from penumbra.shared.geometry.surface import Surface
+from penumbra.sim.skin.field import PadField, limb
 
 GAPS_M = np.arange(2, 41) * 0.005
 ANGLES_DEG = np.arange(10) * 10.0

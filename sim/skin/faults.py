@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.geometry.rigid import Array
-from shared.skin.faults import arrangements
-from shared.skin.layout import Skin
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin.faults import arrangements
+from penumbra.shared.skin.layout import Skin
 
 KINDS = {
     "dead": "a broken wire: no amplitude and no noise",
-    "saturated": "the amplifier at its end",
+    "saturated": "the amplifier at its limit",
     "drift": "an offset that warms up by SIZE volts (default 0.05)",
     "hum": "mains of SIZE volts at 50 Hz (default 0.01)",
     "gain": "a calibration from another pad: signals times SIZE (default 1.5)",
@@ -55,7 +55,9 @@ class SkinFaults:
         pads, electrodes = self._find(where)
         if kind in ARRANGEMENTS:
             if where not in self._skin.pads:
-                raise ValueError(f"skin: {kind} is of a whole pad: one of {', '.join(self._skin.pads)} expected, {where!r} came")
+                raise ValueError(
+                    f"skin: expected one of {', '.join(self._skin.pads)} for {kind}, a fault of a whole pad, got {where!r}"
+                )
             self._pads = {**self._pads, pads[0]: kind}
             return
         kept = {k: fault for k, fault in self._electrodes.items() if k not in electrodes}
@@ -101,18 +103,18 @@ class SkinFaults:
         parts = words.split()
         if len(parts) not in (2, 3) or parts[1] not in KINDS or (parts[0] == "all" and parts[1] != "none"):
             possible = "; ".join(f"{name}: {about}" for name, about in KINDS.items())
-            raise ValueError(f"skin: PAD[/ELECTRODE] FAULT [SIZE] or `all none` expected, {words!r} came. Faults: {possible}")
+            raise ValueError(f"skin: expected PAD[/ELECTRODE] FAULT [SIZE] or `all none`, got {words!r}. Faults: {possible}")
         where, kind = parts[:2]
         if len(parts) == 2:
             return where, kind, SIZES.get(kind, 0.0)
         if kind not in SIZES:
-            raise ValueError(f"skin: {kind} has no size, {parts[2]!r} came")
+            raise ValueError(f"skin: {kind}: expected no size, got {parts[2]!r}")
         try:
             size = float(parts[2])
         except ValueError:
             size = math.nan
         if not 0.0 < abs(size) <= LARGEST[kind]:
-            raise ValueError(f"skin: a size of {kind} up to {LARGEST[kind]:g} expected, {parts[2]!r} came")
+            raise ValueError(f"skin: expected a size of {kind} up to {LARGEST[kind]:g}, got {parts[2]!r}")
         return where, kind, size
 
     def _find(self, where: str) -> tuple[list[int], list[int]]:
@@ -126,5 +128,5 @@ class SkinFaults:
         if where in skin.names:
             return [], [skin.names.index(where)]
         raise ValueError(
-            f"skin: a pad of {', '.join(skin.pads)} or one of their electrodes, such as {skin.names[0]}, expected, {where!r} came"
+            f"skin: expected a pad of {', '.join(skin.pads)} or one of their electrodes, such as {skin.names[0]}, got {where!r}"
         )

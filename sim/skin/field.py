@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from shared.body.anatomy import Mesh
-from shared.cell import description as cells
-from shared.geometry.rigid import Array
-from shared.native import kernel
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.native import kernel
 
 FEMTOFARAD = 4.0 * np.pi * 8.8541878128e-12 * 1e15
 """A unit of charge at one volt [fF]."""

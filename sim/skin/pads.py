@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.cell import description as cells
-from shared.geometry.rigid import Array, inverse
-from shared.skin.layout import Skin
-from shared.skin.response import Response
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array, inverse
+from penumbra.shared.skin.layout import Skin
+from penumbra.shared.skin.response import Response
 
 
 class SkinModel:

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.body.robot import RobotModel
-from shared.cell import description as cells
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.geometry.surface import Surface
-from shared.skin.layout import Near
-from sim.skin.pads import SkinModel
-from sim.world.clearance import Clearance
-from sim.world.motion import JointMotion, LimbMotion, angular_velocity
-from sim.world.person import Person
+from penumbra.shared.body.robot import RobotModel
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin.layout import Near
+from penumbra.sim.skin.pads import SkinModel
+from penumbra.sim.world.clearance import Clearance
+from penumbra.sim.world.motion import JointMotion, LimbMotion, angular_velocity
+from penumbra.sim.world.person import Person
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from shared.body.anatomy import Mesh
-from shared.body.robot import RobotModel
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.geometry.surface import Surface
-from shared.skin.layout import Skin
-from sim.world.motion import JointMotion
-from sim.world.person import Person, frame
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.body.robot import RobotModel
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin.layout import Skin
+from penumbra.sim.world.motion import JointMotion
+from penumbra.sim.world.person import Person, frame
 
 ROBOT_CLEARANCE = 0.022
 """Demanded distance [m] to the robot at the planned instants; between them it shrinks by less than 7 mm."""

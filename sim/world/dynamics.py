@@ -20,11 +20,11 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from shared.body.anatomy import Mesh
-from shared.body.robot import RobotModel
-from shared.cell import description as cells
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.body.robot import RobotModel
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 
 @contextlib.contextmanager

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.cell import description as cells
-from shared.geometry.rigid import Array
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array
 
 PEAK = 1.875
 """Peak over mean speed of a minimum-jerk reach."""
@@ -173,9 +173,8 @@ def joint_motions(cell: cells.Cell, sim: cells.Sim, seed: int) -> dict[str, Join
     total = sum(len(robot.joints) for robot in cell.robots.values())
     if not len(sim.joints_low) == len(sim.joints_high) == total:
         raise cells.CellError(
-            f"sim.joints_low and sim.joints_high: {total} values expected, "
-            f"one for each joint of {', '.join(cell.robots) or 'no robot'}; "
-            f"{len(sim.joints_low)} and {len(sim.joints_high)} came"
+            f"sim.joints_low and sim.joints_high: expected {total} values, one per joint of "
+            f"{', '.join(cell.robots) or 'no robot'}, got {len(sim.joints_low)} and {len(sim.joints_high)}"
         )
     motions, first = {}, 0
     for i, (name, robot) in enumerate(cell.robots.items()):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.body import anatomy as bodies
-from shared.body.anatomy import Mesh
-from shared.cell import description as cells
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.shared.body import anatomy as bodies
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 
 class Person:

@@ -16,25 +16,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from shared.body.anatomy import Mesh
-from shared.body.robot import robot_models
-from shared.cell import description as cells
-from shared.contract.messages import Frame, Joints, Message, Truth, Voltages
-from shared.contract.topics import FRAME, JOINTS, TRUTH, VOLTAGES, Topic
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.perception.lookout import Lookout
-from shared.skin.layout import link_names
-from sim.picture.occluder import OcclusionSchedule, Panel
-from sim.picture.scene import Cameras, View, furniture
-from sim.skin.faults import SkinFaults
-from sim.skin.pads import SkinModel
-from sim.world.actor import Actor, Placed
-from sim.world.motion import Clock, JointMotion, joint_motions
-from sim.world.person import Person
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.body.robot import robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.messages import Frame, Joints, Message, Truth, Voltages
+from penumbra.shared.contract.topics import FRAME, JOINTS, TRUTH, VOLTAGES, Topic
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.lookout import Lookout
+from penumbra.shared.skin.layout import link_names
+from penumbra.sim.picture.occluder import OcclusionSchedule, Panel
+from penumbra.sim.picture.scene import Cameras, View, furniture
+from penumbra.sim.skin.faults import SkinFaults
+from penumbra.sim.skin.pads import SkinModel
+from penumbra.sim.world.actor import Actor, Placed
+from penumbra.sim.world.motion import Clock, JointMotion, joint_motions
+from penumbra.sim.world.person import Person
 
 if TYPE_CHECKING:
-    from sim.world.dynamics import Robots
+    from penumbra.sim.world.dynamics import Robots
 
 FAR = 10.0
 """What the truth calls the gap [m] where the cell has no pads."""
@@ -178,7 +178,7 @@ class World:
     def occlude(self, level: float | None, time_s: float) -> None:
         """Hide a share [0, 1] of the target's pixels from each camera (above 0.95: all), or follow the schedule (None)."""
         if level is not None and not 0.0 <= level <= 1.0:
-            raise ValueError(f"occlude: a share from 0 to 1 or auto expected, {level} came")
+            raise ValueError(f"occlude: expected a share from 0 to 1 or auto, got {level}")
         self.occlusion.command(self.occlusion_clock.at(time_s), level)
 
     def set_motion(self, on: bool, time_s: float) -> None:
@@ -194,7 +194,7 @@ class World:
     def set_speed(self, speed: float, time_s: float) -> None:
         """Scene seconds per second of target and robot."""
         if not 0.0 < speed <= MAX_SPEED:
-            raise ValueError(f"speed: a factor above 0 and at most {MAX_SPEED:g} expected, {speed:g} came")
+            raise ValueError(f"speed: expected a factor above 0 and at most {MAX_SPEED:g}, got {speed:g}")
         self._speed = speed
         self._set_rates(time_s)
 
@@ -227,11 +227,11 @@ class World:
 def _bodies(world: World, scripts: Mapping[str, JointMotion]) -> Robots:
     """The robots of a world as bodies. Raises CellError where pybullet is missing."""
     try:
-        from sim.world import dynamics
+        from penumbra.sim.world import dynamics
     except ModuleNotFoundError:
         raise cells.CellError(
             f"cell {world.cell.name} has a robot: the emulator moves it with pybullet, which is not installed: "
-            "pip install 'pybullet>=3.2.6,<4', or choose a cell without robots such as table "
+            "pip install 'pybullet>=3.2.7,<4', or choose a cell without robots such as table "
             "(pybullet has wheels up to CPython 3.11; on later ones pip compiles it, which takes a C++ compiler)"
         ) from None
     clock = world.clock  # not the world: it holds the bodies, and a cycle of the two would stay until garbage is collected

@@ -19,13 +19,13 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from services.flags import Parser, above_zero, positive
-from services.segmentation import inference, prednet
-from services.segmentation.prednet import Settings
-from services.segmentation.training import evaluate, train
-from shared import training
-from sim.sets import sequences, shots
-from tests.bench import segmentation
+from penumbra.services import flags
+from penumbra.services.segmentation import inference, prednet
+from penumbra.services.segmentation.prednet import Settings
+from penumbra.services.segmentation.training import evaluate, train
+from penumbra.shared import training
+from penumbra.sim.sets import sequences, shots
+from penumbra.tests.bench import segmentation
 
 VARIANTS: dict[str, tuple[Settings, float]] = {
     "hGRU": (Settings(), 0.3),
@@ -73,13 +73,16 @@ def score(trainer: train.Trainer, data: train.Data, seed: int) -> dict[str, Any]
     return {"rows": found["rows"], "ms_per_frame": found["ms_per_frame"]}
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench ablation", description=__doc__)
-    parser.add_argument("--minutes", type=above_zero, default=7.0, help="training of the first variant (default: 7)")
-    parser.add_argument("--steps", type=positive, help="steps of every variant instead")
-    parser.add_argument("--seed", type=int, default=1, help="draws weights, training data and, far away, held-out data")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench ablation",
+    __doc__ or "",
+    flags.Option("--minutes", type=flags.above_zero, default=7.0, help="training of the first variant"),
+    flags.Option("--steps", type=flags.positive, help="steps of every variant instead"),
+    flags.Option("--seed", type=int, default=1, help="draws weights, training data and, far away, held-out data"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench ablation --json ablation.json",
+)
+def main(options: flags.Options) -> int:
     torch.set_num_threads(1)
     console, steps = Console(), options.steps
     found: list[dict[str, Any]] = []

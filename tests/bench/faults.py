@@ -7,7 +7,6 @@ they had been, measurements used twice, and poses called tracking that were wron
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import sys
@@ -24,12 +23,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from services.flags import Parser
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.topics import Topic
-from tests.support import injected, observed
-from tests.support.live import Running, penumbra_up, service_of, wait_for
+from penumbra.services import flags
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.topics import Topic
+from penumbra.tests.support import injected, observed
+from penumbra.tests.support.live import Running, penumbra_up, service_of, wait_for
 
 SERVICES = ("emulator", "segmentation", "search", "haptics", "fusion")
 REPLICATED = SERVICES[1:]
@@ -66,7 +65,7 @@ class Chain:
 
     @property
     def parts(self) -> injected.Breakable:
-        assert self.broken is not None, "a chain of `breakable` expected"
+        assert self.broken is not None, "expected a chain of `breakable`"
         return self.broken
 
     def owner(self, service: str) -> psutil.Process:
@@ -171,7 +170,7 @@ def _all_clocks(seconds: float, chain: Chain, process: None) -> AbstractContextM
 @contextmanager
 def _kill_on_full_disk(chain: Chain, process: psutil.Process) -> Iterator[None]:
     if chain.parts.disk is None:
-        raise PermissionError("full disk: a user who may mount a disk for it expected (root)")
+        raise PermissionError("full disk: expected a user who may mount a disk for it (root)")
     with injected.full(chain.parts.disk):
         injected.kill(process)
         yield
@@ -269,12 +268,12 @@ def plan(faults: Sequence[str], services: Sequence[str], replicas: Sequence[int]
     return [(setup, number, rows) for (setup, number), rows in out.items()]
 
 
-def run(options: argparse.Namespace, done: Callable[[Row], None]) -> None:
+def run(options: flags.Options, done: Callable[[Row], None]) -> None:
     """Goes through the plan, and hands every row to `done`."""
     able = possible(cells.load(options.cell))
     chosen = options.fault or [name for name in able if FAULTS[name].quick or not options.quick]
     for name in set(chosen) - set(able):
-        raise SystemExit(f"--fault {name!r}: a cell with a robot expected, such as --cell arm; {options.cell} has none")
+        raise SystemExit(f"--fault {name!r}: expected a cell with a robot, such as --cell arm; {options.cell} has none")
     replicas = options.replicas or ([1] if options.quick else [1, 2])
     setups = {each.__name__: each for each in (plain, breakable)}
     groups = plan(chosen, options.service or SERVICES, replicas)
@@ -313,16 +312,19 @@ def show(rows: Sequence[Row], console: Console) -> None:
     console.print(table)
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench faults", description=__doc__)
-    parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
-    parser.add_argument("--seed", type=int, default=1, help="draws motion and appearance")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, after every row")
-    parser.add_argument("--quick", action="store_true", help="the faults that show most, without replicas")
-    parser.add_argument("--fault", action="append", choices=FAULTS, help="this fault only; may be repeated")
-    parser.add_argument("--service", action="append", choices=SERVICES, help="strike this service only; may be repeated")
-    parser.add_argument("--replicas", action="append", type=int, choices=(1, 2), help="so many of each service; may be repeated")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench faults",
+    __doc__ or "",
+    flags.Option("--cell", default="table", help="built-in cell or YAML file"),
+    flags.Option("--seed", type=int, default=1, help="draws motion and appearance"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file, after every row"),
+    flags.Option("--quick", is_flag=True, help="the faults that show most, without replicas"),
+    flags.Option("--fault", choices=FAULTS, multiple=True, help="this fault only; may be repeated"),
+    flags.Option("--service", choices=SERVICES, multiple=True, help="strike this service only; may be repeated"),
+    flags.Option("--replicas", type=int, choices=(1, 2), multiple=True, help="so many of each service; may be repeated"),
+    example="penumbra bench faults --quick --json faults.json",
+)
+def main(options: flags.Options) -> int:
     rows: list[Row] = []
 
     def done(row: Row) -> None:

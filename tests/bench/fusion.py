@@ -28,25 +28,27 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from scipy.stats import chi2
 
-from services.flags import Parser, above_zero, positive
-from services.fusion.estimate import Estimate
-from services.fusion.observer import Bank, ErrorStateObserver
-from services.fusion.paper import PaperObserver
-from shared.contract import messages
-from shared.contract.senses import SENSES
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from tests.bench.lib import fusion_runs as runs
-from tests.bench.lib.fusion_baselines import FixedLagSmoother, Newest
+from penumbra.services import flags
+from penumbra.services.fusion.estimate import Estimate
+from penumbra.services.fusion.observer import Bank, ErrorStateObserver
+from penumbra.services.fusion.paper import PaperObserver
+from penumbra.shared.contract import messages
+from penumbra.shared.contract.senses import SENSES
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.tests.bench.lib import fusion_runs as runs
+from penumbra.tests.bench.lib.fusion_baselines import FixedLagSmoother, Newest
 
 HOME, SPREAD = rigid.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0]), (0.12, 0.4)
 """Of the cell `table`."""
@@ -60,6 +62,7 @@ WIDTH = 130
 BASELINES = ("oracle", "average", "gtsam", "paper")
 SLOW, SLOW_EVERY = ("gtsam", "paper"), 4
 """Baselines that take most of the time, and are played in every fourth run only."""
+Indices = NDArray[np.int64]
 SOURCES = tuple(sense.name for sense in SENSES)
 
 
@@ -79,7 +82,7 @@ class Scores:
     states: dict[str, int]
 
 
-def normalised(truth: Array, T: Array, covariance: Array, rolls: bool) -> float:
+def normalised(truth: Array, T: Array, covariance: NDArray[np.floating[Any]], rolls: bool) -> float:
     """The squared pose error of T (4, 4) in units of its covariance (6, 6); without `rolls` along the five directions other than
     the rotation about the limb."""
     error = rigid.pose_error(truth, T)
@@ -215,13 +218,14 @@ def late(seed: int, index: int, seconds: float) -> dict[str, Lateness]:
     drawn = runs.drawn("visible", seed, index, seconds)
     longest = max(bounds[1] for bounds in LATE_S.values())
     times = [t for t in instants(drawn) if t + longest < seconds]
-    found, exact = {}, []
+    found: dict[str, Lateness] = {}
+    exact: list[Array] = []
     for name, bounds in LATE_S.items():
         rng = np.random.default_rng([seed, index])
-        run = runs.delayed(drawn, lambda bounds=bounds, rng=rng: float(rng.uniform(*bounds)))
+        run = runs.delayed(drawn, partial(rng.uniform, *bounds))
         observer, stamps = ErrorStateObserver(HOME, SPREAD), [0.0]
         take = taking(observer)
-        player = Player(run, [take, lambda m, stamps=stamps: stamps.append(max(m.stamp, stamps[-1]))])
+        player = Player(run, [take, partial(_note_stamp, stamps)])
         newest, now, settled = [], [], []
         for when, asked in sorted([*((t, t) for t in times), *((t + longest, t) for t in times)]):
             player.until(when)
@@ -234,6 +238,11 @@ def late(seed: int, index: int, seconds: float) -> dict[str, Lateness]:
         difference = max(_distance(a, b) for a, b in zip(settled, exact, strict=True))
         found[name] = Lateness(np.array(newest), np.array(now), difference)
     return found
+
+
+def _note_stamp(stamps: list[float], message: runs.Message) -> None:
+    """Appends the newest stamp of all messages so far."""
+    stamps.append(max(message.stamp, stamps[-1]))
 
 
 def _distance(a: Array, b: Array) -> float:
@@ -288,7 +297,7 @@ def core_shares(seed: int, seconds: float) -> list[dict[str, float]]:
     return found
 
 
-def _batches(drawn: list[runs.Run], n: int, seconds: float) -> list[tuple[Array, ...]]:
+def _batches(drawn: list[runs.Run], n: int, seconds: float) -> list[tuple[Indices, Indices, Indices, Array, Array]]:
     """What arrives for n targets in each of the steps of a stream at 200 Hz: the arguments of `Bank.measure`."""
     steps = int(seconds * PUBLISHED_HZ)
     arrived: list[list[tuple[int, runs.Message]]] = [[] for _ in range(steps)]
@@ -436,14 +445,17 @@ def _marked(text: str, reached: bool) -> str:
     return text if reached else f"[red]{text}[/red]"
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench fusion", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1, help="draws limbs, errors and delays")
-    parser.add_argument("--runs", type=positive, default=100, help="of each situation (default: %(default)s)")
-    parser.add_argument("--seconds", type=above_zero, default=20.0, help="length of a run (default: %(default)s)")
-    parser.add_argument("--jobs", type=positive, default=2, help="processes (default: %(default)s)")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench fusion",
+    __doc__ or "",
+    flags.Option("--seed", type=int, default=1, help="draws limbs, errors and delays"),
+    flags.Option("--runs", type=flags.positive, default=100, help="of each situation"),
+    flags.Option("--seconds", type=flags.above_zero, default=20.0, help="length of a run"),
+    flags.Option("--jobs", type=flags.positive, default=2, help="processes"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench fusion --json fusion.json",
+)
+def main(options: flags.Options) -> int:
     found = measured(options.seed, options.runs, options.seconds, options.jobs, Console(stderr=True))
     console = Console()
     show(found, console if console.is_terminal else Console(width=max(console.width, WIDTH)))

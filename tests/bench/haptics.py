@@ -21,29 +21,30 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
-from services.flags import Parser
-from services.fusion.observer import ErrorStateObserver
-from services.haptics import paper_network
-from services.haptics.batches import Collector
-from services.haptics.estimator import Estimator
-from services.haptics.service import WEIGHTS
-from services.haptics.size_and_rest import SIZE_SPREAD
-from services.skin.model import links, mountings
-from shared.body.anatomy import target_mesh
-from shared.body.robot import robot_models
-from shared.cell import description as cells
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.geometry.surface import Surface
-from shared.skin.layout import Skin, link_names
-from shared.skin.response import Response, fingerprint
-from sim.skin import field
+from penumbra.services import flags
+from penumbra.services.fusion.observer import ErrorStateObserver
+from penumbra.services.haptics import paper_network
+from penumbra.services.haptics.batches import Collector
+from penumbra.services.haptics.estimator import Estimator
+from penumbra.services.haptics.service import WEIGHTS
+from penumbra.services.haptics.size_and_rest import SIZE_SPREAD
+from penumbra.services.skin.model import links, mountings
+from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.body.robot import robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin.layout import Skin, link_names
+from penumbra.shared.skin.response import Response, fingerprint
+from penumbra.sim.skin import field
 
 ARRAYS = {"bare": "table", "hull": "arm"}
 """Cells: pads in a table top, and pads on a robot's hull."""
@@ -96,7 +97,7 @@ class Rig:
         self.surface = Surface(self.mesh.vertices, self.mesh.faces)
         self.home = self.cell.targets[self.target].home.transform
         sim = self.cell.sim
-        assert sim is not None, f"cell {self.cell.name}: a `sim` section expected"
+        assert sim is not None, f"cell {self.cell.name}: expected a `sim` section"
         self.joints = (np.array(sim.joints_low) + np.array(sim.joints_high)) / 2.0
         carriers, first = {}, 0
         for robot, model in robot_models(self.cell).items():
@@ -321,8 +322,8 @@ def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: A
             known = np.delete(rig.axes(told.T, 8), NAMES.index("roll"), axis=0)
             error = known @ rigid.pose_error(T, told.T)
             fused.append(float(error @ np.linalg.solve(known @ told.covariance @ known.T, error)) / len(known))
-    means = [float(np.mean(values)) if values else float("nan") for values in (published, fused)]
-    return Consistency(*means, seen / max(len(errors), 1), ms, errors)
+    mean_published, mean_fused = (float(np.mean(values)) if values else float("nan") for values in (published, fused))
+    return Consistency(mean_published, mean_fused, seen / max(len(errors), 1), ms, errors)
 
 
 def _rmse(errors: list[Array]) -> dict[str, float]:
@@ -343,7 +344,7 @@ def moving(rig: Rig, seed: int, k: int, seconds: float) -> tuple[list[float], Co
     rate *= SPEEDS[-1] / np.linalg.norm(reach * rate)
     phase[2] = -0.5 * np.pi
 
-    def at(t: Array) -> list[Array]:
+    def at(t: NDArray[np.floating[Any]]) -> list[Array]:
         way = reach * (np.sin(np.outer(t, rate) + phase) - np.sin(phase)) @ axes[:3, :3]
         return [rigid.perturb(T, np.append(step, np.zeros(3))) for step in way]
 
@@ -405,7 +406,7 @@ def sequences(rig: Rig, seed: int, plan: Plan, progress: Progress) -> dict[str, 
         }
     gaps: list[float] = []
     errors: list[Array] = []
-    followed = []
+    followed: list[Consistency] = []
     for k in range(plan.moving):
         more, each = moving(rig, seed, k, plan.moving_s)
         gaps, errors, followed = gaps + more, errors + each.errors, [*followed, each]
@@ -538,15 +539,18 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(row[name] for name in ("array", "gap_m", "pads", "prior", "speed"))
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench haptics", description=(__doc__ or "").partition("\n\n")[0])
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--picture", type=Path, help="draw error against gap here (PNG, PDF or SVG)")
-    parser.add_argument("--array", choices=tuple(ARRAYS), action="append", help="only this one (default: all)")
-    parser.add_argument("--method", choices=("both", "solve"), default="both", help="the paper's beside ours (default: both)")
-    parser.add_argument("--quick", action="store_true", help="a few of everything: whether it runs, no numbers to believe")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench haptics",
+    (__doc__ or "").partition("\n\n")[0],
+    flags.Option("--seed", type=int, default=1),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers here"),
+    flags.Option("--picture", type=Path, help="draw error against gap here (PNG, PDF or SVG)"),
+    flags.Option("--array", choices=tuple(ARRAYS), multiple=True, help="only this one (default: all)"),
+    flags.Option("--method", choices=("both", "solve"), default="both", help="the paper's beside ours"),
+    flags.Option("--quick", is_flag=True, help="a few of everything: whether it runs, no numbers to believe"),
+    example="penumbra bench haptics --quick --json haptics.json",
+)
+def main(options: flags.Options) -> int:
     result = measure(options.seed, QUICK if options.quick else FULL, tuple(options.array or ARRAYS), options.method == "both")
     show(result, Console(width=170))
     if options.picture:

@@ -6,7 +6,6 @@ the truth there. Motion and occlusion are drawn from `--seed`.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import threading
@@ -22,10 +21,10 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from services.flags import Parser, above_zero
-from shared.cell import description as cells
-from shared.contract import messages, topics
-from tests.support.live import penumbra_up, wait_for
+from penumbra.services import flags
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.tests.support.live import penumbra_up, wait_for
 
 VISIBLE = 0.33
 """At most this share of the target hidden: visible (the paper's light occlusion)."""
@@ -218,14 +217,17 @@ def show_errors(result: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench live", description=__doc__)
-    parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
-    parser.add_argument("--seconds", type=above_zero, default=60.0, help="length of the measurement")
-    parser.add_argument("--seed", type=int, default=1, help="draws motion, occlusion and appearance")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    parser.add_argument("--up", nargs=argparse.REMAINDER, default=[], help="further arguments for `penumbra up` (last)")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench live",
+    __doc__ or "",
+    flags.Option("--cell", default="table", help="built-in cell or YAML file"),
+    flags.Option("--seconds", type=flags.above_zero, default=60.0, help="length of the measurement"),
+    flags.Option("--seed", type=int, default=1, help="draws motion, occlusion and appearance"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    flags.Option("--up", takes="rest", metavar="WORDS", help="further arguments for `penumbra up` (last)"),
+    example="penumbra bench live --json live.json",
+)
+def main(options: flags.Options) -> int:
     cell = cells.load(options.cell)
     target = cell.one("targets", None)
     with penumbra_up(options.cell, options.seed, *options.up) as running:

@@ -19,13 +19,12 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from services.flags import Parser, positive
-from services.search.evidence import Intrinsics
-from services.search.objects.pose import RigidObject, find_pose
-from shared.body.anatomy import Mesh
-from shared.geometry import raster
-from shared.geometry import rigid as geometry
-from shared.geometry.rigid import Array
+from penumbra.services import flags
+from penumbra.services.search.evidence import Intrinsics
+from penumbra.services.search.objects.pose import RigidObject, find_pose
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.geometry import raster
+from penumbra.shared.geometry.rigid import Array, apply, from_rpy, perturb, pose_error, transform
 
 Bool = NDArray[np.bool_]
 
@@ -67,7 +66,7 @@ class Thing:
 
 def turn(axis: str, count: int) -> Array:
     """The rotations (count, 3, 3) about an axis by multiples of a part of a turn."""
-    return np.array([geometry.from_rpy((0, 0, 0), np.eye(3)["xyz".index(axis)] * a)[:3, :3] for a in _angles(count)])
+    return np.array([from_rpy((0, 0, 0), np.eye(3)["xyz".index(axis)] * a)[:3, :3] for a in _angles(count)])
 
 
 def _angles(count: int) -> Array:
@@ -76,7 +75,7 @@ def _angles(count: int) -> Array:
 
 def placed(mesh: trimesh.Trimesh, at: tuple[float, float, float], rpy: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
     """A part moved to a place [mm], turned by roll, pitch, yaw [deg] before."""
-    return mesh.apply_transform(geometry.from_rpy(at, np.radians(rpy)))
+    return mesh.apply_transform(from_rpy(at, np.radians(rpy)))
 
 
 def tube(points: Array, radii: Array, segments: int = 24, along: Array | None = None) -> trimesh.Trimesh:
@@ -101,6 +100,13 @@ def tube(points: Array, radii: Array, segments: int = 24, along: Array | None = 
     return trimesh.Trimesh(np.vstack([rings.reshape(-1, 3), points[0], points[-1]]), np.concatenate(faces), process=False)
 
 
+def joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """One mesh of several."""
+    whole = trimesh.util.concatenate(parts)
+    assert isinstance(whole, trimesh.Trimesh)
+    return whole
+
+
 def lathe(profile: Array, flat: float = 1.0, segments: int = 48) -> trimesh.Trimesh:
     """A body of revolution about z of a profile (n, 2) of radius and height; `flat`: its thin half axis over the wide one."""
     r, z = np.asarray(profile, float).T
@@ -108,7 +114,7 @@ def lathe(profile: Array, flat: float = 1.0, segments: int = 48) -> trimesh.Trim
 
 
 def drill() -> trimesh.Trimesh:
-    return trimesh.util.concatenate(
+    return joined(
         [
             tube(np.array([[x, 0, 0] for x in (-75, -70, -20, 40, 62, 70)], float), np.array([22, 28, 30, 28, 24, 20])),
             tube(np.array([[x, 0, 0] for x in (68, 75, 95, 112, 114)], float), np.array([14, 18, 17, 9, 3])),
@@ -125,16 +131,14 @@ def drill() -> trimesh.Trimesh:
 def mug() -> trimesh.Trimesh:
     cup = lathe(np.array([[0.1, -46], [38, -47], [41, -44], [41, 40], [41, 47], [37, 47], [37, -42], [0.1, -43]]))
     a = np.linspace(-1.35, 1.35, 24)
-    return trimesh.util.concatenate(
-        [cup, tube(np.stack([39 + 32 * np.cos(a), 0 * a, 30 * np.sin(a)], 1), np.full((24, 2), [5, 8]), 16)]
-    )
+    return joined([cup, tube(np.stack([39 + 32 * np.cos(a), 0 * a, 30 * np.sin(a)], 1), np.full((24, 2), [5, 8]), 16)])
 
 
 def spray_bottle() -> trimesh.Trimesh:
     body = lathe(
         np.array([[0.1, -100], [40, -99], [43, -90], [43, 0], [38, 40], [22, 75], [14, 90], [14, 105], [0.1, 105.5]]), 0.65
     )
-    return trimesh.util.concatenate(
+    return joined(
         [
             body,
             placed(trimesh.creation.box((78, 24, 26)), (14, 0, 118)),
@@ -148,7 +152,7 @@ def duck() -> trimesh.Trimesh:
     def ball(x: float, y: float, z: float, *half: float) -> trimesh.Trimesh:
         return placed(trimesh.creation.icosphere(4).apply_scale(half), (x, y, z))
 
-    return trimesh.util.concatenate(
+    return joined(
         [
             ball(0, 0, 0, 52, 40, 34),
             ball(34, 0, 46, 28, 26, 27),
@@ -170,7 +174,7 @@ def scissors() -> trimesh.Trimesh:
         parts.append(
             tube(np.stack([-55 + size[0] * np.cos(a), side * 19 + size[1] * np.sin(a), 0 * a], 1), np.full((33, 2), [4.5, 5]), 12)
         )
-    return trimesh.util.concatenate(parts)
+    return joined(parts)
 
 
 def mustard_bottle() -> trimesh.Trimesh:
@@ -202,7 +206,7 @@ def pitcher() -> trimesh.Trimesh:
         np.array([[0.1, -110], [50, -110], [54, -100], [60, 60], [66, 118], [62, 118], [56, 60], [50, -104], [0.1, -104]])
     )
     a = np.linspace(-1.4, 1.4, 24)
-    return trimesh.util.concatenate(
+    return joined(
         [
             body,
             tube(np.stack([-52 - 48 * np.cos(a), 0 * a, 10 + 75 * np.sin(a)], 1), np.full((24, 2), [8, 11]), 16),
@@ -259,7 +263,7 @@ def thing(name: str, seed: int) -> Thing:
 
 
 def iou(a: Bool, b: Bool) -> float:
-    return np.count_nonzero(a & b) / max(np.count_nonzero(a | b), 1)
+    return int(np.count_nonzero(a & b)) / max(int(np.count_nonzero(a | b)), 1)
 
 
 def spoiled(truth: Bool, wanted: float, rng: np.random.Generator) -> Bool:
@@ -280,7 +284,7 @@ def spoiled(truth: Bool, wanted: float, rng: np.random.Generator) -> Bool:
     rows, columns = np.mgrid[: truth.shape[0], : truth.shape[1]]
 
     def made(s: float) -> Bool:
-        mask = distance + s * (wobble + bias) > 0
+        mask: NDArray[Any] = distance + s * (wobble + bias) > 0
         if thin:
             r = int(round(7 * s))
             mask = (
@@ -290,7 +294,7 @@ def spoiled(truth: Bool, wanted: float, rng: np.random.Generator) -> Bool:
                 > 0
             )
         mask = cv2.warpAffine(
-            mask.astype(np.float32), np.float64([[1, 0, s * shift[0]], [0, 1, s * shift[1]]]), truth.shape[::-1]
+            mask.astype(np.float32), np.array([[1, 0, s * shift[0]], [0, 1, s * shift[1]]], float), truth.shape[::-1]
         )
         mask = cv2.GaussianBlur(mask, (0, 0), 0.3 + s * smoothing) > 0.5
         for kind, wanted_too in (("bite", bite), ("blob", blob), ("hole", hole)):
@@ -320,14 +324,14 @@ def drawn_pose(rng: np.random.Generator) -> Array:
     z = rng.uniform(0.6, 1.2)
     centre = (rng.uniform(0.3, 0.7) * WIDTH, rng.uniform(0.3, 0.7) * HEIGHT)
     q = rng.normal(size=4)
-    return geometry.transform(((centre[0] - K.cx) / K.fx * z, (centre[1] - K.cy) / K.fy * z, z), q / np.linalg.norm(q))
+    return transform(((centre[0] - K.cx) / K.fx * z, (centre[1] - K.cy) / K.fy * z, z), q / np.linalg.norm(q))
 
 
 def moved(T: Array, degrees: float, metres: float, rng: np.random.Generator) -> Array:
     """The pose beside T: turned and shifted by exactly this, in random directions."""
     axis, way = rng.normal(size=3), rng.normal(size=3)
     error = np.concatenate([metres * way / np.linalg.norm(way), np.radians(degrees) * axis / np.linalg.norm(axis)])
-    return geometry.perturb(T, error)
+    return perturb(T, error)
 
 
 @dataclass(frozen=True)
@@ -344,9 +348,9 @@ def errors(one: Thing, T: Array, T_true: Array) -> Errors:
     turns = np.tile(np.eye(4), (len(one.symmetries), 1, 1))
     turns[:, :3, :3] = one.symmetries
     candidates = T_true @ turns
-    angles = [np.linalg.norm(geometry.pose_error(candidate, T)[3:]) for candidate in candidates]
+    angles = [np.linalg.norm(pose_error(candidate, T)[3:]) for candidate in candidates]
     nearest = candidates[int(np.argmin(angles))]
-    found, true = geometry.apply(T, one.points), geometry.apply(T_true, one.points)
+    found, true = apply(T, one.points), apply(T_true, one.points)
     distance = cKDTree(true).query(found)[0] if len(turns) > 1 else np.linalg.norm(found - true, axis=1)
     return Errors(float(distance.mean()) / one.diameter, float(min(angles)), T[:3, 3] - T_true[:3, 3], nearest)
 
@@ -356,7 +360,7 @@ def scene(one: Thing, seed: tuple[int, ...], wanted: tuple[float, float]) -> tup
     rng = np.random.default_rng(seed)
     T = drawn_pose(rng)
     vertices, faces = np.asarray(one.mesh.vertices, float), np.ascontiguousarray(one.mesh.faces, np.int32)
-    truth = raster.silhouette(geometry.apply(T, vertices), faces, (K.fx, K.fy, K.cx, K.cy), (0, 0, WIDTH, HEIGHT))
+    truth = raster.silhouette(apply(T, vertices), faces, (K.fx, K.fy, K.cx, K.cy), (0, 0, WIDTH, HEIGHT))
     share = rng.uniform(*wanted)
     return T, truth if share >= 1.0 else spoiled(truth, share, rng)
 
@@ -377,7 +381,7 @@ def measure(name: str, seed: int, count: int) -> list[dict[str, Any]]:
                 result = find_pose(rigid, mask, K, start)
                 ms = (time.perf_counter() - begun) * 1e3
                 error = errors(one, result.T, T_true)
-                e = geometry.pose_error(error.nearest, result.T)
+                e = pose_error(error.nearest, result.T)
                 nees, centimetres = float(e @ np.linalg.solve(result.covariance, e)), np.linalg.norm(e[:3]) * 100
                 found.append((error.add, np.degrees(error.rotation), centimetres, nees, result.state == "lost", ms))
             add, rotation, position, nees_all, lost, ms_all = np.array(found, float).T
@@ -428,13 +432,16 @@ def averages(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench objects", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1, help="draws poses, masks and starts")
-    parser.add_argument("--starts", type=positive, default=30, help="of each object, mask and distance")
-    parser.add_argument("--objects", nargs="+", choices=MAKERS, default=list(MAKERS), metavar="NAME", help=", ".join(MAKERS))
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench objects",
+    __doc__ or "",
+    flags.Option("--seed", type=int, default=1, help="draws poses, masks and starts"),
+    flags.Option("--starts", type=flags.positive, default=30, help="of each object, mask and distance"),
+    flags.Option("--objects", choices=MAKERS, takes="many", default=list(MAKERS), metavar="NAME", help=", ".join(MAKERS)),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench objects --json objects.json",
+)
+def main(options: flags.Options) -> int:
     rows: list[dict[str, Any]] = []
     for name in track(options.objects, description="objects", disable=not sys.stderr.isatty()):
         rows += measure(name, options.seed, options.starts)

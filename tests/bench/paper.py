@@ -14,10 +14,10 @@ from typing import Any
 
 from rich.console import Console
 
-from services.flags import Parser
-from sim.sets import trial
-from tests.bench import table1
-from tests.bench.lib import campaign, curves, page, pictures, trials
+from penumbra.services import flags
+from penumbra.sim.sets import trial
+from penumbra.tests.bench import table1
+from penumbra.tests.bench.lib import campaign, curves, page, pictures, trials
 
 
 def passed(seed: int) -> trials.Played:
@@ -27,11 +27,11 @@ def passed(seed: int) -> trials.Played:
 
 def jobs(seed: int, quick: bool) -> list[campaign.Job]:
     """What is measured beside the table's runs."""
-    here = "tests.bench.paper"
+    here = "penumbra.tests.bench.paper"
     return [
         campaign.Job(f"{seed}-passage", f"{here}:passed", (seed,)),
-        campaign.Job(f"{seed}-haptic{'-quick' * quick}", "tests.bench.lib.curves:haptic_by_gap", (seed, quick)),
-        campaign.Job("response", "tests.bench.lib.curves:response_by_gap", ()),
+        campaign.Job(f"{seed}-haptic{'-quick' * quick}", "penumbra.tests.bench.lib.curves:haptic_by_gap", (seed, quick)),
+        campaign.Job("response", "penumbra.tests.bench.lib.curves:response_by_gap", ()),
     ]
 
 
@@ -54,11 +54,14 @@ def draw(found: dict[str, Any], results: Sequence[trials.Played], others: Sequen
     (folder / "examples.json").write_text(json.dumps(frames, indent=1) + "\n")
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench paper", description=(__doc__ or "").partition("\n\n")[0])
-    table1.arguments(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where pictures, data and index.html go")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench paper",
+    (__doc__ or "").partition("\n\n")[0],
+    *table1.PARAMS,
+    flags.Option("--out", type=Path, required=True, metavar="FOLDER", help="where pictures, data and index.html go"),
+    example="penumbra bench paper --quick --out paper",
+)
+def main(options: flags.Options) -> int:
     started = time.monotonic()
     folder: Path = options.out
     folder.mkdir(parents=True, exist_ok=True)

@@ -8,24 +8,29 @@ from pathlib import Path
 
 from rich.console import Console
 
-from services.flags import Parser, above_zero
-from shared.cell import description as cells
-from shared.contract import topics
-from sim.world.world import record
-from tests.bench.live import SENSES, accuracy, reach_of, show_errors
-from tests.support.replay import SERVICES, Replay
+from penumbra.services import flags
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.sim.world.world import record
+from penumbra.tests.bench.live import SENSES, accuracy, reach_of, show_errors
+from penumbra.tests.support.replay import SERVICES, Replay
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench replay", description=__doc__)
-    parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
-    parser.add_argument("--seconds", type=above_zero, default=60.0, help="length of the recording")
-    parser.add_argument("--seed", type=int, default=1, help="draws motion, occlusion and appearance")
-    parser.add_argument("--skip", type=float, default=2.0, help="seconds at the start that are not scored")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    for service in SERVICES:
-        parser.add_argument(f"--{service}", default="", metavar="FLAGS", help=f"flags of {service}, such as '--method paper'")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench replay",
+    __doc__ or "",
+    flags.Option("--cell", default="table", help="built-in cell or YAML file"),
+    flags.Option("--seconds", type=flags.above_zero, default=60.0, help="length of the recording"),
+    flags.Option("--seed", type=int, default=1, help="draws motion, occlusion and appearance"),
+    flags.Option("--skip", type=float, default=2.0, help="seconds at the start that are not scored"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    *(
+        flags.Option(f"--{service}", default="", metavar="FLAGS", help=f"flags of {service}, such as '--method paper'")
+        for service in SERVICES
+    ),
+    example="penumbra bench replay --json replay.json",
+)
+def main(options: flags.Options) -> int:
     cell = cells.load(options.cell)
     replay = Replay(cell, arguments={service: getattr(options, service).split() for service in SERVICES})
     started = time.monotonic()

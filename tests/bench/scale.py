@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections import defaultdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,14 @@ import zenoh
 from rich.console import Console
 from rich.table import Table
 
-from services.flags import Parser, above_zero
-from shared.cell import description as cells
-from shared.contract import messages, topics
-from shared.runtime import bus
-from tests.bench.lib import buses
-from tests.bench.live import Recording, cpu_times, fused_ages_s, percentiles
-from tests.support.cells import derive
-from tests.support.live import Running, free_port, penumbra_up, wait_for
+from penumbra.services import flags
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.runtime import bus
+from penumbra.tests.bench.lib import buses
+from penumbra.tests.bench.live import Recording, cpu_times, fused_ages_s, percentiles
+from penumbra.tests.support.cells import derive
+from penumbra.tests.support.live import Running, free_port, penumbra_up, wait_for
 
 SIZES, QUICK_SIZES = (1, 2, 4, 8), (1, 2)
 REPLICAS, QUICK_REPLICAS = (1, 2), (1,)
@@ -88,15 +89,17 @@ def payload_sizes(session: zenoh.Session, cell: cells.Cell) -> dict[str, float]:
     sizes = {}
     for topic in topics.TOPICS:
         seen: list[int] = []
-        subscriber = session.declare_subscriber(
-            topic.at(cell=cell.name), lambda sample, seen=seen: seen.append(len(sample.payload))
-        )
+        subscriber = session.declare_subscriber(topic.at(cell=cell.name), partial(_note_size, seen))
         deadline = time.monotonic() + LISTEN_S
         while len(seen) < SAMPLES and time.monotonic() < deadline:
             time.sleep(0.01)
         subscriber.undeclare()
         sizes[topic.name] = float(np.mean(seen)) if seen else 0.0
     return sizes
+
+
+def _note_size(sizes: list[int], sample: zenoh.Sample) -> None:
+    sizes.append(len(sample.payload))
 
 
 def measure(running: Running, recordings: list[Recording], sizes: dict[str, float], seconds: float) -> dict[str, Any]:
@@ -110,9 +113,9 @@ def measure(running: Running, recordings: list[Recording], sizes: dict[str, floa
     heard = [{topic: tuple(rows) for topic, rows in recording.samples.items()} for recording in recordings]
     cpu_after, elapsed, after = cpu_times(processes), time.monotonic() - began, counts(running)
     ages: list[float] = []
-    for rows in heard:
-        vision, fused = ([messages.decode(topic.message, payload) for _, payload in rows[topic.name]]
-                         for topic in (topics.VISION, topics.FUSED))  # fmt: skip
+    for said in heard:
+        vision = [messages.decode(messages.VisionPose, payload) for _, payload in said[topics.VISION.name]]
+        fused = [messages.decode(messages.FusedPose, payload) for _, payload in said[topics.FUSED.name]]
         ages += fused_ages_s(vision, fused).tolist()
     rates = {key: (count - before.get(key, 0)) / elapsed for key, count in after.items()}
     published = per_topic(rates, "published")
@@ -215,16 +218,17 @@ def show(result: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench scale", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1, help="draws motion, occlusion and appearance")
-    parser.add_argument(
-        "--seconds", type=above_zero, default=10.0, help="length of each cell's measurement (default: %(default)s)"
-    )
-    parser.add_argument("--rate", type=above_zero, metavar="HZ", help="of the cameras (default: as in the table cell)")
-    parser.add_argument("--quick", action="store_true", help="small cells, one replica, few rounds: shows that it works")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench scale",
+    __doc__ or "",
+    flags.Option("--seed", type=int, default=1, help="draws motion, occlusion and appearance"),
+    flags.Option("--seconds", type=flags.above_zero, default=10.0, help="length of each cell's measurement"),
+    flags.Option("--rate", type=flags.above_zero, metavar="HZ", help="of the cameras (default: as in the table cell)"),
+    flags.Option("--quick", is_flag=True, help="small cells, one replica, few rounds: shows that it works"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench scale --quick --json scale.json",
+)
+def main(options: flags.Options) -> int:
     sizes, replicas = (QUICK_SIZES, QUICK_REPLICAS) if options.quick else (SIZES, REPLICAS)
     console = Console()
     result: dict[str, Any] = {

@@ -23,18 +23,18 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, rankdata
 
-from services.flags import Parser, positive
-from services.search.mask_fit import Noise
-from services.search.tracker import Search, Searched
-from services.segmentation.inference import Segmenter, load_segmenter
-from shared.contract.labels import Label
-from shared.contract.messages import Mask
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.perception.lookout import Window, corners_of, whole_frame, window_around
-from sim.sets import shots
-from sim.sets.shots import Shot
-from tests.bench.lib import bound
+from penumbra.services import flags
+from penumbra.services.search.mask_fit import Noise
+from penumbra.services.search.tracker import Search, Searched
+from penumbra.services.segmentation.inference import Segmenter, load_segmenter
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.contract.messages import Mask
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.lookout import Window, corners_of, whole_frame, window_around
+from penumbra.sim.sets import shots
+from penumbra.sim.sets.shots import Shot
+from penumbra.tests.bench.lib import bound
 
 HIDDEN = (0.0, 0.3, 0.6, 0.85)
 VIEWS = ((320, 240, 1.5), (640, 480, 1.5), (1280, 960, 4.5), (1280, 960, 8.0))
@@ -538,15 +538,18 @@ def _goal(row: dict[str, Any], paper: dict[str, Any] | None) -> str:
     return f"median <= {median:g}, mean <= {mean:g}"
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench search", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1, help="draws scenes and starts")
-    parser.add_argument("--frames", type=positive, help=f"scenes of each row (default {FULL.scenes}; at least 200 for the NEES)")
-    parser.add_argument("--quick", action="store_true", help="a few scenes of everything, to see that it runs")
-    parser.add_argument("--domain", choices=("wide", "easy"), default="wide", help="looks of the network's scenes")
-    parser.add_argument("--parts", nargs="+", choices=("exact", "network", "judged"), default=["exact", "network", "judged"])
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench search",
+    __doc__ or "",
+    flags.Option("--seed", type=int, default=1, help="draws scenes and starts"),
+    flags.Option("--frames", type=flags.positive, help=f"scenes of each row (default {FULL.scenes}; at least 200 for the NEES)"),
+    flags.Option("--quick", is_flag=True, help="a few scenes of everything, to see that it runs"),
+    flags.Option("--domain", choices=("wide", "easy"), default="wide", help="looks of the network's scenes"),
+    flags.Option("--parts", choices=("exact", "network", "judged"), takes="many", default=["exact", "network", "judged"]),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench search --quick --json search.json",
+)
+def main(options: flags.Options) -> int:
     plan = replace(QUICK if options.quick else FULL, domain=options.domain)
     if options.frames:
         plan = Plan(options.frames, max(options.frames, 200), options.frames, options.frames, options.domain)

@@ -18,12 +18,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from services.flags import Parser, natural, positive
-from services.segmentation import inference
-from services.segmentation.training import evaluate
-from services.segmentation.training.evaluate import WARM_UP, FrameScore
-from shared.perception.lookout import Window, corners_of, whole_frame, window_around
-from sim.sets import sequences, shots
+from penumbra.services import flags
+from penumbra.services.segmentation import inference
+from penumbra.services.segmentation.training import evaluate
+from penumbra.services.segmentation.training.evaluate import WARM_UP, FrameScore
+from penumbra.shared.perception.lookout import Window, corners_of, whole_frame, window_around
+from penumbra.sim.sets import sequences, shots
 
 SEED_BASE = 50_000_000
 """Added to the seed: far from every seed of training, calibration and cards."""
@@ -35,7 +35,14 @@ BEFORE = 10
 """Frames before a full occlusion whose median IoU is what it has to come back to."""
 BACK = 0.9
 """Share of that IoU from which on the mask has recovered."""
-GOALS = {"iou": (0.93, 0.88, 0.78), "area_bias": 0.01, "contour_mean_px": 0.1, "contour_rms_px": 0.6, "recovery": 5, "ms": 15.0}
+GOALS: dict[str, Any] = {
+    "iou": (0.93, 0.88, 0.78),
+    "area_bias": 0.01,
+    "contour_mean_px": 0.1,
+    "contour_rms_px": 0.6,
+    "recovery": 5,
+    "ms": 15.0,
+}
 
 
 def rows(segmenter: inference.Segmenter, data: Iterable[evaluate.Labelled]) -> list[FrameScore]:
@@ -114,20 +121,23 @@ def show(
     console.print(table)
     if known := [n for n in recovered if n is not None]:
         text = f"{np.median(known):.0f} median, {found['recovery_frames']} nine of ten, {max(known)} worst"
-        text += f"; after {len(recovered) - len(known)} more it cannot be told"
+        text += f"; after {len(recovered) - len(known)} more it cannot be determined"
         console.print(f"frames until recovered from {len(known)} full occlusions: {text} (goal: {GOALS['recovery']})")
     times = f"{ms['cpu_ms']} ms of processor time, {ms['wall_ms']} ms by the clock (goal: {GOALS['ms']:.0f})"
     console.print(f"a frame of {VARIETY.size} x {VARIETY.size} on one thread: {times}")
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench segmentation", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1, help="draws the scenes (default: 1)")
-    parser.add_argument("--frames", type=positive, default=1650, help="frames of the rows (default: 1650)")
-    parser.add_argument("--films", type=natural, default=6, help="films of 10 s with full occlusions (default: 6)")
-    parser.add_argument("--weights", type=Path, default=inference.WEIGHTS, help="the network (default: the committed one)")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench segmentation",
+    __doc__ or "",
+    flags.Option("--seed", type=int, default=1, help="draws the scenes"),
+    flags.Option("--frames", type=flags.positive, default=1650, help="frames of the rows"),
+    flags.Option("--films", type=flags.natural, default=6, help="films of 10 s with full occlusions"),
+    flags.Option("--weights", type=Path, default=inference.WEIGHTS, help="the network"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench segmentation --json segmentation.json",
+)
+def main(options: flags.Options) -> int:
     segmenter = inference.load_segmenter(options.weights)
     ms = inference.speed(segmenter, VARIETY.size, VARIETY.size, 200)
     count = -(-options.frames // (VARIETY.frames - WARM_UP))

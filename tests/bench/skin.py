@@ -19,15 +19,15 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import brentq, least_squares
 
-from services.flags import Parser, positive
-from services.skin import model
-from shared.body.anatomy import Mesh, target_mesh
-from shared.cell import description as cells
-from shared.contract.labels import Label
-from shared.geometry import rigid
-from shared.geometry.surface import Surface
-from shared.skin.response import Response, networks
-from sim.skin.field import Body, PadField, limb, shell
+from penumbra.services import flags
+from penumbra.services.skin import model
+from penumbra.shared.body.anatomy import Mesh, target_mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin.response import Response, networks
+from penumbra.sim.skin.field import Body, PadField, limb, shell
 
 Array = np.ndarray
 
@@ -141,7 +141,8 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
     target, aim = next(iter(cell.targets.items()))
     mesh, known, response = target_mesh(aim, cell), networks(cell), Response(cell, target)
     errors: dict[float, list[Array]] = {gap: [] for gap in GAPS_CM}
-    mountings, limbs = model.mountings(cell, target), {}
+    mountings = model.mountings(cell, target)
+    limbs: dict[Any, Any] = {}
     for mounting in mountings:
         count = len(GAPS_CM) * max(1, poses // len(mountings))
         data = model.solve(mounting, mesh, count, seed, gaps=[gap / 100 for gap in GAPS_CM], limbs=limbs)
@@ -166,12 +167,15 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
     }
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench skin", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1, help="draws the poses of the live comparison")
-    parser.add_argument("--poses", type=positive, default=160, help="for each gap of the live comparison (default: %(default)s)")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench skin",
+    __doc__ or "",
+    flags.Option("--seed", type=int, default=1, help="draws the poses of the live comparison"),
+    flags.Option("--poses", type=flags.positive, default=160, help="for each gap of the live comparison"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench skin --json skin.json",
+)
+def main(options: flags.Options) -> int:
     table, arm = cells.load("table"), cells.load("arm")
     found = {"seed": options.seed, **figures(table), "live": live(table, options.seed, options.poses)}
     found["live_hull"] = live(arm, options.seed, options.poses)

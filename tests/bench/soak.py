@@ -28,11 +28,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from services.flags import Parser, above_zero
-from shared.cell import description as cells
-from shared.contract import topics
-from tests.support import injected
-from tests.support.live import Running, connect, penumbra_up, service_of, wait_for
+from penumbra.services import flags
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.tests.support import injected
+from penumbra.tests.support.live import Running, connect, penumbra_command, penumbra_up, service_of, wait_for
 
 DAY_S = 86_400.0
 SAMPLE_S = 5.0
@@ -124,7 +124,7 @@ class Life:
         if self._restart is None or self._restart.poll() is not None:
             endpoint = f"tcp/127.0.0.1:{self.router.port}"
             restart = ["restart", "--cell", self.running.cell, "--connect", endpoint]
-            self._restart = subprocess.Popen([sys.executable, "-m", "services.command.cli", *restart], stdout=subprocess.DEVNULL)
+            self._restart = subprocess.Popen(penumbra_command(*restart), stdout=subprocess.DEVNULL)
 
     def router_loss(self) -> None:
         """The router dies, and another one takes its place."""
@@ -306,16 +306,17 @@ def show(result: dict, console: Console) -> None:
     console.print("in /dev/shm: {first} MB at first, {last} MB at last".format(**result["shm_mb"]))
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench soak", description=__doc__)
-    parser.add_argument("--cell", default="table", help="built-in cell or YAML file")
-    parser.add_argument("--seed", type=int, default=1, help="draws motion and what happens")
-    parser.add_argument("--minutes", type=above_zero, default=30.0, help="how long (default: %(default)g, a day at --speed 48)")
-    parser.add_argument(
-        "--speed", type=above_zero, default=48.0, help="events, times as often as on a day (default: %(default)g)"
-    )
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench soak",
+    __doc__ or "",
+    flags.Option("--cell", default="table", help="built-in cell or YAML file"),
+    flags.Option("--seed", type=int, default=1, help="draws motion and what happens"),
+    flags.Option("--minutes", type=flags.above_zero, default=30.0, help="how long (a day at --speed 48)"),
+    flags.Option("--speed", type=flags.above_zero, default=48.0, help="events, times as often as on a day"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench soak --json soak.json",
+)
+def main(options: flags.Options) -> int:
     result = soak(options.cell, options.seed, options.minutes, options.speed)
     show(result, Console())
     if options.json:

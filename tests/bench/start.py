@@ -29,12 +29,12 @@ import zenoh
 from rich.console import Console
 from rich.table import Table
 
-from services import flags
-from shared.cell import description as cells
-from shared.contract import messages, processes, topics
-from tests.support.live import connect, free_port, service_of
+from penumbra.services import flags
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, processes, topics
+from penumbra.tests.support.live import connect, free_port, penumbra_command, service_of
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 LEFT_OUT = ("__pycache__", ".*", "build", "runs", "*.egg-info")
 """What a fresh clone does not hold: everything compiled or cached."""
 PATIENCE_S = 300.0
@@ -110,7 +110,7 @@ def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
     port = free_port()
     environment = {name: value for name, value in os.environ.items() if name != "PENUMBRA_CACHE"}
     environment |= {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(home)}
-    command = [sys.executable, "-m", "services.command.cli", "up", "--cell", cell, "--seed", str(seed), "--port", str(port)]
+    command = penumbra_command("up", "--cell", cell, "--seed", str(seed), "--port", str(port))
     with tempfile.TemporaryFile("w+") as log:
         began_s = time.monotonic()
         launcher = subprocess.Popen(
@@ -189,7 +189,7 @@ def fresh() -> Iterator[Path]:
     """A folder with a copy of this checkout, `checkout`, in which nothing is compiled, and an empty one for caches, `home`."""
     with tempfile.TemporaryDirectory(prefix="penumbra-start-") as name:
         folder = Path(name)
-        shutil.copytree(ROOT, folder / "checkout", ignore=shutil.ignore_patterns(*LEFT_OUT))
+        shutil.copytree(ROOT, folder / "checkout", symlinks=True, ignore=shutil.ignore_patterns(*LEFT_OUT))
         (folder / "home").mkdir()
         yield folder
 
@@ -226,14 +226,17 @@ def _median(values: list[float]) -> float:
     return round(statistics.median(values), 2) if values else float("nan")
 
 
-def main(argv: list[str] | None = None) -> int:
+@flags.command(
+    "bench start",
+    (__doc__ or "").partition("\n\n")[0],
+    flags.Option("--cell", multiple=True, metavar="CELL", help="may be repeated (default: table and arm)"),
+    flags.Option("--runs", type=flags.positive, default=1, help="cold and warm starts of each"),
+    flags.Option("--seed", type=int, default=1, help="of the emulator"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench start --json start.json",
+)
+def main(options: flags.Options) -> int:
     """`penumbra bench start`"""
-    parser = flags.Parser(prog="penumbra bench start", description=(__doc__ or "").partition("\n\n")[0])
-    parser.add_argument("--cell", action="append", metavar="CELL", help="may be repeated (default: table and arm)")
-    parser.add_argument("--runs", type=flags.positive, default=1, help="cold and warm starts of each (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="of the emulator")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
     found = {}
     try:
         for cell in options.cell or ["table", "arm"]:

@@ -10,7 +10,6 @@ bootstrap over the runs. A sense that has no pose in a frame cannot be scored th
 
 from __future__ import annotations
 
-import argparse
 import functools
 import json
 import tempfile
@@ -25,11 +24,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from services.flags import Parser, positive
-from sim.sets import trial
-from sim.sets.trial import SETTINGS, Setting
-from tests.bench.lib import campaign, trials
-from tests.bench.lib.trials import CHAINS
+from penumbra.services import flags
+from penumbra.sim.sets import trial
+from penumbra.sim.sets.trial import SETTINGS, Setting
+from penumbra.tests.bench.lib import campaign, trials
+from penumbra.tests.bench.lib.trials import CHAINS
 
 REFERENCE = Path(__file__).parents[1] / "references" / "paper_table1.json"
 COLUMNS = {
@@ -86,7 +85,7 @@ def one(setting: dict[str, Any], seed: int, index: int, seconds: float) -> trial
 def jobs(seed: int, count: int, seconds: float) -> list[campaign.Job]:
     """All trials, those of every setting in turn."""
     return [
-        campaign.Job(f"{seed}-{setting}-{k}-{seconds:g}", "tests.bench.table1:one", (asdict(setting), seed, k, seconds))
+        campaign.Job(f"{seed}-{setting}-{k}-{seconds:g}", "penumbra.tests.bench.table1:one", (asdict(setting), seed, k, seconds))
         for k in range(count)
         for setting in SETTINGS
     ]
@@ -247,27 +246,31 @@ def _text(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def measure(options: argparse.Namespace, folder: Path, progress: Progress) -> tuple[dict[str, Any], list[trials.Played]]:
+def measure(options: flags.Options, folder: Path, progress: Progress) -> tuple[dict[str, Any], list[trials.Played]]:
     """The table and the trials that it is made of."""
     count, seconds = (QUICK_TRIALS, QUICK_S) if options.quick else (options.trials, trial.SECONDS)
     results = campaign.run(jobs(options.seed, count, seconds), folder, options.jobs, progress, "trials")
     return table(results, options.seed), results
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """The flags that `penumbra bench paper` has too."""
-    parser.add_argument("--seed", type=int, default=1, help="draws persons, motions, looks, occluders and the camera's places")
-    parser.add_argument("--trials", type=positive, default=TRIALS, help="runs of each cell of the table (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="one short run a cell: whether it runs, no numbers to believe")
-    parser.add_argument("--jobs", type=positive, default=2, help="processes, each on one core (default: %(default)s)")
+PARAMS = (
+    flags.Option("--seed", type=int, default=1, help="draws persons, motions, looks, occluders and the camera's places"),
+    flags.Option("--trials", type=flags.positive, default=TRIALS, help="runs of each cell of the table"),
+    flags.Option("--quick", is_flag=True, help="one short run a cell: whether it runs, no numbers to believe"),
+    flags.Option("--jobs", type=flags.positive, default=2, help="processes, each on one core"),
+)
+"""The flags that `penumbra bench paper` has too."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench table1", description=(__doc__ or "").partition("\n\n")[0])
-    arguments(parser)
-    parser.add_argument("--resume", type=Path, metavar="FOLDER", help="keep finished runs here, and take those that are there")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench table1",
+    (__doc__ or "").partition("\n\n")[0],
+    *PARAMS,
+    flags.Option("--resume", type=Path, metavar="FOLDER", help="keep finished runs here, and take those that are there"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench table1 --quick --json table1.json",
+)
+def main(options: flags.Options) -> int:
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as temporary, campaign.bar(Console(stderr=True)) as progress:
         folder = options.resume or Path(temporary)

@@ -19,16 +19,16 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from services.flags import Parser, above_zero, positive
-from shared.contract import topics
-from shared.contract.messages import Frame, FusedPose, Message, VisionPose
-from shared.contract.topics import Topic
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from sim.sets import shots
-from sim.sets.shots import Domain, Shot
-from tests.bench.search import GONE, LOST
-from tests.support.replay import Replay
+from penumbra.services import flags
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.messages import Frame, FusedPose, Message, VisionPose
+from penumbra.shared.contract.topics import Topic
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.sim.sets import shots
+from penumbra.sim.sets.shots import Domain, Shot
+from penumbra.tests.bench.search import GONE, LOST
+from penumbra.tests.support.replay import Replay
 
 BACKGROUNDS: dict[str, Domain] = {"plain": "easy", "cluttered": "wide"}
 SERVICES = ("segmentation", "search", "fusion")
@@ -185,14 +185,17 @@ def show(result: dict[str, Any], console: Console) -> None:
     console.print(table)
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = Parser(prog="penumbra bench tracking", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1, help="draws persons, motions, occluders and looks")
-    parser.add_argument("--films", type=positive, default=4, help="films with each background")
-    parser.add_argument("--seconds", type=above_zero, default=10.0, help="length of a film")
-    parser.add_argument("--quick", action="store_true", help="one film of 4 s each, to see that it runs")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file")
-    options = parser.parse_args(argv)
+@flags.command(
+    "bench tracking",
+    __doc__ or "",
+    flags.Option("--seed", type=int, default=1, help="draws persons, motions, occluders and looks"),
+    flags.Option("--films", type=flags.positive, default=4, help="films with each background"),
+    flags.Option("--seconds", type=flags.above_zero, default=10.0, help="length of a film"),
+    flags.Option("--quick", is_flag=True, help="one film of 4 s each, to see that it runs"),
+    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
+    example="penumbra bench tracking --quick --json tracking.json",
+)
+def main(options: flags.Options) -> int:
     count, seconds = (1, 4.0) if options.quick else (options.films, options.seconds)
     started = time.monotonic()
     films: dict[str, list[Film]] = {name: [] for name in BACKGROUNDS}

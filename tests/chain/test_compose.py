@@ -14,10 +14,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from services.command import certs
-from shared.contract import topics
-from shared.runtime import bus
-from tests.support.live import connect, wait_for
+from penumbra.services.command import certs
+from penumbra.shared.contract import topics
+from penumbra.shared.runtime import bus
+from penumbra.tests.support.live import connect, wait_for
 
 pytestmark = pytest.mark.containers
 SERVICES = {"router", "emulator", "segmentation", "search", "haptics", "fusion"}

@@ -1,6 +1,7 @@
 """Hostile input against the running chain: nothing crashes, nothing stalls, and the pose is back within a second."""
 
 import time
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -8,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from shared.contract import messages, topics
-from tests.support.live import wait_for
+from penumbra.shared.contract import messages, topics
+from penumbra.tests.support.live import wait_for
 
 NAMES = {"cell": "table", "camera": "front", "robot": "panda", "pad": "p0", "target": "forearm"}
 READ_TOPICS = [topic for topic in topics.TOPICS if topic is not topics.TRUTH]
@@ -17,8 +18,8 @@ READ_TOPICS = [topic for topic in topics.TOPICS if topic is not topics.TRUTH]
 
 def good(topic: topics.Topic, stamp_ns: int) -> dict:
     """The fields of a valid message of this topic."""
-    pose = {"position": np.zeros(3), "orientation": np.array([0.0, 0, 0, 1])}
-    named = {"target": "forearm", "frame": "world"}
+    pose: dict[str, Any] = {"position": np.zeros(3), "orientation": np.array([0.0, 0, 0, 1])}
+    named: dict[str, Any] = {"target": "forearm", "frame": "world"}
     kinds = {
         "frame": lambda: messages.Frame(stamp_ns=stamp_ns, image=np.zeros((48, 64, 3), np.uint8)),
         "mask": lambda: messages.Mask(stamp_ns=stamp_ns, labels=np.zeros((16, 16), np.uint8), x0=0, y0=0, scale=1),

@@ -10,18 +10,19 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
 
-from shared.cell import description as cells
-from shared.contract import messages
-from shared.contract.topics import FRAME, FUSED, HAPTIC, MASK, TRUTH, VISION, Topic
-from tests.support import hosts
-from tests.support.cells import derive
-from tests.support.live import Running, wait_for
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages
+from penumbra.shared.contract.topics import FRAME, FUSED, HAPTIC, MASK, TRUTH, VISION, Topic
+from penumbra.tests.support import hosts
+from penumbra.tests.support.cells import derive
+from penumbra.tests.support.live import Running, wait_for
 
 pytestmark = pytest.mark.skipif(bool(hosts.why_not()), reason=hosts.why_not())
 CAMERA_HZ = 5
@@ -83,9 +84,9 @@ def is_tracking(recorder: Recorder, *senses: str) -> bool:
 
 
 def is_steady(recorder: Recorder) -> bool:
-    """Whether fused poses have come in time for two seconds."""
-    lately = recorder.since(FUSED, time.time_ns() - 2_000_000_000)
-    return len(lately) > 20 and max(heard.age_s for heard in lately) < 0.2
+    """Whether fused poses have come in time for three seconds."""
+    lately = recorder.since(FUSED, time.time_ns() - 3_000_000_000)
+    return len(lately) > 30 and lately[-1].came_ns - lately[0].came_ns > 2.5e9 and max(heard.age_s for heard in lately) < 0.2
 
 
 OLD = messages.Source(age_s=float("inf"), weight=0.0)
@@ -105,31 +106,33 @@ def start(folder, slow: int | None) -> Iterator[Watched]:
 
 
 @pytest.fixture(scope="module")
-def linked(tmp_path_factory):
-    yield from start(tmp_path_factory.mktemp("linked"), None)
+def watched(request, tmp_path_factory):
+    """Three hosts; the parameter is the robot's link in bytes a second, or None. One set ends before the next begins."""
+    yield from start(tmp_path_factory.mktemp("hosts"), request.param)
 
 
-@pytest.fixture(scope="module")
-def slow(tmp_path_factory):
-    yield from start(tmp_path_factory.mktemp("slow"), SLOW)
+linked = pytest.mark.parametrize("watched", [None], indirect=True, ids=["fast"])
+slow = pytest.mark.parametrize("watched", [SLOW], indirect=True, ids=["slow"])
 
 
-def test_the_pose_is_tracked_across_hosts_by_both_senses(linked):
-    for name, recorder in linked.at.items():
-        wait_for(lambda recorder=recorder: is_tracking(recorder, "vision", "haptic"), START_S, f"the pose at {name}", 0.1)
-        truth = linked.at["camera"].heard["truth"][-1].message
+@linked
+def test_the_pose_is_tracked_across_hosts_by_both_senses(watched):
+    for name, recorder in watched.at.items():
+        wait_for(partial(is_tracking, recorder, "vision", "haptic"), START_S, f"the pose at {name}", 0.1)
+        truth = watched.at["camera"].heard["truth"][-1].message
         pose = recorder.heard["fused"][-1].message
         assert np.linalg.norm(pose.position - truth.position) < 0.05
 
 
+@linked
 @pytest.mark.parametrize(("end", "lost", "left"), [("compute", VISION, HAPTIC), ("robot", None, None)])
-def test_a_link_that_was_down_leaves_nothing_stale_behind(linked, end, lost, left):
+def test_a_link_that_was_down_leaves_nothing_stale_behind(watched, end, lost, left):
     """Without the computing host the skin goes on; without the camera's the robot has no sense left, and says so."""
-    robot = linked.at["robot"]
+    robot = watched.at["robot"]
     wait_for(lambda: is_tracking(robot, "vision", "haptic"), START_S, "the pose", 0.1)
-    time.sleep(3.0)
+    wait_for(lambda: is_steady(robot), START_S, "what is left of the start to be over", 0.1)
     before = {topic: robot.hz(topic, 3.0) for topic in (VISION, HAPTIC, FUSED)}
-    with linked.running.links[end].cut():
+    with watched.running.links[end].cut():
         cut_ns = time.time_ns()
         time.sleep(CUT_S)
         back_ns = time.time_ns()
@@ -142,8 +145,12 @@ def test_a_link_that_was_down_leaves_nothing_stale_behind(linked, end, lost, lef
         else:
             assert heard.message.state != "lost" and ages[lost.name] > 1.0 > ages[left.name]
     wait_for(lambda: is_tracking(robot, "vision", "haptic"), 60, "the pose by both senses again", 0.05)
+
+    def is_back(topic: Topic, hz: float) -> bool:
+        return robot.hz(topic, 3.0) > 0.7 * hz
+
     for topic, hz in before.items():
-        wait_for(lambda topic=topic, hz=hz: robot.hz(topic, 3.0) > 0.7 * hz, 60, f"{topic.name} as often as before", 0.1)
+        wait_for(partial(is_back, topic, hz), 60, f"{topic.name} as often as before", 0.1)
     # a pose that fusion has taken in is the newest of its sense: it was never older than a message may be
     for sense, topic in (("vision", VISION), ("haptic", HAPTIC)):
         newest_ns = 0
@@ -154,23 +161,24 @@ def test_a_link_that_was_down_leaves_nothing_stale_behind(linked, end, lost, lef
                 newest_ns = taken_ns
 
 
-def test_poses_cross_a_slow_link_in_time_and_frames_not_at_all(slow):
+@slow
+def test_poses_cross_a_slow_link_in_time_and_frames_not_at_all(watched):
     """A viewer beside the robot asks for frames, each of which would take the link for 14 s."""
-    robot, compute = slow.at["robot"], slow.at["compute"]
-    viewer = Recorder(slow.running.sessions["robot"], slow.running.cell, FRAME, MASK)
+    robot, compute = watched.at["robot"], watched.at["compute"]
+    viewer = Recorder(watched.running.sessions["robot"], watched.running.cell, FRAME, MASK)
     wait_for(lambda: is_tracking(robot, "vision"), START_S, "the pose by the camera alone", 0.1)
     wait_for(lambda: is_steady(compute), START_S, "what is left of the start to be over", 0.1)
     begin_ns = time.time_ns()
-    time.sleep(10.0)
+    wait_for(lambda: len(compute.since(VISION, begin_ns)) > 40, START_S, "forty poses by the camera", 0.1)
     end_ns = time.time_ns()
     left = {heard.message.stamp_ns: heard.came_ns for heard in compute.since(VISION, begin_ns, end_ns)}
     crossed = [heard for heard in robot.since(VISION, begin_ns, end_ns) if heard.message.stamp_ns in left]
     took_s = [(heard.came_ns - left[heard.message.stamp_ns]) * 1e-9 for heard in crossed]
     back = [heard.age_s for heard in compute.since(FUSED, begin_ns, end_ns)]
     print(f"crossing p50 {np.median(took_s):.3f} s, p95 {np.percentile(took_s, 95):.3f} s")
-    print(f"age of the fused pose that came back, p95 {np.percentile(back, 95):.3f} s")
+    print(f"age of the returned fused pose, p95 {np.percentile(back, 95):.3f} s")
     assert len(crossed) > 0.8 * len(left) > 10
     assert np.percentile(took_s, 95) < 0.5 and np.percentile(back, 95) < 0.5, "a frame ahead of them would take 14 s"
-    assert 10 < len(back) / 10 < 2 * FUSED.slow_hz, "thinned out, not held back"
+    assert 0.5 * FUSED.slow_hz < len(back) / (1e-9 * (end_ns - begin_ns)) < 2 * FUSED.slow_hz, "thinned out, not held back"
     assert not viewer.heard["frame"] and not viewer.heard["mask"]
     assert compute.hz(VISION, 5.0) > 0.5 * CAMERA_HZ, "the fast link carries frames as ever"

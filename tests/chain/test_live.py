@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 
 import cv2
@@ -12,12 +11,12 @@ import numpy as np
 import pytest
 import zenoh
 
-from shared.contract import messages, topics
-from tests.support.live import connect, wait_for
+from penumbra.shared.contract import messages, topics
+from penumbra.tests.support.live import connect, penumbra_command, wait_for
 
 
 def penumbra(running, *arguments: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "services.command.cli", *arguments, "--connect", f"tcp/127.0.0.1:{running.port}"]
+    command = penumbra_command(*arguments, "--connect", f"tcp/127.0.0.1:{running.port}")
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
 
@@ -81,7 +80,7 @@ def test_a_snapshot_shows_the_camera_s_picture_with_the_arm_outlined(running, tm
         result = penumbra(running, "snapshot", str(tmp_path / "out.png"))
         assert result.returncode == 0, result.stderr
         picture = cv2.imread(str(tmp_path / "out.png"))
-        assert picture.shape == (480, 640, 3)
+        assert picture is not None and picture.shape == (480, 640, 3)
         green = (picture[..., 1] > 200) & (picture[..., 0] < 120) & (picture[..., 2] < 120)
         return bool(green.sum() > 100)
 
@@ -109,9 +108,7 @@ def test_a_rolling_restart_of_all_that_estimates_never_loses_the_pose(running):
     with connect(running.port) as session:
         fused, states = session.declare_subscriber(topics.FUSED.at(cell="table"), zenoh.handlers.FifoChannel(100_000)), []
         where = ("--connect", f"tcp/127.0.0.1:{running.port}")
-        result = subprocess.run(
-            [sys.executable, "-m", "services.command.cli", "restart", *services, *where], capture_output=True, text=True
-        )
+        result = subprocess.run(penumbra_command("restart", *services, *where), capture_output=True, text=True)
         while (sample := fused.try_recv()) is not None:
             states.append(messages.decode(messages.FusedPose, sample.payload.to_bytes()).state)
     assert result.returncode == 0, result.stdout + result.stderr

@@ -1,19 +1,20 @@
 """What is measured of a fault from outside, on messages whose numbers are known."""
 
+import msgspec
 import numpy as np
 import pytest
 
-from shared.contract import messages, topics
-from tests.support import observed
-from tests.support.nodes import pose
-from tests.support.observed import Seen
+from penumbra.shared.contract import messages, topics
+from penumbra.tests.support import observed
+from penumbra.tests.support.nodes import pose
+from penumbra.tests.support.observed import Seen
 
 SENSES = (topics.VISION, topics.HAPTIC)
 
 
 def fused(at_s, state="tracking", x=0.0, stamp_ns=None):
     message = pose(round(1e9 * at_s) if stamp_ns is None else stamp_ns, x)
-    return Seen(at_s, messages.FusedPose(**{**vars(message), "state": state}))
+    return Seen(at_s, msgspec.structs.replace(message, state=state))
 
 
 def haptic(at_s, state="in_range"):
@@ -83,7 +84,11 @@ def test_a_measurement_counts_once_however_often_it_is_told_and_also_where_it_di
 
 
 def vision(camera):
-    same = {name: value for name, value in vars(haptic(0.0).message).items() if name in ("stamp_ns", "target", "frame")}
+    same = {
+        name: value
+        for name, value in msgspec.structs.asdict(haptic(0.0).message).items()
+        if name in ("stamp_ns", "target", "frame")
+    }
     turned = {"position": np.zeros(3), "orientation": np.array([0.0, 0.0, 0.0, 1.0]), "covariance": np.eye(6)}
     return same | turned | {"camera": camera, "overlap": 1.0, "hidden": 0.0, "state": "tracking"}
 

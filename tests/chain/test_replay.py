@@ -1,30 +1,31 @@
 """A recorded minute through all services: a changed output is a mistake, or a new reference in the same commit
-(`python -m tests.support.replay`)."""
+(`python -m penumbra.tests.support.replay`)."""
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from services.segmentation.inference import load_segmenter
-from shared.cell import description
-from shared.contract.labels import Label
-from shared.contract.topics import FRAME
-from shared.perception.lookout import whole_frame
-from sim.world.world import record
-from tests.support.replay import Heard, Replay, digest
+from penumbra.services.segmentation.inference import load_segmenter
+from penumbra.shared.cell import description
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.contract.topics import FRAME
+from penumbra.shared.perception.lookout import whole_frame
+from penumbra.sim.world.world import record
+from penumbra.tests.support.replay import Heard, Replay, digest
 
 REFERENCE = Path(__file__).parents[1] / "references" / "replay_table.json"
 SEED = 11
 
 
 def play() -> list[Heard]:
-    """The minute with masks in single precision: processors round bfloat16 differently, and some have none."""
+    """Half a minute with masks in single precision: processors round bfloat16 differently, and some have none."""
     table = description.load("table")
     with pytest.MonkeyPatch.context() as context:
         context.setenv("ONEDNN_MAX_CPU_ISA", "AVX2")
-        return Replay(table).run(record(table, SEED, 60.0))
+        return Replay(table).run(record(table, SEED, 30.0))
 
 
 def masks() -> list[list[int]]:
@@ -32,7 +33,7 @@ def masks() -> list[list[int]]:
     changes the window of the next one, so that in the chain the rounding of one processor becomes pixels of another."""
     table = description.load("table")
     window, segmenter = whole_frame(table.cameras["front"]), load_segmenter(precision="f32")
-    frames = [message for topic, _, message in record(table, SEED, 10.0) if topic is FRAME]
+    frames: list[Any] = [message for topic, _, message in record(table, SEED, 10.0) if topic is FRAME]
     found = [np.bincount(segmenter(frame.image, window, frame.stamp_ns).ravel(), minlength=len(Label)) for frame in frames]
     return [counts.tolist() for counts in found[::20]]
 

@@ -2,17 +2,19 @@
 
 import json
 import threading
+from functools import partial
 
 import pytest
+import zenoh
 from rich.console import Console
 
-from shared.cell import description as cells
-from shared.contract import messages, topics
-from shared.runtime import bus
-from tests.bench import scale
-from tests.bench.lib import buses
-from tests.support.cells import derive
-from tests.support.live import connect, free_port, penumbra_up, wait_for
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.runtime import bus
+from penumbra.tests.bench import scale
+from penumbra.tests.bench.lib import buses
+from penumbra.tests.support.cells import derive
+from penumbra.tests.support.live import connect, free_port, penumbra_up, wait_for
 
 CAMERA_HZ = 1
 """Eight cameras share the cores with all that looks at their frames."""
@@ -41,6 +43,7 @@ def test_a_message_of_the_bench_that_is_lost_is_told_and_does_not_hang(monkeypat
             link.per_s(64, "raw", 5.0)
 
 
+@pytest.mark.slow
 def test_the_bench_counts_what_a_cell_does(tmp_path, capsys):
     row = scale.row(1, 1, seed=2, seconds=4.0, rate_hz=2.0)
     assert (row["cameras"], row["targets"], row["replicas"]) == (1, 1, 1)
@@ -63,16 +66,19 @@ def eight(tmp_path_factory):
         yield cells.load(path), running
 
 
+@pytest.mark.slow
 def test_every_camera_is_masked_and_every_target_is_searched_felt_and_fused(eight):
     cell, running = eight
     wanted = {(topic.name, key) for topic in (topics.MASK, topics.VISION, topics.HAPTIC, topics.FUSED)
               for key in keys(topic, cell)}  # fmt: skip
     heard: set[tuple[str, str]] = set()
+
+    def note(name: str, sample: zenoh.Sample) -> None:
+        heard.add((name, str(sample.key_expr)))
+
     with connect(running.port) as session:
         for topic in (topics.MASK, topics.VISION, topics.HAPTIC, topics.FUSED):
-            session.declare_subscriber(
-                topic.at(cell=cell.name), lambda sample, topic=topic: heard.add((topic.name, str(sample.key_expr)))
-            )
+            session.declare_subscriber(topic.at(cell=cell.name), partial(note, topic.name))
         wait_for(lambda: heard >= wanted, START_S, "all streams", 0.2)
 
 
@@ -81,6 +87,7 @@ def keys(topic, cell):
     return [topic.at(cell=cell.name, **{kind: name}) for name in parts]
 
 
+@pytest.mark.slow
 def test_each_camera_s_poses_are_of_the_target_before_it_alone(eight):
     cell, running = eight
     seen: set[tuple[str, str]] = set()
@@ -95,8 +102,9 @@ def test_each_camera_s_poses_are_of_the_target_before_it_alone(eight):
     assert seen == set(zip(cell.cameras, cell.targets, strict=True))
 
 
+@pytest.mark.slow
 def test_the_poses_of_eight_targets_are_at_their_work_places(eight):
     cell, running = eight
     for name, target in cell.targets.items():
-        answer = wait_for(lambda name=name: running.pose(name), 20, f"the pose of {name}")
+        answer = wait_for(partial(running.pose, name), 20, f"the pose of {name}")
         assert abs(answer["position"][0] - target.home.position[0]) < 1.0

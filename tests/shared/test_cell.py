@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shared.cell import description
+from penumbra.shared.cell import description
 
 TABLE = (description.BUILT_IN / "table.yaml").read_text()
 
@@ -34,11 +34,11 @@ def test_the_camera_sees_the_target_s_home_near_the_middle_of_its_image():
 @pytest.mark.parametrize(
     ("old", "new", "place", "reason"),
     [
-        ("noise: 6.2e-6", "noise: -1", "pad_types.five.rest.noise", "greater than or equal to 0, got -1"),
-        ("rate_hz: 20", "rate: 20", "cameras.front.rate", "not permitted, got 20"),
-        ("width: 640", "width: wide", "cameras.front.width", "valid integer"),
-        ("p0: {type: five", "p0: {type: six", "pads.p0.type", "one of ['five'] expected, got 'six'"),
-        ("mesh: body:forearm", "mesh: arm.stl", "targets.forearm.mesh", "no file"),
+        ("noise: 6.2e-6", "noise: -1", "pad_types.five.rest.noise", "of at least 0, got -1"),
+        ("rate_hz: 20", "rate: 20", "cameras.front.rate", "got rate; did you mean rate_hz"),
+        ("width: 640", "width: wide", "cameras.front.width", "expected a whole number, got 'wide'"),
+        ("p0: {type: five", "p0: {type: six", "pads.p0.type", "expected one of five, got 'six'"),
+        ("mesh: body:forearm", "mesh: arm.stl", "targets.forearm.mesh", "got no file"),
         ("low: [-0.08", "low: [0.5", "sim.motion", "lower bound"),
         ("look_at: [0.05, 0.0, 0.15]", "", "cameras.front", "look_at or rpy"),
     ],
@@ -68,3 +68,25 @@ def test_a_file_that_is_not_yaml_is_told_so(tmp_path):
 def test_asking_for_a_camera_that_does_not_exist_names_those_that_do():
     with pytest.raises(description.CellError, match="no camera 'left': it has front"):
         description.load("table").one("cameras", "left")
+
+
+def test_cells_that_were_used_compare_and_hash_by_what_their_files_say():
+    first, second = description.load("arm"), description.load("arm")
+    for cell in (first, second):
+        assert cell.cameras["side"].T_world_camera.shape == cell.robots["panda"].base.transform.shape  # both are kept then
+    assert first.cameras == second.cameras and first.robots["panda"] == second.robots["panda"]
+    assert hash(first.robots["panda"]) == hash(second.robots["panda"])
+    assert first.robots["panda"] != second.robots["panda"].model_copy(update={"joints": ("panda_joint1",)})
+
+
+def test_a_camera_that_looks_straight_down_has_a_pose():
+    camera = description.load("table").cameras["front"].model_dump() | {"position": (0.0, 0.0, 2.0), "look_at": (0.0, 0.0, 0.0)}
+    R = description.Camera(**camera).T_world_camera[:3, :3]
+    np.testing.assert_allclose(R, [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-12)  # +y is up in the picture
+
+
+def test_a_copy_with_other_fields_has_what_follows_from_them():
+    camera = description.load("table").cameras["front"]
+    assert camera.lens.width == camera.width and camera.K[0, 0] == camera.fx
+    copy = camera.model_copy(update={"width": 2 * camera.width, "fx": 2 * camera.fx})
+    assert copy.lens.width == 2 * camera.width and copy.K[0, 0] == 2 * camera.fx

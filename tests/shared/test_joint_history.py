@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shared.perception.joint_history import JointHistory
+from penumbra.shared.perception.joint_history import JointHistory
 
 MS = 1_000_000
 

@@ -1,14 +1,16 @@
 """Where vision looks: around a target that is known, around its home when it is lost."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from shared.body import anatomy
-from shared.cell import description
-from shared.contract.messages import FusedPose
-from shared.geometry import rigid
-from shared.perception.lookout import MAX_PIXELS_WIDE, Lookout, Window, corners_of, whole_frame, window_around
-from tests.support.cells import derive
+from penumbra.shared.body import anatomy
+from penumbra.shared.cell import description
+from penumbra.shared.contract.messages import FusedPose
+from penumbra.shared.geometry import rigid
+from penumbra.shared.perception.lookout import MAX_PIXELS_WIDE, Lookout, Window, corners_of, whole_frame, window_around
+from penumbra.tests.support.cells import derive
 
 S = 1_000_000_000
 
@@ -19,6 +21,7 @@ def test_the_window_holds_the_whole_target_and_stays_while_it_does():
     corners = corners_of(mesh.vertices)
     T = rigid.from_rpy((0.02, 0.0, 0.2), (0.1, 0.1, 0.2))
     window = window_around(camera, [(T, corners)])
+    assert window is not None
     points = rigid.apply(rigid.inverse(camera.T_world_camera) @ T, mesh.vertices)
     pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     assert (pixels > (window.x0, window.y0)).all() and (pixels < (window.right, window.bottom)).all()
@@ -35,7 +38,7 @@ def test_a_target_out_of_the_picture_has_no_window_and_the_whole_frame_is_coarse
     assert whole_frame(camera) == Window(0, 0, 320, 240, 2)
 
 
-def fused(T: rigid.Array, state: str = "tracking", stamp_ns: int = S) -> FusedPose:
+def fused(T: rigid.Array, state: Any = "tracking", stamp_ns: int = S) -> FusedPose:
     position, orientation = rigid.position_orientation(T)
     return FusedPose(
         stamp_ns=stamp_ns, target="forearm", frame="world", position=position, orientation=orientation,

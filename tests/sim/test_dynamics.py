@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.body.anatomy import Mesh
-from shared.body.robot import RobotModel, robot_models
-from shared.cell import description as cells
-from shared.geometry import rigid
-from sim.picture.occluder import box
-from sim.world.dynamics import CATCH_UP, STOP_M, TICK_S, Bystander, Robots, connected_parts
-from sim.world.motion import joint_motions
-from sim.world.world import World
-from tests.support.robots import odd_robot
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.body.robot import RobotModel, robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import rigid
+from penumbra.sim.picture.occluder import box
+from penumbra.sim.world.dynamics import CATCH_UP, STOP_M, TICK_S, Bystander, Robots, connected_parts
+from penumbra.sim.world.motion import joint_motions
+from penumbra.sim.world.world import World
+from penumbra.tests.support.robots import odd_robot
 
 ARM = cells.load("arm")
 REST = np.array([0.0, -0.1, 0.0, -2.0, 0.0, 1.9, 0.785])
@@ -50,7 +51,11 @@ def in_the_way(panda, share=0.5):
 
 
 def person(at):
-    return Bystander([box((0.06, 0.06, 0.3), (0.0, 0.0, 0.0), 1)], lambda time_s: [at(time_s)])
+    return Bystander([box((0.06, 0.06, 0.3), (0.0, 0.0, 0.0), Label.FOREARM)], lambda time_s: [at(time_s)])
+
+
+def resting_cube(T, size):
+    return Bystander([box((size,) * 3, (0.0, 0.0, 0.0), Label.FOREARM)], lambda time_s: [T])
 
 
 def gap(robots):
@@ -60,6 +65,7 @@ def gap(robots):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_in_the_built_in_cell_the_robot_keeps_to_its_script_and_is_never_stopped(seed):
+    assert ARM.sim is not None
     world = World(ARM, seed)
     script = joint_motions(ARM, ARM.sim, seed)["panda"]
     for t in np.arange(0.0, 40.0, 0.05):
@@ -71,11 +77,12 @@ def test_in_the_built_in_cell_the_robot_keeps_to_its_script_and_is_never_stopped
 def test_a_robot_stops_before_it_touches_and_goes_on_when_the_way_is_free(panda):
     place = in_the_way(panda)
     robots = moved(panda, sweep, [person(lambda t: place if t < 8.0 else FAR)])
-    angles, gaps = [], []
+    turned: list[float] = []
+    gaps = []
     for t in np.arange(0.0, 14.0, TICK_S):
-        angles.append(robots.at(t)["panda"][0])
+        turned.append(robots.at(t)["panda"][0])
         gaps.append(gap(robots))
-    angles = np.array(angles)
+    angles = np.array(turned)
     at = {t: round(t / TICK_S) for t in (6.0, 7.9, 8.1, 13.9)}
     assert min(gaps) > 0.0 and min(gaps) < 2 * STOP_M, "it stops near the person and does not touch"
     assert 0.1 < angles[at[6.0]] < 0.5 and angles[at[6.0]] == pytest.approx(angles[at[7.9]], abs=1e-4), "it stands still"
@@ -105,7 +112,7 @@ def test_a_robot_that_is_pushed_yields(panda):
 
 
 def test_the_rated_load_is_carried_and_ten_times_of_it_sinks_to_the_table(panda):
-    table = box((2.0, 2.0, 0.03), (0.0, 0.0, -0.015), 0)
+    table = box((2.0, 2.0, 0.03), (0.0, 0.0, -0.015), Label.BACKGROUND)
     loads = {mass: cells.Payload(mass=mass, link="panda_hand", position=(0.0, 0.0, 0.1)) for mass in (3.0, 30.0)}
     carried = moved(panda, sweep, payload=loads[3.0], obstacles=[table])
     assert max(np.abs(carried.at(t)["panda"] - sweep(t)).max() for t in np.arange(0.0, 6.5, 0.1)) < 2e-3
@@ -134,7 +141,7 @@ def test_times_may_be_asked_for_in_any_order_and_runs_are_alike(panda):
 
 
 def test_a_time_that_is_forgotten_is_reported(panda, monkeypatch):
-    monkeypatch.setattr("sim.world.dynamics.KEPT", 50)
+    monkeypatch.setattr("penumbra.sim.world.dynamics.KEPT", 50)
     robots = moved(panda, sweep)
     robots.at(2.0)
     with pytest.raises(ValueError, match=r"expected a time of the last 1 s, got 0.5 s: make a new world"):
@@ -153,8 +160,7 @@ def test_bodies_are_where_the_kinematics_puts_the_links(tmp_path):
                 T = np.eye(4)
                 T[:3, 3] = vertex
                 T[axis, 3] += side * 0.03  # a cube of 2 cm at 3 cm: a gap of 2 cm, unless another link is nearer
-                cube = Bystander([box((0.02,) * 3, (0.0, 0.0, 0.0), 1)], lambda t, T=T: [T])
-                robots = Robots({"odd": model}, {}, lambda t: {"odd": q}, [cube], [])
+                robots = Robots({"odd": model}, {}, lambda t: {"odd": q}, [resting_cube(T, 0.02)], [])
                 robots.at(TICK_S)
                 assert robots._arms["odd"]._gap < 0.02 + 1e-3, (link, axis, side)
 
@@ -181,14 +187,15 @@ def python(code: str) -> subprocess.CompletedProcess:
 
 def test_a_world_with_a_robot_is_silent():
     done = python(
-        "from shared.cell import description; from sim.world.world import World; World(description.load('arm'), 0).state(1.0)"
+        "from penumbra.shared.cell import description; from penumbra.sim.world.world import World;"
+        "World(description.load('arm'), 0).state(1.0)"
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_without_pybullet_cells_without_robots_run_and_others_say_what_to_install():
     code = """import sys; sys.modules["pybullet"] = None
-from shared.cell import description as cell; from sim.world.world import World
+from penumbra.shared.cell import description as cell; from penumbra.sim.world.world import World
 print(World(cell.load("table"), 0).state(1.0).joints)
 World(cell.load("arm"), 0)"""
     done = python(code)

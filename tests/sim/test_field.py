@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from shared.cell import description as cells
-from shared.geometry import rigid
-from sim.skin.field import FEMTOFARAD, Body, PadField, Panels, limb
-from tests.bench import skin as bench
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.sim.skin.field import FEMTOFARAD, Body, PadField, Panels, limb
+from penumbra.tests.bench import skin as bench
 
 
 @pytest.fixture(scope="module")

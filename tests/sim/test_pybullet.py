@@ -9,11 +9,11 @@ import pybullet_data
 import pytest
 import trimesh
 
-from shared.body import anatomy
-from shared.body.robot import RobotModel
-from shared.cell import description
-from shared.geometry import raster, rigid
-from tests.support.robots import PANDA, odd_robot
+from penumbra.shared.body import anatomy
+from penumbra.shared.body.robot import RobotModel
+from penumbra.shared.cell import description
+from penumbra.shared.geometry import raster, rigid
+from penumbra.tests.support.robots import PANDA, odd_robot
 
 ORIGINAL = Path(pybullet_data.getDataPath()) / "franka_panda"
 """The Panda as Bullet distributes it, from which the built-in one was made."""

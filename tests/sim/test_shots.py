@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from shared.contract.labels import Label
-from shared.geometry import raster, rigid
-from sim.sets import shots
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.geometry import raster, rigid
+from penumbra.sim.sets import shots
 
 
 def silhouette(shot: shots.Shot) -> np.ndarray:
@@ -40,7 +40,7 @@ def test_only_robot_upper_arm_and_occluder_cover_the_target():
 @pytest.mark.parametrize("size, distance_m", [((320, 240), 1.5), ((640, 480), 4.5), ((1280, 960), 8.0)])
 def test_the_target_lies_wholly_in_the_picture_at_the_distance(size, distance_m):
     for index in range(6):
-        shot = shots.shot(33, index, *size, distance_m, images=False)
+        shot = shots.shot(33, index, size[0], size[1], distance_m, images=False)
         whole = silhouette(shot)
         border = np.concatenate([whole[: shots.BORDER_PX].ravel(), whole[:, -shots.BORDER_PX :].ravel()])
         assert whole.any() and not border.any()
@@ -58,8 +58,8 @@ def test_a_picture_is_a_function_of_seed_and_index_and_its_labels_do_not_depend_
 
 
 def test_robots_stand_where_cell_and_joints_say():
-    from services.search.evidence import Intrinsics
-    from services.search.robot_depth import RobotDepth
+    from penumbra.services.search.evidence import Intrinsics
+    from penumbra.services.search.robot_depth import RobotDepth
 
     index = next(i for i in range(1, 40, 2) if shots.shot(36, i, 320, 240, images=False).joints)
     shot = shots.shot(36, index, 320, 240, images=False)
@@ -90,5 +90,5 @@ def test_a_board_passes_and_hides_everything_for_a_while():
 
 
 def test_a_share_that_cannot_be_is_refused():
-    with pytest.raises(ValueError, match=r"from 0 to 1 expected, 1\.2 came"):
+    with pytest.raises(ValueError, match=r"expected a share from 0 to 1, got 1\.2"):
         shots.shot(1, 0, hidden=1.2)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.skin import board
-from sim.skin.board import Board
+from penumbra.shared.skin import board
+from penumbra.sim.skin.board import Board
 
 
 class SimulatedPort:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from shared.cell import description as cells
+from penumbra.shared.cell import description as cells
 
 PITCH = 4.0
 """Distance [m] between work places along x: no camera sees the next one's arm, no pad feels it."""

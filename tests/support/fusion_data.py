@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.fusion.records import UNITS
-from shared.contract import senses
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
+from penumbra.services.fusion.records import UNITS
+from penumbra.shared.contract import senses
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 
 T0_NS = 1_700_000_000_000_000_000
 HOME = rigid.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0])

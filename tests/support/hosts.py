@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -18,11 +17,11 @@ from types import TracebackType
 
 import zenoh
 
-from shared.cell import description as cells
-from shared.runtime import bus
-from tests.support.live import wait_for
+from penumbra.shared.cell import description as cells
+from penumbra.shared.runtime import bus
+from penumbra.tests.support.live import penumbra_command, wait_for
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 NAMESPACES = ("--net", "--mount", "--uts")
 
 
@@ -77,7 +76,7 @@ class Host:
     def start(self, service: str, *arguments: str) -> subprocess.Popen:
         """Starts `penumbra SERVICE`, which connects to the host's own router unless it is told otherwise."""
         environment = os.environ | {"PYTHONPATH": str(ROOT), "PENUMBRA_PARENT": str(os.getpid())}
-        command = [*self._enter(), sys.executable, "-m", "services.command.cli", service, "--log-level", "warning", *arguments]
+        command = [*self._enter(), *penumbra_command(service, "--log-level", "warning", *arguments)]
         self.processes[service] = subprocess.Popen(command, env=environment)
         return self.processes[service]
 

@@ -21,8 +21,9 @@ import numpy as np
 import psutil
 import zenoh
 
-from shared.contract import messages, topics
-from tests.support.live import Running, free_port, penumbra_up, service_of
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.runtime.guard import Numbering
+from penumbra.tests.support.live import Running, free_port, penumbra_command, penumbra_up, service_of
 
 CLOCK_SOURCE = Path(__file__).parent / "clock_shift.c"
 PIDS = 1 << 22
@@ -66,12 +67,12 @@ def slowed(process: psutil.Process, stopped_s: float = 0.4, running_s: float = 0
                 process.send_signal(signal.SIGCONT)
                 done.wait(running_s)
 
-    with _signalled(process, signal.SIGCONT), _meanwhile(alternate, done):
+    with _signalled(process, signal.SIGCONT), meanwhile(alternate, done):
         yield
 
 
 @contextmanager
-def _meanwhile(function: Callable[[], None], done: threading.Event) -> Iterator[None]:
+def meanwhile(function: Callable[[], None], done: threading.Event) -> Iterator[None]:
     """Calls a function in a thread of its own, which ends when `done` is set, as it is in the end."""
     thread = threading.Thread(target=function)
     thread.start()
@@ -125,7 +126,7 @@ def crash_loop(processes: Callable[[], Iterable[psutil.Process]], period_s: floa
             for process in processes():
                 kill(process)
 
-    with _meanwhile(reap, done):
+    with meanwhile(reap, done):
         yield
 
 
@@ -139,7 +140,7 @@ def small_disk(folder: Path, megabytes: float) -> Iterator[None]:
     command = ["mount", "-t", "tmpfs", "-o", f"size={int(megabytes * 1024)}k", "penumbra-test", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise PermissionError(f"a user who may mount a disk for the test expected: {done.stderr.strip()}")
+        raise PermissionError(f"expected a user who may mount a disk for the test: {done.stderr.strip()}")
     try:
         yield
     finally:
@@ -169,7 +170,7 @@ class Link:
 
     def __init__(self, target: int):
         self.port = free_port()
-        command = [sys.executable, "-m", "tests.support.link", str(self.port), str(target)]
+        command = [sys.executable, "-m", "penumbra.tests.support.link", str(self.port), str(target)]
         self._popen = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._answer("ready")
 
@@ -201,8 +202,8 @@ class Link:
 
     def _answer(self, expected: str) -> None:
         assert self._popen.stdout is not None
-        if (came := self._popen.stdout.readline().strip()) != expected:
-            raise AssertionError(f"the link: {expected} expected, {came!r} came")
+        if (got := self._popen.stdout.readline().strip()) != expected:
+            raise AssertionError(f"the link: expected {expected}, got {got!r}")
 
 
 class Router:
@@ -213,7 +214,7 @@ class Router:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "services.command.cli", "router", "--listen", f"tcp/127.0.0.1:{self.port}"]
+        command = penumbra_command("router", "--listen", f"tcp/127.0.0.1:{self.port}")
         self.popen = subprocess.Popen(command, env={**os.environ, **self._environment})
 
     def kill(self) -> None:
@@ -268,13 +269,14 @@ class Clocks:
 def storm(session: zenoh.Session, key: str, times: int = 10) -> Iterator[list[int]]:
     """Every message of a key comes again, `times` times, numbered as another publisher's own; how many so far is in the list."""
     sent = [0]
+    numbering = Numbering()
     publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
     subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(4), allowed_origin=zenoh.Locality.REMOTE)
 
     def repeat() -> None:
         for sample in subscriber:
             for _ in range(times):
-                publisher.put(sample.payload, source_info=zenoh.SourceInfo(publisher.id, sent[0] & 0xFFFFFFFF))
+                publisher.put(sample.payload, attachment=numbering.attachment())
                 sent[0] += 1
 
     thread = threading.Thread(target=repeat, daemon=True)

@@ -1,11 +1,13 @@
 """What may come over a wire or stand in a file, as strategies of hypothesis: the good, and what somebody made of it."""
 
+from typing import Any
+
 import msgpack
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from shared.contract import messages
+from penumbra.shared.contract import messages
 
 STAMPS = st.integers(0, 2**63 - 1)
 FINITE = st.floats(-1e6, 1e6)
@@ -33,7 +35,7 @@ def covariance(draw):
 SIDES = st.integers(1, 12)
 SOURCES = st.dictionaries(NAMES, st.builds(messages.Source, age_s=FINITE, weight=SHARES), max_size=4)
 POSE = {"stamp_ns": STAMPS, "target": NAMES, "frame": NAMES, "position": vector(3), "orientation": quaternion()}
-KINDS = {
+KINDS: dict[type[messages.Message], dict[str, Any]] = {
     messages.Frame: {"stamp_ns": STAMPS, "image": st.tuples(SIDES, SIDES).flatmap(lambda s: npst.arrays(np.uint8, (*s, 3)))},
     messages.Mask: {
         "stamp_ns": STAMPS,

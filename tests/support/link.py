@@ -1,4 +1,4 @@
-"""A link that can be cut: `python -m tests.support.link LISTEN TARGET` passes TCP bytes on between two ports of loopback.
+"""A link that can be cut: `python -m penumbra.tests.support.link LISTEN TARGET` passes TCP bytes on between ports of loopback.
 
 On standard input: `cut PORT...` stops the bytes of the callers that have these ports, and of whoever calls from then on; `mend`
 lets all pass again, those held back first, as where a cable is plugged in again. Nobody is told: a cut link is silent.

@@ -19,18 +19,43 @@ from typing import Any
 import psutil
 import zenoh
 
-from shared.cell import description as cells
-from shared.contract import messages, processes, topics
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, processes, topics
+
+PATIENCE_S = 60.0
+"""A test waits at least so long: what takes a moment on a quiet machine takes a while on a busy one, and a deadline that is not
+reached costs nothing."""
 
 
-def wait_for(condition: Callable[[], Any], seconds: float, what: str, interval: float = 0.02) -> Any:
-    """The first true value of `condition`; fails with `what` where none comes within `seconds`."""
+def wait_for(
+    condition: Callable[[], Any], seconds: float, what: str, interval: float = 0.02, act: Callable[[], object] = lambda: None
+) -> Any:
+    """The first true value of `condition`; fails with `what` where none comes within `seconds`, or PATIENCE_S where that is more.
+    act: is called before each look."""
+    seconds = max(seconds, PATIENCE_S)
     deadline = time.monotonic() + seconds
-    while not (value := condition()):
+    while True:
+        act()
+        if value := condition():
+            return value
         if time.monotonic() > deadline:
             raise AssertionError(f"waited {seconds} s in vain for {what}")
         time.sleep(interval)
-    return value
+
+
+def stays(condition: Callable[[], Any], seconds: float, interval: float = 0.02) -> bool:
+    """Whether a condition holds at every look for `seconds`."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if not condition():
+            return False
+        time.sleep(interval)
+    return True
+
+
+def penumbra_command(*arguments: str) -> list[str]:
+    """The words that run `penumbra ARGUMENTS` in this interpreter."""
+    return [sys.executable, "-m", "penumbra", *arguments]
 
 
 PORTS = range(20_000, 30_000)
@@ -85,6 +110,10 @@ class Running:
         pose = self.pose()
         return pose is not None and pose["state"] == "tracking" and pose["stamp_ns"] > after_ns
 
+    def is_tracked_by_both(self) -> bool:
+        pose = self.pose()
+        return pose is not None and pose["state"] == "tracking" and len(pose["sources"]) == 2
+
     def control(self, command: dict) -> dict | None:
         """The emulator's answer to a control command, or None where nobody answers."""
         for reply in self.session.get(topics.control(self.cell), payload=json.dumps(command), timeout=1.0):
@@ -127,19 +156,7 @@ def penumbra_up(
     (default: nowhere) and stderr of the launcher go.
     """
     port = port or free_port()
-    command = [
-        sys.executable,
-        "-m",
-        "services.command.cli",
-        "up",
-        "--cell",
-        cell,
-        "--seed",
-        str(seed),
-        "--port",
-        str(port),
-        *arguments,
-    ]
+    command = penumbra_command("up", "--cell", cell, "--seed", str(seed), "--port", str(port), *arguments)
     launcher = subprocess.Popen(command, env={**os.environ, **(environment or {})}, **({"stdout": subprocess.DEVNULL} | streams))
     try:
         with connect(port) as session:
@@ -158,8 +175,7 @@ def hold_in_reach(running: Running) -> None:
     wait_for(lambda: _is_in_reach(truths.recv()), 60, "the arm above the pads", 0.0)
     wait_for(lambda: running.control({"command": "motion", "value": "off"}), 10, "the emulator's answer")
     truths.undeclare()
-    both = lambda: running.is_tracking() and len(running.pose()["sources"]) == 2  # noqa: E731
-    wait_for(both, 60, "a tracked pose of the resting arm, by both senses", 0.2)
+    wait_for(running.is_tracked_by_both, 60, "a tracked pose of the resting arm, by both senses", 0.2)
 
 
 def _is_in_reach(sample: zenoh.Sample) -> bool:

@@ -1,4 +1,4 @@
-"""A small real service for the tests of the runtime: `python -m tests.support.nodes SERVICE --connect ENDPOINT`.
+"""A small real service for the tests of the runtime: `python -m penumbra.tests.support.nodes SERVICE --connect ENDPOINT`.
 
 It publishes the fused pose of the table's forearm at 100 Hz (where it owns it), answers the pose query, and counts frames; as
 `camera` it sends them; as `hanging` its timer hangs after a second.
@@ -13,11 +13,16 @@ import time
 
 import numpy as np
 
-from services import flags, run
-from shared.cell import description as cells
-from shared.contract import messages, topics
-from shared.runtime import bus, logs
-from shared.runtime.node import Node
+from penumbra.services import flags, run
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.runtime import bus, logs
+from penumbra.shared.runtime.node import Node
+
+
+def node_command(service: str, endpoint: str, *arguments: str) -> list[str]:
+    """The words that run a small service of this file, which connects to a router."""
+    return [sys.executable, "-m", "penumbra.tests.support.nodes", service, "--connect", endpoint, *arguments]
 
 
 def pose(stamp_ns: int | None = None, x: float = 0.0) -> messages.FusedPose:
@@ -72,7 +77,7 @@ def start(node: Node) -> None:
 
 
 def main() -> None:
-    options = flags.parser(sys.argv[1], __doc__ or "").parse_args(sys.argv[2:])
+    options = flags.parse(flags.COMMON, sys.argv[2:])
     logs.configure(options.log_level, options.log_format, sys.argv[1])
     node = Node(sys.argv[1], cells.load(options.cell), bus.connection(options))
     start(node)

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from shared.contract import messages, topics
-from shared.geometry import rigid
-from tests.support.live import Running
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.geometry import rigid
+from penumbra.shared.runtime.reader import sender_of
+from penumbra.tests.support.live import Running
 
 READ = (topics.FUSED, topics.VISION, topics.HAPTIC, topics.TRUTH, topics.MASK, topics.FRAME, topics.VOLTAGES)
 DECODED = {topics.FUSED.name, topics.VISION.name, topics.HAPTIC.name, topics.TRUTH.name}
@@ -53,20 +54,20 @@ class Outside:
     """Listens to a chain from outside, but not to what its own session sends. Everything is decoded afterwards."""
 
     def __init__(self, session: zenoh.Session, cell: str, target: str, pad: str):
-        self._rows: dict[str, list[tuple[float, bytes, zenoh.SourceInfo | None]]] = {}
-        self._subscribers = []
+        self._rows: dict[str, list[tuple[float, bytes, bytes, int | None]]] = {}
+        self._subscribers: list[zenoh.Subscriber[Any]] = []
         for topic in READ:
             rows = self._rows.setdefault(topic.name, [])
             key = topic.at(cell=cell, target=target, pad=pad)
-            ring, others = zenoh.handlers.RingChannel(1024), zenoh.Locality.REMOTE
-            subscriber = session.declare_subscriber(key, ring, allowed_origin=others)
+            ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(1024)
+            subscriber = session.declare_subscriber(key, ring, allowed_origin=zenoh.Locality.REMOTE)
             threading.Thread(target=self._read, args=(subscriber, rows, topic.name in DECODED), daemon=True).start()
             self._subscribers.append(subscriber)
 
     @staticmethod
-    def _read(subscriber: Any, rows: list[tuple[float, bytes, zenoh.SourceInfo | None]], is_decoded: bool) -> None:
+    def _read(subscriber: Any, rows: list[tuple[float, bytes, bytes, int | None]], is_decoded: bool) -> None:
         for sample in subscriber:
-            rows.append((time.monotonic(), sample.payload.to_bytes() if is_decoded else b"", sample.source_info))
+            rows.append((time.monotonic(), sample.payload.to_bytes() if is_decoded else b"", *sender_of(sample)))
 
     def __enter__(self) -> Outside:
         return self
@@ -78,12 +79,11 @@ class Outside:
     def seen(self, topic: topics.Topic, begin_s: float = -np.inf, end_s: float = np.inf) -> list[Seen]:
         """What came on a topic between two times of the steady clock."""
         out = []
-        for at_s, payload, source in list(self._rows[topic.name]):
+        for at_s, payload, publisher, number in list(self._rows[topic.name]):
             if not begin_s <= at_s <= end_s:
                 continue
             message = messages.decode(topic.message, payload) if topic.name in DECODED else None
-            publisher = "" if source is None else f"{source.source_id.zid}/{source.source_id.eid}"
-            out.append(Seen(at_s, message, publisher, None if source is None else source.source_sn))
+            out.append(Seen(at_s, message, publisher.hex(), number))
         return out
 
     def forget(self) -> None:
@@ -136,7 +136,7 @@ def _union(spans: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
     return out
 
 
-def recovery_s(times: Sequence[float], rate_hz: float, fault_s: float, end_s: float) -> float | None:
+def recovery_s(times: Iterable[float], rate_hz: float, fault_s: float, end_s: float) -> float | None:
     """Seconds from a fault until a stream of messages with these times of arrival has its old rate, and keeps it for two windows;
     None where it has not by the end."""
     wanted = SHARE * rate_hz * WINDOW_S

@@ -6,7 +6,6 @@ making takes on a real machine, so that fusion sees vision late, as it does live
 
 from __future__ import annotations
 
-import argparse
 import heapq
 import importlib
 import itertools
@@ -17,13 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.messages import Message, decode, encode
-from shared.contract.topics import Topic
-from shared.runtime import logs
-from shared.runtime.hang import HANG_S
-from shared.runtime.node import ServiceNode
+from penumbra.services import flags
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.messages import Message, decode, encode
+from penumbra.shared.contract.topics import Topic
+from penumbra.shared.runtime import logs
+from penumbra.shared.runtime.hang import HANG_S
+from penumbra.shared.runtime.node import ServiceNode
 
 SERVICES = ("segmentation", "search", "haptics", "fusion")
 DELAY_NS = {topics.FRAME: 2_000_000, topics.MASK: 30_000_000, topics.VISION: 5_000_000, topics.HAPTIC: 1_000_000}
@@ -52,10 +52,8 @@ class Replay:
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._count = itertools.count()
         for name in services:
-            module = importlib.import_module(f"services.{name}.service")
-            parser = argparse.ArgumentParser()
-            module.arguments(parser)
-            module.start(ReplayNode(self, name), parser.parse_args((arguments or {}).get(name, [])))
+            module = importlib.import_module(f"penumbra.services.{name}.service")
+            module.start(ReplayNode(self, name), flags.parse(module.FLAGS, (arguments or {}).get(name, [])))
 
     def run(self, recording: Iterable[tuple[Topic, dict[str, str], Message]]) -> list[Heard]:
         """Plays messages in the order of their stamps; returns all that was heard."""
@@ -207,8 +205,8 @@ def digest(heard: list[Heard], period_s: float = 1.0) -> dict[str, list[Any]]:
 
 
 def main() -> None:
-    """`python -m tests.support.replay`: writes the reference of tests/chain/test_replay.py again."""
-    from tests.chain.test_replay import REFERENCE, masks, play
+    """`python -m penumbra.tests.support.replay`: writes the reference of tests/chain/test_replay.py again."""
+    from penumbra.tests.chain.test_replay import REFERENCE, masks, play
 
     REFERENCE.write_text(json.dumps({"mask": masks(), **digest(play())}, indent=None).replace("], [", "],\n  [") + "\n")
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from shared.cell import description as cells
+from penumbra.shared.cell import description as cells
 
 PANDA = cells.Robot(
     urdf="panda/panda.urdf",

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from services.posecnn.estimator import PoseCNN, PoseCnnEstimate
-from services.posecnn.network import Network
-from services.posecnn.uncertainty import KINDS, Uncertainty, errors, fitted
-from shared.body.anatomy import Mesh
-from shared.cell.description import Cell
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.perception.lookout import corners_of, whole_frame, window_around
+from penumbra.services.posecnn.estimator import PoseCNN, PoseCnnEstimate
+from penumbra.services.posecnn.network import Network
+from penumbra.services.posecnn.uncertainty import KINDS, Uncertainty, errors, fitted
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.cell.description import Cell
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.lookout import corners_of, whole_frame, window_around
 
 START = (0.02, np.radians(4.0))
 """Root mean square length of the predictions' errors: position [m], rotation [rad]."""

@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from services.posecnn.network import Dense
-from shared.contract.labels import TARGET_LABELS
+from penumbra.services.posecnn.network import Dense
+from penumbra.shared.contract.labels import TARGET_LABELS
 
 
 def matrices(quaternions: Tensor) -> Tensor:

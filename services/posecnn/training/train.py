@@ -8,7 +8,6 @@ that was not.
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import multiprocessing
 import os
@@ -24,19 +23,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from services.flags import Parser, positive
-from services.posecnn import network, patch
-from services.posecnn.estimator import WEIGHTS
-from services.posecnn.network import REFERENCE_PX, STRIDE, Network, PoseCnnSettings, proportions
-from services.posecnn.training import evaluate, loss
-from shared import training
-from shared.body import anatomy
-from shared.cell import description as cells
-from shared.contract.labels import TARGET_LABELS, Label
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.native import processor
-from sim.sets import sequences, shots
+from penumbra.services import flags
+from penumbra.services.posecnn import network, patch
+from penumbra.services.posecnn.estimator import WEIGHTS
+from penumbra.services.posecnn.network import REFERENCE_PX, STRIDE, Network, PoseCnnSettings, proportions
+from penumbra.services.posecnn.training import evaluate, loss
+from penumbra.shared import training
+from penumbra.shared.body import anatomy
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract.labels import TARGET_LABELS, Label
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.native import processor
+from penumbra.sim.sets import sequences, shots
 
 VALIDATION_SEED = 2_000_000
 """Added to the seed for held-out pictures: nothing there was ever trained on."""
@@ -296,21 +295,19 @@ def export(trainer: Trainer, out: Path, each: int) -> dict[str, Any]:
     return card
 
 
-def arguments() -> argparse.ArgumentParser:
-    """The flags of `penumbra posecnn train`."""
-    parser = Parser(prog="penumbra posecnn train", description="Train PoseCNN on simulated pictures.")
-    training.add_arguments(parser, "posecnn", 75.0)
-    parser.add_argument("--cache", type=Path, default=Path("posecnn-data"), help="folder of rendered pictures (6 GB)")
-    parser.add_argument(
-        "--out", type=Path, default=WEIGHTS, help="the weights, their card beside them (default: the committed ones)"
-    )
-    parser.add_argument("--held-out", type=positive, default=500, help="pictures for the calibration, and as many for the score")
-    return parser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Train, then write weights and card."""
-    options = arguments().parse_args(argv)
+@flags.command(
+    "posecnn train",
+    "Trains PoseCNN on simulated pictures, and writes weights and card.",
+    *flags.training("posecnn", 75.0),
+    flags.Option("--cache", type=Path, default=Path("posecnn-data"), help="folder of rendered pictures (6 GB)"),
+    flags.Option(
+        "--out", type=Path, default=WEIGHTS, show_default="the committed ones", help="the weights, their card beside them"
+    ),
+    flags.Option("--held-out", type=flags.positive, default=500, help="pictures for the calibration, and as many for the score"),
+    example="penumbra posecnn train --minutes 75 --out posecnn.npz",
+)
+def main(options: flags.Options) -> int:
+    """Trains, then writes weights and card."""
     schedule = Schedule()
     if checkpoint := training.begun(options):
         trainer = Trainer.restore(checkpoint, schedule)

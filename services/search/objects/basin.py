@@ -18,13 +18,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search import evidence
-from services.search.contour import DROPPED, NEAR, Model, match
-from services.search.evidence import COVERED, FREE, TARGET, Evidence, Intrinsics
-from services.search.mask_fit import Noise
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from shared.native import kernel
+from penumbra.services.search import evidence
+from penumbra.services.search.contour import DROPPED, NEAR, Model
+from penumbra.services.search.evidence import COVERED, FREE, TARGET, Evidence, Intrinsics
+from penumbra.services.search.mask_fit import Noise
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.native import kernel
 
 Bool = NDArray[np.bool_]
 
@@ -205,7 +205,7 @@ def _moments(mask: Bool) -> Moments:
 
 @dataclass(frozen=True)
 class Contour:
-    """The contour at a pose: points (n, 8) as `trace` gives them, offsets r (n,) to the boundary and their kinds (n,)."""
+    """The contour at a pose: points (n, 8) as in `contour.Matched`, offsets r (n,) to the boundary and their kinds (n,)."""
 
     points: Array
     r: Array
@@ -224,12 +224,8 @@ class Contour:
 
 def contour(model: Model, at: Level, T: Array, reach: float, spacing: float = 2.0) -> Contour:
     """The contour at a pose, compared with the mask within `reach` [px of the level]."""
-    k = at.evidence.intrinsics
-    V = model.in_camera(T)
-    points = model.outline(V, k, at.shape, spacing)
-    own = at.evidence.field_of(model.silhouette_of(V, k, (0, 0, *at.shape[::-1])))
-    r, kind = match(points, at.evidence.field, at.evidence.guarded, own, reach)
-    return Contour(points, r, kind)
+    found = model.matched(T, at.evidence, spacing, reach)
+    return Contour(found.points, found.r, found.kind)
 
 
 def robust(r: Array, width: float) -> Array:

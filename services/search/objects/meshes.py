@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.body.anatomy import Mesh
-from shared.geometry.rigid import Array
-from shared.native import kernel
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.body.simplification import simplified
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.native import kernel
 
 Faces = NDArray[np.int32]
 
@@ -25,12 +26,10 @@ DENSE = 5
 """Times as many triangles as wanted, from which a grid thins them out first."""
 CELL = 0.008
 """Its cells, as a share of the largest side: less than a pixel of most pictures."""
-SIMPLIFIED = 1000.0
-"""Largest side of a mesh while it is thinned out: the order in which edges go depends on an absolute distance."""
 
 
 class ObjectFileError(ValueError):
-    """What a user gave cannot be used; the text says what was expected, what came and what to do."""
+    """What a user gave cannot be used; the text says what was expected, what was received and what to do."""
 
 
 def load(path: Path, unit: str) -> Mesh:
@@ -39,23 +38,23 @@ def load(path: Path, unit: str) -> Mesh:
     import trimesh
 
     if not path.is_file():
-        raise ObjectFileError(f"{path}: a mesh file expected, there is none")
+        raise ObjectFileError(f"{path}: expected a mesh file, found none")
     try:
         mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh's readers raise anything
-        raise ObjectFileError(f"{path}: a triangle mesh that trimesh reads expected (PLY, STL, OBJ, GLB, OFF): {error}") from None
+        raise ObjectFileError(f"{path}: expected a triangle mesh that trimesh reads (PLY, STL, OBJ, GLB, OFF): {error}") from None
     vertices, faces = np.asarray(getattr(mesh, "vertices", ())), np.asarray(getattr(mesh, "faces", ()))
     if not len(faces):
-        raise ObjectFileError(f"{path}: a triangle mesh expected, {len(vertices)} points without triangles came")
+        raise ObjectFileError(f"{path}: expected a triangle mesh, got a file without triangles")
     if not np.isfinite(vertices[faces]).all():
-        raise ObjectFileError(f"{path}: finite coordinates expected, some of the mesh's vertices are not: mend the file")
+        raise ObjectFileError(f"{path}: expected finite coordinates, got vertices that are not; repair the file")
     extent = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
     if not EXTENT[0] <= extent * UNITS[unit] <= EXTENT[1]:
         fitting = [name for name, metres in UNITS.items() if 0.02 <= extent * metres <= 3.0]
         hint = f"if its unit is {' or '.join(fitting)}, give it with --mesh-unit" if fitting else "scale it"
         raise ObjectFileError(
-            f"{path}: an object of {EXTENT[0]} to {EXTENT[1]:g} m expected, with --mesh-unit {unit} this one is "
-            f"{extent * UNITS[unit]:.3g} m long: {hint}"
+            f"{path}: expected an object of {EXTENT[0]} to {EXTENT[1]:g} m, got one of {extent * UNITS[unit]:.3g} m with "
+            f"--mesh-unit {unit}; {hint}"
         )
     return Mesh(vertices.astype(np.float64) * UNITS[unit], faces.astype(np.int32), np.zeros(len(faces), np.uint8))
 
@@ -65,16 +64,12 @@ def mend(mesh: Mesh, most: int) -> Mesh:
     gone, and neighbours turn the same side outwards. Holes stay. Raises ObjectFileError where nothing is left."""
     vertices, faces = _merged(mesh.vertices, mesh.faces)
     if not len(faces):
-        raise ObjectFileError("mesh: triangles with an area expected, there are none")
+        raise ObjectFileError("mesh: expected triangles with an area, got none")
     if len(faces) > DENSE * most:
         vertices, faces = _clustered(vertices, faces)
     faces = _oriented(vertices, faces)
     if len(faces) > most:
-        import fast_simplification
-
-        middle, scale = vertices.mean(axis=0), SIMPLIFIED / float(np.ptp(vertices, axis=0).max())
-        simple, faces = fast_simplification.simplify(((vertices - middle) * scale).astype(np.float32), faces, target_count=most)
-        vertices, faces = _merged(simple.astype(np.float64) / scale + middle, faces.astype(np.int32))
+        vertices, faces = _merged(*simplified(vertices, faces, most))
         faces = _oriented(vertices, faces)
     return Mesh(vertices, faces, np.zeros(len(faces), np.uint8))
 

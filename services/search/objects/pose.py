@@ -15,16 +15,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search import image_fit as colours
-from services.search.contour import MEASURED, Model
-from services.search.evidence import COVERED, FREE, TARGET, Intrinsics
-from services.search.mask_fit import Fit, Limits, Noise
-from services.search.objects import basin, meshes
-from services.search.objects.basin import Level, Prior, Pyramid, Score, Shape
-from services.search.settings import ONE_IN_10_000
-from shared.body.anatomy import Mesh
-from shared.geometry import rigid as geometry
-from shared.geometry.rigid import Array
+from penumbra.services.search import image_fit as colours
+from penumbra.services.search.contour import MEASURED, Model
+from penumbra.services.search.evidence import COVERED, FREE, TARGET, Intrinsics
+from penumbra.services.search.mask_fit import Fit, Limits, Noise
+from penumbra.services.search.objects import basin, meshes
+from penumbra.services.search.objects.basin import Level, Prior, Pyramid, Score, Shape
+from penumbra.services.search.settings import ONE_IN_10_000
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.geometry.rigid import Array, inverse, perturb, pose_error, transform
 
 Bool = NDArray[np.bool_]
 State = Literal["tracking", "occluded", "lost"]
@@ -52,8 +51,8 @@ class RigidObject:
     def __init__(self, mesh: Mesh):
         mesh = meshes.mend(mesh, FACES[1])
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        self.T_object_middle = geometry.transform((low + high) / 2.0)
-        self.T_middle_object = geometry.inverse(self.T_object_middle)
+        self.T_object_middle = transform((low + high) / 2.0)
+        self.T_middle_object = inverse(self.T_object_middle)
         mesh = Mesh(mesh.vertices - (low + high) / 2.0, mesh.faces, mesh.labels)
         self.shape = Shape(Model(meshes.mend(mesh, FACES[0])), Model(mesh))
         self.diameter = float(np.linalg.norm(high - low))
@@ -126,7 +125,7 @@ def judged(
     covariance = np.asarray(np.linalg.inv(H + prior.information), np.float64)
     # poses that explain the mask nearly as well may be the right one
     weights = np.exp(-0.5 * np.minimum([score.cost - best.cost for score, _ in found], 100.0))
-    errors = [geometry.pose_error(other, T) for _, other in found]
+    errors = [pose_error(other, T) for _, other in found]
     apart = sum((w * np.outer(e, e) for w, e in zip(weights, errors, strict=True)), np.zeros((6, 6)))
     covariance = covariance + apart / weights.sum()
     if picture is not None:
@@ -162,7 +161,7 @@ def _on_picture(
         small = np.asarray(cv2.resize(window, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
         settings = colours.ImageSettings(mask=max(noise.edge / at.scale, 0.8))
         found = colours.fit_image(model, found, small, replace(e, x0=0, y0=0, scale=1), T, prior, settings)
-    error = geometry.pose_error(found.T_searched, T)
+    error = pose_error(found.T_searched, T)
     if found.length < SHORTEST * masks.fine.evidence.boundary_px or error @ prior @ error > ONE_IN_10_000:
         return T, covariance
     return found.T_searched, np.asarray(np.linalg.inv(np.linalg.inv(found.covariance) + prior), np.float64)
@@ -213,7 +212,7 @@ class Tracker:
     def update(self, mask: Bool, occluder: Bool | None = None, picture: NDArray[np.uint8] | None = None) -> ObjectEstimate:
         """The pose in the next frame; arguments as of `find_pose`. Lost, the pose is the last one and the covariance wide."""
         state = observed(mask, occluder)
-        T = geometry.perturb(self._T, self._velocity * self._dt)
+        T = perturb(self._T, self._velocity * self._dt)
         bridged = min(1.0 + self._missed, max(LONGEST_S / self._dt, 1.0))
         covariance = self._covariance + bridged**2 * self._growth
         prior = Prior(T, np.asarray(np.linalg.inv(covariance), np.float64))
@@ -221,7 +220,7 @@ class Tracker:
         if found is None or found.state == "lost":
             return self._miss(state, found)
         if self._missed == 0:
-            moved = geometry.pose_error(found.T, self._T) / self._dt
+            moved = pose_error(found.T, self._T) / self._dt
             self._velocity = self._velocity + SMOOTHING * (moved - self._velocity)
         self._usual = found.overlap if self._missed else self._usual + 0.1 * (found.overlap - self._usual)
         self._T, self._covariance, self._missed = found.T, found.covariance, 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import math
@@ -16,21 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track as progress
 
-from services.flags import Parser
-from services.search.contour import NEAR
-from services.search.evidence import Intrinsics
-from services.search.objects import meshes, pose
-from services.search.objects.meshes import ObjectFileError
-from services.search.objects.pose import ObjectEstimate, RigidObject, Tracker
-from shared.geometry import rigid as geometry
-from shared.geometry.rigid import Array
+from penumbra.services import flags
+from penumbra.services.search.contour import NEAR
+from penumbra.services.search.evidence import Intrinsics
+from penumbra.services.search.objects import meshes, pose
+from penumbra.services.search.objects.meshes import ObjectFileError
+from penumbra.services.search.objects.pose import ObjectEstimate, RigidObject, Tracker
+from penumbra.shared.cell.faults import meant
+from penumbra.shared.geometry.lens import COEFFICIENTS, FOREIGN, Lens, Undistortion
+from penumbra.shared.geometry.rigid import Array, position_orientation
 
 Bool = NDArray[np.bool_]
 
 PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
-VIEW = (0.15, 60.0)
-"""Focal lengths that are believed, in widths of the image: 147 degrees to 1 degree."""
+UNUSED = ("depth_scale",)
+"""Keys that camera files of object data sets have besides, and that say nothing about the picture."""
+CROPPED = 0.25
+"""How far outside the picture the principal point may lie, as a share of its size: pictures of objects are often cropped."""
 RIGID = 1e-2
 """A rotation matrix's largest error that is taken for rounding."""
 FURTHEST = 100.0
@@ -54,74 +56,94 @@ FIELDS = (
 )
 
 
-def refine(argv: list[str]) -> int:
+CAMERA_HELP = f"{', '.join(CAMERA)}, and for a lens with distortion {', '.join(COEFFICIENTS)} as OpenCV has them"
+COMMON = (
+    flags.Option("--mesh", type=Path, required=True, metavar="FILE", help="PLY, STL, OBJ, GLB or OFF"),
+    flags.Option("--mesh-unit", choices=tuple(meshes.UNITS), default="m", help="of the mesh file's coordinates"),
+    flags.Option("--camera", type=Path, required=True, metavar="JSON", help=CAMERA_HELP),
+    flags.Option("--init", type=Path, required=True, metavar="JSON", help="camera_from_object: 4 x 4, metres"),
+    flags.Option(
+        "--init-sigma",
+        type=float,
+        nargs=2,
+        default=(pose.START[0], math.degrees(pose.START[1])),
+        show_default=f"{pose.START[0]} {math.degrees(pose.START[1]):.0f}",
+        metavar="M DEG",
+        help="how well the start is known along and about each axis",
+    ),
+)
+"""The flags of both commands."""
+
+
+@flags.command(
+    "search refine",
+    "Refines one pose of a rigid mesh on one mask.",
+    *COMMON,
+    flags.Option("--mask", type=Path, required=True, metavar="PNG", help="not black where the object is seen"),
+    flags.Option("--image", type=Path, metavar="PNG", help="the image that the mask is of: the pose is refined on it"),
+    flags.Option("--occluder", type=Path, metavar="PNG", help="not black where something stands in front of the object"),
+    flags.JSON,
+    example="penumbra search refine --mesh cup.stl --mesh-unit mm --camera camera.json --init start.json --mask mask.png",
+)
+def refine(options: flags.Options) -> int:
     """One pose on one mask: 0, whatever its state, or 2 for input that is wrong."""
-    return _told("refine", _refine, argv)
+    return _reported("refine", _refine, options)
 
 
-def track(argv: list[str]) -> int:
+@flags.command(
+    "search track",
+    "Tracks a rigid mesh through a sequence of masks.",
+    *COMMON,
+    flags.Option("--masks", type=Path, required=True, metavar="FOLDER", help="one mask a frame, in the order of their names"),
+    flags.Option("--images", type=Path, metavar="FOLDER", help="the images, of the same names"),
+    flags.Option("--occluders", type=Path, metavar="FOLDER", help="masks of what stands in front, of the same names"),
+    flags.Option("--fps", type=flags.above_zero, default=30.0, help="frames a second of masks and video"),
+    flags.Option("--out", type=Path, default=Path("track"), metavar="FOLDER", help="for poses.csv and overlay.mp4"),
+    example="penumbra search track --mesh cup.stl --camera camera.json --init start.json --masks masks --out track",
+)
+def track(options: flags.Options) -> int:
     """The poses of a sequence of masks, as a table and a video; the exit code as of `refine`."""
-    return _told("track", _track, argv)
+    return _reported("track", _track, options)
 
 
-def _told(name: str, run: Callable[[list[str]], None], argv: list[str]) -> int:
+def _reported(name: str, run: Callable[[flags.Options], None], options: flags.Options) -> int:
     try:
-        run(argv)
+        run(options)
     except ObjectFileError as error:
         print(f"penumbra search {name}: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def _refine(argv: list[str]) -> None:
-    parser = _parser("refine", "Refines one pose of a rigid mesh on one mask.")
-    parser.add_argument("--mask", type=Path, required=True, metavar="PNG", help="not black where the object is seen")
-    parser.add_argument("--image", type=Path, metavar="PNG", help="the image that the mask is of: the pose is refined on it")
-    parser.add_argument("--occluder", type=Path, metavar="PNG", help="not black where something stands in front of the object")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    options = parser.parse_args(argv)
-    rigid, (k, shape), T = _given(options)
-    mask = read_mask(options.mask, shape)
-    occluder = None if options.occluder is None else read_mask(options.occluder, shape)
+def _refine(options: flags.Options) -> None:
+    rigid, files, T = _given(options)
+    k, mask, occluder = files.k, files.mask(options.mask), files.occluder(options.occluder)
     if not mask.any():
-        raise ObjectFileError(f"{options.mask}: pixels that show the object expected (not black), all are black")
+        raise ObjectFileError(f"{options.mask}: expected pixels that show the object (not black), got black ones only")
     check_mask(mask, options.mask)
     check_start(rigid, T, k, mask, occluder, options.init)
-    picture = None if options.image is None else read_picture(options.image, shape)
+    picture = None if options.image is None else files.picture(options.image)
     found = pose.find_pose(rigid, mask, k, T, occluder, picture, options.spread)
     print(json.dumps(as_json(found)) if options.json else as_text(found))
 
 
-def _track(argv: list[str]) -> None:
-    parser = _parser("track", "Tracks a rigid mesh through a sequence of masks.")
-    parser.add_argument(
-        "--masks", type=Path, required=True, metavar="FOLDER", help="one mask a frame, in the order of their names"
-    )
-    parser.add_argument("--images", type=Path, metavar="FOLDER", help="the images, of the same names")
-    parser.add_argument("--occluders", type=Path, metavar="FOLDER", help="masks of what stands in front, of the same names")
-    parser.add_argument("--fps", type=float, default=30.0, help="frames a second of masks and video (default: 30)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("track"), metavar="FOLDER", help="for poses.csv and overlay.mp4 (default: track)"
-    )
-    options = parser.parse_args(argv)
-    if not options.fps > 0:
-        raise ObjectFileError(f"--fps: a number above 0 expected, {options.fps:g} came")
-    rigid, (k, shape), T = _given(options)
+def _track(options: flags.Options) -> None:
+    rigid, files, T = _given(options)
+    k, (height, width) = files.k, files.shape
     names = frames(options.masks)
     images = None if options.images is None else beside(names, options.images)
     occluders = None if options.occluders is None else beside(names, options.occluders)
     options.out.mkdir(parents=True, exist_ok=True)
     tracker = Tracker(rigid, k, T, 1.0 / options.fps, options.spread)
-    video = cv2.VideoWriter(str(options.out / "overlay.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), options.fps, shape[::-1])
+    video = cv2.VideoWriter(str(options.out / "overlay.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), options.fps, (width, height))
     counts = dict.fromkeys(COLOURS, 0)
     try:
         with (options.out / "poses.csv").open("w", newline="") as file:
             table = csv.writer(file)
             table.writerow(FIELDS)
             for i, name in enumerate(progress(names, description="frames", disable=not sys.stderr.isatty())):
-                mask = read_mask(name, shape)
-                occluder = None if occluders is None else read_mask(occluders[i], shape)
-                picture = None if images is None else read_picture(images[i], shape)
+                mask, occluder = files.mask(name), files.occluder(None if occluders is None else occluders[i])
+                picture = None if images is None else files.picture(images[i])
                 if i == 0 and mask.any():
                     check_mask(mask, name)
                     check_start(rigid, T, k, mask, occluder, options.init)
@@ -134,29 +156,15 @@ def _track(argv: list[str]) -> None:
     print(f"{len(names)} frames: " + ", ".join(f"{n} {state}" for state, n in counts.items()) + f"; see {options.out}")
 
 
-def _parser(name: str, about: str) -> argparse.ArgumentParser:
-    parser = Parser(prog=f"penumbra search {name}", description=about)
-    parser.add_argument("--mesh", type=Path, required=True, metavar="FILE", help="PLY, STL, OBJ, GLB or OFF")
-    parser.add_argument("--mesh-unit", choices=meshes.UNITS, default="m", help="of the mesh file's coordinates (default: m)")
-    parser.add_argument("--camera", type=Path, required=True, metavar="JSON", help=", ".join(CAMERA))
-    parser.add_argument("--init", type=Path, required=True, metavar="JSON", help="camera_from_object: 4 x 4, metres")
-    metres, turn = pose.START
-    parser.add_argument(
-        "--init-sigma", type=float, nargs=2, default=(metres, math.degrees(turn)), metavar=("M", "DEG"),
-        help=f"how well the start is known along and about each axis (default: {metres} {math.degrees(turn):.0f})",
-    )  # fmt: skip
-    return parser
-
-
-def _given(options: argparse.Namespace) -> tuple[RigidObject, tuple[Intrinsics, tuple[int, int]], Array]:
-    """What both commands need: object, camera with the image's shape, start."""
+def _given(options: flags.Options) -> tuple[RigidObject, CameraFiles, Array]:
+    """What both commands need: object, reader of the camera's files, start."""
     metres, degrees = options.init_sigma
     if not (0 < metres < 10 and 0 < degrees < 360):
-        raise ObjectFileError(f"--init-sigma: metres and degrees above 0 expected, {metres:g} and {degrees:g} came")
+        raise ObjectFileError(f"--init-sigma: expected metres and degrees above 0, got {metres:g} and {degrees:g}")
     options.spread = metres, math.radians(degrees)
-    camera, T = read_camera(options.camera), read_pose(options.init)
+    files, T = CameraFiles(read_camera(options.camera)), read_pose(options.init)
     try:
-        return RigidObject(meshes.load(options.mesh, options.mesh_unit)), camera, T
+        return RigidObject(meshes.load(options.mesh, options.mesh_unit)), files, T
     except ObjectFileError as error:
         raise ObjectFileError(str(error) if str(options.mesh) in str(error) else f"{options.mesh}: {error}") from None
 
@@ -168,83 +176,80 @@ def _json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text())
     except OSError as error:
-        raise ObjectFileError(f"{path}: a readable JSON file expected: {error.strerror}") from None
+        raise ObjectFileError(f"{path}: expected a readable JSON file: {error.strerror}") from None
     except ValueError as error:
-        raise ObjectFileError(f"{path}: JSON expected: {error}") from None
+        raise ObjectFileError(f"{path}: expected JSON: {error}") from None
     if not isinstance(value, dict):
-        raise ObjectFileError(f"{path}: a JSON object expected, {type(value).__name__} came")
+        raise ObjectFileError(f"{path}: expected a JSON object, got {type(value).__name__}")
     return value
 
 
-def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int]]:
-    """Intrinsics and (height, width) of a camera file. Raises ObjectFileError."""
+def read_camera(path: Path) -> Lens:
+    """Size, intrinsics and distortion of a camera file. Raises ObjectFileError."""
     value = _json(path)
     missing = [name for name in CAMERA if name not in value]
     if missing:
-        raise ObjectFileError(f"{path}: the keys {', '.join(CAMERA)} expected, {', '.join(missing)} missing")
-    for name in CAMERA:
+        raise ObjectFileError(f"{path}: expected the keys {', '.join(CAMERA)}, got none of {', '.join(missing)}")
+    for name in value:
+        if name in FOREIGN:
+            raise ObjectFileError(f"{path}: {name}: {FOREIGN[name]}")
+        if name not in (*CAMERA, *COEFFICIENTS, *UNUSED):
+            known = (*CAMERA, *COEFFICIENTS)
+            raise ObjectFileError(f"{path}: {name}: expected one of the keys {', '.join(known)}, got {name}{meant(name, known)}")
+    for name in (each for each in value if each not in UNUSED):
         number = value[name]
         if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
-            raise ObjectFileError(f"{path}: {name}: a finite number expected, {number!r} came")
+            raise ObjectFileError(f"{path}: {name}: expected a finite number, got {number!r}")
     w, h = value["width"], value["height"]
     if w != int(w) or h != int(h) or not (16 <= w <= 16384 and 16 <= h <= 16384):
-        raise ObjectFileError(f"{path}: width and height of 16 to 16384 whole pixels expected, {w} x {h} came")
-    for name in ("fx", "fy"):
-        if not VIEW[0] * w <= value[name] <= VIEW[1] * w:
-            raise ObjectFileError(
-                f"{path}: {name}: a focal length of {VIEW[0] * w:.0f} to {VIEW[1] * w:.0f} pixels expected for an image "
-                f"{w} wide, {value[name]:g} came: is it in millimetres, or of another image size?"
-            )
-    if not 0.5 < value["fx"] / value["fy"] < 2.0:
-        raise ObjectFileError(f"{path}: fx and fy of nearly the same size expected, {value['fx']:g} and {value['fy']:g} came")
-    for name, size in (("cx", w), ("cy", h)):
-        if not -0.25 * size <= value[name] <= 1.25 * size:
-            raise ObjectFileError(
-                f"{path}: {name}: a principal point in or near the image ({size} pixels) expected, {value[name]:g} came: "
-                "do width and height belong to these intrinsics?"
-            )
-    return Intrinsics(*(float(value[name]) for name in CAMERA[2:])), (int(h), int(w))
+        raise ObjectFileError(f"{path}: expected width and height of 16 to 16384 whole pixels, got {w} x {h}")
+    numbers = {name: float(value.get(name, 0.0)) for name in (*CAMERA[2:], *COEFFICIENTS)}
+    lens = Lens(int(w), int(h), **numbers)
+    for name, reason in lens.faults(room=CROPPED):
+        raise ObjectFileError(f"{path}: {name}: {reason}")
+    return lens
 
 
 def read_pose(path: Path) -> Array:
     """T_camera_object of a pose file. Raises ObjectFileError."""
     value = _json(path)
     if "camera_from_object" not in value:
-        raise ObjectFileError(f"{path}: the key camera_from_object expected, {', '.join(value) or 'no key'} came")
+        raise ObjectFileError(f"{path}: expected the key camera_from_object, got {', '.join(value) or 'no key'}")
     try:
         T = np.array(value["camera_from_object"], dtype=np.float64)
     except (ValueError, TypeError):
         T = np.empty(0)
     if T.shape != (4, 4):
-        raise ObjectFileError(f"{path}: camera_from_object: 4 rows of 4 numbers expected, a shape of {T.shape} came")
+        raise ObjectFileError(f"{path}: camera_from_object: expected 4 rows of 4 numbers, got shape {T.shape}")
     if not np.isfinite(T).all():
-        raise ObjectFileError(f"{path}: camera_from_object: finite numbers expected, some are not")
+        raise ObjectFileError(f"{path}: camera_from_object: expected finite numbers, got some that are not")
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > RIGID or np.linalg.det(R) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise ObjectFileError(
-            f"{path}: camera_from_object: a rotation without scale or mirror image, a translation and the last row 0 0 0 1 "
-            f"expected, a determinant of {np.linalg.det(R):.3g} and the last row {' '.join(f'{v:g}' for v in T[3])} came"
+            f"{path}: camera_from_object: expected a rotation without scale or mirror image, a translation and the last row "
+            f"0 0 0 1, got a determinant of {np.linalg.det(R):.3g} and the last row {' '.join(f'{v:g}' for v in T[3])}"
         )
     u, _, vt = np.linalg.svd(R)
     T[:3, :3] = u @ vt
     distance = float(np.linalg.norm(T[:3, 3]))
     if distance > FURTHEST:
         raise ObjectFileError(
-            f"{path}: camera_from_object in metres expected, this object is {distance:.4g} m away: is it in millimetres?"
+            f"{path}: camera_from_object: expected metres, got an object {distance:.4g} m away; check whether it is in "
+            "millimetres"
         )
     return T
 
 
 def _image(path: Path, shape: tuple[int, int], flags: int) -> NDArray[np.uint8]:
     if not path.is_file():
-        raise ObjectFileError(f"{path}: an image file expected, there is none")
+        raise ObjectFileError(f"{path}: expected an image file, found none")
     image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), flags)
     if image is None:
-        raise ObjectFileError(f"{path}: an image that OpenCV reads expected (PNG, JPEG ...), this is none")
+        raise ObjectFileError(f"{path}: expected an image that OpenCV reads (PNG, JPEG ...), got another file")
     if image.shape[:2] != shape:
         raise ObjectFileError(
-            f"{path}: an image of {shape[1]} x {shape[0]} expected, as the camera's file says, "
-            f"{image.shape[1]} x {image.shape[0]} came"
+            f"{path}: expected an image of {shape[1]} x {shape[0]}, as the camera's file says, got {image.shape[1]} x "
+            f"{image.shape[0]}"
         )
     return np.asarray(image)
 
@@ -266,13 +271,37 @@ def read_picture(path: Path, shape: tuple[int, int]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(_image(path, shape, cv2.IMREAD_COLOR)[..., ::-1])
 
 
+class CameraFiles:
+    """Reads the masks and pictures of a camera as the pinhole pictures that it would have taken without distortion. k: their
+    intrinsics; shape: (height, width)."""
+
+    def __init__(self, lens: Lens):
+        self.k, self.shape = Intrinsics(lens.fx, lens.fy, lens.cx, lens.cy), (lens.height, lens.width)
+        self._undistort = Undistortion(lens)
+
+    def mask(self, path: Path) -> Bool:
+        """The pixels (h, w) of a mask file that are set. Raises ObjectFileError."""
+        mask = read_mask(path, self.shape)
+        return np.asarray(self._undistort(mask.astype(np.uint8) * np.uint8(255)) > 127)
+
+    def occluder(self, path: Path | None) -> Bool | None:
+        """The pixels (h, w) where the object may be hidden: those of a mask file, and those that the camera does not show; None
+        where there are neither. Raises ObjectFileError."""
+        covered, unseen = None if path is None else self.mask(path), self._undistort.unseen
+        return covered if unseen is None else unseen if covered is None else covered | unseen
+
+    def picture(self, path: Path) -> NDArray[np.uint8]:
+        """An image (h, w, 3) uint8 RGB. Raises ObjectFileError."""
+        return self._undistort(read_picture(path, self.shape))
+
+
 def frames(folder: Path) -> list[Path]:
     """The image files of a folder in the order of their names, numbers in names by their value. Raises ObjectFileError."""
     if not folder.is_dir():
-        raise ObjectFileError(f"{folder}: a folder of masks expected, there is none")
+        raise ObjectFileError(f"{folder}: expected a folder of masks, found none")
     found = sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES), key=lambda p: _order(p.stem))
     if not found:
-        raise ObjectFileError(f"{folder}: a folder of images expected ({', '.join(sorted(PICTURES))}), it has none")
+        raise ObjectFileError(f"{folder}: expected a folder of images ({', '.join(sorted(PICTURES))}), found none in it")
     return found
 
 
@@ -295,7 +324,8 @@ def beside(names: list[Path], folder: Path) -> list[Path]:
     missing = [path.stem for path in names if path.stem not in by_stem]
     if missing:
         raise ObjectFileError(
-            f"{folder}: an image for every mask expected, by name, {len(missing)} of {len(names)} are missing, first {missing[0]}"
+            f"{folder}: expected an image of the same name for every mask, got none for {len(missing)} of {len(names)}, first "
+            f"{missing[0]}"
         )
     return [by_stem[path.stem] for path in names]
 
@@ -308,7 +338,8 @@ def check_mask(mask: Bool, path: Path) -> None:
     share = float(mask.mean())
     if share > 0.95:
         raise ObjectFileError(
-            f"{path}: the object and its surroundings expected, {share:.0%} of the mask is set: is it inverted?"
+            f"{path}: expected the object and its surroundings, got a mask with {share:.0%} of its pixels set; check whether "
+            "it is inverted"
         )
 
 
@@ -318,16 +349,16 @@ def check_start(rigid: RigidObject, T: Array, k: Intrinsics, mask: Bool, occlude
     if V[:, 2].min() < NEAR:
         z = (T @ rigid.T_object_middle)[2, 3]
         raise ObjectFileError(
-            f"{path}: camera_from_object: the whole object at least {NEAR} m in front of the camera expected (z > 0), its "
-            f"middle is at z = {z:.3g} m and it is {rigid.diameter:.3g} m long: is this object_from_camera, or the mesh's unit "
-            "another?"
+            f"{path}: camera_from_object: expected the whole object at least {NEAR} m in front of the camera (z > 0), got its "
+            f"middle at z = {z:.3g} m with a length of {rigid.diameter:.3g} m; check that this is not object_from_camera, and "
+            "the mesh's unit"
         )
     u, v = k.fx * V[:, 0] / V[:, 2] + k.cx, k.fy * V[:, 1] / V[:, 2] + k.cy
     h, w = mask.shape
     if u.max() < -w or u.min() > 2 * w or v.max() < -h or v.min() > 2 * h:
         raise ObjectFileError(
-            f"{path}: camera_from_object: an object in or near the image ({w} x {h}) expected, this one is at pixel "
-            f"({u.mean():.0f}, {v.mean():.0f}): do pose and camera belong together?"
+            f"{path}: camera_from_object: expected an object in or near the image ({w} x {h}), got one at pixel ({u.mean():.0f}, "
+            f"{v.mean():.0f}); check that pose and camera belong together"
         )
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     seen = math.hypot(rows[-1] - rows[0] + 1, columns[-1] - columns[0] + 1)
@@ -335,8 +366,8 @@ def check_start(rigid: RigidObject, T: Array, k: Intrinsics, mask: Bool, occlude
     hidden = occluder is not None or rows[0] == 0 or columns[0] == 0 or rows[-1] == h - 1 or columns[-1] == w - 1
     if seen > TIMES * expected or (expected > TIMES * seen and not hidden):
         raise ObjectFileError(
-            f"{path}: a start whose silhouette is about as large as the mask ({seen:.0f} pixels) expected, it is {expected:.0f} "
-            f"pixels large, for a mesh of {rigid.diameter:.3g} m: check --mesh-unit, the focal length and the start's distance"
+            f"{path}: expected a start whose silhouette is about as large as the mask ({seen:.0f} pixels), got {expected:.0f} "
+            f"pixels for a mesh of {rigid.diameter:.3g} m; check --mesh-unit, the focal length and the start's distance"
         )
 
 
@@ -355,7 +386,7 @@ def as_json(found: ObjectEstimate) -> dict[str, Any]:
 
 def as_text(found: ObjectEstimate) -> str:
     """The result in words."""
-    position, q = geometry.position_orientation(found.T)
+    position, q = position_orientation(found.T)
     sigma = np.sqrt(np.diag(found.covariance))
     return "\n".join(
         [
@@ -369,7 +400,7 @@ def as_text(found: ObjectEstimate) -> str:
 
 def row(name: str, found: ObjectEstimate) -> list[Any]:
     """A line of the table: FIELDS."""
-    position, q = geometry.position_orientation(found.T)
+    position, q = position_orientation(found.T)
     sigma = np.sqrt(np.diag(found.covariance))
     return [name, found.state, f"{found.overlap:.4f}", *(f"{value:.6f}" for value in (*position, *q, *sigma))]
 

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from services.segmentation.inference import TARGET_LABELS, classes
-from services.segmentation.prednet import PredNet
-from shared.contract.labels import UNLABELLED, Label
+from penumbra.services.segmentation.inference import TARGET_LABELS, classes
+from penumbra.services.segmentation.prednet import PredNet
+from penumbra.shared.contract.labels import UNLABELLED, Label
 
 WARM_UP = 3
 """Frames at the start of a sequence that do not count: the state knows nothing yet."""

@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from services.segmentation.inference import TARGET_LABELS
-from shared.contract.labels import UNLABELLED
+from penumbra.services.segmentation.inference import TARGET_LABELS
+from penumbra.shared.contract.labels import UNLABELLED
 
 ERROR_WEIGHTS = (1.0, 0.1)
 """Of the first layer's prediction error and of every other's, as in Lotter et al. 2017 (L_all): an upper layer can also lower its

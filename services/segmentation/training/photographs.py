@@ -9,7 +9,6 @@ forearm are forearm, beyond the wrist hand; what cannot be decided is UNLABELLED
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
 from dataclasses import dataclass
@@ -21,8 +20,8 @@ import scipy.io
 from numpy.typing import NDArray
 from rich.progress import track
 
-from services.flags import Parser
-from shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
+from penumbra.services import flags
+from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 
 SLEEVED = (
     "blazer",
@@ -187,27 +186,20 @@ def _distance(ends: NDArray[np.float64], height: int, width: int) -> NDArray[np.
     return np.hypot(x - t * along[0], y - t * along[1]).astype(np.float32)
 
 
-def arguments() -> argparse.ArgumentParser:
-    """The flags of `penumbra segmentation photographs`."""
-    parser = Parser(
-        prog="penumbra segmentation photographs",
-        description="Make frames and masks for `penumbra segmentation train --data` from labelled street photographs.",
-        epilog=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("source", type=Path, help="a copy of github.com/bearpaw/clothing-co-parsing")
-    parser.add_argument("--pose", type=Path, required=True, help="pose_landmark_full.tflite")
-    parser.add_argument("--out", type=Path, default=Path("photographs"), help="folder to write images/ and masks/ to")
-    return parser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Write images/ and masks/ of the photographs in which a person's pose is found."""
-    options = arguments().parse_args(argv)
+@flags.command(
+    "segmentation photographs",
+    "Makes frames and masks for `penumbra segmentation train --data` from labelled street photographs.\n\n" + (__doc__ or ""),
+    flags.Argument("source", type=Path, help="a copy of github.com/bearpaw/clothing-co-parsing"),
+    flags.Option("--pose", type=Path, required=True, metavar="FILE", help="pose_landmark_full.tflite"),
+    flags.Option("--out", type=Path, default=Path("photographs"), help="folder to write images/ and masks/ to"),
+    example="penumbra segmentation photographs clothing-co-parsing --pose pose_landmark_full.tflite",
+)
+def main(options: flags.Options) -> int:
+    """Writes images/ and masks/ of the photographs in which a person's pose is found."""
     annotated = sorted((options.source / "annotations" / "pixel-level").glob("*.mat"))
     if not annotated or not options.pose.is_file():
         wanted = options.pose if annotated else options.source / "annotations" / "pixel-level"
-        print(f"penumbra segmentation photographs: expected {wanted}, got nothing there; see --help", file=sys.stderr)
+        print(f"penumbra segmentation photographs: expected {wanted}, found nothing there; see --help", file=sys.stderr)
         return 2
     names = [str(name[0]) for name in scipy.io.loadmat(options.source / "label_list.mat")["label_list"][0]]
     find = PoseModel(options.pose)

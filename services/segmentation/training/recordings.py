@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.contract.labels import UNLABELLED, Label
+from penumbra.shared.contract.labels import UNLABELLED, Label
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 PIECE = 40
@@ -41,7 +41,7 @@ CLASSES = ", ".join(f"{label.value} {label.name.lower()}" for label in Label) + 
 
 
 class DataError(ValueError):
-    """A folder that cannot be learned from. The text says what was expected, what came and where."""
+    """A folder that cannot be learned from. The text says what was expected, what was received and where."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Frame:
         """RGB image (h, w, 3) and classes (h, w). Raises DataError where a file cannot be read or the two do not fit."""
         image = cv2.imread(str(self.picture), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
-            raise DataError(f"{self.picture}: a picture expected, this file cannot be read as one")
+            raise DataError(f"{self.picture}: expected a picture, got a file that cannot be read as one")
         height, width = image.shape[:2]
         if isinstance(self.truth, Path):
             labels = read_mask(self.truth)
@@ -71,10 +71,10 @@ class Frame:
             try:
                 labels = paint(self.truth, height, width)
             except (ValueError, TypeError) as error:
-                raise DataError(f"annotations of {self.picture}: polygons or run lengths expected: {error}") from None
+                raise DataError(f"annotations of {self.picture}: expected polygons or run lengths: {error}") from None
         if labels.shape != (height, width):
-            came = f"{labels.shape[1]} x {labels.shape[0]}"
-            raise DataError(f"{self.truth}: a mask of {width} x {height} as {self.picture.name} expected, {came} came")
+            got = f"{labels.shape[1]} x {labels.shape[0]}"
+            raise DataError(f"{self.truth}: expected a mask of {width} x {height} as {self.picture.name}, got {got}")
         return image[..., ::-1].astype(np.uint8), labels
 
 
@@ -130,8 +130,8 @@ class Recordings:
             pieces += [Recorded(sequence[i : i + PIECE], size) for i in cuts]
         if len(pieces) < 3:
             raise DataError(
-                f"{folder}: at least 3 sequences, or pieces of {PIECE} frames of them, expected (to learn from, to calibrate and"
-                f" to score with), {len(pieces)} came"
+                f"{folder}: expected at least 3 sequences, or pieces of {PIECE} frames of them (to learn from, to calibrate and "
+                f"to score with), got {len(pieces)}"
             )
         order = np.random.default_rng([seed, 4]).permutation(len(pieces))
         tenth = max(len(pieces) // 10, 1)
@@ -152,10 +152,12 @@ class Recordings:
 def find(folder: Path) -> list[list[Frame]]:
     """The sequences of a folder by the forms that the module's text names, in the order of their names."""
     if not folder.is_dir():
-        raise FileNotFoundError(f"no folder {folder}: one with frames and masks expected (see `penumbra segmentation train -h`)")
+        raise FileNotFoundError(
+            f"{folder}: expected a folder with frames and masks, found none; see `penumbra segmentation train -h`"
+        )
     described = sorted(folder.glob("*.json"))
     if len(described) > 1:
-        raise DataError(f"{folder}: one .json file in COCO's form expected, {', '.join(path.name for path in described)} came")
+        raise DataError(f"{folder}: expected one .json file in COCO format, got {', '.join(path.name for path in described)}")
     if described:
         return in_sequences(folder, coco(described[0]))
     if (folder / "images").is_dir() and (folder / "masks").is_dir():
@@ -187,12 +189,12 @@ def check(sequence: Sequence[Frame]) -> tuple[int, int]:
     if len(sizes) > 1:
         (a, first), (b, other) = list(sizes.items())[:2]
         raise DataError(
-            f"{other.parent}: frames of one size expected in a sequence, {first.name} has {a[1]} x {a[0]}, {other.name}"
-            f" {b[1]} x {b[0]}; put them into folders of their own"
+            f"{other.parent}: expected frames of one size in a sequence, got {a[1]} x {a[0]} in {first.name} and {b[1]} x {b[0]} "
+            f"in {other.name}; put them into separate folders"
         )
     height, width = next(iter(sizes))
     if min(height, width) < SMALLEST:
-        raise DataError(f"{sequence[0].picture}: at least {SMALLEST} x {SMALLEST} pixels expected, {width} x {height} came")
+        raise DataError(f"{sequence[0].picture}: expected at least {SMALLEST} x {SMALLEST} pixels, got {width} x {height}")
     return height, width
 
 
@@ -200,15 +202,15 @@ def read_mask(path: Path) -> NDArray[np.uint8]:
     """Classes (h, w) of a mask's file. Raises DataError where it is none, or a value is no class."""
     mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if mask is None:
-        raise DataError(f"{path}: a mask expected, this file cannot be read as a picture")
+        raise DataError(f"{path}: expected a mask, got a file that cannot be read as a picture")
     if mask.ndim == 3:
         if not (mask[..., :1] == mask[..., 1:3]).all():
-            raise DataError(f"{path}: one channel of class indices expected ({CLASSES}), colours or a palette came")
+            raise DataError(f"{path}: expected one channel of class indices ({CLASSES}), got colours or a palette")
         mask = mask[..., 0]
     wrong = np.argwhere((mask > max(Label)) & (mask != UNLABELLED))
     if len(wrong):
         r, c = wrong[0]
-        raise DataError(f"{path}: classes {CLASSES} expected, {mask[r, c]} came at row {r}, column {c}")
+        raise DataError(f"{path}: expected classes {CLASSES}, got {mask[r, c]} at row {r}, column {c}")
     return mask.astype(np.uint8)
 
 
@@ -221,15 +223,15 @@ def coco(path: Path) -> list[Frame]:
         outlines = [(one["image_id"], one["category_id"], one["segmentation"]) for one in content["annotations"]]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(
-            f'{path}: COCO\'s form expected, an object with "images" (id, file_name), "annotations" (image_id, category_id,'
-            f' segmentation) and "categories" (id, name); {error!r} came'
+            f'{path}: expected COCO format, an object with "images" (id, file_name), "annotations" (image_id, category_id, '
+            f'segmentation) and "categories" (id, name), got {error!r}'
         ) from None
     labels = {}
     for key, name in categories.items():
         label = Label.__members__.get(name.strip().upper().replace(" ", "_").replace("-", "_"))
         if label is None:
             known = ", ".join(label.name.lower() for label in Label)
-            raise DataError(f"{path}: categories named {known} expected, {name!r} came: rename or remove it")
+            raise DataError(f"{path}: expected categories named {known}, got {name!r}; rename or remove it")
         labels[key] = label
     shapes: dict[Any, list[Shape]] = {key: [] for key in files}
     for image, category, outline in outlines:
@@ -241,7 +243,7 @@ def coco(path: Path) -> list[Frame]:
         places = [path.parent / name, path.parent / "images" / name]
         picture = next((place for place in places if place.is_file()), None)
         if picture is None:
-            raise FileNotFoundError(f"{path}: image {name!r} expected at {places[0]} or {places[1]}, it is at neither")
+            raise FileNotFoundError(f"{path}: expected image {name!r} at {places[0]} or {places[1]}, found it at neither")
         frames.append(Frame(picture, tuple(shapes[key])))
     return frames
 
@@ -276,12 +278,12 @@ def fill(polygon: NDArray[np.float64], height: int, width: int) -> NDArray[np.bo
 def run_lengths(outline: Any, height: int, width: int) -> NDArray[np.bool_]:
     """The pixels (h, w) of COCO's run lengths, column by column: {"size": [h, w], "counts": a list, or packed in a string}."""
     if not isinstance(outline, dict) or not {"size", "counts"} <= outline.keys():
-        raise DataError(f'{{"size": [h, w], "counts": …}} expected, {outline!r} came')
+        raise DataError(f'expected {{"size": [h, w], "counts": …}}, got {outline!r}')
     counts = outline["counts"]
     counts = _unpack(counts) if isinstance(counts, str) else counts
     flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
     if tuple(outline["size"]) != (height, width) or len(flat) != height * width:
-        raise DataError(f"size {[height, width]} expected, {outline['size']} with {len(flat)} pixels came")
+        raise DataError(f"expected size {[height, width]}, got {outline['size']} with {len(flat)} pixels")
     return flat.reshape(width, height).T
 
 
@@ -310,12 +312,12 @@ def _pairs(folder: Path, pictures: dict[Path, Path], masks: dict[Path, Path]) ->
     names = sorted(pictures.keys() & masks.keys())
     if not names:
         raise DataError(
-            f"{folder}: pairs NAME.png and NAME_mask.png, or images/NAME.png and masks/NAME.png, or a COCO .json expected;"
-            f" {len(pictures)} pictures and {len(masks)} masks came, no two of one name"
+            f"{folder}: expected pairs NAME.png and NAME_mask.png, or images/NAME.png and masks/NAME.png, or a COCO .json, got "
+            f"{len(pictures)} pictures and {len(masks)} masks, no two of one name"
         )
     alone = sorted(pictures.keys() ^ masks.keys())
     if alone:
         kind = "mask" if alone[0] in pictures else "picture"
         more = f" and {len(alone) - 1} more" if len(alone) > 1 else ""
-        raise DataError(f"{folder}: a {kind} for {alone[0]}{more} expected, there is none: add it or remove the other")
+        raise DataError(f"{folder}: expected a {kind} for {alone[0]}{more}, found none; add it or remove the other")
     return [Frame(pictures[name], masks[name]) for name in names]

@@ -9,7 +9,6 @@ interrupted and resumed ends with the same weights as one that was not. For days
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import functools
 import itertools
@@ -24,16 +23,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from services.flags import Parser, positive
-from services.segmentation import inference, prednet
-from services.segmentation.prednet import PredNet, Settings
-from services.segmentation.training import loss, recordings
-from services.segmentation.training.evaluate import Labelled, calibrate, held_out
-from shared import training
-from shared.contract.labels import UNLABELLED, Label
-from shared.native import processor
-from sim.picture import looks
-from sim.sets import sequences
+from penumbra.services import flags
+from penumbra.services.segmentation import inference, prednet
+from penumbra.services.segmentation.prednet import PredNet, Settings
+from penumbra.services.segmentation.training import loss, recordings
+from penumbra.services.segmentation.training.evaluate import Labelled, calibrate, held_out
+from penumbra.shared import training
+from penumbra.shared.contract.labels import UNLABELLED, Label
+from penumbra.shared.native import processor
+from penumbra.sim.picture import looks
+from penumbra.sim.sets import sequences
 
 VALIDATION_SEED = 1_000_000
 """Added to the seed for held-out data: nothing there was ever trained on."""
@@ -340,47 +339,48 @@ def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
     return card
 
 
-def arguments() -> argparse.ArgumentParser:
-    """The flags of `penumbra segmentation train`."""
-    parser = Parser(
-        prog="penumbra segmentation train",
-        description="Train the segmentation network on simulated sequences, on your own frames and masks, or both.",
-        epilog=recordings.__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    training.add_arguments(parser, "segmentation", 60.0)
-    parser.add_argument("--size", type=int, nargs="+", help="channels of each layer (default: 16 16 32 64)")
-    parser.add_argument("--delay", action=argparse.BooleanOptionalAction, default=False, help="axonal delays between the layers")
-    parser.add_argument("--cell", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations")
-    parser.add_argument("--error-weight", type=float, help="of the prediction errors in the loss (default: 0.3; 0: without)")
-    parser.add_argument("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate (default: %(default)g)")
-    parser.add_argument(
+@flags.command(
+    "segmentation train",
+    "Trains the segmentation network on simulated sequences, on your own frames and masks, or both.\n\n"
+    + (recordings.__doc__ or ""),
+    *flags.training("segmentation", 60.0),
+    flags.Option("--size", type=int, takes="many", metavar="N ...", show_default="16 16 32 64", help="channels of each layer"),
+    flags.Option("--delay/--no-delay", default=False, help="axonal delays between the layers"),
+    flags.Option("--recurrence", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations"),
+    flags.Option("--error-weight", type=float, show_default="0.3; 0: without", help="of the prediction errors in the loss"),
+    flags.Option("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate"),
+    flags.Option(
         "--start",
         type=Path,
-        nargs="?",
-        const=inference.WEIGHTS,
+        takes="maybe",
+        without=str(inference.WEIGHTS),
+        metavar="[FILE]",
         help="start from these weights (without a value: the committed ones), grown to --size, instead of random ones",
-    )
-    parser.add_argument("--data", type=Path, help="your own frames and masks, in the forms below, instead of simulated sequences")
-    parser.add_argument(
+    ),
+    flags.Option(
+        "--data", type=Path, metavar="FOLDER", help="your own frames and masks, in the forms above, instead of simulated ones"
+    ),
+    flags.Option(
         "--simulated",
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="with --data: of the sequences, so that nothing is forgotten",
-    )
-    parser.add_argument(
-        "--out", type=Path, help="the weights, their card beside them (default: the committed ones; with --data segmentation.npz)"
-    )
-    parser.add_argument(
-        "--held-out", type=positive, default=60, help="simulated sequences for calibration, and as many for the score"
-    )
-    return parser
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Train, then write weights and card."""
-    options = arguments().parse_args(argv)
+        help="with --data: share of simulated sequences, so that nothing is forgotten",
+    ),
+    flags.Option(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        show_default="the committed ones; with --data segmentation.npz",
+        help="the weights, their card beside them",
+    ),
+    flags.Option(
+        "--held-out", type=flags.positive, default=60, help="simulated sequences for calibration, and as many for the score"
+    ),
+    example="penumbra segmentation train --data recordings --start --minutes 60",
+)
+def main(options: flags.Options) -> int:
+    """Trains, then writes weights and card."""
     schedule = Schedule(peak_rate=options.rate)
     if options.error_weight is not None:
         schedule = replace(schedule, error_weight=options.error_weight)
@@ -391,7 +391,7 @@ def main(argv: list[str] | None = None) -> int:
     else:
         channels = tuple(options.size or Settings.channels)
         kernels = (*(3 for _ in channels[:-2]), 5, 5)
-        trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.cell), schedule, options.seed)
+        trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.recurrence), schedule, options.seed)
     simulated = Simulated(trainer.seed, options.held_out)
     data: Data = simulated
     try:

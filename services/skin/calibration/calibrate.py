@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -19,15 +18,15 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.error import YAMLError
 
-from services import flags
-from services.skin.calibration import law, recording
-from services.skin.calibration.law import Fit, RecordingError
-from services.skin.calibration.recording import Recording
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.messages import Voltages
-from shared.geometry.rigid import Array
-from shared.runtime import bus
+from penumbra.services import flags
+from penumbra.services.skin.calibration import law, recording
+from penumbra.services.skin.calibration.law import Fit, RecordingError
+from penumbra.services.skin.calibration.recording import Recording
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.messages import Voltages
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.runtime import bus
 
 GAPS_M = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08, 0.12, 0.16, 0.20)
 """Asked for by default: even steps of the signal's logarithm."""
@@ -39,10 +38,55 @@ BY_HAND = 2e-3
 """Standard deviation [m] of a gap that is held by hand with a ruler."""
 
 
-def main(argv: list[str]) -> int:
+def _gap(text: str) -> float:
+    value = flags.above_zero(text)
+    if value > 0.5:
+        raise ValueError(f"expected a gap in metres, at most 0.5, got {text!r}")
+    return value
+
+
+@flags.command(
+    "skin calibrate",
+    __doc__ or "",
+    flags.Option(
+        "--pad", show_default="the recording's column `pad`, or the cell's first pad", help="the pad that is calibrated"
+    ),
+    flags.Option(
+        "--csv",
+        type=Path,
+        metavar="FILE",
+        help="a recording: columns distance_m (`empty` where nothing is near) and one per electrode in volts, many samples a "
+        "distance; without it the limb is held by hand",
+    ),
+    flags.Option(
+        "--distances",
+        type=_gap,
+        takes="many",
+        metavar="M ...",
+        show_default=" ".join(f"{d:g}" for d in GAPS_M),
+        help="gaps to hold the limb at",
+    ),
+    flags.Option("--seconds", type=flags.above_zero, default=2.0, help="samples at each gap"),
+    flags.Option("--record", type=Path, metavar="FILE", help="keep what was read by hand as a recording"),
+    flags.Option(
+        "--placing",
+        type=flags.above_zero,
+        metavar="M",
+        show_default=f"{law.PLACING:g} of recordings, {BY_HAND:g} by hand",
+        help="standard deviation of the gaps",
+    ),
+    flags.Option("--out", type=Path, metavar="FILE", show_default="the cell file itself", help="write the cell here"),
+    flags.Option("--dry-run", is_flag=True, help="print, write nothing"),
+    flags.JSON,
+    *flags.COMMON,
+    example="penumbra skin calibrate --cell mine.yaml --pad p0 --csv recording.csv",
+)
+def main(options: flags.Options) -> int:
     """0, or 2 for readings or a cell file that are wrong."""
+    if options.csv is not None and (options.distances or options.record):
+        flags.refuse("--distances and --record belong to the guided procedure: leave --csv out, or them")
     try:
-        _calibrate(argv)
+        _calibrate(options)
     except (RecordingError, cells.CellError, bus.BusError) as error:
         for line in str(error).splitlines():
             print(f"penumbra skin calibrate: {line}", file=sys.stderr)
@@ -50,8 +94,7 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _calibrate(argv: list[str]) -> None:
-    options = _options(argv)
+def _calibrate(options: flags.Options) -> None:
     cell = cells.load(options.cell)
     path = destination(options.cell, options.out) if not options.dry_run else None
     console = Console(highlight=False, soft_wrap=True, stderr=options.json)
@@ -75,41 +118,6 @@ def _calibrate(argv: list[str]) -> None:
         print(json.dumps({pad: {name: describe(fit) for name, fit in fits.items()} for pad, fits in found.items()}))
 
 
-def _options(argv: list[str]) -> argparse.Namespace:
-    parser = flags.parser("skin calibrate", __doc__ or "")
-    parser.add_argument("--pad", help="which pad (default: the recording's column `pad`, or the cell's first pad)")
-    parser.add_argument("--csv", type=Path, metavar="FILE",
-                        help="a recording: columns distance_m (`empty` where nothing is near) and one per electrode in volts, "
-                             "many samples a distance; without it the limb is held by hand")  # fmt: skip
-    parser.add_argument("--distances", type=_gap, nargs="+", metavar="M",
-                        help=f"gaps to hold the limb at (default: {' '.join(f'{d:g}' for d in GAPS_M)})")  # fmt: skip
-    parser.add_argument("--seconds", type=_positive, default=2.0, help="samples at each gap (default: %(default)s)")
-    parser.add_argument("--record", type=Path, metavar="FILE", help="keep what was read by hand as a recording")
-    by_default = f"{law.PLACING:g} of recordings, {BY_HAND:g} by hand"
-    parser.add_argument("--placing", type=_positive, metavar="M", help=f"standard deviation of the gaps (default: {by_default})")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write the cell here (default: the cell file itself)")
-    parser.add_argument("--dry-run", action="store_true", help="print, write nothing")
-    parser.add_argument("--json", action="store_true", help="print the fits as JSON")
-    options = parser.parse_args(argv)
-    if options.csv is not None and (options.distances or options.record):
-        parser.error("--distances and --record belong to the guided procedure: leave --csv out, or them")
-    return options
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"a number above 0 expected, {text} came")
-    return value
-
-
-def _gap(text: str) -> float:
-    value = _positive(text)
-    if value > 0.5:
-        raise argparse.ArgumentTypeError(f"a gap in metres, at most 0.5, expected, {text} came")
-    return value
-
-
 def destination(cell: str, out: Path | None) -> Path:
     """The file that a calibration goes into. Raises RecordingError for a built-in cell without `out`."""
     source = cells.source(cell)
@@ -121,7 +129,7 @@ def destination(cell: str, out: Path | None) -> Path:
 # ---- readings
 
 
-def _recorded(cell: cells.Cell, options: argparse.Namespace) -> dict[str, Recording]:
+def _recorded(cell: cells.Cell, options: flags.Options) -> dict[str, Recording]:
     """What a CSV file holds of each pad, on axis: rows at an angle or from a plane scan belong to `characterise`."""
     pad = cell.one("pads", options.pad)
     kind = cell.pad_types[cell.pads[pad].type]
@@ -130,8 +138,8 @@ def _recorded(cell: cells.Cell, options: argparse.Namespace) -> dict[str, Record
     if (named != "").any() and options.pad is None:
         unknown = sorted(set(named) - set(cell.pads))
         if unknown:
-            came = ", ".join(unknown)
-            raise RecordingError(f"{options.csv}: pads of cell {cell.name} expected ({', '.join(cell.pads)}), came {came}")
+            got = ", ".join(unknown)
+            raise RecordingError(f"{options.csv}: expected pads of cell {cell.name} ({', '.join(cell.pads)}), got {got}")
         wanted = [name for name in cell.pads if (named == name).any()]
     else:
         wanted = [pad]
@@ -142,12 +150,12 @@ def _recorded(cell: cells.Cell, options: argparse.Namespace) -> dict[str, Record
     for name in wanted:
         own = on_axis & ((named == name) | (named == ""))
         if tuple(cell.pad_types[cell.pads[name].type].electrodes) != found.electrodes:
-            raise RecordingError(f"pad {name} has other electrodes than {pad}: one file a pad type expected")
+            raise RecordingError(f"pad {name}: expected the electrodes of {pad}, got others; use one file per pad type")
         objects = sorted(set(found.labels["object"][own]) - {"", "empty"})
         if len(objects) > 1:
             own &= np.isin(found.labels["object"], ["", "empty", "forearm"]) if "forearm" in objects else own
             if "forearm" not in objects:
-                raise RecordingError(f"{options.csv}: one object expected, or a forearm among them, came {', '.join(objects)}")
+                raise RecordingError(f"{options.csv}: expected one object, or a forearm among them, got {', '.join(objects)}")
         out[name] = found.where(own)
     return out
 
@@ -157,7 +165,7 @@ def guided(
 ) -> Recording:
     """Asks for the empty scene and each gap on the terminal (or a pipe of Enters) and records each. Raises RecordingError where
     the answers end early, BusError where no voltages come."""
-    from shared.runtime.node import Node
+    from penumbra.shared.runtime.node import Node
 
     electrodes = tuple(cell.pad_types[cell.pads[pad].type].electrodes)
     ear = _Ear()
@@ -177,12 +185,12 @@ def guided(
             volts = ear.listen(seconds)
             if volts is None:
                 raise bus.BusError(
-                    f"no voltages of pad {pad} came within {PATIENCE_S:g} s: is `penumbra skin` or `penumbra emulator` running "
-                    f"on cell {cell.name}?"
+                    f"pad {pad}: expected voltages within {PATIENCE_S:g} s, got none; start `penumbra skin` or `penumbra "
+                    f"emulator` on cell {cell.name}"
                 )
             if volts.shape[1] != len(electrodes):
                 raise RecordingError(
-                    f"pad {pad}: {len(electrodes)} electrodes expected as in the cell file, {volts.shape[1]} came"
+                    f"pad {pad}: expected {len(electrodes)} electrodes as in the cell file, got {volts.shape[1]}"
                 )
             means = "  ".join(f"{name} {mean:.4f} V" for name, mean in zip(electrodes, volts.mean(axis=0), strict=True))
             console.print(f"  {len(volts)} samples, {means}")
@@ -200,9 +208,7 @@ def _answer() -> str:
     try:
         return input().strip().lower()
     except EOFError:
-        raise RecordingError(
-            "the answers ended before the last gap: Enter for each of them expected, or q to end early"
-        ) from None
+        raise RecordingError("the answers ended before the last gap: expected Enter for each gap, or q to end early") from None
 
 
 class _Ear:
@@ -255,8 +261,8 @@ def calibrate(cell: cells.Cell, pad: str, recorded: Recording, placing: float = 
         rising = [name for name, fit in fits.items() if fit.law.polarity > 0]
         falling = [name for name in fits if name not in rising]
         raise RecordingError(
-            f"pad {pad}: mixed polarity: as the limb comes near {', '.join(rising)} rise and {', '.join(falling)} fall: one "
-            "amplifier makes all go one way. Is a channel not connected, or assigned to the wrong electrode?"
+            f"pad {pad}: mixed polarity: as the limb approaches, {', '.join(rising)} rise and {', '.join(falling)} fall: one "
+            "amplifier moves all in one direction; check that every channel is connected, and to the right electrode"
         )
     return fits
 

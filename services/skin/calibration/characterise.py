@@ -6,7 +6,6 @@ signal-to-noise ratio as in its section "Sensor Model". Tables as CSV, and pictu
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import sys
@@ -25,17 +24,17 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from services import flags
-from services.progress import track
-from services.skin.calibration import calibrate, law, recording
-from services.skin.calibration.law import RecordingError
-from services.skin.calibration.recording import Recording
-from shared.cell import description as cells
+from penumbra.services import flags
+from penumbra.services.progress import track
+from penumbra.services.skin.calibration import calibrate, law, recording
+from penumbra.services.skin.calibration.law import RecordingError
+from penumbra.services.skin.calibration.recording import Recording
+from penumbra.shared.cell import description as cells
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from shared.geometry.rigid import Array
+from penumbra.shared.geometry.rigid import Array
 
 HELD_OUT = 5
 """Every fifth place of the distances and angles is kept from a second regression, which is judged by it."""
@@ -60,10 +59,42 @@ class Places:
         return Places(*(getattr(self, name)[rows] for name in ("gap", "angle", "x", "y", "signal", "deviation")))
 
 
-def main(argv: list[str]) -> int:
+def _count(text: str) -> int:
+    if not 10 <= (value := flags.integer(text)) <= 10_000:
+        raise ValueError(f"expected 10 to 10000 samples, got {text!r}")
+    return value
+
+
+def _step(text: str) -> float:
+    if not 0.002 <= (value := flags.number(text)) <= 0.05:
+        raise ValueError(f"expected a step from 0.002 to 0.05 m, got {text!r}")
+    return value
+
+
+@flags.command(
+    "skin characterise",
+    "Measures a pad by distances, angles and plane scans, and writes tables and pictures.",
+    flags.CELL,
+    flags.Option("--out", type=Path, required=True, metavar="FOLDER", help="tables, pictures and summary.json go there"),
+    flags.Option(
+        "--data",
+        type=Path,
+        metavar="FILE",
+        show_default="the emulated skin is measured",
+        help="a recording as of `skin calibrate`, with angle_deg, scan (distance or plane), object, x_m and y_m beside it",
+    ),
+    flags.Option("--pad", show_default="the cell's first", help="the pad"),
+    flags.Option("--target", show_default="the cell's first", help="the limb of the emulated skin"),
+    flags.Option("--samples", type=_count, default=50, help="emulated samples at a place"),
+    flags.Option("--step", type=_step, default=0.01, metavar="M", help="emulated plane scans' grid"),
+    flags.Option("--seed", type=int, default=0, help="of the emulated noise"),
+    flags.JSON,
+    example="penumbra skin characterise --cell mine.yaml --pad p0 --data recording.csv --out p0",
+)
+def main(options: flags.Options) -> int:
     """0, or 2 for a recording or a cell that cannot be used."""
     try:
-        _characterise(argv)
+        _characterise(options)
     except (RecordingError, cells.CellError) as error:
         for line in str(error).splitlines():
             print(f"penumbra skin characterise: {line}", file=sys.stderr)
@@ -71,8 +102,7 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _characterise(argv: list[str]) -> None:
-    options = _options(argv)
+def _characterise(options: flags.Options) -> None:
     cell = cells.load(options.cell)
     pad = cell.one("pads", options.pad)
     target = cell.one("targets", options.target)
@@ -99,38 +129,9 @@ def _characterise(argv: list[str]) -> None:
     console.print(f"{options.out}: {', '.join(sorted(path.name for path in options.out.iterdir()))}")
 
 
-def _options(argv: list[str]) -> argparse.Namespace:
-    about = "Distances, angles and plane scans of a pad: tables and pictures."
-    parser = flags.Parser(prog="penumbra skin characterise", description=about)
-    flags.add_cell(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="tables, pictures and summary.json go there")
-    parser.add_argument("--data", type=Path, metavar="FILE",
-                        help="a recording as of `skin calibrate`, with angle_deg, scan (distance or plane), object, x_m and y_m "
-                             "beside it (default: the emulated skin is measured)")  # fmt: skip
-    parser.add_argument("--pad", help="which pad (default: the cell's first)")
-    parser.add_argument("--target", help="the limb of the emulated skin (default: the cell's first target)")
-    parser.add_argument("--samples", type=_count, default=50, help="emulated samples at a place (default: %(default)s)")
-    parser.add_argument("--step", type=_step, default=0.01, metavar="M", help="emulated plane scans' grid (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the emulated noise (default: 0)")
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    return parser.parse_args(argv)
-
-
-def _count(text: str) -> int:
-    if not 10 <= (value := int(text)) <= 10_000:
-        raise argparse.ArgumentTypeError(f"10 to 10000 samples expected, {text} came")
-    return value
-
-
-def _step(text: str) -> float:
-    if not 0.002 <= (value := float(text)) <= 0.05:
-        raise argparse.ArgumentTypeError(f"a step from 0.002 to 0.05 m expected, {text} came")
-    return value
-
-
 def emulated(cell: cells.Cell, pad: str, target: str, samples: int, step: float, seed: int, sparse: int = 1) -> Recording:
     """A recording of the emulated skin (`sim.skin.characterisation`); sparse: only every so many poses."""
-    from sim.skin import characterisation
+    from penumbra.sim.skin import characterisation
 
     kind = cell.pads[pad].type
     poses = characterisation.poses(cell, target, kind, step)[:: max(1, sparse)]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from shared.cell import description as cells
-from shared.geometry.rigid import Array
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array
 
 LAW_ERROR = 0.04
 """What the law is wrong by, as a share of the signal: that of the field model's responses around it, 1 to 20 cm."""
@@ -39,7 +39,7 @@ MIXED = 0.25
 
 
 class RecordingError(ValueError):
-    """Readings that no law can be fitted to; the text says what was expected, what came and what to do."""
+    """Readings that no law can be fitted to; the text says what was expected, what was received and what to do."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,8 @@ def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str
     if len(rows) < FEWEST:
         why = f"; {notes[-1]}" if clipped else ""
         raise RecordingError(
-            f"electrode {name}: at least {FEWEST} gaps expected (the empty scene may be one), {len(rows)} came{why}: record "
-            "more, from 1 to 20 cm" + (", and turn the amplifier down" if clipped else "")
+            f"electrode {name}: expected at least {FEWEST} gaps (the empty scene may be one), got {len(rows)}{why}; record more, "
+            "from 1 to 20 cm" + (", and turn the amplifier down" if clipped else "")
         )
     gap_, mean, error = (np.array(column) for column in zip(*rows, strict=True))
     noise = _pooled(np.array(variances)) if variances else None
@@ -144,8 +144,8 @@ def fit(read: Readings, nominal: cells.Law, name: str, placing: float = PLACING)
     near = np.isfinite(read.gap)
     if near.sum() < FEWEST - 1 or read.gap[near].max() < 2.0 * max(read.gap[near].min(), SAME_GAP):
         raise RecordingError(
-            f"electrode {name}: gaps expected of which the farthest is at least twice the nearest, "
-            f"{', '.join(map(_gap, read.gap[near])) or 'none'} came: record from 1 to 20 cm"
+            f"electrode {name}: expected gaps of which the farthest is at least twice the nearest, got "
+            f"{', '.join(map(_gap, read.gap[near])) or 'none'}; record from 1 to 20 cm"
         )
     polarity = _polarity(read, name)
     if read.noise is None:
@@ -222,7 +222,7 @@ def _polarity(read: Readings, name: str) -> Literal[-1, 1]:
     if span < SURE * np.hypot(read.error[low], read.error[high]):
         raise RecordingError(
             f"electrode {name}: no contrast: it reads {read.mean.mean():.4f} V at every gap, within {1e3 * span:.2g} mV: "
-            "is it connected, and was the limb above this pad?"
+            "check that it is connected, and that the limb was above this pad"
         )
     steps = np.diff(read.mean)
     sure = np.abs(steps) > SURE * np.hypot(read.error[1:], read.error[:-1])

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.skin.calibration.law import RecordingError
-from shared.geometry.rigid import Array
+from penumbra.services.skin.calibration.law import RecordingError
+from penumbra.shared.geometry.rigid import Array
 
 UNITS = {"distance_m": 1.0, "distance_cm": 0.01, "distance_mm": 0.001}
 EMPTY = ("", "inf", "infinity", "empty", "rest", "none")
@@ -53,21 +53,21 @@ def read(path: Path, electrodes: Sequence[str]) -> Recording:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: a CSV file expected: {error}") from None
+        raise RecordingError(f"{path}: expected a CSV file: {error}") from None
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
     if len(lines) < 2:
-        raise RecordingError(f"{path}: a line of column names and samples below it expected, {len(lines)} lines came")
+        raise RecordingError(f"{path}: expected a line of column names and samples below it, got {len(lines)} lines")
     separator = max(";\t,", key=lines[0][1].count)
     header = [name.strip().strip('"') for name in lines[0][1].split(separator)]
     place = {name.lower(): i for i, name in enumerate(header)}
     if len(place) < len(header):
-        raise RecordingError(f"{path}:{lines[0][0]}: every column once expected, came {', '.join(header)}")
+        raise RecordingError(f"{path}:{lines[0][0]}: expected every column once, got {', '.join(header)}")
     unit = [name for name in UNITS if name in place]
     missing = [name for name in electrodes if name.lower() not in place]
     if len(unit) != 1 or missing:
         raise RecordingError(
-            f"{path}:{lines[0][0]}: the columns distance_m (or _cm, _mm) and {', '.join(electrodes)} [V] expected, "
-            f"came {', '.join(header)}"
+            f"{path}:{lines[0][0]}: expected the columns distance_m (or _cm, _mm) and {', '.join(electrodes)} [V], got "
+            f"{', '.join(header)}"
         )
     known = {*unit, *(name.lower() for name in electrodes), *LABELS, *NUMBERS}
     unknown = [name for name in header if name.lower() not in known]
@@ -75,7 +75,7 @@ def read(path: Path, electrodes: Sequence[str]) -> Recording:
     rows = []
     for number, cells in zip((n for n, _ in lines[1:]), csv.reader((s for _, s in lines[1:]), delimiter=separator), strict=True):
         if len(cells) != len(header):
-            raise RecordingError(f"{path}:{number}: {len(header)} cells expected as in the first line, {len(cells)} came")
+            raise RecordingError(f"{path}:{number}: expected {len(header)} cells as in the first line, got {len(cells)}")
         rows.append((number, cells))
 
     def numbers(name: str, empty: float, words: Mapping[str, float] | None = None) -> Array:
@@ -85,20 +85,20 @@ def read(path: Path, electrodes: Sequence[str]) -> Recording:
     gap = numbers(unit[0], np.inf, dict.fromkeys(EMPTY, np.inf)) * UNITS[unit[0]]
     wrong = np.flatnonzero(np.isfinite(gap) & ((gap < 0.0) | (gap > FARTHEST)) | np.isnan(gap))
     if len(wrong):
-        raise RecordingError(
-            f"{path}:{rows[wrong[0]][0]}: a distance from 0 to {FARTHEST:g} m expected, {gap[wrong[0]]:g} m came"
-        )
+        raise RecordingError(f"{path}:{rows[wrong[0]][0]}: expected a distance from 0 to {FARTHEST:g} m, got {gap[wrong[0]]:g} m")
     volts = np.stack([numbers(name, np.nan) for name in electrodes], axis=1)
     volts[~np.isfinite(volts)] = np.nan
     low = np.argwhere(volts < 0.0)
     if len(low):
         raise RecordingError(
-            f"{path}:{rows[low[0][0]][0]}: an amplitude of at least 0 V expected, {volts[tuple(low[0])]:g} came for "
+            f"{path}:{rows[low[0][0]][0]}: expected an amplitude of at least 0 V, got {volts[tuple(low[0])]:g} for "
             f"{electrodes[low[0][1]]}"
         )
     largest = float(np.nanmax(volts, initial=0.0))
     if largest > 30.0:
-        raise RecordingError(f"{path}: amplitudes in volts expected, {largest:g} came: are they millivolts or counts?")
+        raise RecordingError(
+            f"{path}: expected amplitudes in volts, got {largest:g}; check whether they are millivolts or counts"
+        )
     labels = {name: np.full(len(rows), "", dtype=np.str_) for name in LABELS}
     for name in set(LABELS) & set(place):
         labels[name] = np.array([cells[place[name]].strip() for _, cells in rows], dtype=np.str_)
@@ -106,7 +106,7 @@ def read(path: Path, electrodes: Sequence[str]) -> Recording:
     for name, column in beside.items():
         if not np.isfinite(column).all():
             line = rows[int(np.argmin(np.isfinite(column)))][0]
-            raise RecordingError(f"{path}:{line}: a number expected for {name}, or nothing")
+            raise RecordingError(f"{path}:{line}: expected a number for {name}, or nothing")
     return Recording(gap, volts, tuple(electrodes), labels, beside, tuple(notes))
 
 
@@ -139,4 +139,4 @@ def _number(path: Path, line: int, name: str, text: str, empty: float, words: Ma
     try:
         return float(text.replace(",", ".") if separator != "," else text)
     except ValueError:
-        raise RecordingError(f"{path}:{line}: a number expected for {name}, {text!r} came") from None
+        raise RecordingError(f"{path}:{line}: expected a number for {name}, got {text!r}") from None

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search import evidence
-from services.search.evidence import COVERED, Intrinsics
-from services.search.robot_depth import RobotDepth
-from shared.body.anatomy import Mesh
-from shared.geometry import raster, rigid
-from shared.geometry.rigid import Array
-from sim.sets.shots import Shot
+from penumbra.services.search import evidence
+from penumbra.services.search.evidence import COVERED, Intrinsics
+from penumbra.services.search.robot_depth import RobotDepth
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.geometry import raster, rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.sim.sets.shots import Shot
 
 VARIANCE_PX2 = 1.0 / 12.0
 """Of an error that is uniform in a pixel."""
@@ -109,7 +109,7 @@ def _edges(mesh: Mesh) -> NDArray[np.int64]:
     pairs = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
     order = np.lexsort(pairs.T)
     first, second = order[::2], order[1::2]
-    assert np.array_equal(pairs[first], pairs[second]), "a closed mesh expected"
+    assert np.array_equal(pairs[first], pairs[second]), "expected a closed mesh"
     return np.column_stack([pairs[first], first // 3, second // 3])
 
 

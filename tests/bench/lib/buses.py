@@ -1,6 +1,9 @@
-"""Our bus beside Zenoh's plain bytes: the same payloads, quality of service and rings between the same two processes.
+"""Our bus beside plain Zenoh: arrays of the same size, quality of service and rings between the same two processes.
 
-`python -m tests.bench.lib.buses ENDPOINT` is the receiver: on `begin` it forgets, on `end` it prints what came as JSON.
+Both sides have an array and want an array. Plain Zenoh does the least for that: the array's bytes behind as many others as our
+message has, so that payloads are equally long; it numbers, checks and counts nothing.
+
+`python -m penumbra.tests.bench.lib.buses ENDPOINT` is the receiver: on `begin` it forgets, on `end` it prints what came as JSON.
 """
 
 from __future__ import annotations
@@ -15,15 +18,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Condition, Thread
+from typing import Any
 
+import msgspec
 import numpy as np
 import zenoh
 
-from shared.cell import description as cells
-from shared.contract import messages, topics
-from shared.contract.topics import Topic
-from shared.runtime import bus
-from shared.runtime.node import Node
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.contract.topics import Topic
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
 
 CELL = cells.load("arm")
 NAMES = {"robot": "panda", "camera": "side"}
@@ -43,8 +48,14 @@ class Payload:
     make: Callable[[int], messages.Message]
 
     @property
-    def names(self) -> dict[str, str]:
+    def names(self) -> dict[str, Any]:
         return {name: value for name, value in NAMES.items() if f"{{{name}}}" in self.topic.key}
+
+    @property
+    def array(self) -> np.ndarray:
+        """What a message carries."""
+        (array,) = (value for value in msgspec.structs.astuple(self.make(0)) if isinstance(value, np.ndarray))
+        return array
 
     @property
     def raw_key(self) -> str:
@@ -55,11 +66,12 @@ def _payload(topic: Topic, name: str, depth: int, make: Callable[[int], messages
     return Payload(replace(topic, name=name, key=f"{topic.key}/{name}", rate_hz=1e7, depth=depth), make)
 
 
+FEW, MANY = np.zeros(1), np.zeros(500)
 IMAGE = np.zeros((480, 640, 3), np.uint8)
 LABELS = np.zeros((480, 480), np.uint8)
 PAYLOADS = {
-    64: _payload(topics.JOINTS, "tiny", 16, lambda now: messages.Joints(stamp_ns=now, position=np.zeros(1))),
-    4_000: _payload(topics.JOINTS, "small", 16, lambda now: messages.Joints(stamp_ns=now, position=np.zeros(500))),
+    64: _payload(topics.JOINTS, "tiny", 16, lambda now: messages.Joints(stamp_ns=now, position=FEW)),
+    4_000: _payload(topics.JOINTS, "small", 16, lambda now: messages.Joints(stamp_ns=now, position=MANY)),
     230_000: _payload(topics.MASK, "mask", 8, lambda now: messages.Mask(stamp_ns=now, labels=LABELS, x0=0, y0=0, scale=1)),
     921_000: _payload(topics.FRAME, "image", 2, lambda now: messages.Frame(stamp_ns=now, image=IMAGE)),
 }
@@ -72,8 +84,9 @@ class Sender:
 
     def __init__(self, node: Node, payload: Payload):
         self._node, self._payload = node, payload
-        self._bytes = messages.encode(payload.make(0))
-        self.bytes = len(self._bytes)
+        self._array, self._names = payload.array, payload.names
+        self.bytes = len(messages.encode(payload.make(0)))
+        self._before = bytes(self.bytes - self._array.nbytes)
         assert node.session is not None
         self._publisher = node.session.declare_publisher(
             payload.raw_key,
@@ -84,9 +97,10 @@ class Sender:
     def send(self, kind: str) -> None:
         now = time.time_ns()
         if kind == "raw":
-            self._publisher.put(self._bytes, attachment=now.to_bytes(8, "little"))
+            payload = b"".join((self._before, self._array.data))
+            self._publisher.put(payload, attachment=now.to_bytes(8, "little"))
         else:
-            self._node.publish(self._payload.topic, self._payload.make(now), **self._payload.names)
+            self._node.publish(self._payload.topic, self._payload.make(now), **self._names)
 
 
 class Link:
@@ -135,7 +149,7 @@ class Link:
             sender.send(kind)
             if self._ask("end"):
                 return
-        raise AssertionError(f"nothing {kind} came within {PATIENCE_S} s")
+        raise AssertionError(f"{kind}: expected a message within {PATIENCE_S} s, got none")
 
     def _ask(self, what: str) -> list[list[int]]:
         assert self._receiver.stdin is not None and self._receiver.stdout is not None
@@ -147,8 +161,8 @@ class Link:
 @contextmanager
 def linked(endpoint: str) -> Iterator[Link]:
     """A sender here and a receiver in a process of its own, both clients of a router."""
-    command = [sys.executable, "-m", "tests.bench.lib.buses", endpoint]
-    root = Path(__file__).parents[3]
+    command = [sys.executable, "-m", "penumbra.tests.bench.lib.buses", endpoint]
+    root = Path(__file__).parents[4]
     receiver = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=root)
     try:
         with Node("sender", CELL, bus.Connection(connect=(endpoint,))) as node:
@@ -172,8 +186,11 @@ def receive(endpoint: str) -> None:
         take(payload, message.stamp_ns)
 
     def hear_raw(payload: Payload, subscriber: zenoh.Subscriber) -> None:
+        array = payload.array
+        dtype, shape, before = array.dtype, array.shape, len(messages.encode(payload.make(0))) - array.nbytes
         for sample in subscriber:
-            sample.payload.to_bytes()
+            assert sample.attachment is not None
+            np.frombuffer(sample.payload.to_bytes(), dtype, offset=before).reshape(shape)
             take(payload, int.from_bytes(sample.attachment.to_bytes(), "little"))
 
     for payload in PAYLOADS.values():

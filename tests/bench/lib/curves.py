@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from shared.cell import description as cells
-from shared.geometry import raster, rigid
-from sim.sets import trial
-from sim.skin.field import PadField, limb
-from tests.bench import haptics, skin, table1
-from tests.bench.lib.trials import ERRORS, Played
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import raster, rigid
+from penumbra.sim.sets import trial
+from penumbra.sim.skin.field import PadField, limb
+from penumbra.tests.bench import haptics, skin, table1
+from penumbra.tests.bench.lib.trials import ERRORS, Played
 
 EDGES_M = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0)
 """Camera distances are pooled between these."""

@@ -5,12 +5,14 @@ Each takes the messages as they arrive and says where the limb is now.
 
 from __future__ import annotations
 
+from typing import SupportsFloat, SupportsIndex, SupportsInt
+
 import gtsam
 import numpy as np
 
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from tests.bench.lib.fusion_runs import PERIOD_S, Message
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.tests.bench.lib.fusion_runs import PERIOD_S, Message
 
 FRESH_S = 0.25
 """A measurement older than this counts only where there is no newer one: `services.fusion.estimate.Limits.tracking_age`."""
@@ -80,7 +82,8 @@ class FixedLagSmoother:
 
     def take(self, message: Message) -> None:
         tick = round(1000.0 * message.stamp)
-        graph, values, stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = {}
         for node in self._missing(tick):
             if not self._ticks:
                 graph.add(gtsam.PriorFactorNavState(node, self._last, gtsam.noiseModel.Gaussian.Information(self._prior)))

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from shared.cell import description as cells
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from sim.world.motion import PEAK, LimbMotion, Reach
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.sim.world.motion import PEAK, LimbMotion, Reach
 
 T0_NS = 1_700_000_000_000_000_000
 PERIOD_S = {"vision": 0.05, "haptic": 0.02}
@@ -203,12 +203,12 @@ def drawn(name: str, seed: int, index: int, seconds: float) -> Run:
             t = k * period
             T, hidden = at(t), situation.hidden(t, phase)
             if source == "vision" and hidden < 1.0:
-                said = (*senses.seen(T, hidden), hidden)
+                said, share = senses.seen(T, hidden), hidden
             elif source == "haptic" and T[2, 3] - RADIUS_M < RANGE_M and situation.feels(t):
-                said = (*senses.felt(T), None)
+                said, share = senses.felt(T), None
             else:
                 continue
-            messages.append(Message(t + rng.uniform(*DELAY_S[source]), t, source, *said))
+            messages.append(Message(t + rng.uniform(*DELAY_S[source]), t, source, *said, share))
     return Run(situation, seconds, at, sorted(messages, key=lambda m: m.arrival))
 
 

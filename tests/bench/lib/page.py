@@ -7,8 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from sim.sets.trial import HIDDEN
-from tests.bench import table1
+from penumbra.sim.sets.trial import HIDDEN
+from penumbra.tests.bench import table1
 
 STYLE = """
 :root { color-scheme: light; --ink: #1c2530; --pale: #66707c; --line: #dfe4e9; --ours: #1257a8; --good: #e6f3e9; --bad: #fbe7e4; }
@@ -67,8 +67,8 @@ def write(found: dict[str, Any], folder: Path, path: Path, quick: bool) -> None:
         "</div>",
         f"<p class='note'>{escape(found['camera'].capitalize())}; the paper names none. Ours in blue with the 95 % confidence "
         "interval of a bootstrap over the runs, then the paper's number; green: at most the paper's. Fused poses are those of a "
-        "frame's exposure, told when the camera's pose of it is known; as published: what was said at the exposure. A sense is "
-        "scored where it has a pose; the last column says how often it has none.</p>",
+        "frame's exposure, reported when the camera's pose of it is known; as published: the value published at the "
+        "exposure. A sense is scored where it has a pose; the last column says how often it has none.</p>",
         _goals(found),
     ]
     for name, (title, text) in CAPTIONS.items():

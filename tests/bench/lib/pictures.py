@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sim.sets.trial import BINNING, DISTANCE_M, FOCAL_PX, HIDDEN, PASSAGE, PASSAGE_S, Trial
-from tests.bench import table1
-from tests.bench.lib import curves
+from penumbra.sim.sets.trial import BINNING, DISTANCE_M, FOCAL_PX, HIDDEN, PASSAGE, PASSAGE_S, Trial
+from penumbra.tests.bench import table1
+from penumbra.tests.bench.lib import curves
 
 INK, PALE, GRID = "#1c2530", "#8a94a0", "#dfe4e9"
 OURS, VISION, RIVAL, RIVAL_FUSED, PAPER = "#1257a8", "#5aa2e0", "#c8433a", "#e59b3c", "#7d8590"

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from shared.body.anatomy import Mesh
-from shared.contract import topics
-from shared.contract.messages import FusedPose, Truth, VisionPose, decode
-from shared.geometry import rigid
-from shared.geometry.rigid import Array
-from sim.sets.trial import HIDDEN, LEAD_S, SECONDS, Setting, Trial
-from tests.support.replay import Replay
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.messages import FusedPose, Truth, VisionPose, decode
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.sim.sets.trial import HIDDEN, LEAD_S, SECONDS, Setting, Trial
+from penumbra.tests.support.replay import Replay
 
 EPOCH_NS = 10**18
 """Time zero of a trial."""

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from services.fusion.observer import ErrorStateObserver
-from shared.geometry import rigid
-from shared.geometry.rigid import perturb
-from tests.bench import fusion
-from tests.bench.lib import fusion_runs as runs
-from tests.bench.lib.fusion_baselines import FixedLagSmoother, Newest
+from penumbra.services.fusion.observer import ErrorStateObserver
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import perturb
+from penumbra.tests.bench import fusion
+from penumbra.tests.bench.lib import fusion_runs as runs
+from penumbra.tests.bench.lib.fusion_baselines import FixedLagSmoother, Newest
 
 TILTED = rigid.from_rpy([0.02, -0.03, 0.15], [0.4, -0.3, 0.7])
 

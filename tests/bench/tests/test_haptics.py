@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.geometry import rigid
-from sim.skin import field
-from tests.bench import haptics as bench
+from penumbra.shared.geometry import rigid
+from penumbra.sim.skin import field
+from penumbra.tests.bench import haptics as bench
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +26,7 @@ def test_limbs_are_placed_at_their_gap_in_front_of_the_pads_in_use(rig: bench.Ri
         np.testing.assert_allclose(rig.axes(T, count) @ rig.axes(T, count).T, np.eye(6), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_bounds_information_is_that_of_the_full_fields_derivatives(rig: bench.Rig) -> None:
     rng = np.random.default_rng(3)
     T, size = rig.place(rng, 0.06, 8)
@@ -43,6 +44,7 @@ def test_the_bounds_information_is_that_of_the_full_fields_derivatives(rig: benc
         np.testing.assert_allclose(ours, theirs, rtol=0.08)
 
 
+@pytest.mark.slow
 def test_the_benchmark_writes_rows_as_promised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "QUICK", bench.Plan(1, 1, 1, 1, 1.2, 1))
     for name, value in (("GAPS", (0.03, 0.10)), ("PADS", (8, 1)), ("RESTING_GAPS", (0.03,)), ("REST_S", 1.5)):

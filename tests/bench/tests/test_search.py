@@ -3,18 +3,20 @@
 import itertools
 import json
 from dataclasses import replace
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
-from services.search import contour
-from services.search.evidence import Intrinsics
-from services.search.tracker import Searched
-from shared.contract.messages import FusedPose, VisionPose
-from shared.geometry import rigid
-from sim.sets import shots
-from tests.bench import search, tracking
-from tests.bench.lib import bound
+from penumbra.services.search import contour
+from penumbra.services.search.evidence import Intrinsics
+from penumbra.services.search.tracker import Searched
+from penumbra.shared.contract.messages import FusedPose, VisionPose
+from penumbra.shared.geometry import rigid
+from penumbra.sim.sets import shots
+from penumbra.tests.bench import search, tracking
+from penumbra.tests.bench.lib import bound
 
 
 def rms_cm(information: np.ndarray) -> float:
@@ -113,10 +115,10 @@ def test_a_mask_shows_the_target_where_it_agrees_with_the_truth_at_any_scale():
     window = search.window_of(shot, shot.T_world_target)
     mask = search.exact_mask(shot, window)
     assert search.shows_target(mask, shot)
-    coarse = replace(mask, labels=np.ascontiguousarray(mask.labels[::2, ::2]), scale=2)
+    coarse = msgspec.structs.replace(mask, labels=np.ascontiguousarray(mask.labels[::2, ::2]), scale=2)
     assert search.shows_target(coarse, shot)
-    assert not search.shows_target(replace(mask, labels=np.zeros_like(mask.labels)), shot)
-    assert not search.shows_target(replace(mask, x0=mask.x0 // 2, y0=mask.y0 // 2 + 40), shot)
+    assert not search.shows_target(msgspec.structs.replace(mask, labels=np.zeros_like(mask.labels)), shot)
+    assert not search.shows_target(msgspec.structs.replace(mask, x0=mask.x0 // 2, y0=mask.y0 // 2 + 40), shot)
 
 
 def test_giving_up_is_right_where_a_mask_shows_something_else_and_the_start_was_right_by_luck():
@@ -128,6 +130,7 @@ def test_giving_up_is_right_where_a_mask_shows_something_else_and_the_start_was_
     assert not told(0.1, False, False)  # right all the same
 
 
+@pytest.mark.slow
 def test_the_search_s_benchmark_runs_and_tells_all_rows(tmp_path):
     out = tmp_path / "search.json"
     assert search.main(["--seed", "46", "--quick", "--json", str(out)]) == 0
@@ -141,9 +144,15 @@ def test_the_search_s_benchmark_runs_and_tells_all_rows(tmp_path):
     assert sum(kind["frames"] for kind in result["lost"].values()) == 5 * search.QUICK.lost
 
 
-def pose(kind, stamp_ns: int, T: np.ndarray, state: str):
+def pose(kind, stamp_ns: int, T: np.ndarray, state: Any):
     position, orientation = rigid.position_orientation(T)
-    common = {"stamp_ns": stamp_ns, "target": "forearm", "frame": "world", "position": position, "orientation": orientation}
+    common: dict[str, Any] = {
+        "stamp_ns": stamp_ns,
+        "target": "forearm",
+        "frame": "world",
+        "position": position,
+        "orientation": orientation,
+    }
     if kind is VisionPose:
         return VisionPose(**common, camera="front", covariance=np.eye(6), overlap=1.0, hidden=0.0, state=state)
     return FusedPose(**common, velocity=np.zeros(6), covariance=np.eye(6), state=state, sources={})
@@ -172,6 +181,7 @@ def test_tracking_what_is_hidden_is_counted_as_false(monkeypatch):
     assert told["tracked"] == 0.5
 
 
+@pytest.mark.slow
 def test_the_tracking_benchmark_runs_on_both_backgrounds(tmp_path):
     out = tmp_path / "tracking.json"
     assert tracking.main(["--seed", "47", "--quick", "--json", str(out)]) == 0

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.segmentation.prednet import Settings
-from tests.bench import ablation, segmentation
+from penumbra.services.segmentation.prednet import Settings
+from penumbra.tests.bench import ablation, segmentation
 
 
 def test_recovery_is_counted_from_half_free_again_to_the_overlap_of_before():

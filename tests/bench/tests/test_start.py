@@ -4,8 +4,8 @@ import os
 
 import pytest
 
-from shared.contract.processes import PROCESSES
-from tests.bench import start
+from penumbra.shared.contract.processes import PROCESSES
+from penumbra.tests.bench import start
 
 
 def test_a_start_tells_when_each_process_showed_itself_and_when_the_pose_was_tracked(tmp_path):
@@ -19,11 +19,10 @@ def test_a_start_tells_when_each_process_showed_itself_and_when_the_pose_was_tra
 
 
 def test_a_start_that_does_not_come_to_a_pose_fails_with_the_launchers_last_words(tmp_path):
-    command = tmp_path / "services" / "command"
-    command.mkdir(parents=True)
-    for package in (command.parent, command):
-        (package / "__init__.py").write_text("")
-    (command / "cli.py").write_text("print('no licence')")
+    package = tmp_path / "penumbra"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "__main__.py").write_text("print('no licence')")
     with pytest.raises(start.Failed, match="the launcher of cell table ended: no licence"):
         start.start(tmp_path, "table", 1, tmp_path)
 

@@ -8,12 +8,12 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from shared.body import anatomy
-from shared.geometry import rigid
-from sim.sets import trial
-from sim.sets.trial import SETTINGS, Setting
-from tests.bench import table1
-from tests.bench.lib import campaign, page, pictures, trials
+from penumbra.shared.body import anatomy
+from penumbra.shared.geometry import rigid
+from penumbra.sim.sets import trial
+from penumbra.sim.sets.trial import SETTINGS, Setting
+from penumbra.tests.bench import table1
+from penumbra.tests.bench.lib import campaign, page, pictures, trials
 
 EYE = (0.0, 0.0, -2.0)
 """A camera that looks along z."""
@@ -70,9 +70,10 @@ def test_a_turn_about_the_origin_moves_the_centre_and_a_twist_about_the_axis_is_
 
 
 def test_the_centre_of_mass_of_a_box_is_its_middle_and_that_of_the_forearm_lies_in_it(drawn):
-    from sim.picture.occluder import box
+    from penumbra.shared.contract.labels import Label
+    from penumbra.sim.picture.occluder import box
 
-    np.testing.assert_allclose(trials.centroid(box((0.1, 0.2, 0.3), (1.0, 2.0, 3.0), 1)), (1.0, 2.0, 3.0))
+    np.testing.assert_allclose(trials.centroid(box((0.1, 0.2, 0.3), (1.0, 2.0, 3.0), Label.OCCLUDER)), (1.0, 2.0, 3.0))
     cell = drawn[0].cell
     mesh = anatomy.target_mesh(next(iter(cell.targets.values())), cell)
     x, y, z = trials.centroid(mesh)
@@ -113,7 +114,7 @@ def test_trials_differ_by_seed_and_index_and_are_the_same_again(drawn):
     assert again.cell.model_dump() == first.cell.model_dump()
     assert other.cell.name == first.cell.name and other.seed != first.seed
     size, changed = (next(iter(each.cell.targets.values())).size for each in (first, other))
-    assert size != changed and abs(np.log(size.length)) <= np.log1p(trial.SIZE)
+    assert size is not None and size != changed and abs(np.log(size.length)) <= np.log1p(trial.SIZE)
     assert trial.draw(first.setting, SEEDS[0], 1).cell.name == "arm"
 
 
@@ -147,7 +148,9 @@ def test_a_score_is_the_mean_over_frames_with_a_pose_and_tells_how_many_have_non
 def test_the_confidence_interval_draws_whole_runs():
     rng = np.random.default_rng(1)
     means = rng.normal(5.0, 1.0, 20)
-    low, high = table1.bootstrap([np.full(40, mean) for mean in means])
+    interval = table1.bootstrap([np.full(40, mean) for mean in means])
+    assert interval is not None
+    low, high = interval
     wide = 1.96 * means.std() / np.sqrt(20)
     assert (low, high) == (pytest.approx(means.mean() - wide, abs=0.15), pytest.approx(means.mean() + wide, abs=0.15))
     assert table1.bootstrap([np.array([1.0, 2.0]), np.zeros(0)]) is None
@@ -175,9 +178,10 @@ def test_the_table_has_the_papers_layout_and_tells_which_goals_are_missed():
     assert "0.10 [0.10, 0.10] / 1.59" in console.export_text()
 
 
+@pytest.mark.slow
 def test_one_run_goes_through_the_services_and_a_page_is_made_of_it(tmp_path):
     setting, seconds = Setting("inside", "short", "light"), trial.LEAD_S + 0.15
-    job = campaign.Job("one", "tests.bench.table1:one", ({**vars(setting)}, 5, 0, seconds))
+    job = campaign.Job("one", "penumbra.tests.bench.table1:one", ({**vars(setting)}, 5, 0, seconds))
     with campaign.bar(Console(quiet=True)) as progress:
         (played,) = campaign.run([job], tmp_path, 1, progress, "trials")
     assert len(played["times_s"]) == round(seconds * trial.RATE_HZ) and trials.is_scored(played).sum() == 3
@@ -195,7 +199,7 @@ def test_one_run_goes_through_the_services_and_a_page_is_made_of_it(tmp_path):
     assert " / 1.59" in html and "A quick run" in html
 
 
-CALLS = []
+CALLS: list[int] = []
 
 
 def count(k):
@@ -207,7 +211,7 @@ def count(k):
 
 
 def test_a_killed_benchmark_goes_on_where_it_was_and_computes_nothing_twice(tmp_path, monkeypatch):
-    jobs = [campaign.Job(f"job-{k}", "tests.bench.tests.test_table1:count", (k,)) for k in range(4)]
+    jobs = [campaign.Job(f"job-{k}", f"{__name__}:count", (k,)) for k in range(4)]
     CALLS.clear()
     with campaign.bar(Console(quiet=True)) as progress:
         with pytest.raises(KeyboardInterrupt):
@@ -219,8 +223,9 @@ def test_a_killed_benchmark_goes_on_where_it_was_and_computes_nothing_twice(tmp_
     assert CALLS[5:] == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_several_processes_give_the_same_results_in_the_same_order(tmp_path):
-    jobs = [campaign.Job(f"job-{k}", "tests.bench.tests.test_table1:count", (k,)) for k in (5, 3, 4)]
+    jobs = [campaign.Job(f"job-{k}", f"{__name__}:count", (k,)) for k in (5, 3, 4)]
     with campaign.bar(Console(quiet=True)) as progress:
         assert campaign.run(jobs, tmp_path, 2, progress, "jobs") == [{"k": 5}, {"k": 3}, {"k": 4}]
 

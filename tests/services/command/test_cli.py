@@ -1,29 +1,34 @@
 """The `penumbra` command as a user meets it."""
 
 import functools
+import importlib.metadata
 import json
+import math
+import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import click
 import pytest
 
-from services import progress
-from services.command import cli, doctor
-from shared.cell import description as cells
-from shared.contract import processes, topics
-from shared.runtime import bus
-from shared.runtime.node import Node
-from tests.support.live import free_port, wait_for
-from tests.support.nodes import pose_json, start
+from penumbra.services import flags, progress
+from penumbra.services.command import cli, doctor
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import processes, topics
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.tests.support.live import free_port, penumbra_command, wait_for
+from penumbra.tests.support.nodes import pose_json, start
 
 CELL = cells.load("table")
 ROOT = Path(__file__).parents[3]
 
 
 def run(*argv, code=None):
-    command = [sys.executable, "-c", code] if code else [sys.executable, "-m", "services.command.cli"]
+    command = [sys.executable, "-c", code] if code else penumbra_command()
     return subprocess.run([*command, *argv], capture_output=True, text=True, timeout=60)
 
 
@@ -42,22 +47,53 @@ def endpoint():
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["fly"], "penumbra: no command 'fly': one of up, restart, scale, router, "),
+        (["fly"], "penumbra: expected a command, got 'fly'; choose one of up, "),
         (
             ["fusion", "--cell", "nowhere"],
             "penumbra fusion: no cell 'nowhere': give one of arm, table, or the path of a YAML file",
         ),
         (["pose", "leg"], "penumbra pose: cell table has no target 'leg': it has forearm"),
-        (["pose", "--connect", "nonsense"], "penumbra pose: endpoint 'nonsense': PROTOCOL/ADDRESS expected"),
+        (
+            ["pose", "--connect", "nonsense"],
+            "penumbra pose: endpoint: expected PROTOCOL/ADDRESS, as in tcp/127.0.0.1:7447, got 'nonsense'",
+        ),
         (
             ["pose", "--config", "/nowhere.json5"],
-            "penumbra pose: --config /nowhere.json5: a Zenoh configuration (JSON5) expected",
+            "penumbra pose: --config /nowhere.json5: expected a Zenoh configuration (JSON5)",
         ),
-        (["router", "--fly"], "penumbra router: unrecognized arguments: --fly (see penumbra router --help)"),
-        (["bench", "nothing"], "penumbra bench: one of ablation, faults, fusion, haptics, live"),
+        (["router", "--fly"], "penumbra router: no option --fly (see penumbra router --help)"),
+        (
+            ["bench", "nothing"],
+            "penumbra bench: expected a benchmark, got 'nothing'; choose one of ablation, faults, fusion, haptics, live",
+        ),
+        (["bench"], "penumbra bench: expected a benchmark, got none; choose one of ablation, "),
+        (["poes"], "penumbra: expected a command, got 'poes'; did you mean pose? (see penumbra --help)"),
+        (["pose", "--cel", "table"], "penumbra pose: no option --cel; did you mean --cell? (see penumbra pose --help)"),
+        (["segmentation", "trian"], "penumbra segmentation: expected a command, got 'trian'; did you mean train?"),
+        (
+            ["router", "--log-level", "inof"],
+            "penumbra router: --log-level: expected debug, info, warning or error, got 'inof'; did",
+        ),
+        (["pose", "--wait", "nan"], "penumbra pose: --wait: expected a time above 0, in seconds, got 'nan'"),
+        (["pose", "--wait", "-3"], "penumbra pose: --wait: expected a time above 0, in seconds, got '-3'"),
+        (["pose", "--watch", "--wait"], "penumbra pose: expected --watch or --wait, got both"),
+        (["topics", "--seconds", "3"], "penumbra topics: expected --hz beside --seconds, got --seconds alone"),
+        (["topics", "--hz", "--seconds", "inf"], "penumbra topics: --seconds: expected a number above 0, got 'inf'"),
+        (["restart", "fusion", "--all"], "penumbra restart: expected --all or names, got both: fusion"),
+        (["scale", "fusion"], "penumbra scale: NAME=NUMBER: expected NAME=NUMBER, as in segmentation=2, got 'fusion'"),
+        (["scale"], "penumbra scale: expected NAME=NUMBER, got nothing"),
+        (["snapshot", "nowhere/cell.png"], "penumbra snapshot: FILE: expected a file in a folder that exists"),
+        (
+            ["haptics", "train", "--steps", "3", "--minutes", "1"],
+            "penumbra haptics train: expected --minutes or --steps, got both",
+        ),
+        (["bench", "live", "--seconds", "-1"], "penumbra bench live: --seconds: expected a number above 0, got '-1'"),
+        (["bench", "fusion", "--runs", "0"], "penumbra bench fusion: --runs: expected a whole number from 1, got '0'"),
+        (["bench", "search", "--frames", "0"], "penumbra bench search: --frames: expected a whole number from 1, got '0'"),
     ],
 )
 def test_a_wrong_command_is_one_line_that_says_what_to_do_and_exit_code_two(argv, line, capsys):
+    code: str | int | None
     try:
         code = cli.main(argv)
     except SystemExit as end:
@@ -68,6 +104,80 @@ def test_a_wrong_command_is_one_line_that_says_what_to_do_and_exit_code_two(argv
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.parametrize("command", [*cli.COMMANDS, *(f"{p.name} {tool.name}" for p in processes.PROCESSES for tool in p.tools)])
+def test_every_help_has_an_example_whose_flags_there_are(command, capsys):
+    assert cli.main([*command.split(), "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "%(default)" not in out
+    example = out.partition("Example:\n")[2]
+    assert f"penumbra {command}" in example
+    for line in example.splitlines():
+        words = line.partition("#")[0].split()
+        if words[:1] == ["penumbra"]:
+            assert all(word.startswith("--version") or word in out for word in words if word.startswith("--"))
+
+
+def test_help_shows_what_the_flag_help_shows(capsys):
+    assert cli.main(["help", "search", "refine"]) == 0
+    told = capsys.readouterr().out
+    assert cli.main(["search", "refine", "--help"]) == 0
+    assert told == capsys.readouterr().out != ""
+
+
+def test_bench_help_names_every_benchmark_with_what_it_measures(capsys):
+    assert cli.main(["bench", "--help"]) == 0
+    out = capsys.readouterr().out
+    for path in (ROOT / "tests" / "bench").glob("*.py"):
+        assert path.stem == "__init__" or any(len(line.split()) > 3 for line in out.splitlines() if f"  {path.stem} " in line)
+
+
+def test_the_version_is_that_of_the_installation(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"penumbra {importlib.metadata.version('penumbra')}\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("penumbra po", {"pose", "posecnn"}),
+        ("penumbra segmentation tr", {"train"}),
+        ("penumbra pose --cell a", {"arm"}),
+        ("penumbra pose --cell table f", {"forearm"}),
+        ("penumbra restart h", {"haptics"}),
+        ("penumbra up --vision ", {"procnet", "posecnn"}),
+        ("penumbra bench ta", {"table1"}),
+    ],
+)
+def test_a_shell_completes_commands_flags_and_names_of_the_cell(line, expected):
+    words = {"_PENUMBRA_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(len(line.split(" ")) - 1)}
+    command = [sys.executable, "-m", "penumbra"]
+    out = subprocess.run(command, env={**os.environ, **words}, capture_output=True, text=True, timeout=60)
+    assert {each.partition(",")[2] for each in out.stdout.splitlines()} == expected, out.stderr
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_completion_of_every_shell_can_be_printed(shell, capsys):
+    assert cli.main(["completion", shell]) == 0
+    assert "_PENUMBRA_COMPLETE" in capsys.readouterr().out
+
+
+def test_flags_that_take_several_words_take_all_up_to_the_next_flag():
+    params = [
+        flags.Option("--size", type=int, takes="many"),
+        flags.Option("--serial", takes="many", without="*"),
+        flags.Option("--up", takes="rest"),
+        flags.Option("--wait", type=flags.seconds, takes="maybe", without="inf"),
+        flags.Argument("target", required=False, help="of the cell"),
+    ]
+    found = flags.parse(params, ["--size", "16", "-3", "--serial", "--wait", "arm", "--up", "--size", "x"])
+    assert (found.size, found.serial, found.up) == ((16, -3), ("*",), ("--size", "x"))
+    assert (found.wait, found.target) == (math.inf, "arm")
+    assert flags.parse(params, ["--wait", "3", "--serial", "p0", "p1"]).serial == ("p0", "p1")
+    assert flags.parse(params, ["--wait", "3"]).wait == 3.0
+    with pytest.raises(click.UsageError):
+        flags.parse(params, ["--size"])
+
+
 def test_a_service_that_logs_json_tells_its_error_as_json_and_an_unknown_format_is_refused(monkeypatch):
     out = run("fusion", "--cell", "nowhere", "--log-format", "json")
     line = json.loads(out.stderr)
@@ -75,7 +185,7 @@ def test_a_service_that_logs_json_tells_its_error_as_json_and_an_unknown_format_
     assert line["message"].startswith("no cell 'nowhere': give one of arm, table")
     monkeypatch.setenv("PENUMBRA_LOG_FORMAT", "xml")
     out = run("pose")
-    assert (out.returncode, "--log-format: text or json expected, 'xml' came" in out.stderr) == (2, True)
+    assert (out.returncode, "--log-format: expected text or json, got 'xml'" in out.stderr) == (2, True)
 
 
 def test_a_bad_cell_file_is_told_with_its_line(tmp_path, capsys):
@@ -89,21 +199,26 @@ def test_no_router_is_one_line_that_says_how_to_start_one(capsys):
     where = f"tcp/127.0.0.1:{free_port()}"
     assert cli.main(["pose", "--connect", where]) == 2
     assert capsys.readouterr().err == (
-        f"penumbra pose: no router at {where}: start `penumbra router` or `penumbra up`, or give --connect\n"
+        f"penumbra pose: no router at {where}: nothing listens there: start `penumbra router` or `penumbra up`, or give "
+        "--connect\n"
     )
 
 
 def test_a_missing_package_is_one_line_with_the_extra_that_installs_it():
-    code = "import sys; sys.modules['msgspec'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = (
+        "import sys; sys.modules['msgspec'] = None; from penumbra.services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
     result = run("fusion", code=code)
     assert (result.returncode, result.stderr) == (2, "penumbra fusion: msgspec is not installed: pip install -e '.[fusion]'\n")
 
 
 @pytest.mark.parametrize("command", ["segmentation train", "posecnn train", "haptics train", "skin model"])
 def test_training_without_torch_names_the_extra_for_training(command):
-    code = "import sys; sys.modules['torch'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; sys.modules['torch'] = None; from penumbra.services.command.cli import main; sys.exit(main(sys.argv[1:]))"
     result = run(*command.split(), code=code)
-    extra = processes.tool(*command.split()).extra
+    tool = processes.tool(*command.split())
+    assert tool is not None
+    extra = tool.extra
     assert "train" in extra.split(",")
     assert (result.returncode, result.stderr) == (2, f"penumbra {command}: torch is not installed: pip install -e '.[{extra}]'\n")
 
@@ -111,7 +226,9 @@ def test_training_without_torch_names_the_extra_for_training(command):
 def test_an_import_error_in_our_own_code_is_not_explained_away():
     with pytest.raises(ImportError):
         cli._explain_import(
-            "fusion", [], ImportError("cannot import name 'x' from 'shared.runtime.bus'", name="shared.runtime.bus")
+            "fusion",
+            [],
+            ImportError("cannot import name 'x' from 'penumbra.shared.runtime.bus'", name="penumbra.shared.runtime.bus"),
         )
 
 
@@ -119,14 +236,15 @@ def test_help_lists_every_command(capsys):
     assert cli.main(["--help"]) == 0
     out = capsys.readouterr().out
     assert all(f"  {name} " in out for name in cli.COMMANDS)
+    assert all(f"  {code} " in out for code in cli.EXIT_CODES)
 
 
 @pytest.mark.parametrize("command", ["pose", "topics", "router"])
 def test_light_commands_import_nothing_heavy(command):
-    code = f"import sys, services.command.cli as cli; cli.main([{command!r}, '--fly'])"
+    code = f"import sys, penumbra.services.command.cli as cli; cli.main([{command!r}, '--fly'])"
     guard = "import atexit, sys; atexit.register(lambda: print(sorted({m.partition('.')[0] for m in sys.modules})))\n"
     loaded = run(code=guard + code).stdout
-    assert "'shared'" in loaded
+    assert "'zenoh'" in loaded
     assert not [heavy for heavy in ("torch", "numba", "cv2", "pybullet", "trimesh") if f"'{heavy}'" in loaded]
 
 
@@ -145,7 +263,7 @@ def test_pose_as_json_is_exactly_what_fusion_answers(endpoint, capsys):
 
 def test_pose_loads_nothing_heavy(endpoint):
     program = (
-        "import sys; from services.command import cli; cli.main(['pose', '--json', '--connect', sys.argv[1]]); "
+        "import sys; from penumbra.services.command import cli; cli.main(['pose', '--json', '--connect', sys.argv[1]]); "
         "print([name for name in ('torch', 'numba', 'cv2', 'pybullet', 'trimesh') if name in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", program, endpoint], capture_output=True, text=True, timeout=30)
@@ -153,10 +271,11 @@ def test_pose_loads_nothing_heavy(endpoint):
 
 
 def test_watch_prints_pose_after_pose_until_ctrl_c(endpoint):
-    command = [sys.executable, "-m", "services.command.cli", "pose", "--watch", "--json", "--connect", endpoint]
+    command = penumbra_command("pose", "--watch", "--json", "--connect", endpoint)
     # a shell starts what runs in its background with Ctrl-C ignored: not so here, wherever the tests run
     listening = functools.partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     watch = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=listening)
+    assert watch.stdout is not None
     try:
         stamps = [json.loads(watch.stdout.readline())["stamp_ns"] for _ in range(4)]
         assert stamps == sorted(set(stamps))
@@ -167,16 +286,68 @@ def test_watch_prints_pose_after_pose_until_ctrl_c(endpoint):
         watch.communicate()
 
 
-def test_a_pose_that_nobody_knows_is_told(endpoint, capsys, monkeypatch):
+def test_a_pose_that_no_process_answers_names_the_cells_and_processes_that_run(endpoint, capsys):
     assert cli.main(["pose", "--cell", "arm", "--connect", endpoint]) == 2
-    assert "nobody knows the pose of forearm in cell arm: is `penumbra fusion` running?" in capsys.readouterr().err
+    assert (
+        "no answer for the pose of forearm in cell arm: no process of it is on this router, where cells run: table; "
+        "give --cell table"
+    ) in capsys.readouterr().err
 
 
-def test_topics_lists_every_topic_with_its_unit(capsys):
-    assert cli.main(["topics"]) == 0
+def answering(endpoint, *states):
+    """A fusion that answers with one state after another, and with the last one from then on."""
+    node = Node("fusion", cells.load("arm"), bus.Connection(connect=(endpoint,)))
+    rest = list(states)
+
+    def answer(parameters, payload):
+        state = rest.pop(0) if len(rest) > 1 else rest[0]
+        return json.dumps({**json.loads(pose_json()), "state": state}).encode(), "application/json"
+
+    node.answer(topics.current_pose("arm", "forearm"), answer)
+    return node
+
+
+def test_a_lost_pose_has_an_exit_code_of_its_own(endpoint, capsys):
+    with answering(endpoint, "lost"):
+        assert wait_for(lambda: (code := cli.main(["pose", "--cell", "arm", "--connect", endpoint])) != 2 and code, 5, "it") == 3
+        assert "lost, in frame world" in capsys.readouterr().out
+        assert cli.main(["pose", "--cell", "arm", "--connect", endpoint, "--wait", "0.3"]) == 3
+        assert capsys.readouterr().out.count("lost") == 1
+
+
+def test_pose_waits_until_the_target_is_tracked(endpoint, capsys):
+    with answering(endpoint, "lost", "lost", "coasting", "tracking"):
+        assert cli.main(["pose", "--cell", "arm", "--connect", endpoint, "--wait", "--json"]) == 0
+        assert [json.loads(line)["state"] for line in capsys.readouterr().out.splitlines()] == ["tracking"]
+
+
+def test_pose_waits_for_a_router_too_and_says_at_the_end_what_is_missing(capsys):
+    where = f"tcp/127.0.0.1:{free_port()}"
+    began = time.monotonic()
+    assert cli.main(["pose", "--connect", where, "--wait", "1.5"]) == 2
+    assert time.monotonic() - began >= 1.5
+    assert f"no router at {where}" in capsys.readouterr().err
+
+
+def test_commands_that_look_print_json(endpoint, capsys):
+    assert cli.main(["topics", "--hz", "--seconds", "1", "--json", "--connect", endpoint]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["topics"][topics.FUSED.at(cell="table", target="forearm")]["rate_hz"] > 10
+    assert {process["service"] for process in found["processes"]} == {"router", "worker"}
+    assert cli.main(["doctor", "--json", "--connect", endpoint]) == 0
+    assert {finding["status"] for finding in json.loads(capsys.readouterr().out)} <= {"ok", "warn"}
+
+
+def test_topics_lists_the_keys_that_the_cell_has_and_no_other(capsys):
+    assert cli.main(["topics", "--cell", "arm"]) == 0
     out = capsys.readouterr().out
-    assert all(topic.name in out for topic in topics.TOPICS)
-    assert "joint angles [rad]" in out
+    assert all(f" {topic.name} " in out for topic in topics.TOPICS)
+    assert "joint angles [rad]" in out and "penumbra/arm/skin/p7/voltages" in out and "{" not in out
+    assert cli.main(["topics", "--cell", "table", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert {row["topic"] for row in rows} == {topic.name for topic in topics.TOPICS} - {"joints"}, "the table has no robot"
+    user = Node("user", CELL)
+    assert sorted(row["key"] for row in rows) == sorted(key for topic in topics.TOPICS for key in user.keys(topic, {}))
 
 
 def test_topics_hz_measures_what_arrives(endpoint, capsys):
@@ -189,20 +360,20 @@ def test_sim_passes_the_command_on_and_prints_the_answer_or_the_refusal(endpoint
     def control(parameters, payload):
         request = json.loads(payload)
         if request["command"] != "occlude":
-            raise ValueError("occlude expected")
+            raise ValueError("expected occlude")
         return json.dumps({"occlude": request["value"]}).encode()
 
     with Node("emulator", CELL, bus.Connection(connect=(endpoint,))) as emulator:
         emulator.answer(topics.control("table"), control)
         wait_for(lambda: cli.main(["sim", "occlude", "0.8", "--connect", endpoint]) == 0, 5, "the answer")
-        assert capsys.readouterr().out.splitlines()[-1] == '{"occlude": "0.8"}'
+        assert capsys.readouterr().out.splitlines()[-1] == "occlude    0.8"
         assert cli.main(["sim", "fly", "--connect", endpoint]) == 2
-        assert capsys.readouterr().err == "penumbra sim: occlude expected\n"
+        assert capsys.readouterr().err == "penumbra sim: expected occlude\n"
 
 
 def test_sim_without_an_emulator_says_what_to_start(endpoint, capsys):
     assert cli.main(["sim", "state", "--connect", endpoint]) == 2
-    assert "no emulator in cell table: start `penumbra emulator`" in capsys.readouterr().err
+    assert "no emulator in cell table: its processes are router, worker: start `penumbra emulator`" in capsys.readouterr().err
 
 
 def test_doctor_warns_of_a_router_that_does_not_run_and_finds_one_that_does(endpoint):
@@ -235,8 +406,9 @@ def test_doctor_asks_for_more_shared_memory_and_for_cards_of_weights(tmp_path, m
 
 
 def test_a_command_ends_quietly_when_its_reader_does(endpoint):
-    command = [sys.executable, "-m", "services.command.cli", "pose", "--watch", "--json", "--connect", endpoint]
+    command = penumbra_command("pose", "--watch", "--json", "--connect", endpoint)
     watch = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert watch.stdout is not None and watch.stderr is not None
     watch.stdout.readline()
     watch.stdout.close()
     assert watch.stderr.read() == ""
@@ -246,7 +418,7 @@ def test_a_command_ends_quietly_when_its_reader_does(endpoint):
 @pytest.mark.parametrize("argv", [["topics"], ["--help"], ["pose", "--json"]])
 def test_output_that_cannot_be_written_is_one_line_and_no_traceback(argv, endpoint):
     argv = [*argv, "--connect", endpoint] if argv[0] == "pose" else argv
-    command = [sys.executable, "-m", "services.command.cli", *argv]
+    command = penumbra_command(*argv)
     with open("/dev/full", "w") as full:
         result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
     told = f"penumbra {argv[0].strip('-')}: the output cannot be written: No space left on device\n"

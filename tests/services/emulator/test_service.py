@@ -1,27 +1,28 @@
 """The emulator as a process: what control queries say, how turns keep time, and what really arrives on the bus."""
 
 import json
+import math
 import os
 import subprocess
-import sys
 import threading
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from services.emulator.control import COMMANDS, control
-from services.emulator.pacing import Pacer, Time
-from services.skin.driver import Line
-from services.skin.port import SerialPort
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.runtime import bus
-from shared.runtime.node import Node
-from sim.world.world import World
-from tests.support.live import free_port, wait_for
+from penumbra.services.emulator.control import COMMANDS, control
+from penumbra.services.emulator.pacing import Pacer, Time
+from penumbra.services.skin.driver import Line
+from penumbra.services.skin.port import SerialPort
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.sim.world.world import World
+from penumbra.tests.support.live import free_port, penumbra_command, wait_for
 
 ROOT = Path(__file__).parents[3]
 
@@ -56,25 +57,25 @@ def test_every_command_answers_with_what_is_in_force(world):
 @pytest.mark.parametrize(
     ("payload", "text"),
     [
-        (b"", r'\{"command": NAME, "value": VALUE\} expected, \'\' came'),
-        (b"\xff\xfe", "expected, .* came. Commands:"),
+        (b"", r'expected \{"command": NAME, "value": VALUE\}, got \'\''),
+        (b"\xff\xfe", "expected .*, got .*. Commands:"),
         (b"[]", "NAME"),
         (b"nan", "NAME"),
         (b'{"command": 3}', "NAME"),
         (b'{"command": "state", "colour": "red"}', "colour"),
-        (b'{"command": "fly"}', "'fly' came. Commands:\n  occlude"),
-        (b'{"command": "occlude"}', "occlude: a share .*from 0 to 1, or auto expected, None came"),
-        (b'{"command": "occlude", "value": "most"}', "occlude: .* or auto expected, 'most' came"),
-        (b'{"command": "occlude", "value": 1.5}', "occlude: a share from 0 to 1 or auto expected, 1.5 came"),
-        (b'{"command": "occlude", "value": NaN}', "occlude: a share from 0 to 1 or auto expected, nan came"),
-        (b'{"command": "occlude", "value": true}', "or auto expected, True came"),
-        (b'{"command": "motion", "value": "fast"}', "motion: on or off.* expected, 'fast' came"),
-        (b'{"command": "motion", "value": [1]}', "motion: on or off"),
-        (b'{"command": "speed", "value": -1}', "speed: a factor above 0 and at most 4 expected, -1 came"),
+        (b'{"command": "fly"}', "got 'fly'. Commands:\n  occlude"),
+        (b'{"command": "occlude"}', "occlude: expected a share .*from 0 to 1, or auto, got None"),
+        (b'{"command": "occlude", "value": "most"}', "occlude: expected .* or auto, got 'most'"),
+        (b'{"command": "occlude", "value": 1.5}', "occlude: expected a share from 0 to 1 or auto, got 1.5"),
+        (b'{"command": "occlude", "value": NaN}', "occlude: expected a share from 0 to 1 or auto, got nan"),
+        (b'{"command": "occlude", "value": true}', "or auto, got True"),
+        (b'{"command": "motion", "value": "fast"}', "motion: expected on or off.*, got 'fast'"),
+        (b'{"command": "motion", "value": [1]}', "motion: expected on or off"),
+        (b'{"command": "speed", "value": -1}', "speed: expected a factor above 0 and at most 4, got -1"),
         (b'{"command": "board", "value": "p0-0 error"}', "no boards are served: start the emulator with --serial"),
-        (b'{"command": "pause", "value": 3}', "pause takes no value, 3 came"),
-        (b'{"command": "skin", "value": 3}', r"skin: PAD\[/ELECTRODE\] FAULT .* expected, 3 came"),
-        (b'{"command": "skin", "value": "p0/r torn"}', "'p0/r torn' came. Faults: dead: a broken wire"),
+        (b'{"command": "pause", "value": 3}', "pause: expected no value, got 3"),
+        (b'{"command": "skin", "value": 3}', r"skin: expected PAD\[/ELECTRODE\] FAULT .*, got 3"),
+        (b'{"command": "skin", "value": "p0/r torn"}', "got 'p0/r torn'. Faults: dead: a broken wire"),
     ],
 )
 def test_a_bad_command_is_refused_with_what_is_possible_and_changes_nothing(world, payload, text):
@@ -102,8 +103,8 @@ def test_a_pacer_gives_every_tick_once_while_turns_are_in_time():
 
 
 def test_the_world_goes_on_where_the_wall_clock_is_set_and_only_its_stamps_jump():
-    wall_ns = lambda: time.monotonic_ns() + shift_ns  # noqa: E731
     shift_ns = 10**18
+    wall_ns = lambda: time.monotonic_ns() + shift_ns  # noqa: E731
     world_time = Time(wall_ns)
     began_ns = world_time.epoch_ns()
     assert 0 <= world_time.now_ns() < 10**10
@@ -150,10 +151,11 @@ def emulator(ports):
     """A router in this process, a real emulator beside it, and a node that hears it: (node, what it heard)."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)
-    command = [sys.executable, "-m", "services.command.cli", "emulator", "--cell", "arm", "--seed", "2", "--connect", endpoint]
+    command = penumbra_command("emulator", "--cell", "arm", "--seed", "2", "--connect", endpoint)
     command += ["--serial", "p7", "--serial-folder", str(ports)]
     process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    node, heard = Node("listener", cells.load("arm"), bus.Connection("client", (endpoint,))), {}
+    node = Node("listener", cells.load("arm"), bus.Connection("client", (endpoint,)))
+    heard: dict[tuple[str, ...], list[tuple[int, Any]]] = {}
 
     def hear(topic, message, names):
         stream = (topic.name, *(value for name, value in names.items() if name != "publisher"))
@@ -177,19 +179,22 @@ def test_the_emulator_publishes_every_stream_of_the_cell_on_its_beat_and_in_time
     wait_for(lambda: set(heard) == streams, 60.0, "all streams")  # the first run compiles
     heard.clear()
 
-    def ages_ms(stream):
-        return [(received - m.stamp_ns) / 1e6 for received, m in list(heard.get(stream, ()))]
+    def smallest_age_ms(stream):
+        return min(((received - m.stamp_ns) / 1e6 for received, m in list(heard.get(stream, ()))), default=math.inf)
+
+    def is_in_time(stream):
+        return smallest_age_ms(stream) < 15.0
 
     for stream in streams:
         # A reading is sent at its instant: rendering alone takes longer than this. A machine that does other things as well
         # reaches it at times.
-        wait_for(lambda s=stream: min(ages_ms(s), default=99.0) < 15.0, 30.0, f"{stream} within 15 ms of its stamp")
+        wait_for(partial(is_in_time, stream), 30.0, f"{stream} within 15 ms of its stamp")
     wait_for(lambda: len(heard[("frame", "side")]) >= 5, 30.0, "5 frames")
     for stream in streams:
         stamps = np.array([m.stamp_ns for _, m in heard[stream]])
         periods = np.diff(stamps) / (50e6 if stream[0] == "frame" else 5e6)
         np.testing.assert_allclose(periods, np.maximum(np.round(periods), 1), atol=1e-6)  # some may be left out, none is between
-        assert min(ages_ms(stream)) > 0.0  # and none comes before its time
+        assert smallest_age_ms(stream) > 0.0  # and none comes before its time
 
 
 def test_the_emulator_obeys_control_queries_and_refuses_others(emulator):
@@ -204,9 +209,9 @@ def test_the_emulator_obeys_control_queries_and_refuses_others(emulator):
     wait_for(lambda: heard[("truth", "forearm")][-1][1].hidden == 1.0, 5.0, "the arm to be hidden")
     assert ask("pause")["paused"] is True
     wait_for(lambda: not heard[("truth", "forearm")][-1][1].velocity.any(), 5.0, "stillness")
-    with pytest.raises(bus.Refused, match=r"'dance' came. Commands:"):
+    with pytest.raises(bus.Refused, match=r"got 'dance'. Commands:"):
         ask("dance")
-    with pytest.raises(bus.Refused, match=r"one of p7-0, p7-1, p7-2 and one of error, .*, 'p6-0 error' came"):
+    with pytest.raises(bus.Refused, match=r"one of p7-0, p7-1, p7-2 and one of error, .*, got 'p6-0 error'"):
         ask("board", "p6-0 error")
     assert ask("resume")["paused"] is False
     wait_for(lambda: heard[("truth", "forearm")][-1][1].velocity.any(), 5.0, "motion")
@@ -223,6 +228,7 @@ def test_the_boards_of_a_pad_on_serial_ports_feel_what_the_world_and_its_faults_
     ask("skin", "p7/l saturated")
     cell = cells.load("arm")
     world = World(cell, 2)
+    assert world.skin is not None
     skin = world.skin.skin
     own = skin.of(skin.pads.index("p7"))
     expected = skin.amplitude(world.change(world.state(scene_s)))[own]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from services.fusion.observer import ErrorStateObserver
-from services.fusion.settings import Settings
-from shared import chi_square
-from shared.contract import senses
-from shared.geometry import rigid
-from shared.geometry.rigid import Array, perturb, pose_error
-from tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, Errors, ns, without_roll
+from penumbra.services.fusion.observer import ErrorStateObserver
+from penumbra.services.fusion.settings import Settings
+from penumbra.shared import chi_square
+from penumbra.shared.contract import senses
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array, perturb, pose_error
+from penumbra.tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, Errors, ns, without_roll
 
 ERRORS = senses.Errors(0.8, 1.0, 1e-4)
 SENSES = tuple(dataclasses.replace(sense, errors=ERRORS) for sense in senses.SENSES)

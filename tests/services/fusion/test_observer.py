@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from services.fusion import filter, so3
-from services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, Refused
-from services.fusion.observer import Bank, ErrorStateObserver
-from services.fusion.paper import PaperObserver
-from services.fusion.settings import Settings
-from shared.contract.messages import MAX_FUTURE_S
-from shared.contract.senses import SENSES
-from shared.geometry import rigid
-from shared.geometry.rigid import Array, perturb, pose_error
-from shared.native import Kernel
-from tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, ns, without_roll
+from penumbra.services.fusion import filter
+from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, Refused
+from penumbra.services.fusion.observer import Bank, ErrorStateObserver
+from penumbra.services.fusion.paper import PaperObserver
+from penumbra.services.fusion.settings import Settings
+from penumbra.shared.contract.messages import MAX_FUTURE_S
+from penumbra.shared.contract.senses import SENSES
+from penumbra.shared.geometry import rigid, so3
+from penumbra.shared.geometry.rigid import Array, perturb, pose_error
+from penumbra.shared.native import Kernel
+from penumbra.tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, ns, without_roll
 
 OBSERVERS = [ErrorStateObserver, PaperObserver]
 

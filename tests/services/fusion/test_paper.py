@@ -9,11 +9,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import block_diag, expm, solve_continuous_are
 
-from services.fusion import paper
-from services.fusion.paper import SENSES, C, PaperObserver, PaperSettings
-from shared.geometry import rigid
-from shared.geometry.rigid import perturb
-from tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, ns, without_roll
+from penumbra.services.fusion import paper
+from penumbra.services.fusion.paper import SENSES, C, PaperObserver, PaperSettings
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import perturb
+from penumbra.tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, ns, without_roll
 
 
 def test_the_papers_noise_of_vision_grows_with_what_is_hidden_and_has_a_floor() -> None:

@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
 
-from services.command import look
-from services.fusion import service
-from services.fusion.observer import ErrorStateObserver
-from shared.cell import description
-from shared.contract import messages, topics
-from shared.contract.senses import SENSES, Errors, Measures, Sense
-from shared.geometry.rigid import perturb
-from shared.runtime import bus
-from shared.runtime.node import Node
-from tests.support.fusion_data import HOME, SPREAD, VISION, ns
-from tests.support.live import free_port, wait_for
+from penumbra.services import flags
+from penumbra.services.command import look
+from penumbra.services.fusion import service
+from penumbra.services.fusion.observer import ErrorStateObserver
+from penumbra.shared.cell import description
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.contract.senses import SENSES, Errors, Measures, Sense
+from penumbra.shared.geometry.rigid import perturb
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.tests.support import injected
+from penumbra.tests.support.fusion_data import HOME, SPREAD, VISION, ns
+from penumbra.tests.support.live import free_port, wait_for
 
 TRUE = np.array([0.03, -0.02, 0.18])
 """Where the limb rests [m]."""
@@ -34,17 +36,22 @@ CAMERA_ERROR = np.array([0.02, 0.0, 0.0])
 OUTLIER = np.array([0.3, 0.0, 0.0])
 
 
-@dataclass(frozen=True, kw_only=True)
-class BeaconPosition(messages.Message):
+if TYPE_CHECKING:
+    PositionCovariance: TypeAlias = np.ndarray
+else:
+    PositionCovariance = messages.array("float64", 3, 3, check=messages.not_semidefinite)
+
+
+class BeaconPosition(messages.Message, frozen=True, kw_only=True):
     """What a made-up sensor measures that sees a beacon on the forearm and nothing of the arm's rotation."""
 
-    target: str
-    frame: str
-    position: np.ndarray = messages._array("float64", 3)
-    covariance: np.ndarray = messages._array("float64", 3, 3, check=messages._not_semidefinite)
+    target: messages.Name
+    frame: messages.Name
+    position: messages.Position
+    covariance: PositionCovariance
 
 
-TOPIC = topics.Topic("beacon", "penumbra/{cell}/target/{target}/beacon", BeaconPosition, 50, 16, 0.1, "beacon",
+TOPIC = topics.Topic("beacon", "penumbra/{cell}/target/{target}/beacon", BeaconPosition, 50, 16, 0.1, ("beacon",),
                      "a beacon's position", topics.Priority.POSE, 20)  # fmt: skip
 BEACON = Sense("beacon", TOPIC, Measures.POSITION, Errors(lasting=0.2, time_constant=0.3))
 THREE, TOPICS = (*SENSES, BEACON), (*topics.TOPICS, TOPIC)
@@ -52,7 +59,7 @@ THREE, TOPICS = (*SENSES, BEACON), (*topics.TOPICS, TOPIC)
 
 def beacon(position: np.ndarray, **changes: object) -> BeaconPosition:
     """A measurement with a standard deviation of 2 mm."""
-    values = {"stamp_ns": time.time_ns(), "target": "forearm", "frame": "world"}
+    values: dict[str, Any] = {"stamp_ns": time.time_ns(), "target": "forearm", "frame": "world"}
     return BeaconPosition(**(values | {"position": position, "covariance": np.diag([4e-6] * 3)} | changes))
 
 
@@ -104,19 +111,17 @@ class Chain:
 def chain() -> Iterator[Chain]:
     table = description.load("table")
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    parser = argparse.ArgumentParser()
-    service.arguments(parser)
     router = Node("router", table, bus.Connection(mode="router", listen=(endpoint,)))
     fusion, eye, sensor, user = (
         Node(name, table, bus.Connection(connect=(endpoint,))) for name in (service.NAME, "search", "beacon", "user")
     )
-    service.start(fusion, parser.parse_args([]), senses=THREE)
+    service.start(fusion, flags.parse(service.FLAGS, []), senses=THREE)
     with router, fusion, eye, sensor, user:
         yield Chain(endpoint, fusion, eye, sensor, user)
 
 
 @contextmanager
-def publishing(node: Node, topic: topics.Topic, make: object, period_s: float) -> Iterator[None]:
+def publishing(node: Node, topic: topics.Topic, make: Callable[[], messages.Message], period_s: float) -> Iterator[None]:
     """A measurement each period, in a thread of its own."""
     done = threading.Event()
 
@@ -124,13 +129,8 @@ def publishing(node: Node, topic: topics.Topic, make: object, period_s: float) -
         while not done.wait(period_s):
             node.publish(topic, make(), target="forearm")
 
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
+    with injected.meanwhile(publish, done):
         yield
-    finally:
-        done.set()
-        thread.join()
 
 
 def test_a_third_sense_that_measures_a_position_is_fused_weighed_listed_and_gated(
@@ -152,11 +152,11 @@ def test_a_third_sense_that_measures_a_position_is_fused_weighed_listed_and_gate
             # listed
             report = chain.report()
             assert report["beacon"]["accepted"] > 0 and report["haptic"]["accepted"] == 0
-            flags = ["--cell", "table", "--connect", chain.endpoint]
-            assert look.list_topics(["--cell", "table"], TOPICS) == 0
+            params = look.list_topics.params
+            look.show_topics(flags.parse(params), TOPICS)
             listed = next(line for line in capsys.readouterr().out.splitlines() if line.startswith(" beacon"))
-            assert "penumbra/table/target/{target}/beacon" in listed and "BeaconPosition" in listed
-            assert look.list_topics([*flags, "--hz", "--seconds", "0.5"], TOPICS) == 0
+            assert "penumbra/table/target/forearm/beacon" in listed and "BeaconPosition" in listed
+            look.show_topics(flags.parse(params, ["--connect", chain.endpoint, "--hz", "--seconds", "0.5"]), TOPICS)
             heard = next(line for line in capsys.readouterr().out.splitlines() if "target/forearm/beacon" in line)
             rate_hz, expected_hz = (float(each) for each in heard.split()[1:3])
             assert rate_hz > 0.0 and expected_hz == TOPIC.rate_hz
@@ -169,10 +169,10 @@ def test_a_third_sense_that_measures_a_position_is_fused_weighed_listed_and_gate
 
 def test_what_is_wrong_with_a_third_sense_s_messages_is_refused_and_counted(chain: Chain) -> None:
     chain.sensor.publish(TOPIC, beacon(TRUE, frame="moon"), target="forearm")
-    wrong = {"frame": {"frame": "moon"}, "covariance": {"covariance": np.zeros((3, 3))}}
+    wrong: dict[str, dict[str, Any]] = {"frame": {"frame": "moon"}, "covariance": {"covariance": np.zeros((3, 3))}}
     for kind, changes in wrong.items():
 
-        def is_refused(kind: str = kind, changes: dict = changes) -> bool:
+        def is_refused(kind: str = kind, changes: dict[str, Any] = changes) -> bool:
             chain.sensor.publish(TOPIC, beacon(TRUE, **changes), target="forearm")
             return chain.report().get("beacon", {}).get("refused", {}).get(kind, 0) > 0
 
@@ -222,8 +222,6 @@ def test_a_sense_whose_message_does_not_hold_what_it_measures_is_refused() -> No
 
 def test_the_papers_observer_takes_its_two_senses_whatever_the_table_has() -> None:
     table = description.load("table")
-    parser = argparse.ArgumentParser()
-    service.arguments(parser)
     node = Node(service.NAME, table)
-    service.start(node, parser.parse_args(["--observer", "paper"]), senses=THREE)
+    service.start(node, flags.parse(service.FLAGS, ["--observer", "paper"]), senses=THREE)
     assert {sense for sense in node.report().report["forearm"] if sense != "state"} == {"vision", "haptic"}

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 
-from services.fusion import service
-from services.fusion.estimate import Refused, information
-from shared.cell import description
-from shared.contract import messages, topics
-from shared.runtime import bus
-from shared.runtime.node import Node
-from tests.support.fusion_data import ns
-from tests.support.live import free_port, wait_for
+from penumbra.services import flags
+from penumbra.services.fusion import service
+from penumbra.services.fusion.estimate import Refused, information
+from penumbra.shared.cell import description
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.tests.support.fusion_data import ns
+from penumbra.tests.support.live import free_port, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +36,7 @@ def router(table: description.Cell) -> Iterator[str]:
 
 
 def vision_pose(table: description.Cell, **changes: object) -> messages.VisionPose:
-    values = {
+    values: dict[str, Any] = {
         "stamp_ns": time.time_ns(),
         "target": "forearm",
         "camera": "front",
@@ -51,10 +53,8 @@ def vision_pose(table: description.Cell, **changes: object) -> messages.VisionPo
 
 @pytest.mark.parametrize("observer", ["default", "paper"])
 def test_the_service_publishes_and_answers_in_both_formats(observer: str, table: description.Cell, router: str) -> None:
-    parser = argparse.ArgumentParser()
-    service.arguments(parser)
     fusion = Node(service.NAME, table, bus.Connection(connect=(router,)))
-    service.start(fusion, parser.parse_args(["--observer", observer]))
+    service.start(fusion, flags.parse(service.FLAGS, ["--observer", observer]))
     user = Node("user", table, bus.Connection(connect=(router,)))
     key = topics.current_pose("table", "forearm")
     heard: list[messages.FusedPose] = []
@@ -75,7 +75,7 @@ def test_the_service_publishes_and_answers_in_both_formats(observer: str, table:
             )
             return "vision" in answer()["sources"]
 
-        wait_for(occluded, 5.0, "vision to be heard")
+        wait_for(occluded, 5.0, "vision to be received")
         assert answer()["state"] == "lost"
 
         def tracking() -> bool:
@@ -110,9 +110,7 @@ def test_the_service_publishes_and_answers_in_both_formats(observer: str, table:
 
 
 def test_the_next_replica_speaks_while_the_owner_is_silent_and_no_longer(table: description.Cell, router: str) -> None:
-    parser = argparse.ArgumentParser()
-    service.arguments(parser)
-    options = parser.parse_args([])
+    options = flags.parse(service.FLAGS, [])
 
     class Frozen(Node):
         """Alive to the others, but silent when told so."""
@@ -149,11 +147,9 @@ def test_a_replica_that_takes_over_goes_on_with_the_pose(
 ) -> None:
     """Also where it begins before it has heard anything: the default observer goes on from what the old one publishes; the
     paper's leaves the word to the old one until it has."""
-    monkeypatch.setattr("shared.runtime.node.NEWS_S", 5.0)  # however busy the machine is
-    monkeypatch.setattr("shared.runtime.node.WARM_UP_S", 60.0)
-    parser = argparse.ArgumentParser()
-    service.arguments(parser)
-    options = parser.parse_args(["--observer", observer])
+    monkeypatch.setattr("penumbra.shared.runtime.node.NEWS_S", 5.0)  # however busy the machine is
+    monkeypatch.setattr("penumbra.shared.runtime.node.WARM_UP_S", 60.0)
+    options = flags.parse(service.FLAGS, ["--observer", observer])
 
     def replica() -> Node:
         node = Node(service.NAME, table, bus.Connection(connect=(router,)))
@@ -168,7 +164,7 @@ def test_a_replica_that_takes_over_goes_on_with_the_pose(
         wait_for(lambda: see() or (heard and heard[-1][0].state == "tracking"), 10.0, "a tracked pose")
         with replica() as new:
             del heard[:]
-            wait_for(lambda: len(heard) > 5, 5.0, "poses while the new one has heard nothing")
+            wait_for(lambda: len(heard) > 5, 5.0, "poses while the new one has received nothing")
             if observer == "default":
                 wait_for(lambda: new.health()["ready"], 5.0, "the new one to be ready without a measurement of its own")
             else:
@@ -189,10 +185,8 @@ def test_a_replica_that_takes_over_goes_on_with_the_pose(
 def test_what_the_service_refuses_is_counted_in_its_health_by_kind_and_moves_nothing(
     observer: str, table: description.Cell, router: str
 ) -> None:
-    parser = argparse.ArgumentParser()
-    service.arguments(parser)
     fusion = Node(service.NAME, table, bus.Connection(connect=(router,)))
-    service.start(fusion, parser.parse_args(["--observer", observer]))
+    service.start(fusion, flags.parse(service.FLAGS, ["--observer", observer]))
     user, rival = (Node("user", table, bus.Connection(connect=(router,))) for _ in range(2))
     key = topics.current_pose("table", "forearm")
 
@@ -200,11 +194,11 @@ def test_what_the_service_refuses_is_counted_in_its_health_by_kind_and_moves_not
         (reply,) = user.query(topics.health("table", service.NAME, fusion.instance)) or [b"{}"]
         return json.loads(reply)
 
-    def refused() -> dict:
-        return health().get("report", {}).get("forearm", {}).get("vision", {}).get("refused", {})
+    def are_refused(counted: dict[str, int]) -> bool:
+        return health().get("report", {}).get("forearm", {}).get("vision", {}).get("refused", {}) == counted
 
-    def by_decoder() -> int:
-        return health()["topics"][topics.VISION.at(cell="table", target="forearm")]["bad"].get("values", 0)
+    def are_not_decoded(count: int) -> bool:
+        return health()["topics"][topics.VISION.at(cell="table", target="forearm")]["bad"].get("values", 0) == count
 
     with fusion, user, rival:
         good = threading.Event()
@@ -217,7 +211,7 @@ def test_what_the_service_refuses_is_counted_in_its_health_by_kind_and_moves_not
         publisher.start()
         wait_for(lambda: health().get("report", {}).get("forearm", {}).get("state") == "tracking", 5.0, "the state tracking")
         away = np.array([0.06, 0.02, 0.15])
-        wrong = [
+        wrong: list[tuple[str, Node, dict[str, Any]]] = [
             ("frame", user, {"frame": "moon"}),
             ("frame", user, {"target": "leg"}),
             ("camera", user, {"camera": "back"}),
@@ -229,10 +223,10 @@ def test_what_the_service_refuses_is_counted_in_its_health_by_kind_and_moves_not
             counted[kind] = counted.get(kind, 0) + 1
             stamp_ns = time.time_ns() + changes.pop("stamp_ns", 0)
             node.publish(topics.VISION, vision_pose(table, position=away, stamp_ns=stamp_ns, **changes), target="forearm")
-            wait_for(lambda counted=counted: refused() == counted, 5.0, f"{kind} among {counted}")
-        for k, changes in enumerate(({"orientation": np.zeros(4)}, {"covariance": np.diag([1.0, 1, 1, 1, 1, -1])})):
-            user.publish(topics.VISION, vision_pose(table, position=away, **changes), target="forearm")
-            wait_for(lambda k=k: by_decoder() == k + 1, 5.0, "what is not even decoded")
+            wait_for(partial(are_refused, counted), 5.0, f"{kind} among {counted}")
+        for k, (field, value) in enumerate((("orientation", np.zeros(4)), ("covariance", np.diag([1.0, 1, 1, 1, 1, -1])))):
+            user.publish(topics.VISION, vision_pose(table, position=away, **{field: value}), target="forearm")
+            wait_for(partial(are_not_decoded, k + 1), 5.0, "what is not even decoded")
         wait_for(lambda: health()["report"]["forearm"]["vision"]["accepted"] > 5, 5.0, "that good poses go on being accepted")
         good.set()
         publisher.join()
@@ -245,10 +239,8 @@ def test_what_the_service_refuses_is_counted_in_its_health_by_kind_and_moves_not
 def test_a_camera_whose_clock_is_ahead_by_less_than_the_bus_allows_is_fused(
     observer: str, table: description.Cell, router: str
 ) -> None:
-    parser = argparse.ArgumentParser()
-    service.arguments(parser)
     fusion, user = (Node(name, table, bus.Connection(connect=(router,))) for name in (service.NAME, "user"))
-    service.start(fusion, parser.parse_args(["--observer", observer]))
+    service.start(fusion, flags.parse(service.FLAGS, ["--observer", observer]))
 
     def see(ahead_s: float) -> dict:
         stamp_ns = time.time_ns() + int(1e9 * ahead_s)
@@ -302,10 +294,8 @@ def test_a_clock_that_is_set_makes_the_pose_lost_until_the_next_measurement_and_
 
 
 def test_a_target_that_the_cell_does_not_have_is_told(table: description.Cell) -> None:
-    parser = argparse.ArgumentParser()
-    service.arguments(parser)
     with pytest.raises(description.CellError, match="cell table has no target 'leg': it has forearm"):
-        service.start(Node(service.NAME, table), parser.parse_args(["--target", "leg"]))
+        service.start(Node(service.NAME, table), flags.parse(service.FLAGS, ["--target", "leg"]))
 
 
 def test_a_covariance_that_is_none_is_refused() -> None:

@@ -10,21 +10,21 @@ import pytest
 import torch
 import trimesh
 
-from services.fusion.observer import ErrorStateObserver
-from services.haptics import paper_network as networks
-from services.haptics import train
-from services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
-from services.haptics.paper_nearest import nearest_points
-from services.haptics.paper_network import Relative
-from services.haptics.size_and_rest import SIZE, SIZE_SPREAD, Size, Tare
-from services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, Prior, Reading, Solver, marginal, peak
-from shared.body.anatomy import target_mesh
-from shared.cell import description as cells
-from shared.geometry import rigid
-from shared.geometry.surface import Surface
-from shared.skin.layout import Skin
-from shared.skin.response import Response
-from sim.skin import field
+from penumbra.services.fusion.observer import ErrorStateObserver
+from penumbra.services.haptics import paper_network as networks
+from penumbra.services.haptics import train
+from penumbra.services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
+from penumbra.services.haptics.paper_nearest import nearest_points
+from penumbra.services.haptics.paper_network import Relative
+from penumbra.services.haptics.size_and_rest import SIZE, SIZE_SPREAD, Size, Tare
+from penumbra.services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, Prior, Reading, Solver, marginal, peak
+from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin.layout import Skin
+from penumbra.shared.skin.response import Response
+from penumbra.sim.skin import field
 
 MS = 1_000_000
 WEIGHTS = Path(train.__file__).parent / "weights"
@@ -33,16 +33,6 @@ SIZES = np.array([0.03, -0.2])
 ANYWHERE = np.repeat([0.12, 0.4], 3)
 THREE_SIGMA = 20.06
 """Squared Mahalanobis distance of six directions that is as improbable as three standard deviations of one."""
-
-
-@pytest.fixture(scope="module")
-def table() -> cells.Cell:
-    return cells.load("table")
-
-
-@pytest.fixture(scope="module")
-def skin(table: cells.Cell) -> Skin:
-    return Skin(table)
 
 
 @pytest.fixture(scope="module")
@@ -300,6 +290,7 @@ def test_a_limb_that_comes_back_elsewhere_is_found_at_once(skin: Skin, response:
     assert np.abs(rigid.pose_error(there, which.pose)[1:3]).max() < 0.015
 
 
+@pytest.mark.slow
 def test_of_two_places_that_feel_alike_far_away_neither_is_called_certain(
     skin: Skin, response: Response, forearm: Surface, pads: np.ndarray
 ) -> None:
@@ -398,7 +389,9 @@ def scenes(table: cells.Cell) -> train.Scenes:
 def test_numpy_and_torch_give_the_same_pose_and_the_loss_is_the_gaussians(scenes: train.Scenes) -> None:
     torch.manual_seed(0)
     model = train.build(30)
-    torch.nn.init.normal_(model[-1].weight, std=0.05)
+    last = model[-1]
+    assert isinstance(last, torch.nn.Linear)
+    torch.nn.init.normal_(last.weight, std=0.05)
     rng = np.random.default_rng(0)
     mean, scale = rng.standard_normal(30), rng.uniform(0.5, 2, 30)
     x = rng.standard_normal(30).astype(np.float32)
@@ -415,6 +408,7 @@ def test_numpy_and_torch_give_the_same_pose_and_the_loss_is_the_gaussians(scenes
     assert train.loss(out, label).item() == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_r_c_is_what_the_errors_were_and_grows_with_the_gap(scenes: train.Scenes) -> None:
     """A network that answers home whatever it feels: its errors are the scenes' own scatter, the same everywhere."""
     inputs = scenes.inputs(scenes.draw(np.random.default_rng(0), 2)).shape[1]
@@ -436,7 +430,7 @@ def test_weights_of_another_cell_are_refused_and_a_calibration_is_no_other_cell(
     assert networks.fingerprint(table.model_copy(update={"pads": pads}), "forearm") == networks.fingerprint(table, "forearm")
 
 
-@pytest.mark.parametrize("name", ["table", "arm"])
+@pytest.mark.parametrize("name", ["table", pytest.param("arm", marks=pytest.mark.slow)])
 def test_the_committed_weights_reach_what_their_card_says(name: str) -> None:
     cell = cells.load(name)
     network = networks.load(WEIGHTS / f"{name}-forearm.npz", cell, "forearm")
@@ -449,6 +443,7 @@ def test_the_committed_weights_reach_what_their_card_says(name: str) -> None:
             assert got[1] < 2.0 * promised[1] + 2.0
 
 
+@pytest.mark.slow
 def test_training_can_be_interrupted_goes_on_and_writes_weights_with_a_card(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -465,7 +460,7 @@ def test_training_can_be_interrupted_goes_on_and_writes_weights_with_a_card(
     loss = train.loss
     monkeypatch.setattr(train, "loss", interrupted)
     assert train.main([*flags, "--cell", "table"]) == 130
-    assert "stopped at step 3: go on with --resume" in capsys.readouterr().out
+    assert "stopped at step 3: continue with --resume" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="expected a checkpoint for target forearm of cell arm"):
         train.main([*flags, "--cell", "arm", "--resume"])
     assert train.main([*flags, "--cell", "table", "--resume"]) == 0

@@ -2,38 +2,28 @@
 
 from __future__ import annotations
 
-import argparse
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from services.haptics import service
-from services.haptics.batches import Backlog, Collector, VoltageWindow
-from services.haptics.pad_poses import PadPoses
-from shared.body.robot import robot_models
-from shared.cell import description as cells
-from shared.contract import messages, topics
-from shared.geometry import rigid
-from shared.runtime import bus
-from shared.runtime.node import Node
-from shared.skin.layout import Skin
-from shared.skin.response import Response
-from sim.world.world import TICK_NS, Sensors, World
-from tests.support.live import free_port, wait_for
+from penumbra.services.haptics import service
+from penumbra.services.haptics.batches import Backlog, Collector, VoltageWindow
+from penumbra.services.haptics.pad_poses import PadPoses
+from penumbra.shared.body.robot import robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.geometry import rigid
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.shared.skin.layout import Skin
+from penumbra.shared.skin.response import Response
+from penumbra.sim.world.world import TICK_NS, Sensors, World
+from penumbra.tests.support.live import free_port, wait_for
 
 MS = 1_000_000
 OPTIONS = {"method": "solve", "weights": service.WEIGHTS, "window_ms": 10.0}
-
-
-@pytest.fixture(scope="module")
-def table() -> cells.Cell:
-    return cells.load("table")
-
-
-@pytest.fixture(scope="module")
-def skin(table: cells.Cell) -> Skin:
-    return Skin(table)
 
 
 # ---- windows
@@ -195,7 +185,7 @@ def test_the_service_answers_every_window_within_milliseconds_and_goes_on_withou
     world = World(table, seed=3)
     world.plan(3.0)
     poses: list[tuple[int, messages.HapticPose]] = []
-    options = argparse.Namespace(**OPTIONS)
+    options = SimpleNamespace(**OPTIONS)
     haptics = Node("haptics", table, bus.Connection(connect=(endpoint,)))
     service.start(haptics, options)
     reader = Node("reader", table, bus.Connection(connect=(endpoint,)))
@@ -224,7 +214,7 @@ def test_the_service_answers_every_window_within_milliseconds_and_goes_on_withou
 
         def played(count: int) -> None:
             before = len(poses)
-            wait_for(lambda: tick() or len(poses) >= before + count, 15, f"{count} poses", interval=0.0)
+            wait_for(lambda: len(poses) >= before + count, 15, f"{count} poses", 0.0, tick)
 
         played(60)
         silent_ns = emulator.now_ns()
@@ -266,7 +256,7 @@ def test_a_fused_pose_is_looked_at_only_where_a_camera_had_a_part_in_it_lately()
 def test_a_turned_pad_stands_out_by_its_misfit_in_the_health(table: cells.Cell, skin: Skin) -> None:
     """Its electrodes read what the ones opposite should; its estimate goes on without it."""
     node = Node("haptics", table, bus.Connection(connect=("tcp/127.0.0.1:1",)))
-    misfits, which = service.Misfits(node), service.estimator(node, argparse.Namespace(**OPTIONS), table, "forearm")
+    misfits, which = service.Misfits(node), service.estimator(node, SimpleNamespace(**OPTIONS), table, "forearm")
     T = rigid.from_rpy((0.02, -0.02, 0.075), (0.0, 0.05, 0.1))
     T_pads_target = np.stack([rigid.inverse(pad) for pad in skin.T_world_pads()]) @ T
     signals = skin.gain * skin.sensitivity * Response(table, "forearm").change(T_pads_target)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.haptics.settings import HapticSettings
-from services.haptics.solve import Reading
-from services.haptics.starts import Limb, Starts
-from services.haptics.track import Home, Place, Track, roll_axis
-from services.haptics.trust import PadTrust, SmoothedMisfit
-from shared.body.anatomy import target_mesh
-from shared.cell import description as cells
-from shared.geometry import rigid
-from shared.geometry.surface import Surface
-from shared.skin.layout import Skin
+from penumbra.services.haptics.settings import HapticSettings
+from penumbra.services.haptics.solve import Reading
+from penumbra.services.haptics.starts import Limb, Starts
+from penumbra.services.haptics.track import Home, Place, Track, roll_axis
+from penumbra.services.haptics.trust import PadTrust, SmoothedMisfit
+from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin.layout import Skin
 
 SETTINGS = HapticSettings()
 HOME = Home(rigid.transform([0.0, 0.0, 0.2]), np.repeat([0.12, 0.4], 3), SETTINGS)

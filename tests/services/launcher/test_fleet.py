@@ -6,18 +6,20 @@ import os
 import signal
 import sys
 import threading
+from functools import partial
 
 import pytest
 from rich.console import Console
 
-from services.command import cli
-from services.launcher import launch
-from services.launcher.fleet import Fleet, Kind
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.runtime import bus
-from shared.runtime.node import Node
-from tests.support.live import free_port, wait_for
+from penumbra.services.command import cli
+from penumbra.services.launcher import launch
+from penumbra.services.launcher.fleet import Fleet, Kind
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.tests.support.live import free_port, wait_for
+from penumbra.tests.support.nodes import node_command
 
 CELL = cells.load("table")
 ALWAYS_CRASHES = [sys.executable, "-c", "import sys; sys.exit('out of luck')"]
@@ -28,11 +30,11 @@ class Launched:
 
     def __init__(self, node, fleet, kinds):
         self.node, self.fleet = node, fleet
-        self.living = {name: set() for name in kinds}
+        self.living: dict[str, set[str]] = {name: set() for name in kinds}
         self.fewest = {}
         tokens = node.session.liveliness().declare_subscriber(topics.alive("table"), self._on_token, history=True)
         self._tokens = tokens
-        self.launcher = launch.Launcher(node, fleet, Console(width=400, quiet=True))
+        self.launcher = launch.Launcher(node, fleet, Console(width=400, quiet=True), keep_going=True)
         self.thread = threading.Thread(target=self.launcher.run, args=(120,))
         self.thread.start()
 
@@ -46,6 +48,9 @@ class Launched:
 
     def pids(self, service):
         return [process.pid for process in self.fleet.processes if process.name.partition(" ")[0] == service]
+
+    def has(self, service, count):
+        return len(self.living[service]) == count
 
     def command(self, *argv):
         return cli.main([*argv, "--connect", self.node.connection.listen[0]])
@@ -77,9 +82,11 @@ def launched():
 
 
 def small(name, beside=True, **environment):
-    """The small service of tests.support.nodes under another name."""
+    """The small service of penumbra.tests.support.nodes under another name."""
     return lambda endpoint: Kind(
-        [sys.executable, "-m", "tests.support.nodes", name, "--connect", endpoint], environment=environment, beside=beside
+        node_command(name, endpoint),
+        environment=environment,
+        beside=beside,
     )
 
 
@@ -92,7 +99,7 @@ def test_a_rolling_restart_replaces_every_process_and_no_service_is_ever_without
     for name, pids in before.items():
         assert len(up.pids(name)) == len(pids)
         assert not set(up.pids(name)) & set(pids)
-        wait_for(lambda name=name, pids=pids: len(up.living[name]) == len(pids), 5, "the old ones to be gone")
+        wait_for(partial(up.has, name, len(pids)), 5, "the old ones to be gone")
     assert [process.name for process in up.fleet.processes] == ["worker", "helper 1", "helper 2"]
     out = capsys.readouterr().out
     assert "waiting for worker 2 (" in out
@@ -118,14 +125,14 @@ def test_a_successor_that_does_not_start_is_told_and_the_old_one_goes_on(launche
     broken = tmp_path / "broken"
     code = (
         f"import os, runpy, sys; os.path.exists({str(broken)!r}) and sys.exit('no licence'); "
-        "runpy.run_module('tests.support.nodes', None, '__main__')"
+        "runpy.run_module('penumbra.tests.support.nodes', None, '__main__')"
     )
     kind = lambda endpoint: Kind([sys.executable, "-c", code, "worker", "--connect", endpoint])  # noqa: E731
     up = launched({"worker": kind, "helper": small("helper")}, {"worker": 1, "helper": 1})
     before = {name: up.pids(name) for name in ("worker", "helper")}
     broken.touch()
     assert up.command("restart", "--all") == 1
-    assert "worker 2 does not start: exit code 1: no licence" in capsys.readouterr().out
+    assert "worker 2 did not start: exit code 1: no licence" in capsys.readouterr().out
     assert {name: up.pids(name) for name in ("worker", "helper")} == before
 
 
@@ -137,7 +144,7 @@ def test_a_crash_loop_is_told_and_does_not_hold_up_what_is_restarted(launched, c
     told = "crashing waiting: crash loop: exit code 1: out of luck"
     wait_for(lambda: told in up.node.health()["reasons"], 20, "the report of a crash loop")
     assert up.node.health()["status"] == "degraded"
-    line = "a process dies again and again; the others go on"
+    line = "a process exits repeatedly; the others continue"
     wait_for(lambda: [record for record in caplog.records if record.message == line], 5, "the line in the log")
     assert up.command("restart", "worker") == 0
     assert len(up.pids("worker")) == 1 and up.pids("worker") != before
@@ -170,13 +177,16 @@ def test_a_hung_process_is_ended_by_force_when_it_is_replaced(launched):
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["restart", "magic"], "penumbra restart: restart magic: one of worker expected: these run here"),
-        (["scale", "magic=2"], "penumbra scale: scale magic=2: NAME=NUMBER, NAME one of worker, sensor, meeting expected"),
-        (["scale", "worker=65"], "penumbra scale: worker=65: 0 to 64 of worker expected"),
+        (["restart", "magic"], "penumbra restart: restart: expected one of worker, which run here, got magic"),
+        (
+            ["scale", "magic=2"],
+            "penumbra scale: scale: expected NAME=NUMBER with NAME one of worker, sensor, meeting, got magic=2",
+        ),
+        (["scale", "worker=65"], "penumbra scale: worker: expected 0 to 64, got 65"),
         (["scale", "meeting=0"], "penumbra scale: meeting: expected 1, got 0: all other processes meet there"),
         (
             ["scale", "sensor=2"],
-            "penumbra scale: sensor=2: 0 to 1 of sensor expected, because it stands for what there is but once",
+            "penumbra scale: sensor: expected 0 to 1, because only one can run, got 2",
         ),
     ],
 )
@@ -201,7 +211,7 @@ def test_one_change_at_a_time():
     with pytest.raises(ValueError, match="busy: restart of worker, begins; ask again"):
         ask(command="scale", service="worker", number=2, id="b")
     assert ask(command="state", id="a")["what"] == "restart of worker"
-    with pytest.raises(ValueError, match="no change b was asked for here"):
+    with pytest.raises(ValueError, match="expected a change requested from this launcher, got b"):
         ask(command="state", id="b")
 
 

@@ -3,7 +3,9 @@
 import contextlib
 import ctypes
 import os
+import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -13,16 +15,17 @@ from pathlib import Path
 import psutil
 import pytest
 
-from services.launcher import forkserver, supervised
-from services.launcher.fleet import Fleet, Kind
-from services.launcher.forkserver import Forked, ForkServer
-from services.launcher.supervised import Supervised
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.processes import PROCESSES
-from shared.runtime import bus
-from shared.runtime.node import Node
-from tests.support.live import free_port, wait_for
+from penumbra.services.launcher import forkserver, supervised
+from penumbra.services.launcher.fleet import Fleet, Kind
+from penumbra.services.launcher.forkserver import Forked, ForkServer
+from penumbra.services.launcher.supervised import Supervised
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.processes import PROCESSES
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.tests.support.live import free_port, penumbra_command, wait_for
+from penumbra.tests.support.nodes import node_command
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are adopted on Linux only")
 
@@ -56,7 +59,7 @@ def make(tmp_path, monkeypatch):
         started.append(server)
         server.start()
         if is_ready:
-            wait_for(lambda: server.watch(True) or server.has_modules, 60, "a fork server that has all modules")
+            wait_for(lambda: server.has_modules, 60, "a fork server that has all modules", act=lambda: server.watch(True))
         return server
 
     yield make
@@ -165,15 +168,17 @@ def test_every_service_can_be_forked(make):
 
 
 def test_a_module_that_is_not_installed_is_left_to_its_service(make):
-    assert make("services.nowhere.service", "json").has_modules
+    assert make("penumbra.services.nowhere.service", "json").has_modules
 
 
 def test_a_service_is_back_from_the_fork_server_in_less_than_half_the_time_of_a_plain_start(router, make, supervise):
-    server = make("tests.support.nodes")
-    process = supervise(None, "tests.support.nodes", "worker", "--connect", router)
+    server = make("penumbra.tests.support.nodes")
+    process = supervise(None, "penumbra.tests.support.nodes", "worker", "--connect", router)
     times = {}
     with Node("test", CELL, bus.Connection(connect=(router,))) as node:
-        tokens = lambda: [r.ok for r in node.session.liveliness().get(topics.alive("table", "worker"), timeout=1.0) if r.ok]  # noqa: E731
+        session = node.session
+        assert session is not None
+        tokens = lambda: [r.ok for r in session.liveliness().get(topics.alive("table", "worker"), timeout=1.0) if r.ok]  # noqa: E731
         wait_for(lambda: len(tokens()) == 1, 20, "the service")
         for origin in (None, server):
             process._forkserver, taken = origin, []
@@ -190,8 +195,8 @@ def test_a_service_is_back_from_the_fork_server_in_less_than_half_the_time_of_a_
 
 
 def test_after_a_restart_by_command_services_are_forked_from_what_is_installed_then(router, make):
-    server = make("tests.support.nodes")
-    command = [sys.executable, "-m", "tests.support.nodes", "worker", "--connect", router]
+    server = make("penumbra.tests.support.nodes")
+    command = node_command("worker", router)
     fleet = Fleet({"worker": Kind(command)}, {"worker": 1}, server)
     fleet.start()
     try:
@@ -217,7 +222,7 @@ def test_after_a_restart_by_command_services_are_forked_from_what_is_installed_t
 def test_a_forked_service_and_the_fork_server_end_with_the_launcher(number):
     counts = {process.name: 0 for process in PROCESSES if process.replicas} | {"router": 1, "fusion": 1}
     replicas = [word for name, count in counts.items() for word in ("--replicas", f"{name}={count}")]
-    command = [sys.executable, "-m", "services.command.cli", "up", "--port", str(free_port()), *replicas]
+    command = penumbra_command("up", "--port", str(free_port()), *replicas)
     up = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         (server,) = wait_for(lambda: children(up.pid, "penumbra fork server"), 60, "the fork server", 0.1)
@@ -232,6 +237,17 @@ def test_a_forked_service_and_the_fork_server_end_with_the_launcher(number):
     finally:
         up.kill()
         up.wait()
+
+
+def test_a_fork_server_whose_launcher_is_gone_ends_without_a_word():
+    """A socket that is closed with something unread in it, here that the fork server is ready, resets the other end."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    command = [sys.executable, "-m", "penumbra.services.launcher.forkserver", str(theirs.fileno()), "json"]
+    server = subprocess.Popen(command, pass_fds=[theirs.fileno()], stderr=subprocess.PIPE, text=True)
+    theirs.close()
+    wait_for(lambda: select.select([ours], [], [], 0)[0], 30, "the fork server")
+    ours.close()
+    assert server.communicate(timeout=10)[1] == ""
 
 
 def children(pid, word):

@@ -1,5 +1,6 @@
 """The launcher with real processes, some of them misbehaving."""
 
+import contextlib
 import os
 import re
 import signal
@@ -13,19 +14,20 @@ import psutil
 import pytest
 from rich.console import Console
 
-from services.launcher import display, launch, supervised
-from services.launcher.fleet import Fleet, Kind
-from services.launcher.forkserver import ForkServer
-from services.launcher.supervised import Supervised
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.messages import Truth
-from shared.contract.processes import PROCESSES
-from shared.contract.report import Report, TopicReport
-from shared.runtime import bus
-from shared.runtime.node import Node
-from tests.support.live import connect, free_port, service_of, wait_for
-from tests.support.nodes import pose
+from penumbra.services import flags as command_line
+from penumbra.services.launcher import display, launch, supervised
+from penumbra.services.launcher import up as up_command
+from penumbra.services.launcher.fleet import Fleet, Kind
+from penumbra.services.launcher.supervised import Supervised
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.messages import Truth
+from penumbra.shared.contract.processes import PROCESSES
+from penumbra.shared.contract.report import Report, TopicReport
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.tests.support.live import connect, free_port, penumbra_command, service_of, stays, wait_for
+from penumbra.tests.support.nodes import node_command, pose
 
 CELL = cells.load("table")
 ROOT = Path(__file__).parents[3]
@@ -92,8 +94,12 @@ def test_a_process_that_was_asked_for_nothing_it_has_fails_with_its_last_words_a
     until = supervise(process)
     until(lambda: process.state == "failed", 3, "failure")
     assert process.note == "exit code 2: cell table has no camera: it has front"
-    with pytest.raises(AssertionError):
-        until(lambda: process.restarts, 0.5, "a restart that must not come")
+
+    def stays_down():
+        process.watch()
+        return not process.restarts
+
+    assert stays(stays_down, 0.5)
 
 
 def test_a_process_that_hangs_is_killed_and_started_again(supervise, monkeypatch):
@@ -104,15 +110,17 @@ def test_a_process_that_hangs_is_killed_and_started_again(supervise, monkeypatch
     process.heard()
     until(lambda: process.pid not in (None, first), 3, "another process")
     assert "no answer" in process.note
-    with pytest.raises(AssertionError):
-        until(lambda: process.restarts > 1, 0.6, "a kill while it was never heard: it may still be loading")
+
+    def is_spared():
+        process.watch()
+        return process.restarts <= 1
+
+    assert stays(is_spared, 0.6), "not killed before its first answer: it may still be loading"
 
 
 def test_a_process_whose_handler_hangs_is_killed_and_started_again_although_it_answers(router, monkeypatch):
     monkeypatch.setattr(supervised, "SILENT_S", 1.5)
-    fleet = Fleet(
-        {"hanging": Kind([sys.executable, "-m", "tests.support.nodes", "hanging", "--connect", router])}, {"hanging": 1}
-    )
+    fleet = Fleet({"hanging": Kind(node_command("hanging", router))}, {"hanging": 1})
     (process,) = fleet.processes
     with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
         node.every(0.1, lambda: node.stopping.set() if process.restarts else None)
@@ -121,7 +129,7 @@ def test_a_process_whose_handler_hangs_is_killed_and_started_again_although_it_a
     assert re.fullmatch(r"timer publish of 0.01 s hangs for \d+ s, killed by SIGKILL.*", process.note)
 
 
-def test_stopping_takes_less_than_three_seconds_whatever_the_processes_do(supervise):
+def test_stopping_waits_for_nobody_who_would_not_end_by_himself(supervise):
     processes = [
         python("sleeper", SLEEPS),
         python("deaf", IGNORES_SIGTERM),
@@ -132,8 +140,8 @@ def test_stopping_takes_less_than_three_seconds_whatever_the_processes_do(superv
     tree = until(lambda: len(found := family(processes)) >= 4 and found, 5, "a grandchild")
     started = time.monotonic()
     supervised.stop(processes)
-    assert time.monotonic() - started < 3.0
-    wait_for(lambda: not any(alive(process) for process in tree), 1, "all of them to be gone")
+    assert time.monotonic() - started < 10 * supervised.TERMINATE_S, "they would sleep for ten minutes"
+    wait_for(lambda: not any(alive(process) for process in tree), 10, "all of them to be gone")
 
 
 def family(processes):
@@ -147,7 +155,9 @@ def alive(process):
 
 def test_the_launcher_shows_a_service_running_and_its_topics(capsys):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    fleet = Fleet({"steady": Kind([sys.executable, "-m", "tests.support.nodes", "steady", "--connect", endpoint])}, {"steady": 1})
+    fleet = Fleet(
+        {"steady": Kind([sys.executable, "-m", "penumbra.tests.support.nodes", "steady", "--connect", endpoint])}, {"steady": 1}
+    )
     (steady,) = fleet.processes
     node = Node("launcher", CELL, bus.Connection("router", listen=(endpoint,)))
     with node:
@@ -156,9 +166,17 @@ def test_the_launcher_shows_a_service_running_and_its_topics(capsys):
         launcher.watch.refresh()
         node.every(0.1, lambda: node.stopping.set() if is_shown(launcher, steady) else None)
         launcher.run(20)
+        for size in ((80, 24), (40, 24)):
+            narrow = Console(width=size[0], height=size[1])
+            with narrow.capture() as drawn:
+                narrow.print(display.Picture("penumbra pose", launcher.watch).draw([steady.row()], *size))
+            lines = drawn.get().splitlines()
+            assert lines[1:5] == ["forearm: tracking", "x 0.0  y 0.0  z 20.0 cm", "roll 0  pitch 0  yaw 0 deg",
+                                  "from haptic 30 %, vision 70 %"]  # fmt: skip
+            assert any(line.startswith("fused ") for line in lines)
+            assert len(lines) < size[1] and max(map(len, lines)) <= size[0]
         with console.capture() as drawn:
-            console.print(display.table("a cell", [steady.row()], launcher.watch))
-    assert "fused" in drawn.get()
+            console.print(display.plain([steady.row()], launcher.watch))
     assert "pose of forearm: tracking, at 0.0 0.0 20.0 cm" in drawn.get()
     assert steady.state == "stopped"
     assert "restarts: none" in capsys.readouterr().out
@@ -188,7 +206,7 @@ def test_the_error_is_measured_against_the_truth_at_the_time_of_the_pose():
 
 
 def up(*arguments, **kwargs):
-    command = [sys.executable, "-m", "services.command.cli", "up", *arguments]
+    command = penumbra_command("up", *arguments)
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs)
 
 
@@ -220,7 +238,7 @@ def test_up_refuses_replicas_of_what_does_not_exist():
     process = up("--replicas", "magic=2")
     _, err = process.communicate(timeout=20)
     assert process.returncode == 2
-    assert "NAME one of router, emulator, segmentation" in err
+    assert "--replicas magic=2: expected one of router, emulator, segmentation" in err
 
 
 def started_by(process):
@@ -230,21 +248,23 @@ def started_by(process):
         return []
 
 
-@pytest.mark.parametrize(("number", "seconds"), [(signal.SIGINT, 3.0), (signal.SIGKILL, 1.0)])
-def test_nothing_is_left_behind_however_the_launcher_ends(number, seconds):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_nothing_is_left_behind_however_the_launcher_ends(number):
     port = free_port()
     process = up("--port", str(port), *NOTHING, "--replicas", "fusion=2")
     node = Node("test", CELL, bus.Connection(connect=(f"tcp/127.0.0.1:{port}",)))
     try:
         with node.open(patience_s=10):
-            tokens = lambda: [r for r in node.session.liveliness().get(topics.alive("table", "fusion"), timeout=1.0) if r.ok]  # noqa: E731
+            session = node.session
+            assert session is not None
+            tokens = lambda: [r for r in session.liveliness().get(topics.alive("table", "fusion"), timeout=1.0) if r.ok]  # noqa: E731
             wait_for(lambda: len(tokens()) == 2, 20, "both replicas on the bus", 0.1)
         children = started_by(process)
         services = [name for child in children if (name := service_of(child))]
         assert sorted(services) == ["fusion", "fusion", "router"]
         started = time.monotonic()
         process.send_signal(number)
-        wait_for(lambda: process.poll() is not None and not any(alive(child) for child in children), seconds, "the end of all")
+        wait_for(lambda: process.poll() is not None and not any(alive(child) for child in children), 30, "the end of all")
         print(f"{number.name}: all gone after {time.monotonic() - started:.2f} s")
         assert process.returncode == (0 if number != signal.SIGKILL else -signal.SIGKILL)
     finally:
@@ -348,31 +368,34 @@ def test_up_uses_the_router_of_the_environment_unless_it_is_given_a_port(router)
         (["--port", "0"], "--port: expected a port from 1 to 65535, got '0'"),
         (["--seconds", "nan"], "--seconds: expected a time above 0, in seconds, got 'nan'"),
         (["--seconds", "-3"], "--seconds: expected a time above 0, in seconds, got '-3'"),
-        (["--method", "foo"], "--method: invalid choice: 'foo'"),
-        (["--observer", "foo"], "--observer: invalid choice: 'foo'"),
-        (["--cel", "table"], "unrecognized arguments: --cel table"),
+        (["--method", "foo"], "--method: expected default or paper, got 'foo'"),
+        (["--observer", "foo"], "--observer: expected default or paper, got 'foo'"),
+        (["--cel", "table"], "no option --cel; did you mean --cell?"),
         (["--replicas", "router=0"], "--replicas router: expected 1, got 0: all other processes meet there"),
     ],
 )
 def test_up_refuses_a_bad_flag_in_one_line(flags, words, capsys):
     with pytest.raises((SystemExit, cells.CellError)) as ended:
-        launch.main(flags, ForkServer())
+        up_command.main(flags)
     assert words in (capsys.readouterr().err or str(ended.value))
 
 
 def test_the_children_of_up_import_nothing_from_the_current_folder(tmp_path):
-    for name in ("shared", "services", "sim", "zenoh", "json"):
+    for name in ("penumbra", "shared", "zenoh", "json"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text(f"raise SystemExit('the {name} of the current folder')")
-    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); "
+    main = "from penumbra.services.command.cli import main; sys.exit(main(sys.argv[1:]))"
     flags = ["up", "--port", str(free_port()), "--seconds", "3", *NOTHING, "--replicas", "fusion=1"]
     for fork in (True, False):  # without a fork server every process is started plainly
-        broken = "" if fork else "from services.launcher import forkserver; forkserver.ForkServer.start = lambda self: None; "
+        broken = (
+            "" if fork else "from penumbra.services.launcher import forkserver; forkserver.ForkServer.start = lambda self: None; "
+        )
         command = [
             sys.executable,
             "-P",
             "-c",
-            code.replace("from services.command.cli", f"{broken}from services.command.cli"),
+            f"{code}{broken}{main}",
             *flags,
         ]
         out = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
@@ -393,3 +416,70 @@ def test_up_ends_in_order_and_without_noise_also_when_its_terminal_is_closed(num
     assert process.returncode == 0
     assert "restarts: none" in out
     assert "Traceback" not in err and "waiting for the router" not in err
+
+
+def test_up_ends_where_a_process_does_not_start_and_names_it(router, capsys):
+    for keep_going in (False, True):
+        fleet = Fleet(
+            {"wrong": Kind([sys.executable, "-c", REFUSES]), "idle": Kind([sys.executable, "-c", SLEEPS])},
+            {"wrong": 1, "idle": 1},
+        )
+        with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
+            began = time.monotonic()
+            assert launch.Launcher(node, fleet, Console(width=400), keep_going).run(8.0) == 1
+            is_early = time.monotonic() - began < 8.0
+        out = capsys.readouterr().out
+        assert is_early is not keep_going
+        assert "failed: wrong: exit code 2: cell table has no camera: it has front" in out
+        assert ("wrong did not start, and the others were ended: penumbra up --keep-going" in out) is not keep_going
+
+
+def test_up_ends_where_a_process_dies_each_time_it_starts(router, capsys):
+    fleet = Fleet({"crashing": Kind([sys.executable, "-c", ALWAYS_CRASHES])}, {"crashing": 1})
+    with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
+        assert launch.Launcher(node, fleet, Console(width=400)).run(60) == 1
+    assert "crashing did not start" in capsys.readouterr().out
+
+
+def test_a_state_is_shown_when_it_has_lasted_and_an_end_at_once():
+    now = [0.0]
+    steady = display.Steady(lambda: now[0])
+    assert steady.show("search", "starting") == "starting"
+    assert steady.show("search", "running") == "running"
+    for now[0] in (0.5, 1.0, 1.5):
+        assert steady.show("search", "degraded") == "running"
+    now[0] = 1.6
+    assert steady.show("search", "running") == "running"
+    now[0] = 1.7
+    assert steady.show("search", "degraded") == "running", "it has to last again"
+    now[0] = 3.3
+    assert steady.show("search", "degraded") == "degraded"
+    assert steady.show("search", "waiting") == "waiting"
+
+
+def test_the_screen_names_the_command_that_works():
+    options = up_options("--cell", "table")
+    assert launch.pose_command(options) == "penumbra pose"
+    assert launch.pose_command(up_options("--port", "7557", "--cell", "arm")) == (
+        "penumbra pose --cell arm --connect tcp/127.0.0.1:7557"
+    )
+
+
+def up_options(*argv):
+    options = command_line.parse(up_command.PARAMS, argv)
+    options.port = options.port or launch.PORT
+    return options
+
+
+def test_a_dumb_terminal_gets_plain_lines():
+    primary, secondary = os.openpty()
+    command = [sys.executable, "-m", "penumbra", "up", "--port", str(free_port()), "--seconds", "3", *NOTHING]
+    process = subprocess.Popen(command, stdout=secondary, stderr=secondary, env={**os.environ, "TERM": "dumb"})
+    os.close(secondary)
+    out = b""
+    with contextlib.suppress(OSError):
+        while part := os.read(primary, 4096):
+            out += part
+    os.close(primary)
+    assert process.wait(20) == 0
+    assert b"\x1b" not in out and b"launcher running" in out

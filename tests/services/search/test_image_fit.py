@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
-from services.search.tracker import Search, Searched
-from shared.contract.labels import Label
-from shared.contract.messages import Mask
-from shared.geometry import rigid
-from shared.perception.lookout import corners_of, window_around
-from sim.sets import shots
-from sim.sets.shots import Shot
+from penumbra.services.search.tracker import Search, Searched
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.contract.messages import Mask
+from penumbra.shared.geometry import rigid
+from penumbra.shared.perception.lookout import corners_of, window_around
+from penumbra.sim.sets import shots
+from penumbra.sim.sets.shots import Shot
 
 PRIOR = np.diag(np.repeat([0.0115**2, 0.04**2], 3))
 """Covariance of the starts: together 2 cm and 4 degrees."""

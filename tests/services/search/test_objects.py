@@ -5,23 +5,26 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
 
-from services.command import cli
-from services.search.objects import meshes, tools
-from services.search.objects.pose import RigidObject, Tracker, find_pose
-from shared.body.anatomy import Mesh
-from shared.geometry import raster
-from shared.geometry import rigid as geometry
-from tests.bench import objects as bench
-from tests.bench.objects import CONVERGED, HEIGHT, WIDTH, K, Thing, errors, moved, scene, spoiled, thing
+from penumbra.services.command import cli
+from penumbra.services.search.objects import meshes, tools
+from penumbra.services.search.objects.pose import RigidObject, Tracker, find_pose
+from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.geometry import raster
+from penumbra.shared.geometry.lens import Lens
+from penumbra.shared.geometry.rigid import apply, from_rpy, perturb, pose_error
+from penumbra.sim.picture.distortion import Distortion
+from penumbra.tests.bench import objects as bench
+from penumbra.tests.bench.objects import CONVERGED, HEIGHT, WIDTH, K, Thing, errors, moved, scene, spoiled, thing
 
 EXACT, NOISY = (1.0, 1.0), (0.85, 0.87)
-CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": K.fx, "fy": K.fy, "cx": K.cx, "cy": K.cy}
+CAMERA: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "fx": K.fx, "fy": K.fy, "cx": K.cx, "cy": K.cy}
 
 
 def mesh_of(one: Thing) -> Mesh:
@@ -31,11 +34,11 @@ def mesh_of(one: Thing) -> Mesh:
 
 def drawn(one: Thing, T: np.ndarray) -> np.ndarray:
     mesh = mesh_of(one)
-    return raster.silhouette(geometry.apply(T, mesh.vertices), mesh.faces, (K.fx, K.fy, K.cx, K.cy), (0, 0, WIDTH, HEIGHT))
+    return raster.silhouette(apply(T, mesh.vertices), mesh.faces, (K.fx, K.fy, K.cx, K.cy), (0, 0, WIDTH, HEIGHT))
 
 
 def nees(found, T: np.ndarray) -> float:
-    error = geometry.pose_error(T, found.T)
+    error = pose_error(T, found.T)
     return float(error @ np.linalg.solve(found.covariance, error))
 
 
@@ -99,7 +102,7 @@ def test_an_object_wholly_behind_something_is_lost(rigid, drill):
 
 
 def test_the_border_of_the_picture_is_not_the_objects_contour(drill, rigid):
-    T = geometry.from_rpy((0.0, 0.02, 0.8), (1.2, 0.3, 0.5))
+    T = from_rpy((0.0, 0.02, 0.8), (1.2, 0.3, 0.5))
     T[0, 3] = (15 - K.cx) / K.fx * T[2, 3]  # its middle at the left border
     mask = drawn(drill, T)
     assert mask[:, 0].any()
@@ -110,13 +113,13 @@ def test_the_border_of_the_picture_is_not_the_objects_contour(drill, rigid):
 def test_a_ball_keeps_the_rotation_of_its_start_and_says_that_it_does_not_know_it():
     ball = trimesh.creation.icosphere(4, radius=0.06)
     rigid = RigidObject(Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, np.int32), np.zeros(len(ball.faces), np.uint8)))
-    T = geometry.from_rpy((0.05, 0.0, 0.9), (0.3, 0.2, 0.1))
+    T = from_rpy((0.05, 0.0, 0.9), (0.3, 0.2, 0.1))
     one = Thing("ball", ball, np.eye(3)[None])
     start = moved(T, 20.0, 0.03, np.random.default_rng(0))
     found = find_pose(rigid, drawn(one, T), K, start)
     assert np.linalg.norm(found.T[:3, 3] - T[:3, 3]) < 0.01
     assert np.sqrt(np.linalg.eigvalsh(found.covariance[3:, 3:])[0]) > np.radians(5.0)
-    assert np.linalg.norm(geometry.pose_error(start, found.T)[3:]) < np.radians(15.0)
+    assert np.linalg.norm(pose_error(start, found.T)[3:]) < np.radians(15.0)
 
 
 def test_two_blobs_of_one_object_are_lost_or_covered_by_the_covariance(drill, rigid):
@@ -142,7 +145,7 @@ def test_another_shape_is_not_tracked(rigid):
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[200:212, 100:420] = True  # a bar
     mask[100:380, 250:262] = True  # and another across
-    found = find_pose(rigid, mask, K, geometry.from_rpy((-0.05, 0.0, 0.9), (1.5, 0.0, 0.0)))
+    found = find_pose(rigid, mask, K, from_rpy((-0.05, 0.0, 0.9), (1.5, 0.0, 0.0)))
     assert found.state == "lost"
     assert found.covariance[0, 0] >= 1.0
 
@@ -187,8 +190,8 @@ def test_the_picture_is_sharper_than_the_mask(drill, rigid):
 
 
 def sequence(one: Thing, count: int) -> list[np.ndarray]:
-    T = geometry.from_rpy((-0.12, 0.0, 0.9), (1.2, 0.4, 0.3))
-    return [geometry.perturb(T, [0.006 * i, 0.001 * i, 0.002 * i, 0.01 * i, 0.02 * i, 0.0]) for i in range(count)]
+    T = from_rpy((-0.12, 0.0, 0.9), (1.2, 0.4, 0.3))
+    return [perturb(T, [0.006 * i, 0.001 * i, 0.002 * i, 0.01 * i, 0.02 * i, 0.0]) for i in range(count)]
 
 
 def test_a_sequence_is_tracked_through_a_gap_and_found_again(drill, rigid):
@@ -297,34 +300,39 @@ def wrong(given: dict[str, Path], folder: Path, what: str) -> tuple[list[str], s
     infinite = json.loads(given["init"].read_text())["camera_from_object"]
     infinite[0][0] = float("nan")
     mask = cv2.imread(str(given["mask"]), cv2.IMREAD_GRAYSCALE)
+    assert mask is not None
     text = folder / "text.png"
     text.write_text("no image")
     points = folder / "points.ply"
     trimesh.PointCloud(np.random.default_rng(0).normal(size=(50, 3))).export(points)
     cases = {
-        "empty mask": case("pixels that show the object expected", mask=picture(np.zeros_like(mask))),
-        "full mask": case("is it inverted?", mask=picture(np.full_like(mask, 255))),
-        "small mask": case("an image of 640 x 480 expected", mask=picture(mask[::2, ::2])),
-        "mask is text": case("an image that OpenCV reads expected", mask=text),
-        "no mask": case("an image file expected, there is none", mask=folder / "none.png"),
+        "empty mask": case("expected pixels that show the object", mask=picture(np.zeros_like(mask))),
+        "full mask": case("check whether it is inverted", mask=picture(np.full_like(mask, 255))),
+        "small mask": case("expected an image of 640 x 480", mask=picture(mask[::2, ::2])),
+        "mask is text": case("expected an image that OpenCV reads", mask=text),
+        "no mask": case("expected an image file, found none", mask=folder / "none.png"),
         "millimetres as metres": case("if its unit is", unit="m"),
-        "points": case("a triangle mesh expected", mesh=points),
+        "points": case("expected a triangle mesh, got a file without triangles", mesh=points),
         "mesh is text": case("a triangle mesh", mesh=text),
-        "no mesh": case("a mesh file expected, there is none", mesh=folder / "none.ply"),
-        "no camera": case("a readable JSON file expected", camera=folder / "none.json"),
-        "camera is text": case("JSON expected", camera=text),
-        "missing key": case("fy missing", camera=_without(given["camera"], "fy", folder)),
-        "focal length in millimetres": case("is it in millimetres", camera=changed("camera", fx=4.2)),
-        "principal point outside": case("do width and height belong to these intrinsics?", camera=changed("camera", cx=2000.0)),
+        "no mesh": case("expected a mesh file, found none", mesh=folder / "none.ply"),
+        "no camera": case("expected a readable JSON file", camera=folder / "none.json"),
+        "camera is text": case("expected JSON", camera=text),
+        "missing key": case("got none of fy", camera=_without(given["camera"], "fy", folder)),
+        "focal length in millimetres": case(
+            "check whether it is in millimetres or for another image size", camera=changed("camera", fx=4.2)
+        ),
+        "principal point outside": case(
+            "check that width and height belong to these intrinsics", camera=changed("camera", cx=2000.0)
+        ),
         "unlike focal lengths": case("fx and fy of nearly the same size", camera=changed("camera", fy=200.0)),
-        "no number": case("a finite number expected, 'wide' came", camera=changed("camera", fx="wide")),
-        "behind": case("in front of the camera expected", init=pose(behind)),
+        "no number": case("expected a finite number, got 'wide'", camera=changed("camera", fx="wide")),
+        "behind": case("expected the whole object at least 0.05 m in front of the camera", init=pose(behind)),
         "mirror image": case("without scale or mirror image", init=pose(mirrored)),
         "scaled": case("without scale or mirror image", init=pose(scaled)),
-        "pose in millimetres": case("is it in millimetres?", init=pose(far)),
-        "not finite": case("finite numbers expected", init=changed("init", camera_from_object=infinite)),
-        "three rows": case("4 rows of 4 numbers expected, a shape of (3, 4)", init=pose(T[:3])),
-        "other key": case("the key camera_from_object expected", init=given["camera"]),
+        "pose in millimetres": case("check whether it is in millimetres", init=pose(far)),
+        "not finite": case("expected finite numbers", init=changed("init", camera_from_object=infinite)),
+        "three rows": case("expected 4 rows of 4 numbers, got shape (3, 4)", init=pose(T[:3])),
+        "other key": case("expected the key camera_from_object", init=given["camera"]),
         "tiny start": case("about as large as the mask", init=pose(tiny)),
         "outside start": case("in or near the image", init=pose(aside)),
     }
@@ -355,6 +363,68 @@ def test_wrong_input_is_one_line_that_says_what_to_do_and_exit_code_two(what, gi
     assert len(out.err.splitlines()) == 1
 
 
+BARREL: dict[str, Any] = {"k1": -0.35, "k2": 0.15, "p1": 0.001, "p2": -0.001}
+
+
+def bent(mask_of, lens: Lens) -> np.ndarray:
+    """A silhouette as a lens shows it. mask_of: the silhouette in a window (x0, y0, w, h) of the pinhole picture."""
+    distortion = Distortion(lens)
+    shown = np.repeat(mask_of(distortion.window).astype(np.float32)[..., None], 3, axis=2)
+    return distortion(shown)[..., 0] > 0.5
+
+
+def test_a_distorted_camera_s_mask_gives_the_pose_only_with_its_distortion(given, drill, tmp_path, capsys):
+    mesh = mesh_of(drill)
+    T = sequence(drill, 1)[0]
+    T[:3, 3] = (0.75 * (WIDTH - K.cx) / K.fx * T[2, 3], 0.4 * (HEIGHT - K.cy) / K.fy * T[2, 3], T[2, 3])  # towards a corner
+    k = (K.fx, K.fy, K.cx, K.cy)
+    mask = bent(lambda window: raster.silhouette(apply(T, mesh.vertices), mesh.faces, k, window), Lens(**CAMERA, **BARREL))
+    cv2.imwrite(str(tmp_path / "mask.png"), mask.astype(np.uint8) * 255)
+    (tmp_path / "init.json").write_text(
+        json.dumps({"camera_from_object": moved(T, 8.0, 0.015, np.random.default_rng(0)).tolist()})
+    )
+    away = {}
+    for name, extra in (("known", BARREL), ("ignored", {})):
+        (tmp_path / f"{name}.json").write_text(json.dumps(CAMERA | extra))
+        files = {
+            "mesh": given["mesh"],
+            "camera": tmp_path / f"{name}.json",
+            "mask": tmp_path / "mask.png",
+            "init": tmp_path / "init.json",
+        }
+        words = [word for flag, path in files.items() for word in (f"--{flag}", str(path))]
+        assert cli.main(["search", "refine", "--mesh-unit", "mm", "--json", *words]) == 0
+        found = np.array(json.loads(capsys.readouterr().out)["camera_from_object"])
+        away[name] = float(np.linalg.norm(found[:3, 3] - T[:3, 3]))
+    assert away["known"] < 0.004 and away["ignored"] > 3.0 * away["known"]
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ({"k4": 0.1}, "k4: the rational, thin-prism and tilted models are not supported"),
+        ({"fisheye": True}, "undistort the pictures with cv2.fisheye"),
+        ({"distortion_model": "plumb_bob"}, "expected no name of a model"),
+        ({"dist_coeffs": [0, 0]}, "expected the coefficients one by one, k1 k2 p1 p2 k3"),
+        ({"K1": 0.1}, "got K1; did you mean k1"),
+        ({"k1": True}, "k1: "),
+        ({"k1": -9.0}, "folds over"),
+        ({"fx": K.cx, "cx": K.fx}, "not swapped with cx"),
+    ],
+)
+def test_another_distortion_is_refused_and_never_ignored(given, extra, words, tmp_path, capsys):
+    (tmp_path / "camera.json").write_text(json.dumps(CAMERA | extra))
+    files = {**{name: given[name] for name in ("mesh", "mask", "init")}, "camera": tmp_path / "camera.json"}
+    argv = [word for flag, path in files.items() for word in (f"--{flag}", str(path))]
+    assert cli.main(["search", "refine", "--mesh-unit", "mm", *argv]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_the_camera_file_of_an_object_data_set_is_read(tmp_path):
+    (tmp_path / "camera.json").write_text(json.dumps(CAMERA | {"depth_scale": 0.1}))
+    assert tools.read_camera(tmp_path / "camera.json") == Lens(**CAMERA)
+
+
 def test_track_writes_a_table_and_a_video(given, drill, tmp_path, capsys):
     masks, out = tmp_path / "masks", tmp_path / "out"
     masks.mkdir()
@@ -380,13 +450,14 @@ def test_track_asks_for_a_picture_of_every_mask(given, tmp_path, capsys):
     masks, images = tmp_path / "masks", tmp_path / "images"
     masks.mkdir(), images.mkdir()
     mask = cv2.imread(str(given["mask"]))
+    assert mask is not None
     for name in ("a", "b"):
         cv2.imwrite(str(masks / f"{name}.png"), mask)
     cv2.imwrite(str(images / "a.png"), mask)
     files = {"mesh": given["mesh"], "camera": given["camera"], "init": given["init"], "masks": masks, "images": images}
     argv = ["search", "track", "--mesh-unit", "mm", *(word for name, path in files.items() for word in (f"--{name}", str(path)))]
     assert cli.main(argv) == 2
-    assert "an image for every mask expected, by name, 1 of 2 are missing, first b" in capsys.readouterr().err
+    assert "expected an image of the same name for every mask, got none for 1 of 2, first b" in capsys.readouterr().err
 
 
 def test_the_benchmark_writes_a_row_for_every_object_mask_and_start(tmp_path, capsys):

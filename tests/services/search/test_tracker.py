@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
-from services.search import detect, evidence, paper_search
-from services.search.contour import Model
-from services.search.mask_fit import Noise, fit
-from services.search.robot_depth import RobotDepth
-from services.search.tracker import Search, Searched
-from shared.body import anatomy
-from shared.cell import description
-from shared.contract.labels import Label
-from shared.contract.messages import FusedPose, Mask
-from shared.geometry import raster, rigid
-from shared.perception.prediction import predict
+from penumbra.services.search import detect, evidence, paper_search
+from penumbra.services.search.contour import Model
+from penumbra.services.search.mask_fit import Noise, fit
+from penumbra.services.search.robot_depth import RobotDepth
+from penumbra.services.search.tracker import Search, Searched
+from penumbra.shared.body import anatomy
+from penumbra.shared.cell import description
+from penumbra.shared.contract.labels import Label
+from penumbra.shared.contract.messages import FusedPose, Mask
+from penumbra.shared.geometry import raster, rigid
+from penumbra.shared.perception.prediction import predict
 
 CELL = description.load("table")
 CAMERA = CELL.cameras["front"]
@@ -41,12 +42,13 @@ def scene(seed: int, hidden: float = 0.0, noisy: bool = False, size: int = 192, 
     """A window of size x size around the target; `hidden`: share of its pixels behind a half plane. `noisy`: half a pixel of
     correlated noise on all boundaries and a dilation of a quarter of a pixel (standard deviations)."""
     rng = np.random.default_rng(seed)
+    assert CELL.sim is not None
     motion = CELL.sim.motion
     T = rigid.from_rpy(rng.uniform(motion.low, motion.high), rng.uniform(motion.rpy_low, motion.rpy_high))
     T_camera_target = T_CAMERA_WORLD @ T
     V = rigid.apply(T_camera_target, MESH.vertices)
     u, v = CAMERA.fx * V[:, 0] / V[:, 2] + CAMERA.cx, CAMERA.fy * V[:, 1] / V[:, 2] + CAMERA.cy
-    x0, y0 = int((u.min() + u.max() - size) / 2) + rng.integers(-5, 6), int((v.min() + v.max() - size) / 2) + rng.integers(-5, 6)
+    x0, y0 = (int((w.min() + w.max() - size) / 2) + int(rng.integers(-5, 6)) for w in (u, v))
 
     def draw(faces: np.ndarray) -> np.ndarray:
         return raster.silhouette(V, faces, (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), (x0, y0, size, size)).astype(bool)
@@ -366,9 +368,10 @@ def test_the_prediction_moves_with_the_velocity_and_ends_with_the_track():
         sources={},
     )
     T, covariance = predict(fused, 10**9 - 50_000_000)  # the frame is older than the fused pose
+    assert T is not None and covariance is not None
     np.testing.assert_allclose(rigid.pose_error(T, np.eye(4)), [-0.01, 0.0, 0.0, 0.0, 0.0, -0.05], atol=1e-12)
     assert (np.diag(covariance) > 1e-4).all()
-    for unusable in (None, FusedPose(**{**vars(fused), "state": "lost"})):
+    for unusable in (None, replace(fused, state="lost")):
         assert predict(unusable, 10**9) == (None, None)
     assert predict(fused, 3 * 10**9) == (None, None)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from services.search.settings import ONE_IN_10, ONE_IN_10_000, ONE_IN_100, SearchSettings
-from services.search.verdict import Findings, Verdict, explains_mask, verdict
+from penumbra.services.search.settings import ONE_IN_10, ONE_IN_10_000, ONE_IN_100, SearchSettings
+from penumbra.services.search.verdict import Findings, Verdict, explains_mask, verdict
 
 SETTINGS = SearchSettings()
 GOOD = Findings(

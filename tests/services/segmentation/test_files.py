@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from services.command import cli
-from services.segmentation import inference, prednet
-from services.segmentation.prednet import PredNet, Settings
-from services.segmentation.training import evaluate, recordings, train
-from shared.contract.labels import Label
-from sim.sets import sequences
+from penumbra.services.command import cli
+from penumbra.services.segmentation import inference, prednet
+from penumbra.services.segmentation.prednet import PredNet, Settings
+from penumbra.services.segmentation.training import evaluate, recordings, train
+from penumbra.shared.contract.labels import Label
+from penumbra.sim.sets import sequences
 
 SMALL = Settings(channels=(4, 4, 8), kernels=(3, 3, 3), decoder_channels=4)
 
@@ -164,16 +164,16 @@ def no_coco(folder, scene):
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (broken_size, r"0001_mask.png: a mask of 96 x 96 as 0001.png expected, 96 x 50 came"),
-        (broken_values, r"0001_mask.png: classes 0 background, .* expected, 7 came at row 0, column 0"),
-        (broken_colours, r"0001_mask.png: one channel of class indices expected .* colours or a palette came"),
-        (broken_picture, r"0002.png: a picture expected, this file cannot be read as one"),
-        (without_masks, r"1 pictures and 0 masks came, no two of one name"),
-        (one_mask_missing, r"a mask for 0003 expected, there is none"),
-        (sizes_in_a_sequence, r"0000.png has 96 x 96, 0001.png 96 x 64"),
-        (too_few, r"at least 3 sequences, .* expected .*, 1 came"),
-        (unknown_category, r"categories named background, .* expected, 'dog' came"),
-        (no_coco, r"COCO's form expected"),
+        (broken_size, r"0001_mask.png: expected a mask of 96 x 96 as 0001.png, got 96 x 50"),
+        (broken_values, r"0001_mask.png: expected classes 0 background, .*, got 7 at row 0, column 0"),
+        (broken_colours, r"0001_mask.png: expected one channel of class indices .*, got colours or a palette"),
+        (broken_picture, r"0002.png: expected a picture, got a file that cannot be read as one"),
+        (without_masks, r"got 1 pictures and 0 masks, no two of one name"),
+        (one_mask_missing, r"expected a mask for 0003, found none"),
+        (sizes_in_a_sequence, r"got 96 x 96 in 0000.png and 96 x 64 in 0001.png"),
+        (too_few, r"expected at least 3 sequences, .*, got 1"),
+        (unknown_category, r"expected categories named background, .*, got 'dog'"),
+        (no_coco, r"expected COCO format"),
     ],
 )
 def test_a_folder_that_does_not_fit_is_refused_with_what_was_expected(tmp_path, scene, spoil, says, capsys):
@@ -215,11 +215,12 @@ def test_pictures_get_a_mask_of_their_size_and_an_overlay(tmp_path, scene, weigh
         cv2.imwrite(str(tmp_path / name), picture)
     flags = ["--out", str(tmp_path / "out"), "--weights", str(weights)]
     assert cli.main(["segmentation", "infer", str(tmp_path / "a.png"), str(tmp_path / "b.png"), *flags]) == 0
-    masks = [cv2.imread(str(tmp_path / "out" / f"{name}_mask.png"), cv2.IMREAD_UNCHANGED) for name in "ab"]
-    assert masks[0].shape == (99, 130) and masks[0].max() <= max(Label)
-    assert not masks[0][96:].any()  # left over
-    np.testing.assert_array_equal(*masks)  # each stands for itself
-    assert cv2.imread(str(tmp_path / "out" / "a_overlay.png")).shape == (99, 130, 3)
+    first, second = (cv2.imread(str(tmp_path / "out" / f"{name}_mask.png"), cv2.IMREAD_UNCHANGED) for name in "ab")
+    assert first is not None and first.shape == (99, 130) and first.max() <= max(Label)
+    assert not first[96:].any()  # left over
+    np.testing.assert_array_equal(first, second)  # each stands for itself
+    overlay = cv2.imread(str(tmp_path / "out" / "a_overlay.png"))
+    assert overlay is not None and overlay.shape == (99, 130, 3)
 
 
 def test_a_film_gets_a_mask_a_frame_and_an_overlay_film(tmp_path, scene, weights):
@@ -238,7 +239,11 @@ def test_files_that_cannot_be_read_are_named(tmp_path, weights, capsys):
     broken, film = tmp_path / "a.png", tmp_path / "b.mp4"
     broken.write_bytes(b"\x89PNG\r\n\x1a\n and no more")
     film.write_bytes(b"no film")
-    for path, says in ((broken, "cannot be read: is it whole?"), (film, "OpenCV reads no frame"), (tmp_path / "c", "no file")):
+    for path, says in (
+        (broken, "cannot be read; check that it is whole"),
+        (film, "of which OpenCV reads no frame"),
+        (tmp_path / "c", "found no file"),
+    ):
         assert cli.main(["segmentation", "infer", str(path), "--out", str(tmp_path), "--weights", str(weights)]) == 2
         error = capsys.readouterr().err
         assert says in error and str(path) in error

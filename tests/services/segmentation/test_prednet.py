@@ -1,30 +1,30 @@
 """PredNet and what surrounds it: the network's shape and state, the window that follows the target, training and weights."""
 
-import argparse
 import io
 import json
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from services.segmentation import inference, model, openvino_step, prednet, service
-from services.segmentation.prednet import PredNet, Settings
-from services.segmentation.shift import shift_state
-from services.segmentation.training import evaluate, loss, train
-from shared import training
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.labels import UNLABELLED, Label
-from shared.native import processor
-from shared.perception.lookout import Lookout, Window, corners_of, window_around
-from sim.sets import sequences, shots
-from tests.support import nodes
-from tests.support.live import wait_for
-from tests.support.replay import Replay, ReplayNode
+from penumbra.services.segmentation import inference, model, openvino_step, prednet, service
+from penumbra.services.segmentation.prednet import PredNet, Settings
+from penumbra.services.segmentation.shift import shift_state
+from penumbra.services.segmentation.training import evaluate, loss, train
+from penumbra.shared import training
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.labels import UNLABELLED, Label
+from penumbra.shared.native import processor
+from penumbra.shared.perception.lookout import Lookout, Window, corners_of, window_around
+from penumbra.sim.sets import sequences, shots
+from penumbra.tests.support import nodes
+from penumbra.tests.support.live import wait_for
+from penumbra.tests.support.replay import Replay, ReplayNode
 
 SMALL = Settings(channels=(4, 4, 8), kernels=(3, 3, 3), decoder_channels=4)
 TINY = sequences.Variety(frames=4, size=64)
@@ -55,7 +55,7 @@ def test_what_can_be_stored_can_be_trained():
 
 
 def test_a_cell_that_does_not_exist_is_refused_with_those_that_do():
-    with pytest.raises(ValueError, match="one of hgru, convlstm, conv expected, 'gru' came"):
+    with pytest.raises(ValueError, match="expected one of hgru, convlstm, conv, got 'gru'"):
         Settings(cell="gru")
 
 
@@ -90,7 +90,7 @@ def test_without_delay_the_mask_hears_of_a_picture_at_once_and_with_it_layers_he
 
 
 def test_an_image_of_a_size_that_does_not_fit_is_refused_with_the_sizes_that_do():
-    with pytest.raises(ValueError, match="multiples of 4 expected, 30 x 32 came"):
+    with pytest.raises(ValueError, match="expected positive multiples of 4, got 30 x 32"):
         PredNet(SMALL).initial_state(1, 32, 30)
 
 
@@ -113,7 +113,7 @@ def test_what_is_unlabelled_is_neither_learned_nor_scored():
     labels[unknown] = UNLABELLED
     logits = torch.randn(1, len(Label), 16, 16, requires_grad=True)
     losses = (loss.dice, loss.target_dice, loss.focal)
-    sum(each(logits, labels) for each in losses).backward()
+    torch.stack([each(logits, labels) for each in losses]).sum().backward()
     assert logits.grad is not None
     reached = logits.grad.abs().sum(1) > 0
     assert not reached[unknown].any() and reached[~unknown].all()
@@ -126,6 +126,7 @@ def test_what_is_unlabelled_is_neither_learned_nor_scored():
     hidden = np.where(np.arange(64) < 32, np.uint8(Label.HAND), np.uint8(UNLABELLED))
     half = sequences.Sequence(known.images, np.broadcast_to(hidden, known.labels.shape), known.hidden)
     net = PredNet(SMALL)
+    assert net.head.bias is not None
     net.head.weight.data[:] = 0.0
     net.head.bias.data[:] = -9.0 * (torch.arange(len(net.head.bias)) // 4 != Label.HAND)  # four pixels a position
     for each in (known, half):
@@ -186,9 +187,9 @@ def test_a_compact_checkpoint_is_a_quarter_of_the_exact_one_and_goes_on_with_a_r
         trainer.train_step(data, 0.1)
     training.save(trainer, tmp_path / "exact", tmp_path / "compact")
     assert (tmp_path / "compact").stat().st_size < 0.3 * (tmp_path / "exact").stat().st_size
-    options = argparse.Namespace(resume=True, checkpoint=tmp_path / "missing", compact=tmp_path / "compact")
+    options = SimpleNamespace(resume=True, checkpoint=tmp_path / "missing", compact=tmp_path / "compact")
     place = training.begun(options)
-    assert place == tmp_path / "compact"
+    assert place is not None and place == tmp_path / "compact"
     again = train.Trainer.restore(place, trainer.schedule)
     for a, b in zip(trainer.net.parameters(), again.net.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)  # half precision
@@ -213,7 +214,9 @@ def test_a_network_grown_from_another_gives_its_masks_and_learns_to_hear_of_its_
         more, errors, second = larger(image, second)
         torch.testing.assert_close(more, logits, rtol=1e-4, atol=1e-5)
     (loss.focal(more, torch.randint(0, len(Label), (1, 32, 32))) + loss.prediction_error(errors)).backward()
-    grad = larger.predict[0].weight.grad
+    first_layer = larger.predict[0]
+    assert isinstance(first_layer, torch.nn.Conv2d)
+    grad = first_layer.weight.grad
     assert grad is not None and (grad[:, 4:].abs().sum((0, 2, 3)) > 0).all()
     with pytest.raises(ValueError, match=r"expected at least the channels \(4, 4, 8\)"):
         prednet.grown(net, Settings((4, 2, 8), SMALL.kernels, SMALL.decoder_channels))
@@ -230,6 +233,7 @@ def test_training_may_start_from_weights_and_its_card_tells_of_them(tmp_path):
     assert again.started_from == {"seed": 7, "date": "2026-01-01", "minutes": 3.0}
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(data):
     trainer = train.Trainer(SMALL, train.Schedule(frames=2, patches=((0.0, 64, 4),), warm_up=10), seed=1)
     losses = [trainer.train_step(data, 0.15)["focal"] for _ in range(40)]
@@ -279,7 +283,7 @@ def test_a_segmenter_forgets_when_time_jumps_and_remembers_when_it_flows():
     flowing = [first(image, window, 10**9 + k * 50_000_000) for k in range(1, 4)]
     assert any((mask != start).any() for mask in flowing)
     np.testing.assert_array_equal(first(image, window, 10**9 + 10**10), start)
-    with pytest.raises(ValueError, match="window inside the image of 64 x 64 expected"):
+    with pytest.raises(ValueError, match="expected a window inside the image of 64 x 64"):
         first(image, Window(8, 0, 64, 64), 10**9 + 10**10)
 
 
@@ -339,7 +343,7 @@ def test_a_network_of_other_channels_and_more_inputs_runs_with_nothing_but_its_w
 
 def test_weights_that_are_not_their_card_s_are_refused():
     network = prednet.stored(PredNet(SMALL))
-    with pytest.raises(ValueError, match=r"weights of Settings\(channels=\(4, 4, 16\).* expected, got others"):
+    with pytest.raises(ValueError, match=r"expected weights of Settings\(channels=\(4, 4, 16\).*, got others"):
         openvino_step.Compiled(model.Model(Settings((4, 4, 16), SMALL.kernels, SMALL.decoder_channels), network.weights), "f32")
 
 
@@ -354,13 +358,14 @@ def test_at_a_coarse_scale_the_network_sees_the_means_of_pixels():
 def test_where_the_processor_has_no_bfloat16_the_masks_are_computed_in_single_precision(isa):
     """oneDNN, which OpenVINO computes with, is told to do without; the process finds that out, and the masks are the same."""
     code = (
-        "import sys, numpy as np; from services.segmentation import inference; from shared.perception.lookout import Window;"
-        "from tests.services.segmentation.test_prednet import scene; images = scene();"
+        "import sys, numpy as np; from penumbra.services.segmentation import inference;"
+        "from penumbra.shared.perception.lookout import Window;"
+        "from penumbra.tests.services.segmentation.test_prednet import scene; images = scene();"
         "segmenter = inference.load_segmenter(); window = Window(0, 0, 96, 96);"
         "masks = [segmenter(image, window, (t + 1) * 50_000_000) for t, image in enumerate(images)];"
         "np.save(sys.stdout.buffer, np.stack(masks))"
     )
-    script = f"from shared.native import processor; assert not processor.has_bfloat16(); {code}"
+    script = f"from penumbra.shared.native import processor; assert not processor.has_bfloat16(); {code}"
     environment = {**os.environ, "ONEDNN_MAX_CPU_ISA": isa}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, env=environment)
     assert done.returncode == 0, done.stderr.decode()
@@ -416,7 +421,7 @@ def test_a_replica_that_waits_has_compiled_for_the_window_of_now():
     cell = cells.load("table")
     replay, segmenter = Replay(cell, services=()), inference.load_segmenter()  # which has what the service's own have
     node = Waiting(replay, "segmentation")
-    service.start(node, argparse.Namespace(camera=None, weights=inference.WEIGHTS))
+    service.start(node, SimpleNamespace(camera=None, weights=inference.WEIGHTS))
     assert not node.is_warm(), "nobody has said where to look"
     poses = [nodes.pose(stamp_ns, x=0.2) for stamp_ns in range(1_000_000_000, 2_000_000_000, 100_000_000)]
     replay.run((topics.FUSED, {"target": "forearm"}, pose) for pose in poses)

@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.command import cli
-from services.skin.calibration import calibrate, law, recording
-from services.skin.calibration.law import RecordingError
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.messages import Voltages
-from shared.runtime import bus
-from shared.runtime.node import Node
-from shared.skin.layout import Skin
+from penumbra.services.command import cli
+from penumbra.services.skin.calibration import calibrate, law, recording
+from penumbra.services.skin.calibration.law import RecordingError
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.messages import Voltages
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.shared.skin.layout import Skin
 
 CELL = cells.load("table")
 KIND = CELL.pad_types["five"]
@@ -99,14 +99,14 @@ def test_the_range_ends_where_the_ratio_is_one_decibel():
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (lambda gaps, v: (gaps[:600], v[:600]), r"at least 4 gaps expected .* 3 came: record more"),
+        (lambda gaps, v: (gaps[:600], v[:600]), r"expected at least 4 gaps .*, got 3; record more"),
         (lambda gaps, v: (np.repeat([0.1, 0.11, 0.12, 0.13], 200), v[:800]), "farthest is at least twice the nearest"),
         (
             lambda gaps, v: (gaps, 0.0 * v + 0.2 + 2e-3 * np.random.default_rng(1).standard_normal(len(v))),
             "no contrast: it reads 0.2",
         ),
         (lambda gaps, v: (gaps, np.where(gaps < 0.018, v - 0.35, v)), "mixed polarity: .* the other way from 1.5 cm to 2 cm"),
-        (lambda gaps, v: (gaps, np.full_like(v, 1.65)), "0 came; saturated at 1 cm, .*turn the amplifier down"),
+        (lambda gaps, v: (gaps, np.full_like(v, 1.65)), "got 0; saturated at 1 cm, .*turn the amplifier down"),
         (lambda gaps, v: (gaps, np.where(np.arange(len(v)) % 3 > 0, np.nan, v)), "are not numbers: record them again"),
         (lambda gaps, v: (gaps, np.repeat(v.reshape(-1, 200).mean(axis=1), 200)), "no noise at all"),
     ],
@@ -173,17 +173,17 @@ def test_a_recording_that_is_written_is_read_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("", "a line of column names and samples below it expected, 0 lines came"),
-        ("c,r,l,t,b\n1,1,1,1,1\n", "the columns distance_m .* expected, came c, r, l, t, b"),
-        ("distance_m,c,r,l,t\n0.1,1,1,1,1\n", "came distance_m, c, r, l, t"),
+        ("", "expected a line of column names and samples below it, got 0 lines"),
+        ("c,r,l,t,b\n1,1,1,1,1\n", "expected the columns distance_m .*, got c, r, l, t, b"),
+        ("distance_m,c,r,l,t\n0.1,1,1,1,1\n", "got distance_m, c, r, l, t"),
         ("distance_m,c,c,r,l,t,b\n0.1,1,1,1,1,1,1\n", "every column once"),
-        ("distance_m,c,r,l,t,b\n0.1,1,1,1,1\n", "csv:2: 6 cells expected .* 5 came"),
-        ("distance_m,c,r,l,t,b\n0.1,1,high,1,1,1\n", "csv:2: a number expected for r, 'high' came"),
-        ("distance_m,c,r,l,t,b\n0.1,1,1,1,1,1\nfar,1,1,1,1,1\n", "csv:3: a number expected for distance_m, 'far' came"),
-        ("distance_m,c,r,l,t,b\n15,1,1,1,1,1\n", "csv:2: a distance from 0 to 2 m expected, 15 m came"),
-        ("distance_m,c,r,l,t,b\n0.1,1,-1,1,1,1\n", "csv:2: an amplitude of at least 0 V expected, -1 came for r"),
-        ("distance_m,c,r,l,t,b\n0.1,614,1,1,1,1\n", "amplitudes in volts expected, 614 came: are they millivolts"),
-        ("distance_m,c,r,l,t,b,angle_deg\n0.1,1,1,1,1,1,nan\n", "csv:2: a number expected for angle_deg"),
+        ("distance_m,c,r,l,t,b\n0.1,1,1,1,1\n", "csv:2: expected 6 cells .*, got 5"),
+        ("distance_m,c,r,l,t,b\n0.1,1,high,1,1,1\n", "csv:2: expected a number for r, got 'high'"),
+        ("distance_m,c,r,l,t,b\n0.1,1,1,1,1,1\nfar,1,1,1,1,1\n", "csv:3: expected a number for distance_m, got 'far'"),
+        ("distance_m,c,r,l,t,b\n15,1,1,1,1,1\n", "csv:2: expected a distance from 0 to 2 m, got 15 m"),
+        ("distance_m,c,r,l,t,b\n0.1,1,-1,1,1,1\n", "csv:2: expected an amplitude of at least 0 V, got -1 for r"),
+        ("distance_m,c,r,l,t,b\n0.1,614,1,1,1,1\n", "expected amplitudes in volts, got 614; check whether they are millivolts"),
+        ("distance_m,c,r,l,t,b,angle_deg\n0.1,1,1,1,1,1,nan\n", "csv:2: expected a number for angle_deg"),
     ],
 )
 def test_a_bad_recording_is_refused_with_its_line(tmp_path, text, complaint):
@@ -250,7 +250,7 @@ def test_what_cannot_be_calibrated_leaves_the_cell_file_alone(tmp_path, own_cell
     for arguments, text in (
         ([], "electrode p0/t: no contrast"),
         (["--pad", "p9"], "no pad 'p9'"),
-        (["--csv", str(tmp_path / "none.csv")], "a CSV file expected"),
+        (["--csv", str(tmp_path / "none.csv")], "expected a CSV file"),
     ):
         assert cli.main(["skin", "calibrate", "--cell", str(own_cell), "--csv", str(tmp_path / "r.csv"), *arguments]) == 2
         assert text in capsys.readouterr().err
@@ -300,7 +300,7 @@ def test_the_guided_procedure_says_what_is_missing(router, tmp_path, monkeypatch
     command = ["skin", "calibrate", "--pad", "p2", "--seconds", "0.1", "--out", str(tmp_path / "x.yaml"), "--connect", router]
     monkeypatch.setattr("builtins.input", lambda: "")
     assert cli.main(command) == 2
-    assert "no voltages of pad p2 came within 0.2 s: is `penumbra skin`" in capsys.readouterr().err
+    assert "pad p2: expected voltages within 0.2 s, got none; start `penumbra skin`" in capsys.readouterr().err
 
     def ended():
         raise EOFError

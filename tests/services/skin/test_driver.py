@@ -1,26 +1,26 @@
 """The driver of the sensing boards against emulated ones: on a line with a simulated clock, and on real pseudo-terminals."""
 
-import argparse
 import threading
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from services.command import cli
-from services.emulator.serial_boards import Terminals
-from services.skin import service
-from services.skin.driver import Batches, BoardSilent, Line, PadReader, Row, resonance
-from services.skin.port import SerialPort
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.runtime import bus
-from shared.runtime.node import Node
-from shared.skin import board
-from sim.skin.board import FAULTS, Board, Tank
-from tests.support.boards import SimulatedPort
-from tests.support.live import free_port, wait_for
+from penumbra.services.command import cli
+from penumbra.services.emulator.serial_boards import Terminals
+from penumbra.services.skin import service
+from penumbra.services.skin.driver import Batches, BoardSilent, Line, PadReader, Row, resonance
+from penumbra.services.skin.port import SerialPort
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.shared.skin import board
+from penumbra.sim.skin.board import FAULTS, Board, Tank
+from penumbra.tests.support.boards import SimulatedPort
+from penumbra.tests.support.live import free_port, wait_for
 
 CELL = cells.load("table")
 ELECTRODES = ["c", "r", "l", "t", "b"]
@@ -166,7 +166,9 @@ def test_a_device_that_is_no_board_is_told():
         def write(self, data):
             self._came += data
 
-    with pytest.raises(BoardSilent, match="takes 80000 Hz expected, wrong answers came: is chatty another device"):
+    with pytest.raises(
+        BoardSilent, match="expected a board that accepts 80000 Hz, got wrong answers; check whether chatty is another device"
+    ):
         Line(Echo(emulated()[0], [0.0], "chatty"), range(6)).tune()
 
 
@@ -184,10 +186,11 @@ def test_many_faults_in_a_row_never_let_a_wrong_amplitude_through(pad):
 
 
 def test_an_electrode_has_one_board_and_reads_nothing_without(pad):
-    with pytest.raises(ValueError, match="electrode c: one board that measures it expected, 2 came"):
+    with pytest.raises(ValueError, match="electrode c: expected one board that measures it, got 2"):
         PadReader([], [READERS[0].channels, READERS[0].channels], ELECTRODES, 1.0)
-    volts = PadReader(pad.lines[:1], [READERS[0].channels], ELECTRODES, 3.3 / 4095).read().volts
-    np.testing.assert_allclose(volts, [REST["c"], REST["r"], 0.0, 0.0, 0.0], atol=6.0 * SIGMA)
+    row = PadReader(pad.lines[:1], [READERS[0].channels], ELECTRODES, 3.3 / 4095).read()
+    assert row is not None
+    np.testing.assert_allclose(row.volts, [REST["c"], REST["r"], 0.0, 0.0, 0.0], atol=6.0 * SIGMA)
 
 
 # ---- batches
@@ -306,7 +309,7 @@ def heard():
 
     def start(ports):
         node = Node("skin", CELL, bus.Connection(connect=(endpoint,)))
-        service.start(node, argparse.Namespace(port=ports, pad="p3", cycles=128))
+        service.start(node, SimpleNamespace(device=ports, pad="p3", cycles=128))
         nodes.append(node.open())
         return node
 
@@ -352,12 +355,12 @@ def test_a_board_that_is_pulled_out_is_told_and_read_again_when_it_is_back(heard
     def state():
         return node.health()["report"]["p3"]["state"]
 
-    wait_for(lambda: "is the board plugged in?" in state(), 10, "the missing board to be told")
+    wait_for(lambda: "is the board plugged in?" in state(), 10, "the missing board to be reported")
     with served(emulated()) as (names, unplug):
         plug_in(names)
         wait_for(lambda: messages, 30, "the first message")
         unplug()
-        wait_for(lambda: state() != "reading", 10, "the lost board to be told")
+        wait_for(lambda: state() != "reading", 10, "the lost board to be reported")
     messages.clear()
     with served(emulated()) as (names, _):
         plug_in(names)
@@ -368,16 +371,19 @@ def test_a_board_that_is_pulled_out_is_told_and_read_again_when_it_is_back(heard
 @pytest.mark.parametrize(
     ("argv", "text"),
     [
-        ([], "no pad of cell table has boards: give --port DEVICE, or `boards:` in the cell file"),
-        (["--pad", "p1"], "pad p1 of cell table has no boards: give --port"),
+        ([], "no pad of cell table has boards: give --device DEVICE, or `boards:` in the cell file"),
+        (["--pad", "p1"], "pad p1 of cell table has no boards: give --device"),
         (["--pad", "p9"], "cell table has no pad 'p9'"),
-        (["--port", "/dev/a"] * 4, "--port: a port for each board expected, /dev/a came twice"),
+        (["--device", "/dev/a"] * 4, "--device: expected a port per board, got /dev/a twice"),
         (
-            [word for name in "abcd" for word in ("--port", f"/dev/{name}")],
-            "pad p0 has 3 boards (c, r; l, t; b), 4 ports came: give --port for each, in this order",
+            [word for name in "abcd" for word in ("--device", f"/dev/{name}")],
+            "pad p0: expected 3 ports, one per board (c, r; l, t; b), got 4; give --device for each, in this order",
         ),
-        (["--port", "/dev/a", "--port", "/dev/b", "--port", "/dev/a"], "a port for each board expected, /dev/a came twice"),
-        (["--port", "/dev/a", "--port", "/dev/b", "--port", "/dev/c", "--cycles", "0"], "--cycles: 1 to 60000 expected, 0 came"),
+        (["--device", "/dev/a", "--device", "/dev/b", "--device", "/dev/a"], "expected a port per board, got /dev/a twice"),
+        (
+            ["--device", "/dev/a", "--device", "/dev/b", "--device", "/dev/c", "--cycles", "0"],
+            "--cycles: expected 1 to 60000, got 0",
+        ),
     ],
 )
 def test_ports_that_do_not_fit_the_pad_are_refused_in_one_line(argv, text, capsys):
@@ -392,9 +398,11 @@ def test_the_cell_file_can_name_ports_and_channels():
         cells.SensingBoard(port="/dev/y", channels={"c": (0,), "r": (5,)}),
     ]
     cell = CELL.model_copy(update={"pads": {**CELL.pads, "p2": CELL.pads["p2"].model_copy(update={"boards": tuple(boards)})}})
-    assert service.pads(cell, None, None) == {"p2": tuple(boards)}
+    assert service.pads(cell, (), None) == {"p2": tuple(boards)}
     assert [reader.port for reader in service.pads(cell, ["/dev/v", "/dev/w"], "p2")["p2"]] == ["/dev/v", "/dev/w"]
     boards[1] = boards[1].model_copy(update={"port": None})
     cell.pads["p2"] = CELL.pads["p2"].model_copy(update={"boards": tuple(boards)})
-    with pytest.raises(cells.CellError, match=r"pads.p2.boards: a port of every board expected: add it, or give --pad p2 --port"):
-        service.pads(cell, None, None)
+    with pytest.raises(
+        cells.CellError, match=r"pads.p2.boards: expected a port of every board; add it, or give --pad p2 --device"
+    ):
+        service.pads(cell, (), None)

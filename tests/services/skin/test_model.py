@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.skin import model
-from shared.body.anatomy import forearm_mesh, target_mesh
-from shared.cell import description as cells
-from shared.geometry import rigid
-from shared.skin.response import FOLDER, Response, Rest, networks
-from sim.skin.field import PadField, limb
+from penumbra.services.skin import model
+from penumbra.shared.body.anatomy import forearm_mesh, target_mesh
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.shared.skin.response import FOLDER, Response, Rest, networks
+from penumbra.sim.skin.field import PadField, limb
 
 
 @pytest.fixture
@@ -18,6 +18,7 @@ def few_limbs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(model, "LIMBS", 3)
 
 
+@pytest.mark.slow
 def test_a_cell_with_another_limb_is_fitted_once_and_then_usable(tmp_path, few_limbs, capsys) -> None:
     text = (cells.BUILT_IN / "table.yaml").read_text()
     path = tmp_path / "mine.yaml"

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from shared.body import anatomy
-from shared.cell import description
-from shared.contract.labels import Label
+from penumbra.shared.body import anatomy
+from penumbra.shared.cell import description
+from penumbra.shared.contract.labels import Label
 
 
 def solid(mesh: anatomy.Mesh) -> trimesh.Trimesh:
@@ -29,6 +29,7 @@ def test_the_forearm_has_the_measures_asked_for():
     assert (forearm[:, 0].min(), hand[:, 0].max()) == pytest.approx((-0.14, 0.14 + 0.2))
     for x, around in ((-0.14 + 0.25 * 0.28, 0.3), (0.1399, 0.18)):
         section = solid(mesh).section(plane_origin=(x, 0, 0), plane_normal=(1, 0, 0))
+        assert section is not None
         largest = max(np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in section.discrete)
         assert largest == pytest.approx(around, rel=0.02)  # a polygon of 18 corners is 0.5 % shorter than its ellipse
 
@@ -51,7 +52,7 @@ def test_a_user_s_mesh_is_read_from_beside_the_cell_file(tmp_path):
     ("write", "reason"),
     [
         (lambda path: path.write_text("no mesh"), "triangle mesh"),
-        (lambda path: trimesh.creation.box((400, 80, 80)).export(path), "scale it to metres"),
+        (lambda path: trimesh.creation.box((400, 80, 80)).export(path), "scale it by 0.001 to metres"),
     ],
 )
 def test_a_mesh_that_cannot_be_a_limb_is_refused_with_the_reason(tmp_path, write, reason):

@@ -5,16 +5,16 @@ import dataclasses
 import re
 import subprocess
 import sys
-import time
+import timeit
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from shared.body.robot import RobotModel, robot_models
-from shared.cell import description as cells
-from shared.geometry import rigid
-from tests.support.robots import ODD, ODD_JOINTS, PANDA, odd_robot
+from penumbra.shared.body.robot import RobotModel, robot_models
+from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry import rigid
+from penumbra.tests.support.robots import ODD, ODD_JOINTS, PANDA, odd_robot
 
 
 @pytest.fixture(scope="module")
@@ -37,17 +37,16 @@ def test_meshes_are_the_files_of_the_urdf(panda):
     np.testing.assert_allclose(high - low, [0.0632, 0.2045, 0.0916], atol=2e-3)  # metres, not millimetres
 
 
-def test_one_pose_takes_far_less_than_a_millisecond(panda):
-    q, best = np.zeros(7), np.inf
-    for _ in range(20):  # the best of some: other processes may run
-        begin = time.perf_counter()
-        panda.link_transforms(q)
-        best = min(best, time.perf_counter() - begin)
-    assert best < 150e-6  # 35 microseconds on the machine where it was written
+def test_one_pose_costs_no_more_than_a_few_products_of_matrices_a_link(panda):
+    def cost(call):
+        return min(timeit.repeat(call, number=10, repeat=20))  # the best of some: other processes may run
+
+    q, T = np.zeros(7), np.eye(4)
+    assert cost(lambda: panda.link_transforms(q)) < 10 * len(panda.link_transforms(q)) * cost(lambda: T @ T)
 
 
 def test_a_wrong_number_of_joint_angles_is_told(panda):
-    with pytest.raises(ValueError, match=r"7 values \(panda_joint1, .*\) expected, shape \(6,\) came"):
+    with pytest.raises(ValueError, match=r"expected 7 values \(panda_joint1, .*\), got shape \(6,\)"):
         panda.link_transforms(np.zeros(6))
 
 
@@ -145,7 +144,7 @@ def test_a_joint_named_twice_is_reported(tmp_path):
         ("panda/panda.urdf", "none.urdf", r"robots.panda.urdf: no file .*none.urdf: give a URDF beside the cell file"),
         ("panda/panda_hand", "panda/thumb", r"pads.p0.link: robot panda has no link 'thumb': it has panda_link0"),
         ("  table: [0.9", "  payloads: {panda: {mass: 1, link: tip}}\n  table: [0.9", r"sim.payloads.panda.link: robot panda"),
-        ("  table: [0.9", "  payloads: {ur5: {mass: 1, link: tip}}\n  table: [0.9", r"sim.payloads.ur5: expected one of \['pan"),
+        ("  table: [0.9", "  payloads: {ur5: {mass: 1, link: tip}}\n  table: [0.9", r"sim.payloads.ur5: expected one of panda"),
     ],
 )  # fmt: skip
 def test_a_cell_whose_robot_lacks_what_it_names_is_refused_with_the_line(tmp_path, old, new, place):
@@ -160,8 +159,8 @@ def test_a_cell_whose_robot_lacks_what_it_names_is_refused_with_the_line(tmp_pat
 def test_a_robot_costs_little_to_read():
     """Half a second with pybullet; CPU time of a process of its own, which has nothing else to do."""
     code = """import resource
-from shared.cell import description
-from shared.body.robot import RobotModel
+from penumbra.shared.cell import description
+from penumbra.shared.body.robot import RobotModel
 arm = description.load("arm")
 begin = resource.getrusage(resource.RUSAGE_SELF)
 RobotModel(arm.robots["panda"], arm.folder).meshes

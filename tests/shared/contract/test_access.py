@@ -1,7 +1,6 @@
 """The secured bus: a real router with access control, and a session for each certificate. Whoever may not say something is not
 heard by the router's own reader, which hears everything that comes in."""
 
-import argparse
 import itertools
 import json
 import stat
@@ -10,24 +9,25 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zenoh
 
-from services.command import certs, cli
-from services.launcher import launch
-from shared.cell import description as cells
-from shared.contract import access, messages, topics
-from shared.contract.processes import PROCESSES
-from shared.runtime import bus
-from shared.runtime.node import Node
-from tests.support.live import free_port, wait_for
-from tests.support.nodes import pose
+from penumbra.services.command import certs, cli
+from penumbra.services.launcher import launch
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import access, messages, topics
+from penumbra.shared.contract.processes import PROCESSES
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.tests.support.live import free_port, wait_for
+from penumbra.tests.support.nodes import pose
 
 CELL = cells.load("table")
 STRANGER = "stranger"
 """Whose certificate is of the same authority, but whose name stands in no rule."""
-WHO = (*access.SERVICES, access.OPERATOR, access.VIEWER)
+WHO = (*access.SERVICES, access.DRIVER, access.OPERATOR, access.VIEWER)
 NAMES = {"cell": "table", "camera": "front", "robot": "panda", "pad": "p0", "target": "forearm"}
 
 
@@ -38,6 +38,7 @@ class Bus:
         self.folder = folder
         self.endpoint = f"tls/127.0.0.1:{free_port()}"
         self.router = Node("router", CELL, bus.Connection("router", listen=(self.endpoint,), secure=folder)).open()
+        assert self.router.session is not None
         self.heard = self.router.session.declare_subscriber("penumbra/**", zenoh.handlers.FifoChannel(4096))
         self.clients: dict[str, zenoh.Session] = {}
 
@@ -157,16 +158,16 @@ def test_a_question_is_answered_only_by_whose_it_is(secured, who, service, key):
 
 
 @pytest.mark.parametrize("who", WHO)
-def test_only_an_operator_steers_and_everybody_may_ask_for_the_pose(secured, who):
+def test_only_an_operator_steers_and_everybody_may_ask_for_the_pose_and_the_cell(secured, who):
     asked = {}
-    for key in (topics.control("table"), topics.current_pose("table", "forearm")):
+    for key in (topics.control("table"), topics.current_pose("table", "forearm"), topics.description("table")):
         queryable = secured.router.session.declare_queryable(key, zenoh.handlers.FifoChannel(8))
         replies = secured.client(who).get(key, timeout=10.0)
         secured.settle(who)
         asked[key.rpartition("/")[2]] = queryable.try_recv() is not None
         queryable.undeclare()
         del replies
-    assert asked == {"control": who == access.OPERATOR, "pose": True}
+    assert asked == {"control": who == access.OPERATOR, "pose": True, "description": True}
 
 
 @pytest.mark.parametrize("who", WHO)
@@ -225,7 +226,7 @@ def test_a_router_passes_on_what_the_router_of_another_host_has_let_through(secu
         try:
             secured.puts()
             own = topics.FUSED.at(**NAMES)
-            wait_for(lambda: put(writer, own, b"put") or secured.puts(), 30, "a message of the far host")
+            wait_for(secured.puts, 30, "a message of the far host", act=lambda: put(writer, own, b"put"))
             for topic in topics.TOPICS:
                 put(writer, topic.at(**NAMES), b"put")
             came: list[zenoh.Sample] = []
@@ -253,7 +254,7 @@ def test_services_work_on_a_secured_bus_as_on_another(secured, folder):
 
     emulator.answer(topics.control("table"), refuse)
     with reader, writer, emulator:
-        wait_for(lambda: writer.publish(topics.FUSED, pose(), target="forearm") or got, 10, "a pose")
+        wait_for(lambda: got, 10, "a pose", act=lambda: writer.publish(topics.FUSED, pose(), target="forearm"))
         assert reader.query(topics.current_pose("table", "forearm")) == [b"here"]
         services = {json.loads(answer)["service"] for answer in reader.query(topics.health("table"), timeout_s=10.0)}
         assert services == {"router", "search", "fusion", "emulator"}
@@ -266,8 +267,8 @@ def test_processes_and_commands_take_the_switch(folder, capsys):
     endpoint = f"tls/127.0.0.1:{free_port()}"
     flags = ["--secure", str(folder), "--connect", endpoint]
     commands = [
-        ["services.command.cli", "router", "--secure", str(folder), "--listen", endpoint],
-        ["tests.support.nodes", "fusion", *flags],
+        ["penumbra.services.command.cli", "router", "--secure", str(folder), "--listen", endpoint],
+        ["penumbra.tests.support.nodes", "fusion", *flags],
     ]
     processes = [subprocess.Popen([sys.executable, "-m", *command], stderr=subprocess.DEVNULL) for command in commands]
     try:
@@ -332,8 +333,10 @@ def test_a_router_at_an_address_that_its_certificate_does_not_name_is_not_truste
 
 
 def test_the_waiting_for_a_router_says_which_certificates_are_expected(folder):
-    with pytest.raises(bus.BusError, match=f"with a certificate of the same CA as in {folder}"):
-        Node("fusion", CELL, bus.Connection(connect=(f"tls/127.0.0.1:{free_port()}",), secure=folder)).open(patience_s=0.0)
+    connection = bus.Connection(connect=(f"tls/127.0.0.1:{free_port()}",), secure=folder)
+    with pytest.raises(bus.BusError, match="nothing listens there"):
+        Node("fusion", CELL, connection).open(patience_s=0.0)
+    assert connection.whereabouts.endswith(f"with a certificate of the same CA as in {folder}")
 
 
 # ---- the switch
@@ -342,9 +345,12 @@ def test_the_waiting_for_a_router_says_which_certificates_are_expected(folder):
 @pytest.mark.parametrize(
     ("connection", "reason"),
     [
-        (bus.Connection(connect=("tcp/127.0.0.1:7447",)), "endpoint 'tcp/127.0.0.1:7447': .* with --secure: tls$"),
-        (bus.Connection("peer"), "client or router expected"),
-        (bus.Connection(service="fusion", secure=Path("nowhere")), "ca.pem, fusion.pem, fusion-key.pem expected, ca.pem cannot"),
+        (bus.Connection(connect=("tcp/127.0.0.1:7447",)), "endpoint: .* got 'tcp/127.0.0.1:7447'; protocols with --secure: tls$"),
+        (bus.Connection("peer"), "--mode: expected client or router with --secure"),
+        (
+            bus.Connection(service="fusion", secure=Path("nowhere")),
+            "expected ca.pem, fusion.pem, fusion-key.pem, got no readable ca.pem",
+        ),
     ],
 )
 def test_what_would_not_be_secure_is_refused(folder, connection, reason):
@@ -353,10 +359,10 @@ def test_what_would_not_be_secure_is_refused(folder, connection, reason):
 
 
 def test_the_switch_is_a_flag_or_the_environment_and_off_without(folder, monkeypatch):
-    from services import flags as arguments
+    from penumbra.services import flags
 
     def secure(*argv):
-        return bus.connection(arguments.parser("test", "").parse_args(argv)).secure
+        return bus.connection(flags.parse(flags.COMMON, argv)).secure
 
     monkeypatch.delenv("PENUMBRA_SECURE", raising=False)
     assert secure() is None
@@ -369,7 +375,7 @@ def test_the_launcher_stays_on_loopback_unless_secured_and_hands_the_switch_on(f
     def options(**changed):
         plain = {"connect": [], "port": 7, "secure": None, "replicas": [], "vision": "procnet", "cell": "table"}
         flags = {"seed": None, "observer": None, "method": None, "log_level": "info", "log_format": "text"}
-        return argparse.Namespace(**{**plain, **flags, **changed})
+        return SimpleNamespace(**{**plain, **flags, **changed})
 
     assert (launch.listening(options()), launch.meeting_points(options())) == ("tcp/127.0.0.1:7", ("tcp/127.0.0.1:7",))
     secured = options(secure=folder)
@@ -382,7 +388,7 @@ def test_the_launcher_stays_on_loopback_unless_secured_and_hands_the_switch_on(f
 
 def test_every_process_of_the_launcher_and_every_publisher_has_a_certificate():
     publishers = {name for topic in topics.TOPICS for name in topic.publishers}
-    assert publishers <= set(access.SERVICES)
+    assert publishers <= {*access.SERVICES, access.DRIVER}
     assert {process.name for process in PROCESSES} <= set(access.HOLDERS)
 
 

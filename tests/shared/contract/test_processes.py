@@ -1,9 +1,9 @@
 """The one table of processes: what is not derived from it agrees with it, and a new row is enough for a new service."""
 
-import argparse
 import ast
 import importlib.metadata
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from services import flags
-from services.command import cli, doctor
-from services.launcher import launch
-from shared.contract import topics
-from shared.contract.processes import LAUNCHER, PROCESSES, REPORTING, ROUTER, find
-from tests.support.live import free_port
+from penumbra.services import flags
+from penumbra.services.command import cli, doctor
+from penumbra.services.launcher import launch, up
+from penumbra.shared.contract import access, topics
+from penumbra.shared.contract.processes import LAUNCHER, PROCESSES, REPORTING, ROUTER, find
+from penumbra.tests.support.live import free_port
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -47,7 +47,7 @@ COMMANDS = {
     **{
         name: (command.function.partition(":")[0], command.extra)
         for name, command in cli.COMMANDS.items()
-        if isinstance(command, cli.Command)
+        if isinstance(command, cli.Entry)
     },
 }
 """Everything that can be run, with its module and the extra that it needs."""
@@ -56,7 +56,7 @@ COMMANDS = {
 def test_no_service_imports_another_one_and_the_contract_names_them_all():
     contracts = PROJECT["tool"]["importlinter"]["contracts"]
     (contract,) = (each for each in contracts if each["type"] == "independence")
-    assert sorted(contract["modules"]) == sorted(f"services.{name}" for name in NAMES)
+    assert sorted(contract["modules"]) == sorted(f"penumbra.services.{name}" for name in NAMES)
 
 
 def test_every_process_has_a_stage_in_the_dockerfile_with_its_own_folder_and_extra():
@@ -65,6 +65,7 @@ def test_every_process_has_a_stage_in_the_dockerfile_with_its_own_folder_and_ext
     assert sorted(stages) == sorted(NAMES)
     for process in PROCESSES:
         stage = stages[process.name]
+        assert "COPY penumbra penumbra\n" in stage
         assert f"COPY services/{process.name} services/{process.name}\n" in stage
         assert f'CMD ["{process.name}"]' in stage
         assert ("COPY sim sim\n" in stage) == process.imports_sim, process.name
@@ -85,7 +86,7 @@ def test_compose_runs_the_processes_that_the_table_says(file):
 
 
 def test_publishers_and_queryables_are_those_of_processes_in_the_table():
-    names = {process.name for process in REPORTING}
+    names = {access.DRIVER, *(process.name for process in REPORTING)}
     assert {name for topic in topics.TOPICS for name in topic.publishers} <= names
     assert sorted(name for process in REPORTING for name in process.answers) == sorted(topics.QUERYABLES)
     assert find("launcher") is LAUNCHER and find("nobody") is None and ROUTER.name == "router"
@@ -93,12 +94,11 @@ def test_publishers_and_queryables_are_those_of_processes_in_the_table():
 
 @pytest.mark.parametrize("process", PROCESSES, ids=NAMES)
 def test_a_flag_that_up_passes_on_is_one_of_the_service_with_the_same_choices(process):
-    parser = argparse.ArgumentParser(allow_abbrev=False)
-    __import__(process.module, fromlist=["arguments"]).arguments(parser)
-    own = {action.dest: action for action in parser._actions}
+    own = {option.name: option for option in __import__(process.module, fromlist=["FLAGS"]).FLAGS}
     for flag in process.flags:
-        assert sorted(own[flag.name].choices or ()) == sorted(flag.choices)
-        assert (own[flag.name].type or str) is flag.type
+        expected = flags.Option("--x", type=flag.type, choices=flag.choices).type
+        assert type(own[flag.name].type) is type(expected)
+        assert sorted(getattr(own[flag.name].type, "choices", ())) == sorted(flag.choices)
 
 
 @pytest.mark.parametrize("process", [process for process in PROCESSES if process.trained_by], ids=lambda process: process.name)
@@ -129,7 +129,7 @@ def foreign_imports(module):
         if name in seen:
             continue
         seen.add(name)
-        if name.partition(".")[0] in ("services", "shared", "sim", "tests"):
+        if name.partition(".")[0] == "penumbra":
             waiting += [name.rpartition(".")[0], *top_level_imports(name)]
         elif name:
             found.add(name.partition(".")[0])
@@ -162,7 +162,7 @@ def test_extras_that_name_others_install_what_those_do():
 
 @pytest.mark.parametrize("command", ["haptics train", "segmentation train", "skin model"])
 def test_a_tool_that_lacks_a_package_names_the_extra_that_installs_it_for_the_tool(command):
-    code = "import sys; sys.modules['torch'] = None; from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; sys.modules['torch'] = None; from penumbra.services.command.cli import main; sys.exit(main(sys.argv[1:]))"
     out = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True)
     hint = f"penumbra {command}: torch is not installed: pip install -e '.[{TOOLS[command][1]}]'"
     assert (out.returncode, out.stderr.splitlines()[-1]) == (2, hint)
@@ -173,10 +173,10 @@ def test_a_tool_that_lacks_a_package_names_the_extra_that_installs_it_for_the_to
 ROW = """
     Process(
         "echo",
-        "repeats what it receives (`echo loud`: loudly)",
+        "repeats what it receives",
         extra="router",
         flags=(Flag("volume", "of the echo", choices=("low", "high")),),
-        tools=(Tool("loud", "services.echo.loud:main", extra="router"),),
+        tools=(Tool("loud", "loudly", "penumbra.services.echo.loud:main", extra="router"),),
         trained_by="loud",
         answers=("current_pose",),
         in_compose=False,
@@ -185,13 +185,13 @@ ROW = """
 """
 SERVICE = '''"""Repeats what it receives."""
 
-from shared.contract.topics import FUSED
+from penumbra.services import flags
+from penumbra.shared.contract.topics import FUSED
 
 NAME = "echo"
 
 
-def arguments(parser):
-    parser.add_argument("--volume", choices=("low", "high"), default="low")
+FLAGS = (flags.Option("--volume", choices=("low", "high"), default="low"),)
 
 
 def start(node, options):
@@ -200,37 +200,48 @@ def start(node, options):
 '''
 
 
+TOOL = '''"""Echoes."""
+
+from penumbra.services import flags
+
+
+@flags.command("echo loud", "Echoes.", flags.Argument("word", help="what is echoed"), example="penumbra echo loud hello")
+def main(options):
+    print("ECHO", options.word)
+'''
+
+
 @pytest.fixture(scope="module")
 def with_echo(tmp_path_factory):
     """A copy of the house with one more row in the table and one more folder: nothing else is touched."""
     root = tmp_path_factory.mktemp("house")
-    for folder in ("services", "shared", "sim"):
-        shutil.copytree(ROOT / folder, root / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    table = root / "shared" / "contract" / "processes.py"
+    shutil.copytree(ROOT / "penumbra", root / "penumbra", ignore=shutil.ignore_patterns("__pycache__", "tests"))
+    table = root / "penumbra" / "shared" / "contract" / "processes.py"
     before, after = table.read_text().split("\n)\n\nLAUNCHER = ")
     table.write_text(f"{before}{ROW}\nLAUNCHER = {after}")
-    own = root / "services" / "echo"
+    own = root / "penumbra" / "services" / "echo"
     own.mkdir()
     (own / "__init__.py").write_text('"""Repeats what it receives."""\n')
     (own / "service.py").write_text(SERVICE)
-    (own / "loud.py").write_text("def main(argv):\n    print('ECHO', *argv)\n")
+    (own / "loud.py").write_text(TOOL)
     return root
 
 
 def run_in(root, *argv):
-    code = f"import sys; sys.path.insert(0, {str(root)!r}); from services.command.cli import main; sys.exit(main(sys.argv[1:]))"
-    return subprocess.run([sys.executable, "-P", "-c", code, *argv], cwd=root, capture_output=True, text=True, timeout=60)
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    command = [sys.executable, "-P", "-m", "penumbra", *argv]
+    return subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=60)
 
 
 def test_a_new_service_is_in_the_help_and_its_tools_and_flags_work(with_echo):
-    assert "  echo          repeats what it receives (`echo loud`: loudly)\n" in run_in(with_echo, "--help").stdout
+    assert "  echo          repeats what it receives (also: loud)\n" in run_in(with_echo, "--help").stdout
     assert run_in(with_echo, "echo", "loud", "hello").stdout == "ECHO hello\n"
-    assert "--volume {low,high}" in run_in(with_echo, "up", "--help").stdout
+    assert "--volume [low|high]" in run_in(with_echo, "up", "--help").stdout
     assert "Repeats what it receives." in run_in(with_echo, "echo", "--help").stdout
 
 
 def test_a_new_service_is_allowed_to_answer_and_report_on_a_secured_bus(with_echo):
-    code = "import json; from shared.contract import access; print(json.dumps(access.control()))"
+    code = "import json; from penumbra.shared.contract import access; print(json.dumps(access.control()))"
     rules = json.loads(subprocess.run([sys.executable, "-c", code], cwd=with_echo, capture_output=True, text=True).stdout)
     (answers,) = (rule for rule in rules["rules"] if rule["id"] == "echo answers")
     assert answers["key_exprs"] == [topics.health("*", "echo"), topics.current_pose("*", "*")]
@@ -250,16 +261,15 @@ def test_up_starts_a_new_service_with_its_flags(with_echo):
     assert out.returncode == 0
 
 
-def test_no_parser_takes_abbreviated_flags():
-    assert flags.Parser().allow_abbrev is False
-    paths = [path for folder in ("services", "shared", "sim", "tests/bench") for path in (ROOT / folder).rglob("*.py")]
-    own = ROOT / "services" / "flags.py"
-    others = [path for path in paths if path != own and "ArgumentParser(" in path.read_text()]
-    assert all("allow_abbrev=False" in path.read_text() for path in others), others
+def test_there_is_one_way_to_a_command_line():
+    folders = ("services", "shared", "sim", "tests/bench")
+    paths = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    assert len(paths) > 100
+    assert not [path for path in paths if "argparse" in path.read_text()]
 
 
 def test_up_gives_every_flag_of_the_table_to_its_process():
-    options = launch.parser().parse_args(["--observer", "paper", "--method", "paper", "--seed", "7", "--port", "7"])
+    options = flags.parse(up.PARAMS, ["--observer", "paper", "--method", "paper", "--seed", "7", "--port", "7"])
     commands = {process.service: process.command for process in launch.fleet(launch.cells.load("table"), options).processes}
     for name, words in {"fusion": ["--observer", "paper"], "search": ["--method", "paper"], "emulator": ["--seed", "7"]}.items():
         assert commands[name][-2:] == words

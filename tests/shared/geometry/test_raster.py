@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from shared.body import anatomy
-from shared.cell import description
-from shared.geometry import raster, rigid
+from penumbra.shared.body import anatomy
+from penumbra.shared.cell import description
+from penumbra.shared.geometry import raster, rigid
 
 K = (100.0, 100.0, 49.5, 49.5)
 
 
-def square(z: float, half: float = 0.2):
+def square(z: float, half: float = 0.2) -> tuple[np.ndarray, np.ndarray]:
     corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
     return corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
@@ -40,7 +40,7 @@ def test_triangles_that_share_edges_leave_no_hole_and_cover_nothing_twice():
         rim = np.stack([np.cos(angle), np.sin(angle)], axis=1) * 0.4
         vertices = np.column_stack([np.vstack([rng.uniform(-0.1, 0.1, 2), rim]), np.ones(10)])
         faces = np.array([[0, 1 + i, 1 + (i + 1) % 9] for i in range(9)], np.int32)
-        covered = sum(raster.silhouette(vertices, faces[i : i + 1], K, (0, 0, 100, 100)).astype(int) for i in range(9))
+        covered = np.sum([raster.silhouette(vertices, faces[i : i + 1], K, (0, 0, 100, 100)) for i in range(9)], axis=0)
         together = raster.silhouette(vertices, faces, K, (0, 0, 100, 100))
         assert covered.max() <= 2  # 2 only where the middle lies outside the rim's polygon and the fan folds
         np.testing.assert_array_equal(covered > 0, together)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shared.geometry import rigid
+from penumbra.shared.geometry import rigid
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_euler_angles_are_those_of_scipy_and_defined_where_the_pitch_is_a_quarte
 
 
 def test_a_quaternion_of_no_length_is_refused():
-    with pytest.raises(ValueError, match=r"a unit quaternion \(x, y, z, w\) expected, \(0.0, 0.0, 0.0, 0.0\) came"):
+    with pytest.raises(ValueError, match=r"expected a unit quaternion \(x, y, z, w\), got \(0.0, 0.0, 0.0, 0.0\)"):
         rigid.transform((0, 0, 0), (0, 0, 0, 0))
 
 

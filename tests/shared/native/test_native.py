@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.haptics import paper_nearest
-from services.search import contour
-from shared.geometry import raster, surface
-from shared.native import KERNELS, Kernel, build, inner, kernel, machine
-from shared.native.compiler import LIBC
-from shared.native.signature import Signature
+from penumbra.services.haptics import paper_nearest
+from penumbra.services.search import contour
+from penumbra.shared.geometry import raster, surface
+from penumbra.shared.native import KERNELS, Kernel, build, inner, kernel, machine
+from penumbra.shared.native.compiler import LIBC
+from penumbra.shared.native.signature import Signature
 
 ROOT = Path(__file__).parents[3]
 
@@ -35,7 +35,8 @@ def symbols(library, kind):
 
 def test_every_kernel_is_in_every_library_as_its_source_is_now():
     build.import_kernels()
-    ours = {each.name: each for each in KERNELS.values() if each.name.split(".")[0] in build.FLOORS}
+    floors = tuple(floor.replace("/", ".") for floor in build.FLOORS)
+    ours = {each.name: each for each in KERNELS.values() if each.name.startswith(floors)}
     assert {name: each.fingerprint for name, each in ours.items()} == manifest()["kernels"], build.AGAIN
     for name in manifest()["libraries"]:
         assert symbols(machine.FOLDER / name, "T") == {each.symbol for each in ours.values()}, build.AGAIN
@@ -49,14 +50,15 @@ def test_a_library_needs_nothing_but_libc_and_libm():
         assert "NEEDED" not in described and "DYN" in described
 
 
+@pytest.mark.slow
 def test_a_library_is_what_its_sources_give(tmp_path):
     """A sample: three kernels, compiled again, alone and for every processor, give the same bytes as once more; the whole is
-    compared by `python -m shared.native.build --check`."""
+    compared by `python -m penumbra.shared.native.build --check`."""
     code = """
         import hashlib, sys
-        from shared.geometry import raster, surface
-        from shared.native import KERNELS
-        from shared.native.compiler import TARGETS, compiled
+        from penumbra.shared.geometry import raster, surface
+        from penumbra.shared.native import KERNELS
+        from penumbra.shared.native.compiler import TARGETS, compiled
         kernels = [KERNELS[name] for name in sorted(KERNELS)]
         print([hashlib.sha256(compiled(kernels, target)).hexdigest() for target in TARGETS.values()])
     """
@@ -85,8 +87,8 @@ def calls(rng):
     points = 2.0 * rng.standard_normal((20, 3))
     yield surface.nearest_points, (points, *shell.arrays, np.empty(20), np.empty((20, 3)), np.empty((20, 3)))
     V = np.ascontiguousarray(0.3 * vertices + rng.uniform(-0.1, 0.1, 3) + [0, 0, 0.6])
-    yield raster._silhouette, (V, faces, 60.0, 60.0, 32.0, 24.0, np.zeros((48, 64), bool))
-    yield contour._front, (V, faces, np.zeros_like(faces))
+    yield raster.draw_silhouette, (V, faces, 60.0, 60.0, 32.0, 24.0, np.zeros((48, 64), bool))
+    yield contour._front, (V, faces, True, np.zeros_like(faces))
     images = np.full((48, 64), np.inf, np.float32), np.zeros((48, 64), np.uint8), np.zeros((48, 64), np.int32)
     yield raster._draw, (V, faces, 60.0, 60.0, 32.0, 24.0, np.ones(len(faces), np.uint8), 0, *images)
     n = 12
@@ -120,6 +122,7 @@ def imported(path, text):
     """The module of this text."""
     path.write_text(textwrap.dedent(text))
     spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -127,7 +130,7 @@ def imported(path, text):
 
 SCALE = """
     import numpy as np
-    from shared.native import inner, kernel
+    from penumbra.shared.native import inner, kernel
     FACTOR = {factor}
     @inner
     def scaled(x):
@@ -167,8 +170,8 @@ def test_what_is_compiled_runs_also_where_it_cannot_be_kept(tmp_path, monkeypatc
 
 
 def test_without_numba_an_edited_kernel_says_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "shared.native.jit", None)
-    monkeypatch.delattr("shared.native.jit", raising=False)
+    monkeypatch.setitem(sys.modules, "penumbra.shared.native.jit", None)
+    monkeypatch.delattr("penumbra.shared.native.jit", raising=False)
     module = imported(tmp_path / "lonely.py", SCALE.format(factor=7.0, expression="FACTOR * x"))
     with pytest.raises(ImportError, match=r"lonely\.scale: expected compiled code .* pip install 'penumbra\[native\]'"):
         module.scale(np.ones(2), np.empty(2))
@@ -249,7 +252,7 @@ def test_no_service_imports_numba_when_its_kernels_are_called():
     code = """
         import sys
         import numpy as np
-        from shared.geometry import raster
+        from penumbra.shared.geometry import raster
         V, faces = np.array([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]]), np.array([[0, 1, 2]], np.int32)
         assert raster.silhouette(V, faces, (9.0, 9.0, 0.0, 0.0), (0, 0, 9, 9)).any()
         assert not {"numba", "llvmlite"} & set(sys.modules)

@@ -1,28 +1,27 @@
 """Real sessions and a real router on loopback."""
 
-import dataclasses
 import json
 import logging
 import os
 import subprocess
-import sys
 import threading
 import time
 
 import msgpack
+import msgspec
 import numpy as np
 import pytest
 import zenoh
 
-from shared.cell import description as cells
-from shared.contract import messages, topics
-from shared.runtime import bus
-from shared.runtime import reader as reader_module
-from shared.runtime.guard import RATE_TIMES
-from shared.runtime.node import Node
-from shared.runtime.traffic import RATE_WINDOW_S, Rate
-from tests.support.live import free_port, wait_for
-from tests.support.nodes import pose
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime import reader as reader_module
+from penumbra.shared.runtime.guard import RATE_TIMES
+from penumbra.shared.runtime.node import Node
+from penumbra.shared.runtime.traffic import RATE_WINDOW_S, Rate
+from penumbra.tests.support.live import free_port, penumbra_command, wait_for
+from penumbra.tests.support.nodes import pose
 
 CELL = cells.load("table")
 
@@ -61,12 +60,7 @@ def log(caplog):
 
 def until(condition, publish, what, seconds=5.0):
     """Publishes again and again until something has happened."""
-
-    def step():
-        publish()
-        return condition()
-
-    return wait_for(step, seconds, what, interval=0.01)
+    return wait_for(condition, seconds, what, 0.01, publish)
 
 
 def raw(node, topic, payload, **names):
@@ -88,7 +82,7 @@ def test_a_message_arrives_with_the_names_in_its_key(node):
 
 
 def test_a_reader_is_told_which_of_two_publishers_sent_a_message(node):
-    heard = {}
+    heard: dict[str, list[int]] = {}
     reader, writers = node(), [node(), node()]
     reader.subscribe(topics.VOLTAGES, lambda message, names: heard.setdefault(names["publisher"], []).append(message.stamp_ns))
     reader.open(), [writer.open() for writer in writers]
@@ -105,7 +99,12 @@ def test_a_reader_is_told_which_of_two_publishers_sent_a_message(node):
 def test_a_slow_reader_of_one_topic_does_not_hold_up_another(node):
     slow, ages = [], []
     reader, writer = node(), node()
-    reader.subscribe(topics.MASK, lambda message, names: (time.sleep(0.05), slow.append(time.time_ns() - message.stamp_ns)))
+
+    def take_long(message, names):
+        time.sleep(0.05)
+        slow.append(time.time_ns() - message.stamp_ns)
+
+    reader.subscribe(topics.MASK, take_long)
     reader.subscribe(topics.FUSED, lambda message, names: ages.append(time.time_ns() - message.stamp_ns))
     reader.open(), writer.open()
     until(lambda: ages and slow, lambda: send(writer), "both topics")
@@ -153,7 +152,7 @@ def test_messages_of_another_version_are_ignored_counted_and_told_once_however_m
     until(lambda: got, lambda: writer.publish(topics.FUSED, pose(), target="forearm"), "a message of our version")
     (told,) = log("message refused")
     assert told.fields["kind"] == "version"
-    assert f"wire version {messages.VERSION} expected, {messages.VERSION + 1} came" in told.fields["why"]
+    assert f"expected wire version {messages.VERSION}, got {messages.VERSION + 1}" in told.fields["why"]
     assert reader.health()["wire_version"] == messages.VERSION
 
 
@@ -189,7 +188,12 @@ def test_an_exception_of_a_handler_is_counted_and_logged_once_and_the_next_messa
 def test_what_a_reader_missed_is_counted_from_the_publishers_numbers(node):
     got, go = [], threading.Event()
     reader, writer = node(), node()
-    reader.subscribe(topics.MASK, lambda message, names: (got.append(message), go.wait(5)))
+
+    def hold(message, names):
+        got.append(message)
+        go.wait(5)
+
+    reader.subscribe(topics.MASK, hold)
     reader.open(), writer.open()
     until(lambda: got, lambda: send(writer), "the first mask")
     key = topics.MASK.at(cell="table", camera="front")
@@ -218,7 +222,7 @@ def test_a_message_that_is_sent_again_is_refused_and_the_next_one_taken(node):
     sample = wait_for(tape.try_recv, 5, "the recorded pose")
 
     def replay():
-        replayer.session.put(key, sample.payload, source_info=sample.source_info)
+        replayer.session.put(key, sample.payload, attachment=sample.attachment)
 
     until(lambda: bad().get("replayed", 0) >= 3, replay, "three refusals")
     before = len(got)
@@ -290,19 +294,22 @@ def test_a_camera_may_send_at_the_rate_that_the_cell_gives_it(tmp_path):
     assert rates == [300, 300, 300, 200]
 
 
-def test_the_rate_of_a_steady_stream_is_its_rate_and_falls_when_it_ends():
-    rate = Rate()
-    for k in range(400):
-        rate.add(k * 0.005)
-        if k > 10:
-            assert rate.hz(k * 0.005) == pytest.approx(200, rel=0.02)
-    assert rate.hz(2.0 + 10 * RATE_WINDOW_S) < 0.1
+@pytest.mark.parametrize("every_s", [0.05, 0.2, 1.0])
+def test_the_rate_of_a_steady_stream_is_its_rate_and_falls_when_it_ends(every_s):
+    rate, looks_s = Rate(), np.arange(0.0, 8.0, every_s)
+    for now_s in looks_s:
+        rate.look(int(200 * now_s), now_s)
+        if now_s > 2 * every_s:  # the first look that saw something started the clock
+            assert rate.hz == pytest.approx(200, rel=0.02)
+    for now_s in 8.0 + np.arange(0.0, 10 * RATE_WINDOW_S, every_s):
+        rate.look(int(200 * looks_s[-1]), now_s)
+    assert rate.hz < 0.1
 
 
 def test_a_query_is_answered_and_a_refusal_carries_its_text(node):
     def answer(parameters, payload):
         if parameters.get("format") == "xml":
-            raise ValueError("format: json expected, xml came")
+            raise ValueError("format: expected json, got xml")
         if parameters.get("format") == "crash":
             raise KeyError("lost")
         return payload + json.dumps(parameters).encode(), "application/json"
@@ -311,7 +318,7 @@ def test_a_query_is_answered_and_a_refusal_carries_its_text(node):
     server.answer("penumbra/table/echo", answer)
     wait_for(lambda: asker.query("penumbra/table/echo"), 5, "an answer")
     assert asker.query("penumbra/table/echo", "format=json", b"hello ") == [b'hello {"format": "json"}']
-    with pytest.raises(bus.Refused, match="json expected, xml came"):
+    with pytest.raises(bus.Refused, match="expected json, got xml"):
         asker.query("penumbra/table/echo", "format=xml")
     with pytest.raises(bus.Refused, match="server failed: KeyError"):
         asker.query("penumbra/table/echo", "format=crash")
@@ -320,9 +327,10 @@ def test_a_query_is_answered_and_a_refusal_carries_its_text(node):
 
 def test_a_query_that_nobody_answers_returns_at_once_with_nothing(node):
     asker = node().open()
+    timeout_s = 60.0
     started = time.monotonic()
-    assert asker.query("penumbra/table/nobody", timeout_s=5.0) == []
-    assert time.monotonic() - started < 1.0
+    assert asker.query("penumbra/table/nobody", timeout_s=timeout_s) == []
+    assert time.monotonic() - started < 0.2 * timeout_s
 
 
 def test_a_taken_port_is_told_with_what_to_do(endpoint):
@@ -357,14 +365,12 @@ def test_the_settings_of_a_configuration_file_stand_unless_a_flag_says_otherwise
 
 @pytest.mark.parametrize("endpoint", ["nonsense", "tcp/", "pigeon/127.0.0.1:7447"])
 def test_an_endpoint_that_zenoh_does_not_know_is_refused_and_not_waited_for(endpoint):
-    with pytest.raises(bus.BusError, match=r"PROTOCOL/ADDRESS expected|does not open|nothing that Zenoh takes"):
+    with pytest.raises(bus.BusError, match=r"expected PROTOCOL/ADDRESS|does not open|expected what Zenoh accepts"):
         Node("test", CELL, bus.Connection(connect=(endpoint,))).open(patience_s=30)
 
 
 def router_process(endpoint):
-    return subprocess.Popen(
-        [sys.executable, "-m", "services.command.cli", "router", "--listen", endpoint], stderr=subprocess.DEVNULL
-    )
+    return subprocess.Popen(penumbra_command("router", "--listen", endpoint), stderr=subprocess.DEVNULL)
 
 
 def test_nodes_wait_for_the_router_and_go_on_after_it_was_away_for_five_seconds(log):
@@ -387,17 +393,17 @@ def test_nodes_wait_for_the_router_and_go_on_after_it_was_away_for_five_seconds(
         killed = time.monotonic()
         wait_for(lambda: len(log("waiting")) == 4, 5, "both to say that the router is gone")
         wait_for(lambda: time.monotonic() - killed > 5.0, 6, "five seconds without a router")
-        before = len(got)
+        before, back_ns = len(got), time.time_ns()
         router = router_process(endpoint)
         wait_for(lambda: len(got) > before, 3, "messages after the router came back")
         wait_for(lambda: len(log("the router is back")) == 2, 3, "both to say so")
-        newest = got[-1]
-        assert time.time_ns() - newest.stamp_ns < 1e9, "no backlog"
+        assert got[before].stamp_ns > back_ns, "no backlog"
         assert reader.query(topics.health("table", "writer")), "queryables are declared again"
     finally:
         router.kill()
         router.wait()
-        reader.close(), writer.close()
+        reader.close()
+        writer.close()
 
 
 def test_a_reader_refuses_a_large_message_without_copying_it(node):
@@ -418,7 +424,7 @@ def test_publishing_says_which_names_are_missing_unknown_or_not_in_the_cell(node
     with pytest.raises(ValueError, match="topic fused has the names target, not camera"):
         writer.publish(topics.FUSED, pose(), target="forearm", camera="front")
     with pytest.raises(messages.BadMessage, match="position"):
-        writer.publish(topics.FUSED, dataclasses.replace(pose(), position=np.zeros(4)), target="forearm")
+        writer.publish(topics.FUSED, msgspec.structs.replace(pose(), position=np.zeros(4)), target="forearm")
 
 
 def test_zenoh_endpoints_are_taken_from_the_environment_where_no_flag_gives_them(monkeypatch):
@@ -430,9 +436,9 @@ def test_zenoh_endpoints_are_taken_from_the_environment_where_no_flag_gives_them
 
 
 def parse(argv):
-    from services import flags as arguments
+    from penumbra.services import flags
 
-    return arguments.parser("test", "").parse_args(argv)
+    return flags.parse(flags.COMMON, argv)
 
 
 def test_many_frames_a_second_pass_through_shared_memory_or_tcp_unchanged(node):
@@ -457,7 +463,12 @@ def test_the_session_of_another_zenoh_program_reads_what_a_node_publishes(node, 
 
 def test_the_latest_message_is_decoded_only_when_it_is_looked_at_and_all_are_counted(node, monkeypatch):
     decoded = []
-    monkeypatch.setattr(reader_module, "decode", lambda *arguments: decoded.append(1) or messages.decode(*arguments))
+
+    def counted(kind, payload):
+        decoded.append(1)
+        return messages.decode(kind, payload)
+
+    monkeypatch.setattr(reader_module, "decode", counted)
     reader, writer = node(), node()
     latest = reader.latest(topics.FUSED)
     assert latest.get(target="forearm") is None
@@ -495,7 +506,7 @@ def test_what_a_reader_refuses_the_latest_message_refuses_too(node):
     until(lambda: bad().get("version"), lambda: writer.session.put(key, other), "another version refused")
     until(
         lambda: bad().get("replayed"),
-        lambda: replayer.session.put(key, sample.payload, source_info=sample.source_info),
+        lambda: replayer.session.put(key, sample.payload, attachment=sample.attachment),
         "a replay refused",
     )
     assert latest.get(target="forearm").stamp_ns == good.stamp_ns, "what was refused is not shown"

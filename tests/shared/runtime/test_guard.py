@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.contract.messages import BadMessage
-from shared.runtime.guard import FORGET_S, NUMBERS, PUBLISHERS, RATE_TIMES, WINDOW, Bucket, Guard, Window
+from penumbra.shared.contract.messages import BadMessage
+from penumbra.shared.runtime.guard import FORGET_S, NUMBERS, PUBLISHERS, RATE_TIMES, WINDOW, Bucket, Guard, Window
 
 
 def refusal(call, *arguments) -> str:
@@ -68,7 +68,7 @@ def test_what_a_rate_refuses_is_not_counted_as_missing():
     guard, missing = Guard(1.0), 0
     for k in range(100):
         try:
-            missing += guard.admit("flood", k, k * 0.1)
+            missing += guard.admit("flood", k, k * 0.1) or 0
         except BadMessage as error:
             assert error.kind == "rate"
     assert missing == 0

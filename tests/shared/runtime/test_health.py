@@ -14,29 +14,21 @@ import psutil
 import pytest
 from rich.console import Console
 
-from services.command import cli, doctor
-from services.command import health as cell_health
-from services.launcher import display
-from services.launcher.supervised import Supervised
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.report import Report
-from shared.runtime import bus, health, progress
-from shared.runtime.node import Node
-from shared.runtime.traffic import Traffic
-from tests.support.live import free_port, wait_for
-from tests.support.nodes import pose
+from penumbra.services.command import cli, doctor
+from penumbra.services.launcher import display
+from penumbra.services.launcher.supervised import Supervised
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.report import Report
+from penumbra.shared.runtime import bus, health, progress, running
+from penumbra.shared.runtime.node import Node
+from penumbra.shared.runtime.traffic import Traffic
+from penumbra.tests.support.live import wait_for
+from penumbra.tests.support.nodes import node_command, pose
 
 CELL = cells.load("table")
-WAITS = "waiting for camera/front/frame: emulator is not there yet"
+WAITS = "waiting for camera/front/frame: emulator or driver is not there yet"
 FUSED = topics.FUSED.at(cell="table", target="forearm")
-
-
-@pytest.fixture
-def router():
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with Node("router", CELL, bus.Connection("router", listen=(endpoint,))) as node:
-        yield node
 
 
 @pytest.fixture
@@ -55,8 +47,8 @@ def client(router):
 
 @pytest.fixture
 def worker(router):
-    """The small service of tests.support.nodes as a process; it reads a camera that nobody plays."""
-    command = [sys.executable, "-m", "tests.support.nodes", "worker", "--connect", router.connection.listen[0]]
+    """The small service of penumbra.tests.support.nodes as a process; it reads a camera that nobody plays."""
+    command = node_command("worker", router.connection.listen[0])
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     wait_for(lambda: [each for each in seen(router) if each.service == "worker"], 20, "the worker")
     yield process
@@ -65,7 +57,7 @@ def worker(router):
 
 
 def seen(node):
-    return cell_health.ask(node.session, "table")
+    return running.ask(node.session, "table")
 
 
 def test_counters_that_grew_lately_are_told_and_forgotten_after_a_while():
@@ -96,7 +88,7 @@ def test_every_reason_names_what_is_missing_and_since_when():
     assert health.judge("", received, grown, ["fusion: waiting"], now_ns) == (
         "degraded",
         [
-            "nothing heard on skin/a/voltages yet",
+            "nothing received on skin/a/voltages yet",
             "no skin/b/voltages for 3.2 s",
             "refused on skin/c/voltages in the last 30 s: 2 past",
             "faults in the last 30 s: 1 ValueError at x.py:3",
@@ -109,11 +101,11 @@ def test_missing_inputs_of_one_kind_are_one_reason():
     now_ns = 10**12
     pads = {f"penumbra/arm/skin/p{k}/voltages": Traffic(0.1) for k in range(8)}
     pads["penumbra/arm/skin/*/voltages"] = Traffic(math.inf)  # counts what is on no pad of the cell
-    assert health.judge("", pads, {}, [], now_ns) == ("degraded", ["nothing heard on skin/*/voltages (8) yet"])
+    assert health.judge("", pads, {}, [], now_ns) == ("degraded", ["nothing received on skin/*/voltages (8) yet"])
     for k, traffic in enumerate(list(pads.values())[:8]):
         traffic.took(now_ns - (k + 1) * 100_000_000, now_ns)
     fused = {"penumbra/arm/target/forearm/pose/fused": Traffic(0.1)}
-    expected = ["no skin/*/voltages (7 of 8) for 0.8 s", "nothing heard on target/forearm/pose/fused yet"]
+    expected = ["no skin/*/voltages (7 of 8) for 0.8 s", "nothing received on target/forearm/pose/fused yet"]
     assert health.judge("", pads | fused, {}, [], now_ns)[1] == expected
 
 
@@ -127,13 +119,14 @@ def test_a_process_that_prepares_its_work_or_waits_for_one_that_does_is_starting
 
 
 def test_an_input_is_waited_for_while_its_publisher_starts_and_missing_when_it_should_have_come(monkeypatch):
-    answers, now_s = {"haptics": []}, [0.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now_s[0])
+    answers: dict[str, list[Report] | None] = {"haptics": []}
+    now_s = [0.0]
+    monkeypatch.setattr("penumbra.shared.runtime.progress.time.monotonic", lambda: now_s[0])
 
     def ask(service):
-        if answers[service] is None:
+        if (reports := answers[service]) is None:
             raise bus.Refused("Timeout")
-        return [json.dumps(each.as_json()).encode() for each in answers[service]]
+        return [json.dumps(each.as_json()).encode() for each in reports]
 
     waiting = progress.Waiting(ask)
     traffic = Traffic(0.1, ("haptics",))
@@ -151,7 +144,7 @@ def test_an_input_is_waited_for_while_its_publisher_starts_and_missing_when_it_s
     assert why(25.0) == "haptics is compiling 12 of 40", "it is too busy to answer"
     answers["haptics"] = [Report("haptics", "a", "ok")]
     assert why(30.0) == "haptics has just started"
-    assert why(30.0 + progress.SETTLE_S) == "", "it should have been heard by now"
+    assert why(30.0 + progress.SETTLE_S) == "", "it should have been received by now"
     answers["haptics"] = [Report("haptics", "a", "starting")]
     assert why(progress.STARTING_S - 1.0) == "haptics is starting"
     assert why(progress.STARTING_S + 1.0) == "", "nothing takes that long"
@@ -210,13 +203,13 @@ def test_from_outside_every_instance_is_told_and_one_that_hangs_is_down(router, 
     found = {each.service: each for each in seen(router)}
     assert found["router"].status == "ok"
     assert (found["worker"].status, found["worker"].reasons) == ("starting", (WAITS,))
-    monkeypatch.setattr(cell_health, "ANSWER_S", 0.2)
+    monkeypatch.setattr(running, "ANSWER_S", 0.2)
     worker.send_signal(signal.SIGSTOP)  # its token is there until its lease ends
     wait_for(lambda: psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED, 5, "it to stop")
     hung = next(each for each in seen(router) if each.service == "worker")
     worker.send_signal(signal.SIGCONT)
     assert hung.status == "down"
-    assert hung.reasons == ("it hangs: no answer within 0.2 s",)
+    assert hung.reasons == ("hangs: no answer within 0.2 s",)
 
 
 def test_doctor_tells_how_the_running_processes_fare(router, worker, capsys):
@@ -247,7 +240,7 @@ def test_the_live_view_shows_what_a_running_process_suffers_from(router, worker)
     assert (row.state, row.note) == ("starting", WAITS)
     console = Console(width=200)
     with console.capture() as drawn:
-        console.print(display.table("a cell", [row], watch))
+        console.print(display.Picture("penumbra pose", watch).draw([row], 200, 50))
     assert "starting" in drawn.get() and WAITS in drawn.get()
     assert process.row(Report("worker", "a", "ok")).state == "running"
 
@@ -275,10 +268,8 @@ def test_the_heartbeat_tells_the_status_and_the_health_check_of_the_containers_r
 
 
 def checked(path):
-    """Exit code and first line of the check in the Dockerfile."""
-    text = (Path(__file__).parents[3] / "docker" / "Dockerfile").read_text()
-    program = text.partition('CMD ["python", "-S", "-c", "')[2].partition('"]')[0]
-    result = subprocess.run(
-        [sys.executable, "-S", "-c", program.replace("/tmp/heartbeat", str(path))], capture_output=True, text=True
-    )
+    """Exit code and first line of a container's health check."""
+    program = Path(__file__).parents[3] / "docker" / "heartbeat.py"
+    environment = {**os.environ, "PENUMBRA_HEARTBEAT": str(path)}
+    result = subprocess.run([sys.executable, "-S", program], env=environment, capture_output=True, text=True)
     return result.returncode, result.stdout.partition("\n")[0]

@@ -2,19 +2,18 @@
 
 import signal
 import subprocess
-import sys
 import urllib.request
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from shared.cell import description as cells
-from shared.contract import topics
-from shared.contract.report import Report
-from shared.runtime import bus, metrics
-from shared.runtime.node import Node
-from tests.support.live import free_port, wait_for
-from tests.support.nodes import pose
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
+from penumbra.shared.contract.report import Report
+from penumbra.shared.runtime import bus, metrics
+from penumbra.shared.runtime.node import Node
+from penumbra.tests.support.live import free_port, penumbra_command, wait_for
+from penumbra.tests.support.nodes import pose
 
 CELL = cells.load("table")
 FUSED = topics.FUSED.at(cell="table", target="forearm")
@@ -55,9 +54,14 @@ def served():
 def test_the_page_says_what_the_health_says(served):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with Node("router", CELL, bus.Connection("router", listen=(endpoint,))) as node:
-        node.subscribe(topics.FUSED, lambda message, names: 1 / 0)
+
+        def fail(message, names):
+            raise ZeroDivisionError
+
+        node.subscribe(topics.FUSED, fail)
         port = served(lambda: [node.report()])
         node.publish(topics.FUSED, pose(), target="forearm")
+        assert node.session is not None
         for payload in (b"\xc1", b"\xc1\xc1"):
             node.session.put(FUSED, payload)
         wait_for(lambda: (r := node.health())["topics"][FUSED]["bad"].get("msgpack") == 2 and r["faults"], 5, "the messages")
@@ -96,9 +100,7 @@ def test_one_page_covers_many_processes_with_their_restarts_and_the_state_of_the
 
 
 def started(*argv):
-    return subprocess.Popen(
-        [sys.executable, "-m", "services.command.cli", *argv], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
+    return subprocess.Popen(penumbra_command(*argv), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
 def test_a_service_serves_its_own_page_until_it_ends_and_ends_in_time():
@@ -136,7 +138,7 @@ def test_a_port_that_is_none_is_refused_in_one_line(text):
     process = started("router", f"--metrics-port={text}")
     _, err = process.communicate(timeout=20)
     assert process.returncode == 2
-    assert f"--metrics-port: a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, expected, {text!r} came" in err
+    assert f"--metrics-port: expected a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, got {text!r}" in err
 
 
 def test_a_port_that_is_taken_is_told_in_one_line(served):

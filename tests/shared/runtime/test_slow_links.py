@@ -1,7 +1,7 @@
 """Slow links: what a router is told about them, and what then crosses. tests/chain/test_hosts.py has a real one."""
 
-import argparse
 import json
+import re
 import threading
 
 import numpy as np
@@ -9,26 +9,25 @@ import psutil
 import pytest
 import zenoh
 
-from services.command import cli
-from services.router import service
-from shared.cell import description as cells
-from shared.contract import messages, topics
-from shared.runtime import bus
-from shared.runtime.node import Node
-from shared.runtime.slow_links import BATCH, SEND_BUFFER, SlowLinks
-from tests.support.live import free_port, wait_for
-from tests.support.nodes import pose
+from penumbra.services import flags
+from penumbra.services.command import cli
+from penumbra.services.router import service
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
+from penumbra.shared.runtime.slow_links import BATCH, SEND_BUFFER, SlowLinks
+from penumbra.tests.support.live import free_port, wait_for
+from penumbra.tests.support.nodes import pose
 
 CELL = cells.load("table")
 LOOPBACK = next(name for name, found in psutil.net_if_addrs().items() if any(each.address == "127.0.0.1" for each in found))
 BOUND = f"#so_sndbuf={SEND_BUFFER}"
 
 
-def started(*flags: str) -> Node:
-    parser = argparse.ArgumentParser()
-    service.arguments(parser)
+def started(*argv: str) -> Node:
     node = Node("router", CELL, bus.Connection("router", listen=("tcp/0.0.0.0:7447",)))
-    service.start(node, parser.parse_args(flags))
+    service.start(node, flags.parse(service.FLAGS, argv))
     return node
 
 
@@ -38,7 +37,7 @@ def test_a_router_without_a_slow_link_is_told_nothing():
 
 def test_a_slow_link_carries_each_stream_as_often_as_the_table_says_or_the_user():
     slow = started(f"--slow={LOOPBACK}", "--slow-hz=fused=2.5", "--slow-hz=frame=0.1").connection.slow
-    assert slow.interfaces == (LOOPBACK,)
+    assert slow is not None and slow.interfaces == (LOOPBACK,)
     rates = dict(slow.rates_hz)
     assert rates.pop("penumbra/table/target/forearm/pose/fused") == 2.5
     assert rates.pop("penumbra/table/camera/front/frame") == 0.1
@@ -48,20 +47,20 @@ def test_a_slow_link_carries_each_stream_as_often_as_the_table_says_or_the_user(
 @pytest.mark.parametrize(
     ("flags", "text"),
     [
-        (["--slow", "wlan77"], "--slow wlan77: a network interface of this host expected: "),
-        (["--slow-hz", "fused=5"], "--slow-hz fused=5: say with --slow INTERFACE which link is slow"),
+        (["--slow", "wlan77"], r"--slow: expected a network interface of this host \(.*\), got wlan77"),
+        (["--slow-hz", "fused=5"], "--slow-hz: expected --slow INTERFACE beside it, got fused=5 alone"),
         (
             ["--slow", LOOPBACK, "--slow-hz", "fused"],
-            "--slow-hz fused: TOPIC=HZ expected, as in fused=20, with TOPIC one of frame",
+            "--slow-hz: expected TOPIC=HZ, as in fused=20, with TOPIC one of frame, .*, got fused",
         ),
-        (["--slow", LOOPBACK, "--slow-hz", "fussed=1"], "--slow-hz fussed=1: TOPIC=HZ expected"),
-        (["--slow", LOOPBACK, "--slow-hz", "fused=-1"], "--slow-hz fused=-1: TOPIC=HZ expected"),
-        (["--slow", LOOPBACK, "--slow-hz", "fused=nan"], "--slow-hz fused=nan: TOPIC=HZ expected"),
+        (["--slow", LOOPBACK, "--slow-hz", "fussed=1"], "--slow-hz: expected TOPIC=HZ, .*, got fussed=1"),
+        (["--slow", LOOPBACK, "--slow-hz", "fused=-1"], "--slow-hz: expected TOPIC=HZ, .*, got fused=-1"),
+        (["--slow", LOOPBACK, "--slow-hz", "fused=nan"], "--slow-hz: expected TOPIC=HZ, .*, got fused=nan"),
     ],
 )
 def test_what_cannot_be_is_told(flags, text, capsys):
     assert cli.main(["router", *flags]) == 2
-    assert text in capsys.readouterr().err
+    assert re.search(text, capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(

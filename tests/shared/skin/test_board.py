@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.command import cli
-from shared.cell import description as cells
-from shared.skin import board
-from shared.skin.board import Command, Kind, PacketError
-from sim.skin.board import FAULTS, Board
-from tests.support.boards import amplitudes, ask
+from penumbra.services.command import cli
+from penumbra.shared.cell import description as cells
+from penumbra.shared.skin import board
+from penumbra.shared.skin.board import Command, Kind, PacketError
+from penumbra.sim.skin.board import FAULTS, Board
+from penumbra.tests.support.boards import amplitudes, ask
 
 REST = np.array([0.2, 0.5])
 PACKET = bytes.fromhex("0400" + "8000" * 6 + "0000") + struct.pack("<24I", *range(262_144, 262_144 + 24 * 128, 128))
@@ -46,13 +46,13 @@ def test_commands_are_sixteen_bytes_little_endian():
 @pytest.mark.parametrize(
     ("build", "text"),
     [
-        (lambda: board.send_measures(0), "1 to 65504 cycles expected, 0 came: a board never answers that"),
-        (lambda: board.send_measures(65505), "65505 came"),
-        (lambda: board.set_frequency(100e3, 10), "2 to 9 expected, 10 came: above 9 the firmware stops"),
-        (lambda: board.set_frequency(-1.0, 4), "electrode_hz: above 0"),
-        (lambda: board.set_frequency(math.nan, 4), "electrode_hz: above 0 .* nan came"),
-        (lambda: Command(0, -1).pack(), "measures from 0 to 2\\^32 - 1 .* expected"),
-        (lambda: Command.unpack(bytes(15)), "16 bytes expected, 15 came"),
+        (lambda: board.send_measures(0), "expected 1 to 65504 cycles, got 0, which a board never answers"),
+        (lambda: board.send_measures(65505), "got 65505"),
+        (lambda: board.set_frequency(100e3, 10), "expected 2 to 9, got 10; above 9 the firmware stops"),
+        (lambda: board.set_frequency(-1.0, 4), "electrode_hz: expected above 0"),
+        (lambda: board.set_frequency(math.nan, 4), "electrode_hz: expected above 0 .*, got nan"),
+        (lambda: Command(0, -1).pack(), "expected .* measures from 0 to 2\\^32 - 1"),
+        (lambda: Command.unpack(bytes(15)), "expected .* 16 bytes, got 15"),
     ],
 )
 def test_a_command_that_no_board_answers_is_refused_before_it_is_sent(build, text):
@@ -134,10 +134,10 @@ def test_no_bytes_crash_the_decoder(data):
     [
         (
             PACKET[:-1],
-            "64, 88, 112, 136, 160, 184, 208 or 232 bytes .* expected, and by its first byte this one has 112, 111 bytes came",
+            "64, 88, 112, 136, 160, 184, 208 or 232 bytes .*, and by its first byte this one has 112, got 111 bytes",
         ),
-        (b"", "expected, 0 bytes came"),
-        (b"\x0b" + bytes(20), "expected, 21 bytes came"),
+        (b"", "got 0 bytes"),
+        (b"\x0b" + bytes(20), "got 21 bytes"),
         (b"\x05" + PACKET[1:], "112 bytes hold 4 samples a cycle, but the first byte says 5: 136 bytes fit"),
         (b"\x00" + PACKET[1:], "but the first byte says 0: a board takes 2 to 9"),
     ],
@@ -148,7 +148,7 @@ def test_a_packet_of_the_wrong_size_is_told_the_sizes_that_fit(data, text):
 
 
 def test_a_channel_without_cycles_has_no_amplitude():
-    with pytest.raises(PacketError, match="none came in channel 2"):
+    with pytest.raises(PacketError, match="got none in channel 2"):
         board.decode(board.encode([1, 1, 0, 1, 1, 1], np.ones((6, 4), int))).fourier()
 
 
@@ -172,12 +172,12 @@ def test_skin_decode_prints_a_reply_as_json(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        (b"04 0g", "hex digits expected, 'g' came as character 4"),
-        (b"04\xff", "hex digits expected, '\\\\xff' came"),
-        (b"040", "two hex digits for each byte expected, 3 digits came"),
-        (b"0400", "112, 2 bytes came"),
-        (b"", "0 bytes came"),
-        (b"04" + b"00" * 111, "none came in channel 0, 1, 2, 3, 4, 5"),
+        (b"04 0g", "expected hex digits, got 'g' as character 4"),
+        (b"04\xff", "expected hex digits, got '\\\\xff'"),
+        (b"040", "expected two hex digits per byte, got 3 digits"),
+        (b"0400", "112, got 2 bytes"),
+        (b"", "got 0 bytes"),
+        (b"04" + b"00" * 111, "got none in channel 0, 1, 2, 3, 4, 5"),
     ],
 )
 def test_skin_decode_refuses_in_one_line_what_is_no_reply(text, error, monkeypatch, capsys):
@@ -194,7 +194,9 @@ def test_the_probes_show_where_commands_begin_whatever_came_before(before):
     stream = before * board.FILLER + b"".join(board.realign_probes())
     frames = [Command.unpack(stream[i : i + 16]) for i in range(0, len(stream) - 15, 16)]
     (probe,) = [frame for frame in frames if frame.is_answered(4)]
-    number, answer = board.realign_answer(b"Error\r\n" + probe.pack() + b"\0")
+    found = board.realign_answer(b"Error\r\n" + probe.pack() + b"\0")
+    assert found is not None
+    number, answer = found
     assert (before + number) % 16 == 0 and answer == probe
     assert board.realign_answer(probe.pack(), 1) is None  # an answer that comes late is of another attempt
 
@@ -334,7 +336,7 @@ def test_faults_happen_once_and_where_they_are_asked_for(device):
     assert np.degrees(np.angle(after / before)) == pytest.approx(90.0, abs=3.0)
     assert abs(mixed) / abs(before) == pytest.approx(math.sqrt(0.5), abs=0.05)  # half with the one phase, half with the other
     assert len(ask(device, clock, request)) == 112
-    with pytest.raises(ValueError, match="one of error, lost, short, missing, slip, 'fire' came"):
+    with pytest.raises(ValueError, match="one of error, lost, short, missing, slip, got 'fire'"):
         device.fault("fire")
 
 

@@ -1,4 +1,4 @@
-"""Rotations and small matrices for the observer's inner loop, compiled into it; each may be called from Python too.
+"""Rotations and small matrices for inner loops, compiled into them; each may be called from Python too.
 
 Rotation vectors r (3,) [rad]; `exp(r)` turns about the fixed axes. What is computed is written to the last argument, `out`,
 because allocating costs more than computing it. Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from shared.native import inner
+from penumbra.shared.native import inner
 
 SWEEPS = 16
 """Largest number of sweeps of Jacobi's method over a matrix. It converges quadratically: six by six takes four to six."""

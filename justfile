@@ -1,0 +1,48 @@
+# `just --list` shows the recipes. CI runs them too (.ci/run).
+set shell := ["bash", "-euo", "pipefail", "-c"]
+export OMP_NUM_THREADS := "1"        # more threads only compete for the cores
+export OMP_WAIT_POLICY := "passive"
+
+# formatting, lint, imports between the floors
+lint:
+    ruff format --check .
+    ruff check .
+    lint-imports
+
+# mypy over the project and its tests
+types:
+    mypy
+
+# the tests of the default run
+test *arguments:
+    pytest {{arguments}}
+
+# what takes tens of seconds per test: other instruction sets, faults, trainings, benchmarks
+test-slow *arguments:
+    pytest -m slow {{arguments}}
+
+# what asks the package index
+test-network:
+    pytest -m network
+
+# the site in build/site; every warning is an error
+docs:
+    python docs/messages.py
+    python -m penumbra.shared.cell.reference docs/own-cell.md
+    mkdocs build --strict --quiet
+
+# build and run the images; needs a Docker engine
+containers:
+    pytest -m containers tests/chain/test_compose.py
+
+# compile the libraries of shared/native for all processors; needs the linkers that shared/native/build.py names
+kernels:
+    python -m penumbra.shared.native.build
+
+# the Kubernetes manifests, from the table of processes
+kubernetes:
+    python docker/kubernetes/generate.py
+
+# the tested set of versions
+lock:
+    uv pip compile --quiet --universal --python-version 3.11 --extra all --extra test --extra docs pyproject.toml -o requirements.lock

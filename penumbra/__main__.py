@@ -1,0 +1,8 @@
+"""`python -m penumbra` is the command `penumbra`."""
+
+import sys
+
+from penumbra.services.command.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,198 @@
+"""A running cell as a program sees it: what is in it, its poses, how it fares, and its sensors to publish from."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from types import TracebackType
+from typing import Self, TypeVar
+
+import numpy as np
+import zenoh
+
+from penumbra.client.pose import Pose
+from penumbra.client.poses import Poses
+from penumbra.client.publish import Camera, Pad, Robot, Stream
+from penumbra.shared.contract import access, topics
+from penumbra.shared.contract.messages import FusedPose, decode
+from penumbra.shared.contract.outline import Outline
+from penumbra.shared.runtime import bus, running
+
+FRAMES_UNDER_WAY = 3
+"""Images of each camera in shared memory: one that is written and two that are read."""
+PUBLISH_S = 3.0
+"""How long the first message of a program waits for the router."""
+
+Sensor = TypeVar("Sensor", Camera, Robot, Pad)
+
+
+class CellBase:
+    """What `Cell` and `AsyncCell` share. session: to read with. connection: how it was opened. outline: what is in the cell.
+
+    Sensors publish in a second session, which the first message opens: on a secured bus it shows the certificate of a driver, and
+    its shared memory has room for the cameras' images. A program that only reads needs neither.
+    """
+
+    def __init__(self, session: zenoh.Session, connection: bus.Connection, outline: Outline):
+        self._session, self._connection, self._outline = session, connection, outline
+        self._closing = threading.Event()
+        self._opening = threading.Lock()  # guards the session for publishing
+        self._publishing: zenoh.Session | None = None
+        self._cameras = {
+            name: Camera(
+                name,
+                found.width,
+                found.height,
+                found.rate_hz,
+                np.array(found.K),
+                np.array(found.T_world_camera),
+                self._stream(topics.FRAME, found.rate_hz, camera=name),
+            )
+            for name, found in outline.cameras.items()
+        }
+        self._robots = {
+            name: Robot(name, joints, self._stream(topics.JOINTS, robot=name)) for name, joints in outline.robots.items()
+        }
+        self._pads = {
+            name: Pad(name, found.electrodes, found.limit_V, self._stream(topics.VOLTAGES, pad=name))
+            for name, found in outline.pads.items()
+        }
+
+    @property
+    def name(self) -> str:
+        """The name of the cell."""
+        return self._outline.name
+
+    @property
+    def frame(self) -> str:
+        """The name of the fixed frame that poses are given in."""
+        return self._outline.frame
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of what is tracked."""
+        return self._outline.targets
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(self._cameras)
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Names of the robots."""
+        return tuple(self._robots)
+
+    @property
+    def pads(self) -> tuple[str, ...]:
+        """Names of the skin's pads."""
+        return tuple(self._pads)
+
+    def camera(self, name: str) -> Camera:
+        """A camera, to publish its images. Raises LookupError for a name that the cell does not have."""
+        return self._one("camera", self._cameras, name)
+
+    def robot(self, name: str) -> Robot:
+        """A robot, to publish its joint angles. Raises LookupError for a name that the cell does not have."""
+        return self._one("robot", self._robots, name)
+
+    def pad(self, name: str) -> Pad:
+        """A pad, to publish its voltages. Raises LookupError for a name that the cell does not have."""
+        return self._one("pad", self._pads, name)
+
+    def __repr__(self) -> str:
+        return f"<cell {self.name!r} at {self._connection.where} with {', '.join(self.targets)}>"
+
+    def _one(self, kind: str, known: Mapping[str, Sensor], name: str) -> Sensor:
+        if name not in known:
+            raise LookupError(f"no {kind} {name!r}; cell {self.name} has: {', '.join(known) or 'none'}")
+        return known[name]
+
+    def _target(self, name: str | None) -> str:
+        """The name of a target, checked; the first one where it is None."""
+        if name is None:
+            return self.targets[0]
+        if name not in self.targets:
+            raise LookupError(f"no target {name!r}; cell {self.name} has: {', '.join(self.targets)}")
+        return name
+
+    def _stream(self, topic: topics.Topic, rate_hz: float = 0.0, **names: str) -> Stream:
+        ((kind, name),) = names.items()
+        key = topic.at(cell=self.name, **names)
+        return Stream(self._publishing_session, topic, key, f"{kind} {name}", max(topic.rate_hz, rate_hz))
+
+    def _publishing_session(self) -> zenoh.Session:
+        """The session that sensors publish in. Raises bus.BusError."""
+        with self._opening:
+            if self._closing.is_set():
+                raise bus.BusError(f"cell {self.name} is closed: publish inside of `with penumbra.connect() as cell`")
+            if self._publishing is None:
+                images = sum(3 * camera.width * camera.height for camera in self._cameras.values())
+                pool_bytes = max(bus.POOL_BYTES, FRAMES_UNDER_WAY * images)
+                connection = replace(self._connection, service=access.DRIVER, pool_bytes=pool_bytes)
+                self._publishing = bus.open_session(connection, self._closing, lambda: None, PUBLISH_S)
+            return self._publishing
+
+    def _why_silent(self) -> str:
+        """Why no pose may come, in words."""
+        if not self._session.info.routers_zid():
+            return f"the router at {self._connection.where} does not answer; poses go on when it is back"
+        return f"nobody publishes it in cell {self.name}: is `penumbra fusion` running?"
+
+    def ask_pose(self, at: int | None, target: str | None, timeout: float) -> Pose:
+        name = self._target(target)
+        parameters = "" if at is None else f"stamp_ns={at}"
+        answers = bus.ask(self._session, topics.current_pose(self.name, name), parameters, timeout_s=timeout)
+        if not answers:
+            raise TimeoutError(f"no pose of {name} within {timeout:g} s: {self._why_silent()}")
+        return Pose.of(decode(FusedPose, answers[0]))
+
+    def ask_health(self) -> tuple[running.Instance, ...]:
+        return tuple(running.ask(self._session, self.name))
+
+    def leave(self) -> None:
+        self._closing.set()
+        self._session.close()
+        with self._opening:
+            if self._publishing is not None:
+                self._publishing.close()
+
+
+class Cell(CellBase):
+    """A running cell, as `penumbra.connect` returns it. Threads may share it, but not one sensor or one iterator over poses."""
+
+    def poses(self, target: str | None = None, *, timeout: float | None = None) -> Poses:
+        """Iterates over the poses of a target (default: the cell's first). Each is the newest at the moment it is taken: fusion
+        publishes 200 a second, and a slow reader skips some. There are poses also while the target is lost; see their `state`.
+
+        timeout: how long to wait for a pose [s]; then TimeoutError says why there is none. None waits without end. When the
+        router or fusion ends and starts again, the poses resume. Raises LookupError for a target that the cell does not have.
+        """
+        name = self._target(target)
+        return Poses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
+
+    def pose(self, *, at: int | None = None, target: str | None = None, timeout: float = 1.0) -> Pose:
+        """The pose of a target (default: the cell's first), asked of fusion.
+
+        at: a moment of about the last second [ns since the epoch], such as the stamp of an image; None: now. The answer uses all
+        measurements that fusion has received so far. timeout: how long to wait for it [s].
+
+        Raises TimeoutError where nobody answers, LookupError for a target that the cell does not have, and ValueError for a
+        moment outside of fusion's history.
+        """
+        return self.ask_pose(at, target, timeout)
+
+    def health(self) -> tuple[running.Instance, ...]:
+        """The state of each process of the cell: `service`, `instance`, `status` (ok, starting, degraded or down), `reasons`."""
+        return self.ask_health()
+
+    def close(self) -> None:
+        """Leaves the bus; loops over poses end."""
+        self.leave()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

@@ -1,0 +1,121 @@
+"""Finding a running cell: its router by an endpoint, and the cell by what fusion answers on `topics.description`."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import zenoh
+
+from penumbra.client.cell import Cell
+from penumbra.shared.contract import outline, topics
+from penumbra.shared.contract.messages import BadMessage
+from penumbra.shared.contract.outline import Outline
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.connection import connect_by_environment, secure_by_environment
+
+ANSWER_S = 1.0
+"""How long one question for the description may take."""
+AGAIN_S = 0.1
+"""Between two questions, while the cell is not there yet."""
+PATIENCE_S = 3.0
+
+
+def connect(
+    cell: str | Path | None = None,
+    *,
+    endpoint: str | None = None,
+    secure: str | Path | None = None,
+    timeout: float = PATIENCE_S,
+) -> Cell:
+    """Connects to a running cell; use it in `with`.
+
+    cell: name of the cell, or its YAML file. Default: $PENUMBRA_CELL, else the only cell that runs at the router.
+    endpoint: of the router, as tcp/192.168.0.7:7447; several are separated by spaces. Default: $PENUMBRA_CONNECT, else this
+    machine.
+    secure: folder of certificates of `penumbra certs`; needs `ca`, `viewer` and, to publish, `driver`. Default: $PENUMBRA_SECURE.
+    timeout: how long to wait for the router and the cell [s]. A program that starts with the machine may use `math.inf`.
+
+    Raises BusError whose text says what is missing: the router, the cell, or a choice between several cells.
+    """
+    return Cell(*Search.of(cell, endpoint, secure, timeout).run())
+
+
+@dataclass(frozen=True)
+class Search:
+    """The search for a cell of this name (None: for the only one). stopping: ends it early."""
+
+    cell: str | None
+    connection: bus.Connection
+    timeout: float
+    stopping: threading.Event
+
+    @classmethod
+    def of(cls, cell: str | Path | None, endpoint: str | None, secure: str | Path | None, timeout: float) -> Search:
+        """As `connect`, with its defaults."""
+        connection = bus.Connection(
+            connect=tuple(endpoint.split()) if endpoint else connect_by_environment(),
+            secure=Path(secure) if secure else secure_by_environment(),
+        )
+        return cls(_name(cell or os.environ.get("PENUMBRA_CELL")), connection, timeout, threading.Event())
+
+    def run(self) -> tuple[zenoh.Session, bus.Connection, Outline]:
+        """The session, how it was opened, and what is in the cell. Raises bus.BusError."""
+        deadline = time.monotonic() + self.timeout
+        session = bus.open_session(self.connection, self.stopping, lambda: None, self.timeout)
+        try:
+            return session, self.connection, self._outline(session, deadline)
+        except BaseException:
+            session.close()
+            raise
+
+    def _outline(self, session: zenoh.Session, deadline: float) -> Outline:
+        while True:
+            try:
+                answers = bus.ask(session, topics.description(self.cell or "*"), timeout_s=ANSWER_S)
+                found = {each.name: each for each in map(outline.decode, answers)}
+            except bus.Refused:  # fusion is not ready yet
+                found = {}
+            except BadMessage as error:
+                raise bus.BusError(str(error)) from None
+            if len(found) == 1:
+                return next(iter(found.values()))
+            if found:
+                names = ", ".join(sorted(found))
+                raise bus.BusError(f"several cells run {self.connection.whereabouts}: {names}; say which, as in connect(cell=…)")
+            if time.monotonic() > deadline or self.stopping.wait(AGAIN_S):
+                raise bus.BusError(self._nobody(session))
+
+    def _nobody(self, session: zenoh.Session) -> str:
+        """Why there is no answer, in words."""
+        services: dict[str, set[str]] = {}
+        for reply in session.liveliness().get(topics.alive("*"), timeout=ANSWER_S):
+            if reply.ok is not None:
+                _, cell, _, service, _ = str(reply.ok.key_expr).split("/")
+                services.setdefault(cell, set()).add(service)
+        where, names = self.connection.whereabouts, ", ".join(sorted(services))
+        if not services:
+            return f"no cell runs {where}: start `penumbra up`"
+        if self.cell is not None and self.cell not in services:
+            return f"no cell {self.cell!r} {where}; running there: {names}"
+        is_coming = "fusion" in services[self.cell] if self.cell else any("fusion" in each for each in services.values())
+        if is_coming:
+            return f"fusion of cell {self.cell or names} {where} is not ready yet: wait longer, as in connect(timeout=60)"
+        return f"no fusion in cell {self.cell or names} {where}: it has the poses; start `penumbra fusion` or `penumbra up`"
+
+
+def _name(cell: str | Path | None) -> str | None:
+    """The name of a cell that is given by its name or its YAML file. Raises BusError for what is neither."""
+    if cell is None or not str(cell):
+        return None
+    if Path(cell).suffix in (".yaml", ".yml"):
+        from penumbra.shared.cell import description  # slow to import, and needed for this only
+
+        return description.load(cell).name
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", str(cell)):
+        raise bus.BusError(f"expected the name of a cell or its YAML file, got {str(cell)!r}: letters, digits, _ and -")
+    return str(cell)

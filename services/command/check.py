@@ -1,0 +1,315 @@
+"""`penumbra check CELL`: everything about a cell file that can be known before a process starts.
+
+What the file alone shows is checked where every process loads it (`shared.cell`). Here is what takes longer: meshes, field
+models, networks, and by geometry what cameras see and pads reach.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from penumbra.services import flags
+from penumbra.shared.body import anatomy
+from penumbra.shared.body.robot import RobotModel, robot_models
+from penumbra.shared.body.simplification import open_edges
+from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.document import Document
+from penumbra.shared.cell.faults import Fault
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin import response
+from penumbra.shared.skin.layout import Near
+
+SERVICES = Path(__file__).parents[1]
+SEGMENTATION, HAPTICS = SERVICES / "segmentation" / "weights", SERVICES / "haptics" / "weights"
+LINK_FACES = 50_000
+"""Number of triangles of a robot's collision meshes above which every picture of the emulator takes longer than its period."""
+LINK_M = 5.0
+"""Extent [m] above which a link's mesh is taken for one in other units."""
+SAMPLES, FEWEST, JOINT_SAMPLES = 400, 40, 30
+"""Number of poses of all targets, of a target at least, and of joint angles, that are drawn to see what pads reach."""
+VERTICES = 80
+"""Number of a target's vertices that stand for its surface there."""
+SPACING = 0.03
+"""Distance [m] from any point of the surface to one of them."""
+FRONT = 0.3
+"""Share of what a pad may sense that lies in front of it, where it faces the target. Pads at the side of a robot have a half."""
+SEEN = 0.5
+"""Share of the region of motion that a camera should see."""
+HOME_SIGMAS = 3.0
+"""Distance from its home, in standard deviations, at which a target is still expected."""
+
+Nearby = dict[str, Near]
+"""The pads that each target may come near."""
+
+
+@flags.command(
+    "check",
+    "Checks a cell file before anything starts: keys, numbers, meshes, URDF, weights, and what cameras see and pads reach. Exit "
+    "code 0: no fault; 1: faults; 2: no such cell.",
+    flags.Argument("cell", metavar="CELL", shell_complete=flags.complete_cell, help="table, arm or a YAML file"),
+    flags.JSON,
+    example="penumbra check mine.yaml",
+)
+def main(options: flags.Options) -> int:
+    """Prints every fault and warning: 0 without faults, 1 with."""
+    path = cells.source(options.cell)
+    _, found = examine(path)
+    wrong, warnings = ([fault for fault in found if fault.is_warning is kind] for kind in (False, True))
+    if options.json:
+        both = {"faults": wrong, "warnings": warnings}
+        parts = {name: [_as_json(fault) for fault in some] for name, some in both.items()}
+        print(json.dumps({"file": str(path), "is_good": not wrong, **parts}))
+        return int(bool(wrong))
+    for fault in wrong:
+        print(fault)
+    for fault in warnings:
+        print(f"warning: {fault}")
+    print(f"{path}: {_count(wrong, 'fault')}, {_count(warnings, 'warning')}")
+    return int(bool(wrong))
+
+
+def refuse(cell: str | Path) -> cells.Cell:
+    """The cell, after its warnings on stderr. Raises CellError with every fault where it has any."""
+    found, faults = examine(cells.source(cell))
+    for fault in faults:
+        if fault.is_warning:
+            print(f"warning: {fault}", file=sys.stderr)
+    if found is None:
+        raise cells.CellError("\n".join(str(fault) for fault in faults if not fault.is_warning))
+    return found
+
+
+def examine(path: Path) -> tuple[cells.Cell | None, list[Fault]]:
+    """The cell of a file, None where it has faults, and its faults and warnings: those of the file itself alone where it has
+    any."""
+    try:
+        reading = cells.read(path)
+    except cells.CellError as error:
+        return None, [_located(path, str(error))]
+    if reading.cell is None:
+        return None, list(reading.faults)
+    cell, document = reading.cell, reading.document
+    found = list(_meshes(cell, document))
+    if all(fault.is_warning for fault in found):  # what follows needs the meshes
+        near = {target: Near.of(cell, target) for target in cell.targets}
+        for look in (_models, _networks, _cameras, _pads, _homes):
+            found += look(cell, document, near)
+    is_good = all(fault.is_warning for fault in found)
+    return cell if is_good else None, sorted(found, key=lambda fault: (fault.is_warning, fault.line))
+
+
+def _located(path: Path, text: str) -> Fault:
+    """The fault of an error whose text begins with file and line."""
+    head, _, reason = text.removeprefix(f"{path}:").partition(": ")
+    return Fault(path, int(head), "", reason) if head.isdecimal() else Fault(path, 1, "", text.removeprefix(f"{path}: "))
+
+
+def _as_json(fault: Fault) -> dict[str, str | int]:
+    return {"file": str(fault.path), "line": fault.line, "place": fault.place, "reason": fault.reason}
+
+
+def _count(faults: list[Fault], name: str) -> str:
+    return f"{len(faults) or 'no'} {name}{'' if len(faults) == 1 else 's'}"
+
+
+def _meshes(cell: cells.Cell, document: Document) -> Iterator[Fault]:
+    """Meshes of targets and links that cannot be read or have another unit; those with holes or too many triangles."""
+    for name, target in cell.targets.items():
+        if target.mesh.startswith("body:"):
+            continue
+        place = f"targets.{name}.mesh"
+        try:
+            _, faces = anatomy.read(cell.folder / target.mesh)
+        except cells.CellError as error:
+            yield document.fault(place, str(error))
+            continue
+        if (count := len(faces)) > anatomy.MOST_FACES:
+            what = f"expected at most {anatomy.MOST_FACES} triangles, got {count}; every start simplifies it to that"
+            yield document.fault(place, f"{what}, which takes time: save a simplified mesh", is_warning=True)
+        if holes := open_edges(faces):
+            what = f"expected a closed surface, got {holes} edges without a second triangle"
+            yield document.fault(place, f"{what}; close the holes, gaps to the skin may be wrong there", is_warning=True)
+    for name, robot in cell.robots.items():
+        place = f"robots.{name}.urdf"
+        try:
+            meshes = RobotModel(robot, cell.folder).meshes
+        except cells.CellError as error:
+            yield document.fault(place, str(error))
+            continue
+        for link, mesh in meshes.items():
+            if (extent := float(np.ptp(mesh.vertices, axis=0).max())) > LINK_M:
+                what = f"expected collision meshes in metres, got {extent:.3g} m for link {link}"
+                yield document.fault(place, f'{what}; give <mesh scale="0.001 0.001 0.001"> if the file is in millimetres')
+        if (count := sum(len(mesh.faces) for mesh in meshes.values())) > LINK_FACES:
+            what = f"expected at most {LINK_FACES} triangles in all collision meshes, got {count}"
+            yield document.fault(place, f"{what}; simplify them, pictures of the emulator take long", is_warning=True)
+
+
+def _models(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
+    """Pads without a field model for a target that comes near them, and pads of one target with different electrodes."""
+    try:
+        known = response.networks(cell)
+    except cells.CellError as error:
+        yield document.fault("pads", str(error))
+        return
+    for target, found in near.items():
+        pads = found.cell.pads
+        sizes = {name: len(cell.pad_types[pad.type].electrodes) for name, pad in pads.items()}
+        for name, size in sizes.items():
+            first, expected = next(iter(sizes.items()))
+            if size != expected:
+                what = f"expected as many electrodes as pad {first} has, {expected}, got {size}"
+                yield document.fault(f"pads.{name}.type", f"{what}; give pads near one target equally many")
+        if missing := [pad for pad in pads if response.fingerprint(cell, pad, target) not in known]:
+            what = f"expected a field model of the pads {', '.join(missing)} for target {target}, got none: their design, their "
+            what += f"mounting or the limb is new; fit it once with `penumbra skin model --cell {document.path}`"
+            yield document.fault(f"pads.{missing[0]}", what)
+
+
+def _networks(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
+    """Weights that are missing. Without its network the skin finds a pose too, from the target's home."""
+    if cell.cameras and SEGMENTATION.parent.is_dir() and not any(SEGMENTATION.glob("*.npz")):
+        what = f"expected weights of the segmentation in {SEGMENTATION}, got none"
+        yield document.fault("cameras", f"{what}; make them with `penumbra segmentation train`")
+    if not HAPTICS.parent.is_dir():  # not installed here
+        return
+    from penumbra.services.haptics import paper_network
+
+    for target, found in near.items():
+        if not found.cell.pads:
+            continue
+        path = HAPTICS / f"{cell.name}-{target}.npz"
+        try:
+            paper_network.load(path, found.cell, target)
+        except (FileNotFoundError, ValueError) as error:
+            is_missing = isinstance(error, FileNotFoundError)
+            got = f"got no {path.name}" if is_missing else f"got that of other pads or another limb in {path.name}"
+            what = f"expected a haptic network for target {target} of cell {cell.name}, {got}; train it with "
+            what += f"`penumbra haptics train --cell {document.path}` (until then the skin starts from the target's home)"
+            yield document.fault("name", what, is_warning=True)
+
+
+def _cameras(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
+    """Cameras that see no target, or little of the region in which it moves; targets that nothing senses."""
+    homes = {name: _around(target) for name, target in cell.targets.items()}
+    seen: set[str] = set()
+    for name, camera in cell.cameras.items():
+        shown = {target for target, points in homes.items() if _share_seen(camera, points) > 0.0}
+        seen |= shown
+        place = f"cameras.{name}.{'rpy' if camera.look_at is None else 'look_at'}"
+        if not shown:
+            what = "expected a camera that sees the home of a target, got one that sees none"
+            yield document.fault(place, f"{what}; correct its position and direction", is_warning=True)
+        elif cell.sim is not None and next(iter(cell.targets)) in shown:
+            share = _share_seen(camera, _grid(cell.sim.motion.low, cell.sim.motion.high))
+            if share < SEEN:
+                what = f"expected a camera that sees most of sim.motion, got one that sees {share:.0%} of it"
+                yield document.fault(place, f"{what}; correct its position and direction, or the region", is_warning=True)
+    for name in cell.targets:
+        if name not in seen and not near[name].cell.pads:
+            what = "expected a camera or pads that sense this target, got none"
+            yield document.fault(f"targets.{name}", f"{what}; add one, or correct the target's home", is_warning=True)
+
+
+def _around(target: cells.Target) -> Array:
+    """Points (n, 3) [m] around a target's home."""
+    room = target.home_spread.position
+    return _grid(np.subtract(target.home.position, room), np.add(target.home.position, room))
+
+
+def _grid(low: ArrayLike, high: ArrayLike) -> Array:
+    """Points (n, 3) that fill a box."""
+    axes = np.linspace(np.asarray(low, float), np.asarray(high, float), 6).T
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+
+
+def _share_seen(camera: cells.Camera, points: Array) -> float:
+    """The share of points (n, 3) [m] in the world that is in a camera's picture."""
+    local = rigid.apply(rigid.inverse(camera.T_world_camera), points)
+    local = local[local[:, 2] > 0.0]
+    pixels = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    inside = (pixels >= 0.0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    return float(np.count_nonzero(inside & camera.lens.is_seen(pixels)) / len(points))
+
+
+def _pads(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
+    """Pads that no target comes near, or only from behind."""
+    rng = np.random.default_rng(0)
+    nearest, facing = dict.fromkeys(cell.pads, np.inf), dict.fromkeys(cell.pads, False)
+    links = _drawn_links(cell, rng)
+    for target, found in near.items():
+        unreached = {name: pad for name, pad in found.cell.pads.items() if not facing[name]}
+        if not unreached:
+            continue
+        skin = _drawn_skin(cell, target, max(SAMPLES // len(near), FEWEST), rng)
+        squares = (skin**2).sum(axis=1)
+        for name, pad in unreached.items():
+            T = links[pad.link] @ pad.T_link_pad
+            places, axes = T[:, :3, 3], T[:, :3, 2]
+            gaps = np.sqrt(np.maximum((places**2).sum(axis=1)[:, None] + squares - 2.0 * places @ skin.T, 0.0))
+            nearest[name] = min(nearest[name], float(gaps.min()))
+            is_felt = gaps < cell.pad_types[pad.type].range + SPACING
+            is_in_front = axes @ skin.T > (axes * places).sum(axis=1)[:, None]
+            facing[name] = bool(np.count_nonzero(is_felt & is_in_front) > FRONT * np.count_nonzero(is_felt))
+    for name, pad in cell.pads.items():
+        reach = cell.pad_types[pad.type].range
+        if nearest[name] > reach + SPACING:
+            got = "none that comes near" if np.isinf(nearest[name]) else f"{nearest[name]:.2g} m at the nearest"
+            what = f"expected a target that comes within {reach:g} m, got {got}; move the pad, nothing can reach it"
+            yield document.fault(f"pads.{name}.position", what, is_warning=True)
+        elif not facing[name]:
+            what = "expected a pad whose z axis points towards the target, got one that points away from it"
+            yield document.fault(f"pads.{name}.rpy", f"{what}; turn it", is_warning=True)
+
+
+def _drawn_skin(cell: cells.Cell, name: str, count: int, rng: np.random.Generator) -> Array:
+    """Points (n, 3) [m] of a target's surface in the world, wherever it may be: in the emulator's region, or around its home."""
+    target = cell.targets[name]
+    home, spread = target.home, target.home_spread
+    if cell.sim is None:
+        middle, half = (*home.position, *home.rpy), HOME_SIGMAS * np.repeat([spread.position, spread.rotation], 3)
+        low, high = np.subtract(middle, half), np.add(middle, half)
+    else:
+        shift = np.subtract(home.position, next(iter(cell.targets.values())).home.position)  # each person has a region
+        motion = cell.sim.motion
+        low, high = np.array([*(motion.low + shift), *motion.rpy_low]), np.array([*(motion.high + shift), *motion.rpy_high])
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 6)
+    poses = np.concatenate([corners, rng.uniform(low, high, (count, 6))])
+    vertices = anatomy.target_mesh(target, cell).vertices
+    vertices = vertices[:: max(1, len(vertices) // VERTICES)]
+    return np.concatenate([rigid.apply(rigid.from_rpy(pose[:3], pose[3:]), vertices) for pose in poses])
+
+
+def _drawn_links(cell: cells.Cell, rng: np.random.Generator) -> dict[str, Array]:
+    """T_world_link (n, 4, 4) of the world and of every robot's links, wherever the joints may be, by the names that pads use."""
+    out = {"world": np.eye(4)[None]}
+    first = 0
+    for name, model in robot_models(cell).items():
+        low, high = np.maximum(model.lower, -np.pi), np.minimum(model.upper, np.pi)
+        if cell.sim is not None:
+            these = slice(first, first + len(model.joints))
+            low, high = np.array(cell.sim.joints_low[these]), np.array(cell.sim.joints_high[these])
+        first += len(model.joints)
+        q = np.concatenate([[low, high, (low + high) / 2.0], rng.uniform(low, high, (JOINT_SAMPLES, len(low)))])
+        out |= {f"{name}/{link}": T for link, T in model.link_transforms(q).items()}
+    return {link: np.broadcast_to(T, (len(T), 4, 4)) for link, T in out.items()}
+
+
+def _homes(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
+    """A first target whose home is not where the emulator moves it."""
+    if cell.sim is None:
+        return
+    name, target = next(iter(cell.targets.items()))
+    room = HOME_SIGMAS * target.home_spread.position
+    low, high = np.subtract(cell.sim.motion.low, room), np.add(cell.sim.motion.high, room)
+    if np.any(np.less(target.home.position, low) | np.greater(target.home.position, high)):
+        what = f"expected a home in or near sim.motion, {list(cell.sim.motion.low)} to {list(cell.sim.motion.high)}"
+        what += f", got {list(target.home.position)}"
+        yield document.fault(f"targets.{name}.home", f"{what}; correct one of them", is_warning=True)

@@ -1,0 +1,220 @@
+"""What runs on this machine: `penumbra ps`, `logs` and `down`."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+from click.shell_completion import CompletionItem
+
+from penumbra.services import flags
+from penumbra.services.command.look import open_session
+from penumbra.services.launcher import runs
+from penumbra.services.launcher.runs import Run
+from penumbra.shared.contract import report, topics
+from penumbra.shared.contract.processes import LAUNCHER
+from penumbra.shared.runtime import bus
+
+MEASURED_S = 0.2
+"""Over which CPU is measured."""
+ANSWER_S = 0.5
+ENDS_S = 10.0
+"""How long a launcher may take to end its processes; then it is killed, and they with it."""
+LOOK_S = 0.2
+
+
+@dataclass(frozen=True)
+class Row:
+    """One process. `cpu`: cores; `uptime_s`: since it began."""
+
+    cell: str
+    process: str
+    pid: int
+    state: str
+    cpu: float
+    memory_mb: float
+    uptime_s: float
+    restarts: int = 0
+    note: str = ""
+
+
+@flags.command(
+    "ps",
+    "Shows the cells that `penumbra up` runs on this machine, and their processes.",
+    flags.JSON,
+    example="penumbra ps\npenumbra ps --json",
+)
+def ps(options: flags.Options) -> None:
+    """Prints a row per process."""
+    found = [row for run in runs.running() for row in rows(run)]
+    if options.json:
+        print(json.dumps([asdict(row) for row in found]))
+    elif not found:
+        print("no cell runs on this machine: start one with `penumbra up`")
+    else:
+        from rich.console import Console
+        from rich.markup import escape
+        from rich.table import Table
+
+        table = Table("cell", "process", "pid", "state", "CPU %", "MB", "up", "restarts", "", box=None)
+        for row in found:
+            table.add_row(row.cell, row.process, str(row.pid), row.state, f"{100 * row.cpu:.0f}", f"{row.memory_mb:.0f}",
+                          _duration(row.uptime_s), str(row.restarts), escape(row.note))  # fmt: skip
+        Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+def rows(run: Run) -> list[Row]:
+    """The launcher of a cell and its processes: their states by the launcher's report, the rest by the operating system."""
+    known: dict[str, dict[str, Any]] = {LAUNCHER.name: {"pid": run.pid, "state": "running"}}
+    try:
+        known |= _reported(run)
+    except bus.BusError as error:
+        known[LAUNCHER.name]["note"] = str(error).partition("\n")[0]
+    measured: dict[str, psutil.Process] = {}
+    for name, fields in known.items():
+        with contextlib.suppress(psutil.Error):
+            if fields.get("pid"):
+                measured[name] = psutil.Process(fields["pid"])
+                measured[name].cpu_percent()
+    time.sleep(MEASURED_S)
+    out = []
+    for name, process in measured.items():
+        with contextlib.suppress(psutil.Error):
+            fields = known[name]
+            memory_mb, age_s = process.memory_info().rss / 1e6, time.time() - process.create_time()
+            out.append(Row(run.cell, name, process.pid, str(fields["state"]), process.cpu_percent() / 100, memory_mb, age_s,
+                           int(fields.get("restarts", 0)), str(fields.get("note", ""))))  # fmt: skip
+    return out
+
+
+def _reported(run: Run) -> dict[str, dict[str, Any]]:
+    """What the launcher reports of its processes. Raises BusError where it cannot be asked."""
+    connection = bus.Connection(connect=run.connect, secure=Path(run.secure) if run.secure else None)
+    with open_session(connection, ANSWER_S) as session:
+        for answer in bus.ask(session, topics.health(run.cell, LAUNCHER.name), timeout_s=ANSWER_S):
+            found = report.read(answer)
+            if found.pid == run.pid:
+                return dict(found.report.get("processes", {}))
+    return {}
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def complete_cell(ctx: object, param: object, incomplete: str) -> list[CompletionItem]:
+    """The cells that run."""
+    return [CompletionItem(run.cell) for run in runs.running() if run.cell.startswith(incomplete)]
+
+
+@flags.command(
+    "down",
+    "Ends a cell that `penumbra up` runs on this machine.",
+    flags.Argument("cell", required=False, shell_complete=complete_cell, help="its name; the one that runs where none is named"),
+    example="penumbra down table",
+)
+def down(options: flags.Options) -> None:
+    """Returns when nothing of the cell runs any more."""
+    for run in _chosen(options.cell):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            launcher = psutil.Process(run.pid)
+            os.kill(run.pid, signal.SIGTERM)
+            if psutil.wait_procs([launcher], ENDS_S)[1]:
+                launcher.kill()
+                launcher.wait()
+        print(f"{run.cell}: ended (pid {run.pid})")
+
+
+def _chosen(cell: str | None) -> list[Run]:
+    """The runs of a cell, or without a name those of the only one. Raises BusError where there are none, or several cells."""
+    found = runs.running()
+    names = sorted({run.cell for run in found})
+    if not found:
+        raise bus.BusError("no cell runs on this machine: start one with `penumbra up`")
+    if cell is None and len(names) > 1:
+        raise bus.BusError(f"expected the name of a cell, got none; choose one of {', '.join(names)}")
+    if cell is not None and cell not in names:
+        raise bus.BusError(f"expected a cell that runs on this machine, got {cell!r}; choose one of {', '.join(names)}")
+    return [run for run in found if cell in (None, run.cell)]
+
+
+@flags.command(
+    "logs",
+    "Prints what the processes of a cell have logged, of one that was started with `penumbra up --detach`.",
+    flags.Argument("service", nargs=-1, shell_complete=flags.complete_service, help="only of these; of all where none is named"),
+    flags.Option("-f", "--follow", is_flag=True, help="go on with what is logged from now on, until Ctrl-C"),
+    flags.Option("-n", "--lines", type=flags.natural, default=100, help="the newest lines of each process"),
+    flags.Option("--cell", shell_complete=complete_cell, show_default="the only one with logs", help="the cell's name"),
+    example="penumbra logs\npenumbra logs -f fusion",
+)
+def logs(options: flags.Options) -> None:
+    """Prints the newest lines, and follows."""
+    where = _folder(options.cell)
+    files = {path.stem: path for path in sorted(where.glob("*.log"))}
+    if unknown := [name for name in options.service if name not in files]:
+        raise bus.BusError(f"{where}: expected the log of one of {', '.join(files)}, got {unknown[0]!r}")
+    chosen = {name: files[name] for name in options.service or files}
+    width = max(map(len, chosen))
+
+    def show(name: str, line: str) -> None:
+        print(f"{name:{width}} | {line.rstrip()}" if len(chosen) > 1 else line.rstrip(), flush=options.follow)
+
+    tails = [Tail(path) for path in chosen.values()]
+    for name, tail in zip(chosen, tails, strict=True):
+        for line in deque(tail.read(), options.lines):
+            show(name, line)
+    while options.follow:
+        for name, tail in zip(chosen, tails, strict=True):
+            for line in tail.read():
+                show(name, line)
+        time.sleep(LOOK_S)
+
+
+def _folder(cell: str | None) -> Path:
+    """The folder of a cell's logs. Raises BusError where it cannot be known which."""
+    base = runs.logs_of("")
+    names = sorted(path.name for path in base.glob("*") if any(path.glob("*.log")))
+    if not names:
+        raise bus.BusError("no logs on this machine: `penumbra up --detach` keeps them")
+    if cell is None:
+        running = sorted({run.cell for run in runs.running() if run.logs})
+        if len(running or names) > 1:
+            raise bus.BusError(f"expected --cell, got none; choose one of {', '.join(running or names)}")
+        cell = (running or names)[0]
+    if cell not in names:
+        raise bus.BusError(f"--cell: expected a cell with logs, one of {', '.join(names)}, got {cell!r}")
+    return base / cell
+
+
+class Tail:
+    """The lines of a log file since the last look, also after it was rolled."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._file = path.open(errors="replace")
+        self._rest = ""
+
+    def read(self) -> Iterator[str]:
+        """Whole lines."""
+        yield from self._lines()
+        with contextlib.suppress(OSError):
+            if os.fstat(self._file.fileno()).st_ino != self._path.stat().st_ino:
+                self._file.close()
+                self._file = self._path.open(errors="replace")
+                yield from self._lines()
+
+    def _lines(self) -> Iterator[str]:
+        *lines, self._rest = (self._rest + self._file.read()).split("\n")
+        yield from lines

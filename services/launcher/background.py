@@ -1,0 +1,84 @@
+"""`penumbra up --detach`: a launcher in the background, and how its start gets on.
+
+The launcher says through a pipe what it is waiting for, a line each time, and at last that the cell is up. The end of the pipe
+before that is the end of the launcher, whose log says why.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from penumbra.services.launcher import runs
+from penumbra.services.launcher.forkserver import import_path
+from penumbra.shared.runtime import bus
+
+UP = "up: "
+"""Begins the last line that a launcher says: what is up."""
+PATIENCE_S = 120.0
+"""A first start compiles; what takes longer is reported, and goes on."""
+ENDS_S = 10.0
+NUMBERS = re.compile(r"[\d.]+ m?s\b")
+"""Times in what a launcher says."""
+
+
+def start(cell: str, argv: Sequence[str]) -> int:
+    """Starts `penumbra up ARGV...` in the background. Returns 0 once the cell is up, the launcher's exit code where it ended, or
+    1 where it is not up after PATIENCE_S. Raises BusError where the cell runs already."""
+    if other := next((run for run in runs.running() if run.cell == cell and run.logs), None):
+        raise bus.BusError(f"cell {cell} runs already (pid {other.pid}): end it with `penumbra down {cell}`")
+    logs = runs.logs_of(cell)
+    logs.mkdir(parents=True, exist_ok=True)
+    log = logs / "launcher.log"
+    if log.exists():
+        log.replace(log.with_name("launcher.log.1"))
+    said, say = os.pipe()
+    words = [word for word in argv if word != "--detach"]
+    with log.open("w") as output:
+        launcher = subprocess.Popen(
+            [sys.executable, "-m", "penumbra", "up", *words, "--notify", str(say)],
+            env={**os.environ, **import_path()},
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            pass_fds=[say],
+            start_new_session=True,
+        )
+    os.close(say)
+    try:
+        return _follow(launcher, said, log)
+    except KeyboardInterrupt:
+        launcher.terminate()
+        launcher.wait(ENDS_S)
+        raise
+    finally:
+        os.close(said)
+
+
+def _follow(launcher: subprocess.Popen[bytes], said: int, log: Path) -> int:
+    """Prints what the launcher says, until it is up, or has ended."""
+    deadline = time.monotonic() + PATIENCE_S
+    text, last = "", ""
+    while select.select([said], [], [], max(0.0, deadline - time.monotonic()))[0]:
+        part = os.read(said, 4096).decode(errors="replace")
+        if not part:
+            code = launcher.wait()
+            print(log.read_text(errors="replace").strip(), file=sys.stderr)
+            return code or 1
+        text += part
+        *lines, text = text.split("\n")
+        for line in lines:
+            if line.startswith(UP):
+                print(f"{line.removeprefix(UP)} (pid {launcher.pid}): see penumbra ps, logs and down")
+                return 0
+            if NUMBERS.sub("", line) != NUMBERS.sub("", last):  # how long something is missing is no news
+                print(line, flush=True)
+            last = line
+    print(f"not up after {PATIENCE_S:.0f} s, and still running (pid {launcher.pid}): {last}; see penumbra logs", file=sys.stderr)
+    return 1

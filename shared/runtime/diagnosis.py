@@ -1,0 +1,84 @@
+"""Why a router cannot be reached: each cause has a sentence of its own, and says what to do."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import ssl
+from pathlib import Path
+
+from penumbra.shared.contract import access
+from penumbra.shared.runtime.connection import Connection
+
+ATTEMPT_S = 0.5
+"""How long one look at an address may take."""
+START = "start `penumbra router` or `penumbra up`, or give --connect"
+BY_TCP = ("tcp", "tls", "ws")
+"""Protocols of which a TCP connection shows whether anybody listens."""
+
+
+def no_router(connection: Connection) -> str:
+    """What is wrong with the endpoints of a connection that does not open, one sentence per endpoint."""
+    endpoints = connection.connect or (() if connection.config else (connection.default,))
+    if not endpoints:
+        return f"no router {connection.whereabouts}: {START}"
+    return "\n".join(_of(endpoint, connection.secure) for endpoint in endpoints)
+
+
+def _of(endpoint: str, secure: Path | None) -> str:
+    protocol, _, rest = endpoint.partition("/")
+    if protocol not in BY_TCP:
+        return f"no router at {endpoint}: {START}"
+    host, colon, digits = rest.partition("#")[0].rpartition(":")
+    if not colon or not digits.isdecimal() or not 0 < int(digits) < 65536:
+        got = digits if colon else "none"
+        return f"no router at {endpoint}: expected {protocol}/HOST:PORT with a port from 1 to 65535, got port {got}"
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), int(digits), type=socket.SOCK_STREAM)
+    except OSError as error:
+        return f"no router at {endpoint}: unknown host {host!r} ({error.strerror or error}): check its name, or give its address"
+    with socket.socket(found[0][0], socket.SOCK_STREAM) as link:
+        link.settimeout(ATTEMPT_S)
+        try:
+            link.connect(found[0][4])
+        except ConnectionRefusedError:
+            return f"no router at {endpoint}: nothing listens there: {START}"
+        except OSError as error:
+            return f"no router at {endpoint}: {host} does not answer ({error.strerror or error}): check the address and firewalls"
+        return _who_listens(endpoint, link, host, secure)
+
+
+def _who_listens(endpoint: str, link: socket.socket, host: str, secure: Path | None) -> str:
+    """Somebody does, but no session opened with it."""
+    try:
+        context = _context(secure)
+    except (OSError, ssl.SSLError) as error:
+        return f"no router at {endpoint}: the certificates in {secure} cannot be used ({error}): make them with `penumbra certs`"
+    try:
+        with context.wrap_socket(link, server_hostname=host.strip("[]")):
+            pass
+    except ssl.SSLCertVerificationError as error:
+        return (
+            f"no router at {endpoint} with a certificate of the CA in {secure} for {host} ({error.verify_message}): use the "
+            "folder of that router's `penumbra certs`, or name the host with --hosts"
+        )
+    except OSError:  # it speaks no TLS, or does not answer
+        if secure is not None or endpoint.startswith("tls/"):
+            return f"no router at {endpoint} that speaks TLS: leave --secure out, or start it with --secure"
+        return f"no router at {endpoint}: what listens there does not answer as a Zenoh router: give another --connect"
+    if secure is None:
+        return f"no router at {endpoint} without TLS: give --secure FOLDER with certificates of `penumbra certs`"
+    return f"no router at {endpoint} that accepts the certificate in {secure}: use the folder of that router's `penumbra certs`"
+
+
+def _context(secure: Path | None) -> ssl.SSLContext:
+    """Of a client; without certificates it accepts every router, only to see whether it speaks TLS."""
+    context = ssl.create_default_context()
+    if secure is None:
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        return context
+    context = ssl.create_default_context(cafile=str(secure / "ca.pem"))
+    holder = access.holder(access.VIEWER, False)
+    with contextlib.suppress(FileNotFoundError):
+        context.load_cert_chain(secure / f"{holder}.pem", secure / f"{holder}-key.pem")
+    return context

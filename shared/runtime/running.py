@@ -1,0 +1,56 @@
+"""How the processes of a cell fare, asked from outside: by `penumbra doctor`, `penumbra topics --hz` and the Python client."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import zenoh
+
+from penumbra.shared.contract import report, topics
+from penumbra.shared.runtime import bus
+
+ANSWER_S = 1.0
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One running instance: its status (ok, starting, degraded or down, as `shared.runtime.health` has them) and the reasons."""
+
+    service: str
+    instance: str
+    status: str
+    reasons: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.service} {self.instance}: {self.status}" + (f": {'; '.join(self.reasons)}" if self.reasons else "")
+
+
+def ask(session: zenoh.Session, cell: str) -> list[Instance]:
+    """Every instance of a cell, by service; one that is on the bus but does not answer within ANSWER_S is down."""
+    found = {}
+    for reply in session.liveliness().get(topics.alive(cell), timeout=ANSWER_S):
+        if reply.ok is not None:
+            service, instance = str(reply.ok.key_expr).split("/")[-2:]
+            found[instance] = Instance(service, instance, "down", (f"hangs: no answer within {ANSWER_S:g} s",))
+    for each in map(report.read, bus.ask(session, topics.health(cell), timeout_s=ANSWER_S)):
+        found[each.instance] = Instance(each.service, each.instance, each.status, tuple(each.reasons))
+    return sorted(found.values(), key=lambda each: (each.service, each.instance))
+
+
+def cells_there(session: zenoh.Session) -> list[str]:
+    """The names of the cells of which a process is on the bus."""
+    replies = session.liveliness().get(topics.alive("*"), timeout=ANSWER_S)
+    return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None})
+
+
+def whats_there(session: zenoh.Session, cell: str, service: str) -> str:
+    """What to do where a service does not answer: which processes, or which other cells, are on this router."""
+    running = sorted({instance.service for instance in ask(session, cell)})
+    if service in running:
+        return f"{service} runs, and has nothing to answer yet: see `penumbra topics --hz`"
+    if running:
+        return f"its processes are {', '.join(running)}: start `penumbra {service}`"
+    others = cells_there(session)
+    if others:
+        return f"no process of it is on this router, where cells run: {', '.join(others)}; give --cell {others[0]}"
+    return "no process of any cell is on this router: start `penumbra up`"

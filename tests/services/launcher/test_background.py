@@ -1,0 +1,93 @@
+"""`penumbra up --detach`, ps, logs and down, with a real launcher; and the records that they read."""
+
+import json
+import os
+
+import psutil
+import pytest
+
+from penumbra.services.command import cli, machine
+from penumbra.services.launcher import runs
+from penumbra.shared.contract.processes import PROCESSES
+from penumbra.tests.support.live import free_port, wait_for
+
+NOTHING = [f"--replicas={process.name}=0" for process in PROCESSES if process.replicas and process.name != "router"]
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path, monkeypatch):
+    """A state folder of the test's own, in which nothing runs at its end."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    yield tmp_path
+    for run in runs.running():
+        psutil.Process(run.pid).kill()
+
+
+def test_a_cell_in_the_background_is_listed_has_logs_and_is_ended(capfd):
+    before = set(os.listdir("/dev/shm"))
+    assert cli.main(["up", "--detach", "--port", str(free_port()), *NOTHING, "--replicas=fusion=1"]) == 0
+    said = capfd.readouterr().out
+    assert "cell table runs (pid " in said.splitlines()[-1]
+    (run,) = runs.running()
+    wait_for(lambda: {row.process for row in machine.rows(run)} == {"launcher", "router", "fusion"}, 10, "all processes")
+    assert cli.main(["ps", "--json"]) == 0
+    rows = {row["process"]: row for row in json.loads(capfd.readouterr().out)}
+    assert rows["launcher"]["pid"] == run.pid and rows["router"]["state"] == "running"
+    assert all(row["memory_mb"] > 1 and row["uptime_s"] >= 0 for row in rows.values())
+    assert cli.main(["logs", "fusion", "-n", "50"]) == 0
+    assert "fusion: on the bus" in capfd.readouterr().out
+    assert cli.main(["logs", "nobody"]) == 2
+    assert "expected the log of one of fusion, launcher, router, got 'nobody'" in capfd.readouterr().err
+    assert cli.main(["ls", "--json", "--connect", *run.connect]) == 0
+    assert {"router": run.connect[0], "cells": ["table"], "why": ""} in json.loads(capfd.readouterr().out)
+    assert cli.main(["up", "--detach", "--port", str(free_port()), *NOTHING]) == 2
+    assert f"cell table runs already (pid {run.pid}): end it with `penumbra down table`" in capfd.readouterr().err
+    children = psutil.Process(run.pid).children(recursive=True)
+    assert cli.main(["down", "arm"]) == 2
+    assert "expected a cell that runs on this machine, got 'arm'; choose one of table" in capfd.readouterr().err
+    assert cli.main(["down"]) == 0
+    assert not any(child.is_running() and child.status() != psutil.STATUS_ZOMBIE for child in children)
+    assert runs.running() == []
+    left = [name for name in set(os.listdir("/dev/shm")) - before if str(run.pid) in name]
+    assert left == []
+
+
+def test_a_cell_that_does_not_start_in_the_background_says_why(capfd):
+    taken = free_port()
+    assert cli.main(["up", "--detach", "--connect", f"tcp/127.0.0.1:{taken}", "--replicas=magic=1"]) == 2
+    assert "--replicas magic=1: expected one of emulator" in capfd.readouterr().err
+
+
+def test_nothing_that_runs_is_said_in_a_line(capfd):
+    for command in (["ps"], ["down"], ["logs"]):
+        assert cli.main(command) == (0 if command == ["ps"] else 2)
+    out, err = capfd.readouterr()
+    assert out == "no cell runs on this machine: start one with `penumbra up`\n"
+    assert err.splitlines() == [
+        "penumbra down: no cell runs on this machine: start one with `penumbra up`",
+        "penumbra logs: no logs on this machine: `penumbra up --detach` keeps them",
+    ]
+
+
+def test_records_of_launchers_that_are_gone_are_removed(state):
+    with runs.recorded("table", ("tcp/127.0.0.1:1",), None, None):
+        (run,) = runs.running()
+        assert (run.cell, run.pid, run.logs) == ("table", os.getpid(), None)
+        path = state / "penumbra" / "run" / f"{os.getpid()}.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "began": 1.0}))
+        assert runs.running() == [], "another process has its number"
+        assert not path.exists()
+
+
+def test_a_log_is_rolled_and_followed_across_its_roll(state, monkeypatch):
+    monkeypatch.setattr(runs, "LOG_BYTES", 200)
+    logs = runs.Logs(state / "here")
+    logs.write("fusion", "first\n")
+    tail = machine.Tail(state / "here" / "fusion.log")
+    seen = list(tail.read())
+    for number in range(60):
+        logs.write("fusion", f"line {number} of sixty\n")
+        seen += tail.read()
+    assert seen == ["first", *(f"line {number} of sixty" for number in range(60))]
+    assert (state / "here" / "fusion.log").stat().st_size <= 200
+    assert len(list((state / "here").glob("fusion.log*"))) == 1 + runs.LOGS_KEPT

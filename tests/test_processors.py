@@ -1,0 +1,56 @@
+"""What is promised holds on other processors than this one: the numerical tests again, with fewer instructions. Each library
+has a switch of its own for it; where the processor has less than a row allows, the row is what the processor has anyway."""
+
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TESTS = {
+    "x86-64-v2": (
+        "tests/shared/geometry",
+        "tests/shared/native",
+        "tests/shared/skin/test_layout.py",
+        "tests/services/fusion/test_observer.py",
+        "tests/services/haptics/test_estimator.py",
+        "tests/services/search/test_tracker.py",
+        "tests/sim/test_field.py",
+        "tests/sim/test_renderer.py",
+    ),
+    "x86-64-v3": (
+        "tests/services/posecnn/test_posecnn.py",
+        "tests/services/segmentation/test_prednet.py",
+        "tests/chain/test_replay.py",
+    ),
+}
+"""Newer processors load the kernels of x86-64-v3 too, so that row is for the libraries of others. OpenVINO is not in the
+other row: held to SSE4.1 on a processor with AVX-512, its version 2026.4 compiles no network ("bad combination")."""
+PROCESSORS = {
+    "x86-64-v2": {
+        "ATEN_CPU_CAPABILITY": "default",
+        "NPY_DISABLE_CPU_FEATURES": "AVX AVX2 FMA3 AVX512F AVX512_SKX AVX512_ICL AVX512_SPR X86_V3 X86_V4",
+        "ONEDNN_MAX_CPU_ISA": "SSE41",
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "PYTEST_ADDOPTS": "-p penumbra.tests.support.without_avx",
+    },
+    "x86-64-v3": {
+        "ATEN_CPU_CAPABILITY": "avx2",
+        "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512_SKX AVX512_ICL AVX512_SPR X86_V4",
+        "ONEDNN_MAX_CPU_ISA": "AVX2",
+        "OPENBLAS_CORETYPE": "Haswell",
+    },
+}
+"""Switches of torch, numpy, oneDNN (in torch and OpenVINO), OpenBLAS (in numpy and scipy) and the kernels' library."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="these are switches of x86-64 code")
+@pytest.mark.parametrize("name", PROCESSORS)
+def test_the_numerical_tests_pass_with_the_instructions_of_an_older_processor(name):
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *TESTS[name]]
+    result = subprocess.run(command, cwd=ROOT, env={**os.environ, **PROCESSORS[name]}, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout[-8000:] + result.stderr[-2000:]
