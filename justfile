@@ -31,6 +31,10 @@ docs:
     python -m penumbra.shared.cell.reference docs/own-cell.md
     mkdocs build --strict --quiet
 
+# the tables of docs/results, from the benchmarks' JSON in docs/results/data
+results:
+    python -m penumbra.tests.bench.lib.published
+
 # build and run the images; needs a Docker engine
 containers:
     pytest -m containers tests/chain/test_compose.py

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from penumbra.tests.bench.lib import published
+
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
@@ -43,3 +45,21 @@ def test_every_page_is_in_the_menu_of_the_site():
 def test_the_page_of_messages_is_that_of_the_tables():
     written = runpy.run_path(str(ROOT / "docs" / "messages.py"))
     assert (ROOT / "docs" / "messages.md").read_text() == written["page"](), "run `just docs`"
+
+
+@pytest.mark.parametrize("page", sorted(published.PAGES.glob("*.md")), ids=lambda page: page.name)
+def test_the_tables_of_the_results_are_what_their_files_give(page):
+    text = page.read_text()
+    assert published.filled(text) == text, "run `just results`"
+
+
+def test_every_result_has_its_page():
+    assert not published.unshown()
+
+
+@pytest.mark.parametrize("page", sorted(published.PAGES.glob("*.md")), ids=lambda page: page.name)
+def test_a_table_that_was_copied_by_hand_says_when_it_was_measured(page):
+    by_hand = {
+        name: text for name, text in published.regions(page.read_text()).items() if not (published.DATA / f"{name}.json").exists()
+    }
+    assert not [name for name, text in by_hand.items() if not published.BY_HAND.match(text)]

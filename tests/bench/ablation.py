@@ -8,7 +8,6 @@ bench segmentation` does. It says which variant learns faster, not what each can
 
 from __future__ import annotations
 
-import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,8 @@ from penumbra.services.segmentation.training import evaluate, train
 from penumbra.shared import training
 from penumbra.sim.sets import sequences, shots
 from penumbra.tests.bench import segmentation
+from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.results import Part, Result
 
 VARIANTS: dict[str, tuple[Settings, float]] = {
     "hGRU": (Settings(), 0.3),
@@ -73,18 +74,30 @@ def score(trainer: train.Trainer, data: train.Data, seed: int) -> dict[str, Any]
     return {"rows": found["rows"], "ms_per_frame": found["ms_per_frame"]}
 
 
-@flags.command(
-    "bench ablation",
+def tables(result: Result) -> list[Part]:
+    """A row for each variant."""
+    title = f"IoU mean by hidden share after {result['variants'][0]['steps']} steps, seed {result['seed']}"
+    table = Table("variant", "parameters", "0 to 33%", "33 to 66%", "66 to 95%", "contour RMS px", "minutes", "ms", title=title)
+    for one in result["variants"]:
+        iou = ["-" if row["iou"] is None else f"{row['iou']:.3f}" for row in one["rows"]]
+        rms = one["rows"][0]["contour_rms_px"]
+        times = (f"{one['minutes']}", f"{one['ms_per_frame']}")
+        table.add_row(one["variant"], f"{one['parameters'] / 1e3:.0f} k", *iou, "-" if rms is None else f"{rms:.2f}", *times)
+    return [table]
+
+
+@results.benchmark(
+    "ablation",
     __doc__ or "",
+    tables,
     flags.Option("--minutes", type=flags.above_zero, default=7.0, help="training of the first variant"),
     flags.Option("--steps", type=flags.positive, help="steps of every variant instead"),
     flags.Option("--seed", type=int, default=1, help="draws weights, training data and, far away, held-out data"),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench ablation --json ablation.json",
 )
-def main(options: flags.Options) -> int:
+def main(options: flags.Options, report: results.Report) -> None:
     torch.set_num_threads(1)
-    console, steps = Console(), options.steps
+    console, steps = Console(stderr=True), options.steps
     found: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         data = train.Simulated(options.seed, HELD_OUT, easy, easy, SEQUENCES)
@@ -97,21 +110,7 @@ def main(options: flags.Options) -> int:
             parameters = sum(p.numel() for p in trainer.net.parameters())
             about = {"variant": name, "parameters": parameters, "steps": trainer.step, "minutes": round(trainer.minutes, 1)}
             found.append({**about, "loss": last, **score(trainer, data, options.seed)})
-            if options.json:
-                options.json.write_text(json.dumps({"seed": options.seed, "variants": found}, indent=1) + "\n")
-    show(found, options.seed, console)
-    return 0
-
-
-def show(found: list[dict[str, Any]], seed: int, console: Console) -> None:
-    title = f"IoU mean by hidden share after {found[0]['steps']} steps, seed {seed}"
-    table = Table("variant", "parameters", "0 to 33%", "33 to 66%", "66 to 95%", "contour RMS px", "minutes", "ms", title=title)
-    for one in found:
-        iou = ["-" if row["iou"] is None else f"{row['iou']:.3f}" for row in one["rows"]]
-        rms = one["rows"][0]["contour_rms_px"]
-        times = (f"{one['minutes']}", f"{one['ms_per_frame']}")
-        table.add_row(one["variant"], f"{one['parameters'] / 1e3:.0f} k", *iou, "-" if rms is None else f"{rms:.2f}", *times)
-    console.print(table)
+            report.save({"seed": options.seed, "variants": found})
 
 
 if __name__ == "__main__":

@@ -8,14 +8,12 @@ they had been, measurements used twice, and poses called tracking that were wron
 from __future__ import annotations
 
 import itertools
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import psutil
@@ -27,6 +25,8 @@ from penumbra.services import flags
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.topics import Topic
+from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.results import Part, Result, marked
 from penumbra.tests.support import injected, observed
 from penumbra.tests.support.live import Running, penumbra_up, service_of, wait_for
 
@@ -293,50 +293,65 @@ def is_back(row: Row) -> bool:
     return row.recovery_s is not None and row.recovery_s <= goal_s
 
 
-def show(rows: Sequence[Row], console: Console) -> None:
-    recovery_goal = f"recovery s\n<= lasts + {GOAL_ALONE_S:g}, with a replica {GOAL_REPLICA_S:g}"
-    gap_goal = f"gap ms\n<= {GOAL_GAP_MS:g}"
-    names = ("fault", "service", "replicas", "lasts s", gap_goal, recovery_goal, "reused\n0", "false tracking\n0")
-    table = Table(*names, "of poses", "worst cm", title="faults; misses are red")
-    for row in rows:
-        recovery = "never" if row.recovery_s is None else f"{row.recovery_s:.2f}"
-        cells = [
-            (f"{row.gap_ms:.0f}", row.gap_ms <= GOAL_GAP_MS),
-            (recovery, is_back(row)),
-            (str(row.reused), row.reused == 0),
-            (str(row.false_tracking), row.false_tracking == 0),
-        ]
-        marked = [text if met else f"[red]{text} ![/red]" for text, met in cells]
-        named = (row.fault, row.service, str(row.replicas), f"{row.lasts_s:g}")
-        table.add_row(*named, *marked, str(row.tracking), f"{row.worst_cm:.1f}")
-    console.print(table)
+def tables(result: Result) -> list[Part]:
+    """A row for each fault and number of replicas: what it does where it strikes each service, and the worst of all of these."""
+    table = Table(
+        *("fault", "of each", "lasts s", *(f"{service}\nback s" for service in (*SERVICES, ALL))),
+        *("gap ms, fusion\nnot struck / struck", "reused", "false tracking\nof poses", "worst cm"),
+        title=f"Faults, seed {result['seed']}",
+        caption=f"Goals: gap <= {GOAL_GAP_MS:g} ms; back within {GOAL_ALONE_S:g} s of the fault's end, with a replica within "
+        f"{GOAL_REPLICA_S:g} s of its beginning; none reused, none falsely tracking. Gap: the largest of all services.",
+    )
+    rows = [Row(**each) for each in result["rows"]]
+    for (fault, replicas), found in itertools.groupby(
+        sorted(rows, key=lambda row: (row.replicas, list(FAULTS).index(row.fault))), key=lambda row: (row.fault, row.replicas)
+    ):
+        own = {row.service: row for row in found}
+        reused, false = (sum(getattr(row, name) for row in own.values()) for name in ("reused", "false_tracking"))
+        table.add_row(
+            *(fault, str(replicas), f"{next(iter(own.values())).lasts_s:g}"),
+            *(_back(own.get(service)) for service in (*SERVICES, ALL)),
+            " / ".join(
+                _gap([row for row in own.values() if (row.service == "fusion") == is_struck]) for is_struck in (False, True)
+            ),
+            marked(str(reused), reused == 0),
+            f"{marked(str(false), false == 0)} of {sum(row.tracking for row in own.values())}",
+            f"{max(row.worst_cm for row in own.values()):.1f}",
+        )
+    return [table]
 
 
-@flags.command(
-    "bench faults",
+def _back(row: Row | None) -> str:
+    if row is None:
+        return "-"
+    return marked("never" if row.recovery_s is None else f"{row.recovery_s:.2f}", is_back(row))
+
+
+def _gap(rows: Sequence[Row]) -> str:
+    longest_ms = max((row.gap_ms for row in rows), default=None)
+    return "-" if longest_ms is None else marked(f"{longest_ms:.0f}", longest_ms <= GOAL_GAP_MS)
+
+
+@results.benchmark(
+    "faults",
     __doc__ or "",
+    tables,
     flags.Option("--cell", default="table", help="built-in cell or YAML file"),
     flags.Option("--seed", type=int, default=1, help="draws motion and appearance"),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file, after every row"),
     flags.Option("--quick", is_flag=True, help="the faults that show most, without replicas"),
     flags.Option("--fault", choices=FAULTS, multiple=True, help="this fault only; may be repeated"),
     flags.Option("--service", choices=SERVICES, multiple=True, help="strike this service only; may be repeated"),
     flags.Option("--replicas", type=int, choices=(1, 2), multiple=True, help="so many of each service; may be repeated"),
     example="penumbra bench faults --quick --json faults.json",
 )
-def main(options: flags.Options) -> int:
-    rows: list[Row] = []
+def main(options: flags.Options, report: results.Report) -> None:
+    rows: list[dict[str, Any]] = []
 
     def done(row: Row) -> None:
-        rows.append(row)
-        if options.json:
-            options.json.write_text(json.dumps({"seed": options.seed, "rows": [asdict(each) for each in rows]}, indent=1))
+        rows.append(asdict(row))
+        report.save({"seed": options.seed, "rows": rows})
 
-    try:
-        run(options, done)
-    finally:
-        show(rows, Console())
-    return 0
+    run(options, done)
 
 
 if __name__ == "__main__":

@@ -22,14 +22,12 @@ and the average hold the newest measurement of each sense, gtsam's smoother and 
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,7 +46,9 @@ from penumbra.shared.contract.senses import SENSES
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.tests.bench.lib import fusion_runs as runs
+from penumbra.tests.bench.lib import results
 from penumbra.tests.bench.lib.fusion_baselines import FixedLagSmoother, Newest
+from penumbra.tests.bench.lib.results import Part, Result, marked
 
 HOME, SPREAD = rigid.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0]), (0.12, 0.4)
 """Of the cell `table`."""
@@ -58,7 +58,6 @@ LATE_S = {"0": (0.0, 0.0), "50": (0.05, 0.05), "200": (0.2, 0.2), "shuffled": (0
 CONFIDENCE = 0.95
 WRONG_GOAL_CM, LATE_GOAL, STEP_GOAL_MS, CORE_GOAL = 3.0, 1.1, 0.3, 1.0
 PUBLISHED_HZ, TARGETS = 200.0, (1, 10, 100)
-WIDTH = 130
 BASELINES = ("oracle", "average", "gtsam", "paper")
 SLOW, SLOW_EVERY = ("gtsam", "paper"), 4
 """Baselines that take most of the time, and are played in every fourth run only."""
@@ -390,78 +389,67 @@ def _pool(jobs: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"))
 
 
-def show(found: dict[str, Any], console: Console) -> None:
-    """The tables, beside their goals."""
-    title = f"seed {found['seed']}: {found['runs']} runs of {found['seconds']:g} s"
-    table = Table("situation", "NEES", "95 % band", "inside", "NIS", "95 % band", "inside", "refused", "tracking", title=title)
+def tables(found: Result) -> list[Part]:
+    """Consistency, errors, late measurements, what a wrong sense does, and times, beside their goals."""
+    title = f"Consistency, seed {found['seed']}: {found['runs']} runs of {found['seconds']:g} s"
+    consistent = Table(
+        "situation", "NEES", "95 % band", "inside", "NIS", "95 % band", "inside", "refused", "tracking", title=title
+    )
     for name, row in found["situations"].items():
-        table.add_row(
+        consistent.add_row(
             name, *_judged(row, "nees"), *_judged(row, "nis"), str(row["refused"]), f"{row['states']['tracking']:.0%}"
         )  # fmt: skip
-    console.print(table)
-    title = f"position error as of now, mean, cm (goal: ours the least); {' and '.join(SLOW)} of every {SLOW_EVERY}th run"
-    table = Table("situation", "ours", "95 % below", *BASELINES, title=title)
+    title = f"Position error as of now, mean, cm (goal: ours the least); {' and '.join(SLOW)} of every {SLOW_EVERY}th run"
+    errors = Table("situation", "ours", "95 % below", *BASELINES, title=title)
     for name, row in found["situations"].items():
         ours = {key: row["error_beside_slow_cm" if key in SLOW else "error_cm"] for key in BASELINES}
-        others = (_marked(f"{value:.2f}", ours[key] <= value) for key, value in row["baselines_cm"].items())
-        table.add_row(name, f"{row['error_cm']:.2f}", f"{row['error_p95_cm']:.2f}", *others)
-    console.print(table)
-    table = Table("ms late", "as of the newest stamp, cm", f"goal <= {LATE_GOAL:g} x", "as of now, cm", "after the fact, mm")
+        others = (marked(f"{value:.2f}", ours[key] <= value) for key, value in row["baselines_cm"].items())
+        errors.add_row(name, f"{row['error_cm']:.2f}", f"{row['error_p95_cm']:.2f}", *others)
+    late = Table("ms late", "as of the newest stamp, cm", f"goal <= {LATE_GOAL:g} x", "as of now, cm", "after the fact, mm")
     for name, value in found["late"].items():
         ratio = value / found["late"]["0"]
-        table.add_row(
-            name, f"{value:.3f}", _marked(f"{ratio:.3f}", ratio <= LATE_GOAL), f"{found['late_now'][name]:.3f}",
+        late.add_row(
+            name, f"{value:.3f}", marked(f"{ratio:.3f}", ratio <= LATE_GOAL), f"{found['late_now'][name]:.3f}",
             f"{found['late_difference_mm'][name]:.2g}",
         )  # fmt: skip
-    console.print(table)
     wrong, step = found["wrong_sense_cm"], found["step_ms"]
-    told = _marked(f"{wrong:.2f} cm", wrong <= WRONG_GOAL_CM)
-    console.print(
-        f"a sense that is wrong by 10 cm moves the pose by at most {told} (goal {WRONG_GOAL_CM:g}; median "
-        f"{found['wrong_sense_median_cm']:.2f})"
-    )
-    console.print(
-        f"one predict, update and publish: {_marked(f'{step:.3f} ms', step <= STEP_GOAL_MS)} (goal {STEP_GOAL_MS:g}), "
-        f"of a picture behind the skin's measurements {found['step_late_ms']:.3f} ms"
-    )
-
-    table = Table(
-        "targets", "share of a core at 200 Hz", "with messages", title=f"a bank of observers (goal: 100 within {CORE_GOAL:g})"
+    bank = Table(
+        "targets", "share of a core at 200 Hz", "with messages", title=f"A bank of observers (goal: 100 within {CORE_GOAL:g})"
     )
     for row in found["targets"]:
-        share = _marked(f"{row['core_share']:.1%}", row["core_share"] <= CORE_GOAL)
-        table.add_row(f"{row['n']}", share, f"{row['with_messages']:.1%}")
-    console.print(table)
+        share = marked(f"{row['core_share']:.1%}", row["core_share"] <= CORE_GOAL)
+        bank.add_row(f"{row['n']}", share, f"{row['with_messages']:.1%}")
+    return [
+        consistent,
+        errors,
+        late,
+        f"A sense that is wrong by 10 cm moves the pose by at most {marked(f'{wrong:.2f} cm', wrong <= WRONG_GOAL_CM)} (goal "
+        f"{WRONG_GOAL_CM:g}; median {found['wrong_sense_median_cm']:.2f}).",
+        f"One predict, update and publish: {marked(f'{step:.3f} ms', step <= STEP_GOAL_MS)} (goal {STEP_GOAL_MS:g}), of a "
+        f"picture behind the skin's measurements {found['step_late_ms']:.3f} ms.",
+        bank,
+    ]
 
 
 def _judged(row: dict[str, Any], key: str) -> tuple[str, str, str]:
     if row[key] is None:
         return "-", "-", "-"
     low, high = row[f"{key}_band"]
-    return _marked(f"{row[key]:.2f}", low <= row[key] <= high), f"{low:.2f} .. {high:.2f}", f"{row[f'{key}_inside']:.0%}"
+    return marked(f"{row[key]:.2f}", low <= row[key] <= high), f"{low:.2f} .. {high:.2f}", f"{row[f'{key}_inside']:.0%}"
 
 
-def _marked(text: str, reached: bool) -> str:
-    return text if reached else f"[red]{text}[/red]"
-
-
-@flags.command(
-    "bench fusion",
+@results.benchmark(
+    "fusion",
     __doc__ or "",
+    tables,
     flags.Option("--seed", type=int, default=1, help="draws limbs, errors and delays"),
     flags.Option("--runs", type=flags.positive, default=100, help="of each situation"),
     flags.Option("--seconds", type=flags.above_zero, default=20.0, help="length of a run"),
     flags.Option("--jobs", type=flags.positive, default=2, help="processes"),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench fusion --json fusion.json",
 )
-def main(options: flags.Options) -> int:
-    found = measured(options.seed, options.runs, options.seconds, options.jobs, Console(stderr=True))
-    console = Console()
-    show(found, console if console.is_terminal else Console(width=max(console.width, WIDTH)))
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
-    return 0
+def main(options: flags.Options, report: results.Report) -> None:
+    report.save(measured(options.seed, options.runs, options.seconds, options.jobs, Console(stderr=True)))
 
 
 if __name__ == "__main__":

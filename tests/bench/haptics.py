@@ -11,7 +11,6 @@ limbs that move through all gaps, and things that are no limb.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -45,6 +44,8 @@ from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin, link_names
 from penumbra.shared.skin.response import Response, fingerprint
 from penumbra.sim.skin import field
+from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.results import Part, Result, marked
 
 ARRAYS = {"bare": "table", "hull": "arm"}
 """Cells: pads in a table top, and pads on a robot's hull."""
@@ -60,6 +61,8 @@ GIRTH, LENGTH = (-0.27, 0.11), (-0.1, 0.1)
 """Range of log sizes."""
 NAMES = ("axial", "lateral", "height", "roll", "pitch", "yaw")
 RATIO_GOAL, MS_GOAL = 1.2, 2.0
+NEAR_M = (0.02, 0.15)
+"""Gaps for which the first goal holds."""
 REST_S, SETTLED_S = 10.0, 1.0
 SHOWN = ("lateral", "height", "axial")
 RESTING_GAPS = (0.02, 0.03, 0.05, 0.075, 0.10, 0.125, 0.15)
@@ -458,57 +461,83 @@ def measure(seed: int, plan: Plan, arrays: tuple[str, ...], paper: bool) -> dict
     return result | {"nees": first["nees"], "ms": first["ms"]["median"], "arrays": parts}
 
 
-def show(result: dict[str, Any], console: Console) -> None:
-    """The tables."""
-    ours = {_key(row): row for row in result["rows"]}
-    theirs = {_key(row): row for row in result["paper"]}
-    title = f"seed {result['seed']}: RMSE (bound), lateral / height / axial mm, pitch / yaw deg"
-    table = Table(
-        "array",
-        "pads",
-        "gap cm",
-        "prior",
-        "m/s",
-        "lateral",
-        "height",
-        "axial",
-        "pitch",
-        "yaw",
-        "worst ratio",
-        "paper",
-        title=title,
+def tables(result: Result) -> list[Part]:
+    """Errors beside their bounds, then limbs that rest and move, and what is taken for one. The JSON has the rows of fewer pads
+    and of moving limbs too: here they count as shares."""
+    parts: list[Part] = [_errors(result), _shares(result)]
+    shown = result["arrays"]
+    consistent = Table(
+        *("array", "limbs", "of the observer's pose", "95 % band", "of the published one", "moving: observer's", "published"),
+        title=f"NEES a degree of freedom, limbs that rest for {REST_S:g} s",
     )
-    for key, row in ours.items():
+    units = [f"{name} {'mm' if name in SHOWN else 'deg'}" for name in NAMES]
+    resting = Table(
+        "array", "gap cm", "NEES", "published", "in range", *units, title="Limbs that rest: RMSE once the size is learnt"
+    )
+    moving = Table("array", "gap m", *units, title="Limbs that move through all gaps: RMSE")
+    foreign = Table("array", *next(iter(shown.values()))["foreign"], title="Taken for a limb (goal: never)")
+    for name, part in shown.items():
+        nees, (low, high) = part["nees"], part["nees"]["band"]
+        consistent.add_row(
+            name, str(nees["limbs"]), marked(f"{nees['mean']:.2f}", low <= nees["mean"] <= high), f"{low:.2f} to {high:.2f}",
+            f"{nees['published']:.2f}", f"{nees['moving']['fused']:.2f}", f"{nees['moving']['published']:.2f}",
+        )  # fmt: skip
+        for gap, each in nees["by_gap"].items():
+            shares = (f"{each['fused']:.2f}", f"{each['published']:.2f}", f"{each['in_range']:.0%}")
+            resting.add_row(name, f"{100 * float(gap):g}", *shares, *(f"{each['rmse'][axis]:.2f}" for axis in NAMES))
+        for band, each in part["moving"].items():
+            moving.add_row(name, band, *(f"{each[axis]:.2f}" for axis in NAMES))
+        foreign.add_row(name, *(marked(f"{share:.0%}", share == 0) for share in part["foreign"].values()))
+        p95 = marked(f"{part['ms']['p95']} ms", part["ms"]["p95"] <= MS_GOAL)
+        parts.append(f"From sample to pose, {name}: {part['ms']['median']} ms, 95th percentile {p95} (goal {MS_GOAL:g}).")
+    return [*parts, consistent, resting, moving, foreign]
+
+
+def _errors(result: Result) -> Table:
+    """Of eight pads and limbs at rest."""
+    theirs = {_key(row): row for row in result["paper"]}
+    table = Table(
+        *("array", "prior", "gap cm", "lateral mm", "height mm", "axial mm", "pitch deg", "yaw deg", "worst ratio"),
+        "paper's method: lateral / height / axial",
+        title=f"Eight pads, limbs at rest, seed {result['seed']}: RMSE (bound)",
+        caption=f"Goal: a ratio to the bound of at most {RATIO_GOAL}. Prior: tracking, 2 cm and 5.7 degrees, or broad.",
+    )
+    for row in result["rows"]:
+        if row["pads"] != PADS[0] or row["speed"]:
+            continue
         values = [f"{row['rmse_mm'][name]:.2f} ({row['bound_mm'][name]:.2f})" for name in SHOWN]
         values += [f"{row['rmse_deg'][name]:.2f} ({row['bound_deg'][name]:.2f})" for name in ("pitch", "yaw")]
-        paper = " / ".join(f"{theirs[key]['rmse_mm'][name]:.1f}" for name in SHOWN) if key in theirs else ""
+        paper = theirs.get(_key(row))
         table.add_row(
-            row["array"], str(row["pads"]), f"{100 * row['gap_m']:g}", "tracking" if row["prior"] else "broad",
-            f"{row['speed']:g}", *values, f"{max(row['ratio'].values()):.2f}", paper,
-        )  # fmt: skip
-    console.print(table)
-    for name, part in result["arrays"].items():
-        nees, ms = part["nees"], part["ms"]
-        verdict = "inside" if nees["band"][0] <= nees["mean"] <= nees["band"][1] else "outside"
-        console.print(
-            f"{name}: limbs that rest for {REST_S:g} s: NEES of the observer's pose {nees['mean']} ({verdict} {nees['band']}, "
-            f"{nees['limbs']} limbs), of the published ones {nees['published']}; moving: {nees['moving']}"
+            *(row["array"], _prior(row["prior"]), f"{100 * row['gap_m']:g}", *values, _judged(max(row["ratio"].values()))),
+            "" if paper is None else " / ".join(f"{paper['rmse_mm'][name]:.1f}" for name in SHOWN),
         )
-        for gap, each in nees["by_gap"].items():
-            console.print(f"  resting at {100 * float(gap):g} cm: {each}")
-        for band, each in part["moving"].items():
-            console.print(f"  moving, gap {band} m: " + ", ".join(f"{key} {value:g}" for key, value in each.items()))
-        console.print(f"  taken for a limb: {part['foreign']}")
-        console.print(f"  from sample to pose: {ms['median']} ms, 95th percentile {ms['p95']} ms (goal {MS_GOAL:g})")
-        worst = [
-            (max(row["ratio"].values()), 100 * row["gap_m"])
-            for row in result["rows"]
-            if row["array"] == name and row["pads"] == 8 and 0.02 <= row["gap_m"] <= 0.15
-        ]
-        if worst:
-            console.print(
-                f"  worst ratio to the bound, 8 pads, 2 to 15 cm: {max(worst)[0]:.2f} at {max(worst)[1]:g} cm (goal {RATIO_GOAL})"
-            )
+    return table
+
+
+def _shares(result: Result) -> Table:
+    """How many errors are near their bound, by the number of pads."""
+    low, high = NEAR_M
+    table = Table(
+        *("array", "pads", "prior", f"within {RATIO_GOAL} times the bound", "largest ratio"),
+        title=f"Errors from {100 * low:g} to {100 * high:g} cm, at rest and moving",
+    )
+    ratios: dict[tuple[str, int, bool], list[float]] = {}
+    for row in result["rows"]:
+        if low <= row["gap_m"] <= high:
+            ratios.setdefault((row["array"], row["pads"], row["prior"]), []).extend(row["ratio"].values())
+    for (array, pads, prior), found in ratios.items():
+        within = float(np.mean(np.array(found) <= RATIO_GOAL))
+        table.add_row(array, str(pads), _prior(prior), marked(f"{within:.0%}", within == 1.0), _judged(max(found)))
+    return table
+
+
+def _prior(is_tracking: bool) -> str:
+    return "tracking" if is_tracking else "broad"
+
+
+def _judged(ratio: float) -> str:
+    return marked(f"{ratio:.2f}", ratio <= RATIO_GOAL)
 
 
 def picture(result: dict[str, Any], path: Path) -> None:
@@ -539,25 +568,22 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(row[name] for name in ("array", "gap_m", "pads", "prior", "speed"))
 
 
-@flags.command(
-    "bench haptics",
+@results.benchmark(
+    "haptics",
     (__doc__ or "").partition("\n\n")[0],
+    tables,
     flags.Option("--seed", type=int, default=1),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers here"),
     flags.Option("--picture", type=Path, help="draw error against gap here (PNG, PDF or SVG)"),
     flags.Option("--array", choices=tuple(ARRAYS), multiple=True, help="only this one (default: all)"),
     flags.Option("--method", choices=("both", "solve"), default="both", help="the paper's beside ours"),
     flags.Option("--quick", is_flag=True, help="a few of everything: whether it runs, no numbers to believe"),
     example="penumbra bench haptics --quick --json haptics.json",
 )
-def main(options: flags.Options) -> int:
+def main(options: flags.Options, report: results.Report) -> None:
     result = measure(options.seed, QUICK if options.quick else FULL, tuple(options.array or ARRAYS), options.method == "both")
-    show(result, Console(width=170))
+    report.save(result)
     if options.picture:
         picture(result, options.picture)
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
-    return 0
 
 
 if __name__ == "__main__":

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 from scipy.spatial import cKDTree
@@ -25,6 +22,8 @@ from penumbra.services.search.objects.pose import RigidObject, find_pose
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster
 from penumbra.shared.geometry.rigid import Array, apply, from_rpy, perturb, pose_error, transform
+from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.results import Part, Result, marked
 
 Bool = NDArray[np.bool_]
 
@@ -409,15 +408,19 @@ def measure(name: str, seed: int, count: int) -> list[dict[str, Any]]:
     return rows
 
 
-def show(rows: list[dict[str, Any]], seed: int, console: Console) -> None:
-    title = f"search refine, seed {seed}: share converged (ADD below {CONVERGED:.0%} of the diameter), median errors"
+def tables(result: Result) -> list[Part]:
+    """A row for each object, mask and start, and for all objects."""
+    title = f"search refine, seed {result['seed']}: share converged (ADD below {CONVERGED:.0%} of the diameter), median errors"
     table = Table("object", "mask", "start", "converged", "goal", "< 10 deg", "ADD", "deg", "cm", "NEES", "ms", title=title)
-    keys = ("converged", "goal", "within_10_deg", "add_median", "rotation_deg_median", "position_cm_median", "nees_median")
-    for row in rows:
+    keys = ("within_10_deg", "add_median", "rotation_deg_median", "position_cm_median", "nees_median")
+    for row in result["rows"]:
         start = f"{row['start_deg']:.0f}°, {row['start_cm']:.0f} cm"
+        converged = marked(f"{row['converged']:.2f}", row["converged"] >= row["goal"])
         numbers = [f"{row[key]:.2f}" for key in keys]
-        table.add_row(row["object"], row["mask_iou"], start, *numbers, f"{row['ms_median']:.0f}")
-    console.print(table)
+        table.add_row(
+            row["object"], row["mask_iou"], start, converged, f">= {row['goal']:.2f}", *numbers, f"{row['ms_median']:.0f}"
+        )
+    return [table]
 
 
 def averages(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -432,24 +435,21 @@ def averages(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
-@flags.command(
-    "bench objects",
+@results.benchmark(
+    "objects",
     __doc__ or "",
+    tables,
     flags.Option("--seed", type=int, default=1, help="draws poses, masks and starts"),
     flags.Option("--starts", type=flags.positive, default=30, help="of each object, mask and distance"),
     flags.Option("--objects", choices=MAKERS, takes="many", default=list(MAKERS), metavar="NAME", help=", ".join(MAKERS)),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench objects --json objects.json",
 )
-def main(options: flags.Options) -> int:
+def main(options: flags.Options, report: results.Report) -> None:
     rows: list[dict[str, Any]] = []
     for name in track(options.objects, description="objects", disable=not sys.stderr.isatty()):
         rows += measure(name, options.seed, options.starts)
     rows += averages(rows)
-    show(rows, options.seed, Console())
-    if options.json:
-        options.json.write_text(json.dumps({"seed": options.seed, "rows": rows}, indent=1))
-    return 0
+    report.save({"seed": options.seed, "rows": rows})
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ runs are kept in FOLDER/runs: a run that was killed goes on where it was.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +16,8 @@ from rich.console import Console
 from penumbra.services import flags
 from penumbra.sim.sets import trial
 from penumbra.tests.bench import table1
-from penumbra.tests.bench.lib import campaign, curves, page, pictures, trials
+from penumbra.tests.bench.lib import campaign, curves, page, pictures, results, trials
+from penumbra.tests.bench.table1 import tables
 
 
 def passed(seed: int) -> trials.Played:
@@ -35,12 +35,12 @@ def jobs(seed: int, quick: bool) -> list[campaign.Job]:
     ]
 
 
-def draw(found: dict[str, Any], results: Sequence[trials.Played], others: Sequence[Any], seed: int, folder: Path) -> None:
+def draw(found: dict[str, Any], played: Sequence[trials.Played], others: Sequence[Any], seed: int, folder: Path) -> None:
     """All pictures with their data."""
     passage, haptic, response = others
     shown = {
         "table": found,
-        "vision_by_distance": curves.vision_by_distance(results),
+        "vision_by_distance": curves.vision_by_distance(played),
         "haptic_by_gap": haptic,
         "through_occlusion": curves.through_occlusion(passage),
         "response_by_gap": response,
@@ -48,33 +48,31 @@ def draw(found: dict[str, Any], results: Sequence[trials.Played], others: Sequen
     for name, data in shown.items():
         pictures.DRAWN[name](data, folder / f"{name}.png")
         if data is not found:
-            (folder / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n")
+            results.write(folder / f"{name}.json", data)
     frames = curves.examples(passage)
     pictures.examples(trial.passage(seed), frames, folder / "examples.png")
-    (folder / "examples.json").write_text(json.dumps(frames, indent=1) + "\n")
+    results.write(folder / "examples.json", frames)
 
 
 @flags.command(
     "bench paper",
     (__doc__ or "").partition("\n\n")[0],
     *table1.PARAMS,
-    flags.Option("--out", type=Path, required=True, metavar="FOLDER", help="where pictures, data and index.html go"),
+    flags.Option("--out", type=results.folder, required=True, metavar="FOLDER", help="where pictures, data and index.html go"),
     example="penumbra bench paper --quick --out paper",
 )
 def main(options: flags.Options) -> int:
     started = time.monotonic()
     folder: Path = options.out
-    folder.mkdir(parents=True, exist_ok=True)
+    report = results.Report(folder / "table1.json")
     with campaign.bar(Console(stderr=True)) as progress:
         others = campaign.run(jobs(options.seed, options.quick), folder / "runs", options.jobs, progress, "curves")
-        found, results = table1.measure(options, folder / "runs", progress)
-    draw(found, results, others, options.seed, folder)
-    found["wall_s"] = round(time.monotonic() - started, 1)
-    (folder / "table1.json").write_text(json.dumps(found, indent=1) + "\n")
+        found, played = table1.measure(options, folder / "runs", progress)
+    draw(found, played, others, options.seed, folder)
+    report.save({**found, "wall_s": round(time.monotonic() - started, 1)})
     page.write(found, folder, folder / "index.html", options.quick)
-    console = Console(width=170)
-    table1.show(found, console)
-    console.print(f"{folder / 'index.html'}: the table, the curves and the paper's numbers")
+    report.show(tables)
+    print(f"{folder / 'index.html'}: the table, the curves and the paper's numbers")
     return 0
 
 

@@ -20,15 +20,16 @@ from typing import Any
 
 import numpy as np
 import zenoh
-from rich.console import Console
 from rich.table import Table
 
 from penumbra.services import flags
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.runtime import bus
-from penumbra.tests.bench.lib import buses
-from penumbra.tests.bench.live import Recording, cpu_times, fused_ages_s, percentiles
+from penumbra.tests.bench.lib import buses, results
+from penumbra.tests.bench.lib.accuracy import percentiles
+from penumbra.tests.bench.lib.results import Part, Result, marked
+from penumbra.tests.bench.live import Recording, cpu_times, fused_ages_s
 from penumbra.tests.support.cells import derive
 from penumbra.tests.support.live import Running, free_port, penumbra_up, wait_for
 
@@ -189,60 +190,57 @@ def ratio(found: dict[str, list[float]]) -> float:
     return round(float(np.median(np.divide(found["ours"], found["raw"]))), 3)
 
 
-def show(result: dict[str, Any], console: Console) -> None:
-    table = Table("size", "replicas", "frames", "masks", "vision", "haptic", "fused", "age p95", "CPU", "MB/s", "links MB/s",
-                  title=f"Cells of 1 to {max(result['sizes'])} work places, seed {result['seed']}, on {result['cores']} cores",
-                  caption="size: cameras and targets; messages a second of each topic; age [ms]: from the exposure to the "
-                  "first fused pose that has taken the frame in; CPU [cores]; MB/s: published payloads; links: all that "
-                  "processes exchange with the router")  # fmt: skip
+def tables(result: Result) -> list[Part]:
+    """The cells, and the bus beside its goals."""
+    places = Table("size", "replicas", "frames", "masks", "vision", "haptic", "fused", "age p95", "CPU", "MB/s", "links MB/s",
+                   title=f"Cells of 1 to {max(result['sizes'])} work places, seed {result['seed']}, on {result['cores']} cores",
+                   caption="size: cameras and targets; messages a second of each topic; age: from the exposure to the "
+                   "first fused pose that has taken the frame in, in ms; CPU: in cores; MB/s: published payloads; links: all "
+                   "that processes exchange with the router")  # fmt: skip
     for each in result["rows"]:
         rates = (each[name] for name in ("offered_per_s", "masks_per_s", "frames_per_s", "haptic_per_s", "fused_per_s"))
         megabytes = (sum(each[name].values()) / 1e6 for name in ("published_bytes_per_s", "link_bytes_per_s"))
-        table.add_row(
+        places.add_row(
             str(each["cameras"]), str(each["replicas"]), *(f"{rate:.1f}" for rate in rates),
             "-" if each["age_p95_ms"] is None else f"{each['age_p95_ms']:.0f}", f"{each['cpu']:.2f}",
             *(f"{rate:.1f}" for rate in megabytes),
         )  # fmt: skip
-    console.print(table)
-    table = Table("bytes", "p50 µs", "plain", "ratio", "goal", "1/s", "plain", "ratio", "goal",
+    alone = Table("bytes", "p50 µs", "plain", "ratio", "goal", "1/s", "plain", "ratio", "goal",
                   title="The bus alone, beside Zenoh's plain bytes",
                   caption="between two processes through a router; p50: from before a message is made until it is read; 1/s: "
                   "messages without a loss, as many under way as a reader keeps")  # fmt: skip
     for each in result["bus"]:
         latency, throughput = each["latency_us"], each["per_s"]
-        table.add_row(
-            str(each["bytes"]), f"{latency['ours']:.0f}", f"{latency['raw']:.0f}", f"{each['latency_ratio']:.2f}",
-            f"<= {LATENCY_GOAL}", str(throughput["ours"]), str(throughput["raw"]), f"{each['throughput_ratio']:.2f}",
-            f">= {THROUGHPUT_GOAL}",
+        slower = marked(f"{each['latency_ratio']:.2f}", each["latency_ratio"] <= LATENCY_GOAL)
+        fewer = marked(f"{each['throughput_ratio']:.2f}", each["throughput_ratio"] >= THROUGHPUT_GOAL)
+        alone.add_row(
+            str(each["bytes"]), f"{latency['ours']:.0f}", f"{latency['raw']:.0f}", slower, f"<= {LATENCY_GOAL}",
+            str(throughput["ours"]), str(throughput["raw"]), fewer, f">= {THROUGHPUT_GOAL}",
         )  # fmt: skip
-    console.print(table)
+    return [places, alone]
 
 
-@flags.command(
-    "bench scale",
+@results.benchmark(
+    "scale",
     __doc__ or "",
+    tables,
     flags.Option("--seed", type=int, default=1, help="draws motion, occlusion and appearance"),
     flags.Option("--seconds", type=flags.above_zero, default=10.0, help="length of each cell's measurement"),
     flags.Option("--rate", type=flags.above_zero, metavar="HZ", help="of the cameras (default: as in the table cell)"),
     flags.Option("--quick", is_flag=True, help="small cells, one replica, few rounds: shows that it works"),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench scale --quick --json scale.json",
 )
-def main(options: flags.Options) -> int:
+def main(options: flags.Options, report: results.Report) -> None:
     sizes, replicas = (QUICK_SIZES, QUICK_REPLICAS) if options.quick else (SIZES, REPLICAS)
-    console = Console()
-    result: dict[str, Any] = {
+    bus_alone = bus_rows(QUICK_ROUNDS if options.quick else ROUNDS)
+    report.save({
         "seed": options.seed,
         "seconds": options.seconds,
         "sizes": sizes,
         "cores": len(os.sched_getaffinity(0)),
-    }
-    result["bus"] = bus_rows(QUICK_ROUNDS if options.quick else ROUNDS)
-    result["rows"] = [row(size, number, options.seed, options.seconds, options.rate) for size in sizes for number in replicas]
-    show(result, console)
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
-    return 0
+        "bus": bus_alone,
+        "rows": [row(size, number, options.seed, options.seconds, options.rate) for size in sizes for number in replicas],
+    })  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -9,11 +9,9 @@ it out.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +32,8 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.perception.lookout import Window, corners_of, whole_frame, window_around
 from penumbra.sim.sets import shots
 from penumbra.sim.sets.shots import Shot
-from penumbra.tests.bench.lib import bound
+from penumbra.tests.bench.lib import bound, results
+from penumbra.tests.bench.lib.results import Part, marked
 
 HIDDEN = (0.0, 0.3, 0.6, 0.85)
 VIEWS = ((320, 240, 1.5), (640, 480, 1.5), (1280, 960, 4.5), (1280, 960, 8.0))
@@ -204,10 +203,6 @@ def network_results(
             out[method].append(searched(film[-1], search, mask, T_prior))
         pictures.append(film[-1])
     return out, pictures
-
-
-WIDTH = 230
-"""Characters of a line that the table needs, where it goes to a file."""
 
 
 def row(masks: str, view: tuple[int, int, float], hidden: float, method: str, results: list[Result], bounds: dict[str, float]):
@@ -475,92 +470,106 @@ def measure(seed: int, plan: Plan, parts: tuple[str, ...]) -> dict[str, Any]:
     return result | (judged(seed, plan) if "judged" in parts else {})
 
 
-def show(result: dict[str, Any], console: Console) -> None:
-    """The tables."""
-    if result["rows"]:
-        show_rows(result, console)
-    for name, part in (("network masks", result["nees"]), ("exact masks", result["nees"].get("exact", {}))):
+def tables(result: dict[str, Any]) -> list[Part]:
+    """Errors beside the bound and the paper's search, consistency, and what the search says of itself."""
+    parts: list[Part] = [_errors(result, kind) for kind in dict.fromkeys(row["masks"] for row in result["rows"])]
+    consistent = Table("masks", "hidden", "mean", "95 % band", "median (4.35)", "frames", title="NEES, 5 degrees of freedom")
+    for name, part in (("network", result["nees"]), ("exact", result["nees"].get("exact", {}))):
         for hidden, each in part.get("by_occlusion", {}).items():
             if each["frames"]:
-                verdict = "inside" if each["band"][0] <= each["mean"] <= each["band"][1] else "outside"
-                console.print(
-                    f"NEES of 5 degrees of freedom, {name}, {float(hidden):.0%} hidden: mean {each['mean']} {verdict} "
-                    f"{each['band']}, median {each['median']} (4.35), {each['frames']} frames"
+                low, high = each["band"]
+                mean = marked(f"{each['mean']:.2f}", low <= each["mean"] <= high)
+                consistent.add_row(
+                    name, f"{float(hidden):.0%}", mean, f"{low:.2f} to {high:.2f}", f"{each['median']:.2f}", str(each["frames"])
                 )
+    if consistent.row_count:
+        parts.append(consistent)
     if "lost_auc" in result:
-        console.print(
-            f"wrong poses doubted: area under the ROC curve {result['lost_auc']} (goal {AUC_GOAL}); "
-            f"{result['lost_auc_giving_up_right']} if giving up on a mask of something else is right, whatever the start"
-        )
-        for kind, each in result["lost"].items():
-            console.print(f"  {kind}: " + ", ".join(f"{value} {key}" for key, value in each.items()))
-        console.print(
-            f"more than {GONE:.0%} hidden and tracking: {result['false_tracking']} of {result['hidden_frames']} (goal 0)"
-        )
+        parts += _judged(result)
+    return parts
 
 
-def show_rows(result: dict[str, Any], console: Console) -> None:
-    """The table of all rows."""
-    title = f"seed {result['seed']}, {result['domain']} domain: errors, median (90th percentile)"
+def _errors(result: dict[str, Any], kind: str) -> Table:
+    """The rows of one kind of masks."""
     table = Table(
-        "masks", "picture", "hidden", "method", "position cm", "mean", "bound cm", "with prior", "bound", "lateral cm",
-        "depth cm", "axis deg", "roll deg", "ms", "not tracking", "goal", title=title,
+        "picture", "hidden", "position cm", "mean", "tracked: median / mean", "bound cm", "with prior / bound", "paper's method",
+        "lateral cm", "depth cm", "axis deg", "roll deg", "ms / paper's", "not tracking", "goal",
+        title=f"{kind.capitalize()} masks, seed {result['seed']}, {result['domain']} domain: median (90th percentile)",
     )  # fmt: skip
     papers = {_key(row): row for row in result["rows"] if row["method"] == "paper"}
     for row in result["rows"]:
-        position = row["position_cm"]
+        if row["masks"] != kind or row["method"] == "paper":
+            continue
+        position, paper, tracked = row["position_cm"], papers[_key(row)], row["tracked_cm"]
         cells = [f"{row[key]:.2f} ({row['p90'][key]:.2f})" for key in ("lateral_cm", "depth_cm", "axis_deg", "roll_deg")]
         table.add_row(
-            row["masks"], f"{row['width']} x {row['height']}, {row['distance_m']:g} m", f"{row['occlusion']:.0%}", row["method"],
-            f"{position['median']:.2f} ({position['p90']:.2f})", f"{position['mean']:.2f}", f"{row['bound_cm']:.2f}",
-            f"{row['searched_cm']:.2f}", f"{row['bound_prior_cm']:.2f}", *cells,
-            f"{row['ms']:.2f}", f"{row['not_tracking']:.0%}", _goal(row, papers.get(_key(row))),
+            f"{row['width']} x {row['height']}, {row['distance_m']:g} m", f"{row['occlusion']:.0%}",
+            f"{position['median']:.2f} ({position['p90']:.2f})", f"{position['mean']:.2f}",
+            f"{tracked['median']:.2f} / {tracked['mean']:.2f}" if tracked else "-", f"{row['bound_cm']:.2f}",
+            f"{row['searched_cm']:.2f} / {row['bound_prior_cm']:.2f}", f"{paper['position_cm']['median']:.2f}", *cells,
+            f"{row['ms']:.1f} / {paper['ms']:.1f}", f"{row['not_tracking']:.0%}", _goal(row, paper),
         )  # fmt: skip
-    console.print(table)
+    return table
+
+
+def _judged(result: dict[str, Any]) -> list[Part]:
+    """What the search says about itself."""
+    kinds = Table(
+        "frames with", *next(iter(result["lost"].values())), title="Poses that the search calls tracked, and wrong ones"
+    )
+    for kind, each in result["lost"].items():
+        kinds.add_row(kind, *map(str, each.values()))
+    area = result["lost_auc"]
+    told = "-" if area is None else marked(f"{area:.3f}", area >= AUC_GOAL)
+    false = marked(f"{result['false_tracking']} of {result['hidden_frames']}", result["false_tracking"] == 0)
+    return [
+        kinds,
+        f"Wrong poses doubted: area under the ROC curve {told} (goal {AUC_GOAL}); {result['lost_auc_giving_up_right']} if giving "
+        "up on a mask of something else is right, whatever the start.",
+        f"More than {GONE:.0%} hidden and tracking: {false} (goal 0).",
+    ]
 
 
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     return row["masks"], row["width"], row["distance_m"], row["occlusion"]
 
 
-def _goal(row: dict[str, Any], paper: dict[str, Any] | None) -> str:
+def _goal(row: dict[str, Any], paper: dict[str, Any]) -> str:
     """What a row reaches of its goals."""
-    if row["method"] == "paper" or paper is None:
-        return ""
     position = row["position_cm"]
     if row["masks"] == "exact":
-        better, faster = paper["position_cm"]["median"] / max(position["median"], 1e-9), paper["ms"] / row["ms"]
         ratio = position["median"] / row["bound_cm"]
-        return f"{ratio:.2f} of bound (<= {BOUND_GOAL:g}), {better:.0f} x better (5), {faster:.0f} x faster (10)"
+        better, faster = paper["position_cm"]["median"] / max(position["median"], 1e-9), paper["ms"] / row["ms"]
+        return ", ".join([
+            f"{marked(f'{ratio:.2f}', ratio <= BOUND_GOAL)} of bound (<= {BOUND_GOAL:g})",
+            f"{marked(f'{better:.0f}', better >= BETTER_GOAL)} x better ({BETTER_GOAL:g})",
+            f"{marked(f'{faster:.1f}', faster >= FASTER_GOAL)} x faster ({FASTER_GOAL:g})",
+        ])  # fmt: skip
     if (row["width"], row["height"], row["distance_m"]) != NEES_VIEW:
         return ""
     median, mean = GOALS[row["occlusion"]]
-    return f"median <= {median:g}, mean <= {mean:g}"
+    is_met = position["median"] <= median and position["mean"] <= mean
+    return marked(f"median <= {median:g}, mean <= {mean:g}", is_met)
 
 
-@flags.command(
-    "bench search",
+@results.benchmark(
+    "search",
     __doc__ or "",
+    tables,
     flags.Option("--seed", type=int, default=1, help="draws scenes and starts"),
     flags.Option("--frames", type=flags.positive, help=f"scenes of each row (default {FULL.scenes}; at least 200 for the NEES)"),
     flags.Option("--quick", is_flag=True, help="a few scenes of everything, to see that it runs"),
     flags.Option("--domain", choices=("wide", "easy"), default="wide", help="looks of the network's scenes"),
     flags.Option("--parts", choices=("exact", "network", "judged"), takes="many", default=["exact", "network", "judged"]),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench search --quick --json search.json",
 )
-def main(options: flags.Options) -> int:
+def main(options: flags.Options, report: results.Report) -> None:
     plan = replace(QUICK if options.quick else FULL, domain=options.domain)
     if options.frames:
         plan = Plan(options.frames, max(options.frames, 200), options.frames, options.frames, options.domain)
     started = time.monotonic()
     result = measure(options.seed, plan, tuple(options.parts))
-    result["wall_s"] = round(time.monotonic() - started, 1)
-    console = Console()
-    show(result, console if console.is_terminal else Console(width=max(console.width, WIDTH)))
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
-    return 0
+    report.save({**result, "wall_s": round(time.monotonic() - started, 1)})
 
 
 if __name__ == "__main__":

@@ -8,13 +8,11 @@ through the window that the service would choose around the true pose. Both by t
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
@@ -24,6 +22,8 @@ from penumbra.services.segmentation.training import evaluate
 from penumbra.services.segmentation.training.evaluate import WARM_UP, FrameScore
 from penumbra.shared.perception.lookout import Window, corners_of, whole_frame, window_around
 from penumbra.sim.sets import sequences, shots
+from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.results import Part, Result, marked
 
 SEED_BASE = 50_000_000
 """Added to the seed: far from every seed of training, calibration and cards."""
@@ -91,53 +91,64 @@ def recoveries(hidden: list[float], iou: list[float]) -> list[int | None]:
     return found
 
 
-def result(seed: int, scores: list[FrameScore], recovered: list[int | None], ms: dict[str, float]) -> dict[str, Any]:
+def result(seed: int, scores: list[FrameScore], recovered: list[int | None], ms: dict[str, float]) -> Result:
     """What the JSON file holds. recovery_frames: nine of ten full occlusions need no more; ms_per_frame: of the processor."""
     table = []
     for (low, high), part in evaluate.by_hidden(scores).items():
         row = evaluate.summary(part) if part else {}
-        names = {"iou": "iou_mean", "area_bias": "area_bias_median", "contour_mean_px": "contour_mean_px"}
-        names |= {"contour_rms_px": "contour_rms_px"}
+        names = {"iou": "iou_mean", "iou_median": "iou_median", "area_bias": "area_bias_median"}
+        names |= {"contour_mean_px": "contour_mean_px", "contour_rms_px": "contour_rms_px"}
         table.append({"occlusion": [low, high], "frames": len(part), **{name: row.get(key) for name, key in names.items()}})
     known = [n for n in recovered if n is not None]
-    frames = round(float(np.percentile(known, 90)), 1) if known else None
-    return {"seed": seed, "rows": table, "recovery_frames": frames, "ms_per_frame": ms["cpu_ms"]}
+    return {
+        "seed": seed,
+        "rows": table,
+        "recovery_frames": round(float(np.percentile(known, 90)), 1) if known else None,
+        "recoveries": recovered,
+        "ms_per_frame": ms["cpu_ms"],
+        "wall_ms_per_frame": ms["wall_ms"],
+    }
 
 
-def show(
-    found: dict[str, Any], scores: list[FrameScore], recovered: list[int | None], ms: dict[str, float], console: Console
-) -> None:
-    """The result beside the issue's goals."""
-    title = f"forearm with hand, visible pixels, seed {found['seed']}"
+def tables(found: Result) -> list[Part]:
+    """Masks by hidden share, recovery and time, beside their goals."""
+    title = f"Forearm with hand, visible pixels, seed {found['seed']}"
     table = Table("hidden", "frames", "IoU mean (median)", "goal", "area bias", "contour mean px", "contour RMS px", title=title)
-    for row, goal, part in zip(found["rows"], GOALS["iou"], evaluate.by_hidden(scores).values(), strict=True):
-        median = f" ({evaluate.summary(part)['iou_median']:.3f})" if part else ""
-        cells = ["-" if row[key] is None else f"{row[key]:+.3f}" for key in ("area_bias", "contour_mean_px", "contour_rms_px")]
-        iou = "-" if row["iou"] is None else f"{row['iou']:.3f}{median}"
+    for row, goal in zip(found["rows"], GOALS["iou"], strict=True):
+        mean, median = row["iou"], row["iou_median"]
+        iou = "-" if mean is None else f"{marked(f'{mean:.3f}', mean >= goal)} ({median:.3f})"
         low, high = row["occlusion"]
+        limits = ((key, GOALS[key]) for key in ("area_bias", "contour_mean_px", "contour_rms_px"))
+        cells = ["-" if row[key] is None else marked(f"{row[key]:+.3f}", abs(row[key]) <= limit) for key, limit in limits]
         table.add_row(f"{low:.0%} to {high:.0%}", str(row["frames"]), iou, f">= {goal}", *cells)
-    limits = (f"within {GOALS['area_bias']:.0%}", f"within {GOALS['contour_mean_px']}", f"<= {GOALS['contour_rms_px']}")
-    table.add_row("goal", "", "", "", *limits)
-    console.print(table)
-    if known := [n for n in recovered if n is not None]:
-        text = f"{np.median(known):.0f} median, {found['recovery_frames']} nine of ten, {max(known)} worst"
-        text += f"; after {len(recovered) - len(known)} more it cannot be determined"
-        console.print(f"frames until recovered from {len(known)} full occlusions: {text} (goal: {GOALS['recovery']})")
-    times = f"{ms['cpu_ms']} ms of processor time, {ms['wall_ms']} ms by the clock (goal: {GOALS['ms']:.0f})"
-    console.print(f"a frame of {VARIETY.size} x {VARIETY.size} on one thread: {times}")
+    goals = (f"within {GOALS['area_bias']:.0%}", f"within {GOALS['contour_mean_px']}", f"<= {GOALS['contour_rms_px']}")
+    table.add_row("goal", "", "", "", *goals)
+    parts: list[Part] = [table]
+    if known := [n for n in found["recoveries"] if n is not None]:
+        most = marked(f"{found['recovery_frames']}", found["recovery_frames"] <= GOALS["recovery"])
+        parts.append(
+            f"Frames until recovered from {len(known)} full occlusions: {np.median(known):.0f} median, {most} nine of ten (goal "
+            f"{GOALS['recovery']}), {max(known)} worst; of {len(found['recoveries']) - len(known)} more it cannot be told."
+        )
+    ms = marked(f"{found['ms_per_frame']} ms", found["ms_per_frame"] <= GOALS["ms"])
+    parts.append(
+        f"A frame of {VARIETY.size} x {VARIETY.size} on one thread: {ms} of processor time (goal {GOALS['ms']:.0f}), "
+        f"{found['wall_ms_per_frame']} ms by the clock."
+    )
+    return parts
 
 
-@flags.command(
-    "bench segmentation",
+@results.benchmark(
+    "segmentation",
     __doc__ or "",
+    tables,
     flags.Option("--seed", type=int, default=1, help="draws the scenes"),
     flags.Option("--frames", type=flags.positive, default=1650, help="frames of the rows"),
     flags.Option("--films", type=flags.natural, default=6, help="films of 10 s with full occlusions"),
     flags.Option("--weights", type=Path, default=inference.WEIGHTS, help="the network"),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench segmentation --json segmentation.json",
 )
-def main(options: flags.Options) -> int:
+def main(options: flags.Options, report: results.Report) -> None:
     segmenter = inference.load_segmenter(options.weights)
     ms = inference.speed(segmenter, VARIETY.size, VARIETY.size, 200)
     count = -(-options.frames // (VARIETY.frames - WARM_UP))
@@ -146,11 +157,7 @@ def main(options: flags.Options) -> int:
     recovered: list[int | None] = []
     for index in track(range(options.films), "films", transient=True):
         recovered += recoveries(*film_scores(segmenter, list(shots.passing(SEED_BASE + options.seed, index))))
-    found = result(options.seed, scores, recovered, ms)
-    show(found, scores, recovered, ms, Console())
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
-    return 0
+    report.save(result(options.seed, scores, recovered, ms))
 
 
 if __name__ == "__main__":

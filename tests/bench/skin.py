@@ -8,14 +8,11 @@ stand for, at poses and sizes that they were not fitted to. `--seed` draws those
 
 from __future__ import annotations
 
-import json
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from rich.console import Console
 from rich.table import Table
 from scipy.optimize import brentq, least_squares
 
@@ -28,6 +25,8 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.response import Response, networks
 from penumbra.sim.skin.field import Body, PadField, limb, shell
+from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.results import Part, Result, marked
 
 Array = np.ndarray
 
@@ -40,6 +39,8 @@ LINK_FACTOR = {10: 0.49, 15: 0.37}
 """Figures of the published pad: boundary elements and the paper's."""
 CAPSENSE_MS = 100.0
 """CapSense, an open simulator of capacitive sensors by finite elements, needs up to so long for a step of one sensor."""
+MEDIAN_GOAL, P95_GOAL, CORE_GOAL = 0.01, 0.05, 0.1
+"""Of the networks: relative errors, share of a core."""
 OFF_CENTRE_M = 0.02
 LINK_RADIUS_M, LINK_LENGTH_M, LINK_BEHIND_M = 0.07, 0.30, 0.005
 """A robot's link: a grounded cylinder behind the pad's face."""
@@ -167,52 +168,57 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
     }
 
 
-@flags.command(
-    "bench skin",
+def tables(found: Result) -> list[Part]:
+    """Figures beside the real pad's, what different bodies change, and the networks that run live."""
+    figure = Table("figure", "ours", "the real pad", title="The pad near a forearm")
+    figure.add_row("all conductors at 1 V, pF", f"{found['plate_pF']:.3f}", f"{PLATE_PF}")
+    for gap, value in found["centre_fF"].items():
+        figure.add_row(f"change at the centre, {gap} cm, fF", f"{value:.3g}", f"{CENTRE_FF[int(gap)]:.3g}")
+    for name, value in LAW.items():
+        figure.add_row(f"law, {name}", f"{found['law'][name]:.5g}", f"{value:.5g}")
+    figure.add_row("SNR of 1 dB at, cm", f"{found['snr_1db_cm']:.1f}", f"{SNR_1DB_CM:g}")
+    for gap, value in found["lateral_contrast"].items():
+        figure.add_row(f"lateral contrast, {gap} cm", f"{value:.3f}", f"{CONTRAST[int(gap)]}")
+    for gap, value in found["link_factor"].items():
+        figure.add_row(f"with a grounded link, {gap} cm, times", f"{value:.2f}", f"{LINK_FACTOR[int(gap)]}")
+    body = Table("body", "2 cm", "5 cm", "10 cm", title="Change at the electrodes c r l t b, fF (loss of capacitance)")
+    for name, rows in found["bodies_fF"].items():
+        body.add_row(name, *(" ".join(f"{v:.3g}" for v in row) for row in rows.values()))
+    parts: list[Part] = [figure, body]
+    for name, where in (("live", "bare pads (table)"), ("live_hull", "on the robot's links (arm)")):
+        one = found[name]
+        error = Table(
+            *("gap, cm", f"median error, % (goal {MEDIAN_GOAL:.0%})", f"95 % below, % (goal {P95_GOAL:.0%})"),
+            title=f"Networks beside boundary elements: {where}",
+        )
+        for gap, value in one["error_median"].items():
+            p95 = one["error_p95"][gap]
+            error.add_row(
+                gap, marked(f"{100 * value:.2f}", value <= MEDIAN_GOAL), marked(f"{100 * p95:.2f}", p95 <= P95_GOAL)
+            )  # fmt: skip
+        share = marked(f"{100 * one['core_share']:.1f} %", one["core_share"] <= CORE_GOAL)
+        each_us = 1000.0 * one["core_share"] / one["pads"]
+        parts += [
+            error,
+            f"{one['pads']} pads at {one['rate_hz']} Hz: {share} of a core (goal {CORE_GOAL:.0%}), {each_us:.1f} us a pad and "
+            f"step, where CapSense needs up to {1000 * CAPSENSE_MS:.0f} us for a sensor.",
+        ]
+    return parts
+
+
+@results.benchmark(
+    "skin",
     __doc__ or "",
+    tables,
     flags.Option("--seed", type=int, default=1, help="draws the poses of the live comparison"),
     flags.Option("--poses", type=flags.positive, default=160, help="for each gap of the live comparison"),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench skin --json skin.json",
 )
-def main(options: flags.Options) -> int:
+def main(options: flags.Options, report: results.Report) -> None:
     table, arm = cells.load("table"), cells.load("arm")
     found = {"seed": options.seed, **figures(table), "live": live(table, options.seed, options.poses)}
     found["live_hull"] = live(arm, options.seed, options.poses)
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
-    show(found, Console())
-    return 0
-
-
-def show(found: dict[str, Any], console: Console) -> None:
-    table = Table("figure", "ours", "the real pad", title="the pad near a forearm")
-    table.add_row("all conductors at 1 V, pF", f"{found['plate_pF']:.3f}", f"{PLATE_PF}")
-    for gap, value in found["centre_fF"].items():
-        table.add_row(f"change at the centre, {gap} cm, fF", f"{value:.3g}", f"{CENTRE_FF[gap]:.3g}")
-    for name, value in LAW.items():
-        table.add_row(f"law, {name}", f"{found['law'][name]:.5g}", f"{value:.5g}")
-    table.add_row("SNR of 1 dB at, cm", f"{found['snr_1db_cm']:.1f}", f"{SNR_1DB_CM:g}")
-    for gap, value in found["lateral_contrast"].items():
-        table.add_row(f"lateral contrast, {gap} cm", f"{value:.3f}", f"{CONTRAST[gap]}")
-    for gap, value in found["link_factor"].items():
-        table.add_row(f"with a grounded link, {gap} cm, times", f"{value:.2f}", f"{LINK_FACTOR[gap]}")
-    console.print(table)
-    table = Table("body", "2 cm", "5 cm", "10 cm", title="change at c r l t b, fF (loss of capacitance)")
-    for name, rows in found["bodies_fF"].items():
-        table.add_row(name, *(" ".join(f"{v:.3g}" for v in row) for row in rows.values()))
-    console.print(table)
-    for name, where in (("live", "bare pads (table)"), ("live_hull", "on the robot's links (arm)")):
-        one = found[name]
-        table = Table("gap, cm", "median error, %", "95 % below, %", title=f"networks beside boundary elements: {where}")
-        for gap, value in one["error_median"].items():
-            table.add_row(f"{gap}", f"{100 * value:.2f}", f"{100 * one['error_p95'][gap]:.2f}")
-        console.print(table)
-        each_us = 1000.0 * one["core_share"] / one["pads"]
-        console.print(
-            f"{one['pads']} pads at {one['rate_hz']} Hz: {100 * one['core_share']:.1f} % of a core, {each_us:.1f} us a pad"
-        )
-        console.print(f"and step, where CapSense needs up to {1000 * CAPSENSE_MS:.0f} us for a sensor")
+    report.save(found)
 
 
 if __name__ == "__main__":

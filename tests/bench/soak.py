@@ -9,7 +9,6 @@ shows as in a day, one of a message as in `--minutes`; growth is given per hour 
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
@@ -31,6 +30,8 @@ from rich.table import Table
 from penumbra.services import flags
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import topics
+from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.results import Part, Result, marked
 from penumbra.tests.support import injected
 from penumbra.tests.support.live import Running, connect, penumbra_command, penumbra_up, service_of, wait_for
 
@@ -292,7 +293,8 @@ def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
     }
 
 
-def show(result: dict, console: Console) -> None:
+def tables(result: Result) -> list[Part]:
+    """What grew, by service."""
     events = ", ".join(f"{n} x {name}" for name, n in result["events"].items())
     table = Table(
         *("service", "processes", "MB", "growth MB/h\n0", "threads\n+0", "handles\n+0", "/dev/shm mapped\n+0"),
@@ -302,26 +304,22 @@ def show(result: dict, console: Console) -> None:
         grown = "lived too short" if row["mb_per_hour"] is None else f"{row['mb_per_hour']:+.1f}"
         gains = [f"{row[name]:+d}" for name in ("threads", "handles", "mapped")]
         table.add_row(row["service"], str(row["processes"]), f"{row['memory_mb']:.0f}", grown, *gains)
-    console.print(table)
-    console.print("in /dev/shm: {first} MB at first, {last} MB at last".format(**result["shm_mb"]))
+    tracked = marked("tracked" if result["tracking_at_end"] else "not tracked", result["tracking_at_end"])
+    return [table, "At the end: {}; in /dev/shm {last} MB, {first} MB at first.".format(tracked, **result["shm_mb"])]
 
 
-@flags.command(
-    "bench soak",
+@results.benchmark(
+    "soak",
     __doc__ or "",
+    tables,
     flags.Option("--cell", default="table", help="built-in cell or YAML file"),
     flags.Option("--seed", type=int, default=1, help="draws motion and what happens"),
     flags.Option("--minutes", type=flags.above_zero, default=30.0, help="how long (a day at --speed 48)"),
     flags.Option("--speed", type=flags.above_zero, default=48.0, help="events, times as often as on a day"),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench soak --json soak.json",
 )
-def main(options: flags.Options) -> int:
-    result = soak(options.cell, options.seed, options.minutes, options.speed)
-    show(result, Console())
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
-    return 0
+def main(options: flags.Options, report: results.Report) -> None:
+    report.save(soak(options.cell, options.seed, options.minutes, options.speed))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,8 @@ from rich.table import Table
 from penumbra.services import flags
 from penumbra.sim.sets import trial
 from penumbra.sim.sets.trial import SETTINGS, Setting
-from penumbra.tests.bench.lib import campaign, trials
+from penumbra.tests.bench.lib import campaign, results, trials
+from penumbra.tests.bench.lib.results import Part, Result, marked
 from penumbra.tests.bench.lib.trials import CHAINS
 
 REFERENCE = Path(__file__).parents[1] / "references" / "paper_table1.json"
@@ -212,13 +213,14 @@ def _rounded(value: float) -> float:
     return round(float(value), 3)
 
 
-def show(found: dict[str, Any], console: Console) -> None:
+def tables(found: Result) -> list[Part]:
     """The table, ours over the paper's, and the goals."""
+    parts: list[Part] = []
     for reach, key in REACHES.items():
         view = Table(
             "camera", "hidden", *(f"{name}\nours / paper" for name in ("ProcNet", "multimodal", "PoseCNN", "multimodal")),
             "paper's method\nvision / fused", "multimodal\npublished", "no pose\nvision / fused",
-            title=f"{reach} of the skin's range: position error, cm",
+            title=f"{reach.capitalize()} of the skin's range: position error, cm",
         )  # fmt: skip
         for distance, name in DISTANCES.items():
             for occlusion, cell in found[key][name].items():
@@ -228,12 +230,14 @@ def show(found: dict[str, Any], console: Console) -> None:
                     f"{100 * cell['no_pose'][k]:.0f}%" if cell["no_pose"][k] is not None else "-" for k in (0, 1)
                 )
                 view.add_row(distance, occlusion, *cells, faithful, _text(cell["ours"][6]), missing)
-        console.print(view)
-    console.print(found["camera"])
+        parts.append(view)
+    parts.append(f"{found['camera'].capitalize()}.")
     for result in found["goals"].values():
         missed = ", ".join(f"{name} {_text(ratio)}" for name, ratio in result["missed"].items())
         more = f"; over it, as a factor: {missed}" if missed else ""
-        console.print(f"{result['goal']}: {result['met']} of {result['of']} cells{more}")
+        met = marked(f"{result['met']} of {result['of']}", not result["missed"])
+        parts.append(f"{result['goal'][0].upper()}{result['goal'][1:]}: {met} cells{more}.")
+    return parts
 
 
 def _cell(cell: dict[str, Any], k: int) -> str:
@@ -262,24 +266,21 @@ PARAMS = (
 """The flags that `penumbra bench paper` has too."""
 
 
-@flags.command(
-    "bench table1",
+@results.benchmark(
+    "table1",
     (__doc__ or "").partition("\n\n")[0],
+    tables,
     *PARAMS,
     flags.Option("--resume", type=Path, metavar="FOLDER", help="keep finished runs here, and take those that are there"),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench table1 --quick --json table1.json",
 )
-def main(options: flags.Options) -> int:
+def main(options: flags.Options, report: results.Report) -> None:
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as temporary, campaign.bar(Console(stderr=True)) as progress:
         folder = options.resume or Path(temporary)
         found, _ = measure(options, folder, progress)
     found["wall_s"] = round(time.monotonic() - started, 1)
-    show(found, Console(width=170))
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
-    return 0
+    report.save(found)
 
 
 if __name__ == "__main__":

@@ -7,11 +7,9 @@ own poses (errors, false reports of tracking, frames until recovered), and the f
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +25,8 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.sim.sets import shots
 from penumbra.sim.sets.shots import Domain, Shot
+from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.results import Part, Result, marked
 from penumbra.tests.bench.search import GONE, LOST
 from penumbra.tests.support.replay import Replay
 
@@ -170,32 +170,35 @@ def _spread(values: list[float]) -> dict[str, float | int | None]:
     return {"median": round(float(median), 3), "p90": round(float(p90), 3), "max": round(float(max(values)), 3)}
 
 
-def show(result: dict[str, Any], console: Console) -> None:
-    """The table."""
-    table = Table("", *BACKGROUNDS, "goal", title=f"seed {result['seed']}: median / 90th percentile / largest")
+def tables(result: Result) -> list[Part]:
+    """Errors, tracked frames and recoveries on each background."""
+    table = Table("", *BACKGROUNDS, "goal", title=f"Films, seed {result['seed']}: median / 90th percentile / largest")
     rows = result["rows"]
     for key, name in ERRORS.items():
         columns = ("-" if row[key]["median"] is None else "{median} / {p90} / {max}".format(**row[key]) for row in rows)
         table.add_row(name, *columns, "")
     table.add_row("frames tracked, up to 95 % hidden", *(f"{row['tracked']:.1%}" for row in rows), "")
-    recovered = (", ".join("-" if n is None else str(n) for n in row["recovery_frames"]) for row in rows)
+    recovered = (
+        ", ".join(marked("-" if n is None else str(n), n is not None and n <= RECOVERY_GOAL) for n in row["recovery_frames"])
+        for row in rows
+    )
     table.add_row("frames until recovered", *recovered, f"<= {RECOVERY_GOAL}")
-    false = (f"{row['false_tracking']} of {row['hidden_frames']}" for row in rows)
+    false = (marked(f"{row['false_tracking']} of {row['hidden_frames']}", not row["false_tracking"]) for row in rows)
     table.add_row("more than 95 % hidden and tracking", *false, "0")
-    console.print(table)
+    return [table]
 
 
-@flags.command(
-    "bench tracking",
+@results.benchmark(
+    "tracking",
     __doc__ or "",
+    tables,
     flags.Option("--seed", type=int, default=1, help="draws persons, motions, occluders and looks"),
     flags.Option("--films", type=flags.positive, default=4, help="films with each background"),
     flags.Option("--seconds", type=flags.above_zero, default=10.0, help="length of a film"),
     flags.Option("--quick", is_flag=True, help="one film of 4 s each, to see that it runs"),
-    flags.Option("--json", type=Path, metavar="FILE", help="write the numbers to this file"),
     example="penumbra bench tracking --quick --json tracking.json",
 )
-def main(options: flags.Options) -> int:
+def main(options: flags.Options, report: results.Report) -> None:
     count, seconds = (1, 4.0) if options.quick else (options.films, options.seconds)
     started = time.monotonic()
     films: dict[str, list[Film]] = {name: [] for name in BACKGROUNDS}
@@ -203,11 +206,7 @@ def main(options: flags.Options) -> int:
     for name, index in track(jobs, "films", console=Console(stderr=True), transient=True):
         films[name].append(played(shots.passing(options.seed, index, domain=BACKGROUNDS[name], seconds=seconds)))
     rows = [{"background": name, **scored(each)} for name, each in films.items()]
-    result = {"seed": options.seed, "rows": rows, "wall_s": round(time.monotonic() - started, 1)}
-    show(result, Console())
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
-    return 0
+    report.save({"seed": options.seed, "rows": rows, "wall_s": round(time.monotonic() - started, 1)})
 
 
 if __name__ == "__main__":

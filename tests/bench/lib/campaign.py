@@ -23,13 +23,13 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-ROOT = Path(__file__).parents[3]
+from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.results import ROOT, Result
+
 DEPENDS = ("shared", "sim", "services", "tests/support/replay.py", "tests/bench/lib/trials.py")
 """What a trial's result depends on, of the project's files."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Every process computes on one thread: they share the cores."""
-
-Result = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,7 @@ def run(jobs: Sequence[Job], folder: Path, processes: int, progress: Progress, w
     missing = [job for job in jobs if not (home / f"{job.name}.json").is_file()]
     task = progress.add_task(what, total=len(jobs), completed=len(jobs) - len(missing))
     for job, result in _computed(missing, processes):
-        partial = home / f"{job.name}.json.part"
-        partial.write_text(json.dumps(result))
-        partial.replace(home / f"{job.name}.json")
+        results.write(home / f"{job.name}.json", result)
         progress.advance(task)
     return [json.loads((home / f"{job.name}.json").read_text()) for job in jobs]
 

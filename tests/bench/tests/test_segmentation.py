@@ -25,10 +25,10 @@ def test_recovery_is_counted_from_half_free_again_to_the_overlap_of_before():
 def test_the_benchmark_writes_the_agreed_numbers(tmp_path, capsys):
     assert segmentation.main(["--seed", "3", "--frames", "20", "--films", "0", "--json", str(tmp_path / "out.json")]) == 0
     found = json.loads((tmp_path / "out.json").read_text())
-    assert list(found) == ["seed", "rows", "recovery_frames", "ms_per_frame"]
+    assert set(found) >= {"seed", "rows", "recovery_frames", "ms_per_frame", "run"}
     assert [row["occlusion"] for row in found["rows"]] == [[0.0, 0.33], [0.33, 0.66], [0.66, 0.95]]
     keys = {"occlusion", "frames", "iou", "area_bias", "contour_mean_px", "contour_rms_px"}
-    assert all(set(row) == keys for row in found["rows"])
+    assert all(set(row) >= keys for row in found["rows"])
     assert 0 < sum(row["frames"] for row in found["rows"]) <= 22
     assert "0.93" in capsys.readouterr().out  # the goal beside it
 

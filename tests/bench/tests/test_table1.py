@@ -1,6 +1,5 @@
 """The experiment: runs keep to their bands, errors are exact, and a killed benchmark goes on."""
 
-import io
 import json
 
 import numpy as np
@@ -14,6 +13,7 @@ from penumbra.sim.sets import trial
 from penumbra.sim.sets.trial import SETTINGS, Setting
 from penumbra.tests.bench import table1
 from penumbra.tests.bench.lib import campaign, page, pictures, trials
+from penumbra.tests.bench.lib.results import markdown
 
 EYE = (0.0, 0.0, -2.0)
 """A camera that looks along z."""
@@ -173,9 +173,7 @@ def test_the_table_has_the_papers_layout_and_tells_which_goals_are_missed():
     assert all(goal["met"] == 16 and not goal["missed"] for goal in found["goals"].values())
     poor = [each | {"chains": result(errors=(9.0,) * 3, fused=(9.5,) * 3)["chains"]} for each in easy]
     assert all(goal["met"] == 0 for goal in table1.table(poor, 7)["goals"].values())
-    console = Console(width=200, record=True, file=io.StringIO())
-    table1.show(found, console)
-    assert "0.10 [0.10, 0.10] / 1.59" in console.export_text()
+    assert "| 0.10 [0.10, 0.10] / 1.59 |" in markdown(table1.tables(found))
 
 
 @pytest.mark.slow

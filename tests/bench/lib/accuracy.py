@@ -1,0 +1,140 @@
+"""How far a chain's estimates are from the truth, by what is seen and felt: what the live chain and the replay have in common.
+
+Errors are taken at each estimate's own stamp against the truth there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from penumbra.services import flags
+from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import messages, topics
+from penumbra.tests.bench.lib.results import Result, marked
+
+VISIBLE = 0.33
+"""At most this share of the target hidden: visible (the paper's light occlusion)."""
+OCCLUDED, OCCLUDED_S = 0.90, 2.0
+"""More than this share hidden, for at least this long: occluded."""
+
+SENSES = {"vision": topics.VISION, "haptic": topics.HAPTIC, "fused": topics.FUSED}
+GOALS_CM = {
+    ("visible", "in_range"): 2.0,
+    ("visible", "out_of_range"): 2.0,
+    ("occluded", "in_range"): 2.5,
+    ("occluded", "out_of_range"): None,
+}
+"""By situation, what the median position error of the fused pose is to be below."""
+USED_STATES = {"tracking", "in_range", "coasting"}
+
+
+@dataclass
+class TruthTrack:
+    """The truth as arrays over its stamps, and the situation at each of them."""
+
+    stamp_ns: np.ndarray
+    position: np.ndarray
+    axis: np.ndarray
+    hidden: np.ndarray
+    gap: np.ndarray
+
+    @classmethod
+    def of(cls, truths: list[messages.Truth]) -> TruthTrack:
+        truths = sorted(truths, key=lambda truth: truth.stamp_ns)
+        axis = Rotation.from_quat([t.orientation for t in truths]).as_matrix()[:, :, 0]
+        return cls(
+            np.array([t.stamp_ns for t in truths]),
+            np.array([t.position for t in truths]),
+            axis,
+            np.array([t.hidden for t in truths]),
+            np.array([t.gap for t in truths]),
+        )
+
+    def situations(self, reach: float) -> dict[tuple[str, str], np.ndarray]:
+        """(visible|occluded, in_range|out_of_range) to a boolean per stamp."""
+        occluded = long_runs(self.hidden > OCCLUDED, self.stamp_ns, OCCLUDED_S)
+        sight = {"visible": self.hidden <= VISIBLE, "occluded": occluded}
+        skin = {"in_range": self.gap <= reach, "out_of_range": self.gap > reach}
+        return {(a, b): seen & felt for a, seen in sight.items() for b, felt in skin.items()}
+
+    def errors(self, estimates: list[Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For estimates within the track: index of the nearest truth, position error [m], angle between limb axes [rad]."""
+        estimates = [e for e in estimates if self.stamp_ns[0] <= e.stamp_ns <= self.stamp_ns[-1]]
+        if not estimates:
+            return np.zeros(0, int), np.zeros(0), np.zeros(0)
+        stamps = np.array([e.stamp_ns for e in estimates])
+        at = lambda values: np.column_stack([np.interp(stamps, self.stamp_ns, column) for column in values.T])  # noqa: E731
+        position = np.linalg.norm(np.array([e.position for e in estimates]) - at(self.position), axis=1)
+        axis = Rotation.from_quat([e.orientation for e in estimates]).as_matrix()[:, :, 0]
+        truth_axis = at(self.axis)
+        cosine = np.sum(axis * truth_axis, axis=1) / np.linalg.norm(truth_axis, axis=1)
+        nearest = np.searchsorted(self.stamp_ns, stamps).clip(0, len(self.stamp_ns) - 1)
+        return nearest, position, np.arccos(cosine.clip(-1, 1))
+
+
+def long_runs(flags: np.ndarray, stamps_ns: np.ndarray, seconds: float) -> np.ndarray:
+    """`flags`, without the runs of true that last less than `seconds`."""
+    out = np.zeros_like(flags)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        if (stamps_ns[end - 1] - stamps_ns[start]) * 1e-9 >= seconds:
+            out[start:end] = True
+    return out
+
+
+def percentiles(values: np.ndarray, scale: float = 1.0) -> dict[str, float | None]:
+    if len(values) == 0:
+        return {"p50": None, "p95": None}
+    return {"p50": round(float(np.percentile(values, 50)) * scale, 3), "p95": round(float(np.percentile(values, 95)) * scale, 3)}
+
+
+def summary(
+    cell: cells.Cell, options: flags.Options, truths: list[messages.Truth], estimates: dict[str, list[Any]], seconds: float
+) -> Result:
+    """What both benchmarks write: errors of each sense's estimates in each situation, how long these lasted of so many seconds,
+    and the share of the fused states. options: those of the command, with seed and seconds."""
+    truth = TruthTrack.of(truths)
+    situations = truth.situations(max(cell.pad_types[pad.type].range for pad in cell.pads.values()))
+    result: Result = {"cell": cell.name, "seed": options.seed, "seconds": options.seconds}
+    for key in ("error_cm", "error_p95_cm", "axis_deg", "samples"):
+        result[key] = {sight: {skin: {} for skin in ("in_range", "out_of_range")} for sight in ("visible", "occluded")}
+    for sense, found in estimates.items():
+        nearest, position, angle = truth.errors([e for e in found if e.state in USED_STATES])
+        for (sight, skin), chosen in situations.items():
+            inside = chosen[nearest]
+            position_cm = percentiles(position[inside], 100)
+            result["error_cm"][sight][skin][sense] = position_cm["p50"]
+            result["error_p95_cm"][sight][skin][sense] = position_cm["p95"]
+            result["axis_deg"][sight][skin][sense] = percentiles(np.degrees(angle[inside]))["p50"]
+            result["samples"][sight][skin][sense] = int(inside.sum())
+    states = [f.state for f in estimates["fused"]]
+    result["fused_states"] = {
+        state: round(states.count(state) / max(len(states), 1), 4) for state in ("tracking", "coasting", "lost")
+    }
+    result["situation_s"] = {
+        sight: {skin: round(float(situations[sight, skin].mean()) * seconds, 1) for skin in ("in_range", "out_of_range")}
+        for sight in ("visible", "occluded")
+    }
+    return result
+
+
+def table(result: Result) -> Table:
+    """Errors by situation, beside their goals."""
+    title = f"Cell {result['cell']}, seed {result['seed']}: position error cm, median (p95); limb axis deg, median"
+    lost, coasting = (result["fused_states"][state] for state in ("lost", "coasting"))
+    caption = f"Fused poses: {lost:.1%} lost, which do not count, {coasting:.1%} coasting, which do."
+    table = Table("situation", "s", *SENSES, "goal", title=title, caption=caption)
+    for (sight, skin), goal_cm in GOALS_CM.items():
+        columns = []
+        for sense in SENSES:
+            median, p95, axis = (result[key][sight][skin][sense] for key in ("error_cm", "error_p95_cm", "axis_deg"))
+            is_met = median is None or goal_cm is None or sense != "fused" or median <= goal_cm
+            columns.append("-" if median is None else f"{marked(f'{median:.2f}', is_met)} ({p95:.2f}), {axis:.1f}°")
+        named = f"{sight}, {skin.replace('_', ' ')}"
+        table.add_row(named, str(result["situation_s"][sight][skin]), *columns, f"fused <= {goal_cm}" if goal_cm else "")
+    return table
