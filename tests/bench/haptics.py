@@ -464,8 +464,7 @@ def measure(seed: int, plan: Plan, arrays: tuple[str, ...], paper: bool) -> dict
 def tables(result: Result) -> list[Part]:
     """Errors beside their bounds, then limbs that rest and move, and what is taken for one. The JSON has the rows of fewer pads
     and of moving limbs too: here they count as shares."""
-    parts: list[Part] = [_errors(result), _shares(result)]
-    shown = result["arrays"]
+    shown, lines = result["arrays"], list[Part]()
     consistent = Table(
         *("array", "limbs", "of the observer's pose", "95 % band", "of the published one", "moving: observer's", "published"),
         title=f"NEES a degree of freedom, limbs that rest for {REST_S:g} s",
@@ -489,8 +488,8 @@ def tables(result: Result) -> list[Part]:
             moving.add_row(name, band, *(f"{each[axis]:.2f}" for axis in NAMES))
         foreign.add_row(name, *(marked(f"{share:.0%}", share == 0) for share in part["foreign"].values()))
         p95 = marked(f"{part['ms']['p95']} ms", part["ms"]["p95"] <= MS_GOAL)
-        parts.append(f"From sample to pose, {name}: {part['ms']['median']} ms, 95th percentile {p95} (goal {MS_GOAL:g}).")
-    return [*parts, consistent, resting, moving, foreign]
+        lines.append(f"From sample to pose, {name}: {part['ms']['median']} ms, 95th percentile {p95} (goal {MS_GOAL:g}).")
+    return [_errors(result), _shares(result), consistent, resting, moving, foreign, *lines]
 
 
 def _errors(result: Result) -> Table:
@@ -502,7 +501,7 @@ def _errors(result: Result) -> Table:
         title=f"Eight pads, limbs at rest, seed {result['seed']}: RMSE (bound)",
         caption=f"Goal: a ratio to the bound of at most {RATIO_GOAL}. Prior: tracking, 2 cm and 5.7 degrees, or broad.",
     )
-    for row in result["rows"]:
+    for row in sorted(result["rows"], key=lambda row: (row["array"], not row["prior"])):
         if row["pads"] != PADS[0] or row["speed"]:
             continue
         values = [f"{row['rmse_mm'][name]:.2f} ({row['bound_mm'][name]:.2f})" for name in SHOWN]

@@ -59,7 +59,7 @@ GOALS = {
 }
 DRAWS = 2000
 CAMERA = (
-    f"one camera: {trial.SENSOR_PX[0]} x {trial.SENSOR_PX[1]} pixels, focal length {trial.FOCAL_PX:g} px, {trial.RATE_HZ:g} Hz, "
+    f"One camera: {trial.SENSOR_PX[0]} x {trial.SENSOR_PX[1]} pixels, focal length {trial.FOCAL_PX:g} px, {trial.RATE_HZ:g} Hz, "
     "read only around the limb; pixels summed: "
     + ", ".join(f"{name} {n} x {n} (focal length then {trial.FOCAL_PX / n:g} px)" for name, n in trial.BINNING.items() if n > 1)
 )
@@ -231,7 +231,7 @@ def tables(found: Result) -> list[Part]:
                 )
                 view.add_row(distance, occlusion, *cells, faithful, _text(cell["ours"][6]), missing)
         parts.append(view)
-    parts.append(f"{found['camera'].capitalize()}.")
+    parts.append(f"{found['camera']}.")
     for result in found["goals"].values():
         missed = ", ".join(f"{name} {_text(ratio)}" for name, ratio in result["missed"].items())
         more = f"; over it, as a factor: {missed}" if missed else ""

@@ -65,7 +65,7 @@ def write(found: dict[str, Any], folder: Path, path: Path, quick: bool) -> None:
         "<h2>The table</h2><div class='wide'>",
         _table(found),
         "</div>",
-        f"<p class='note'>{escape(found['camera'].capitalize())}; the paper names none. Ours in blue with the 95 % confidence "
+        f"<p class='note'>{escape(found['camera'])}; the paper names none. Ours in blue with the 95 % confidence "
         "interval of a bootstrap over the runs, then the paper's number; green: at most the paper's. Fused poses are those of a "
         "frame's exposure, reported when the camera's pose of it is known; as published: the value published at the "
         "exposure. A sense is scored where it has a pose; the last column says how often it has none.</p>",

@@ -28,7 +28,7 @@ def regions(page: str) -> dict[str, str]:
     found = {match[2]: match[3] for match in REGION.finditer(page)}
     if (marks := len(MARK.findall(page))) != 2 * len(found):
         raise ValueError(
-            "expected each region once, as '<!-- NAME: begin -->', an empty line, a text, an empty line and '<!-- NAME: end -->', got "
+            "expected each region once: '<!-- NAME: begin -->', an empty line, a text, an empty line, '<!-- NAME: end -->'; got "
             f"{len(found)} regions and {marks} marks; complete the others"
         )
     return found
