@@ -67,7 +67,10 @@ def unshown(data: Path = DATA) -> set[str]:
 def main() -> None:
     """Writes all pages."""
     if missing := unshown():
-        raise SystemExit(f"{DATA}: expected results that a page has a region for, got {', '.join(sorted(missing))}; add marks")
+        raise SystemExit(
+            f"{DATA.relative_to(ROOT)}: expected a page with a region for each result, got none for "
+            f"{', '.join(sorted(missing))}; add its marks"
+        )
     for path in sorted(PAGES.glob("*.md")):
         path.write_text(filled(path.read_text()))
 
