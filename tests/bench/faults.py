@@ -300,7 +300,8 @@ def tables(result: Result) -> list[Part]:
         *("gap ms, fusion\nnot struck / struck", "reused", "false tracking\nof poses", "worst cm"),
         title=f"Faults, seed {result['seed']}",
         caption=f"Goals: gap <= {GOAL_GAP_MS:g} ms; back within {GOAL_ALONE_S:g} s of the fault's end, with a replica within "
-        f"{GOAL_REPLICA_S:g} s of its beginning; none reused, none falsely tracking. Gap: the largest of all services.",
+        f"{GOAL_REPLICA_S:g} s of its beginning; none reused, none falsely tracking. Gaps are the largest of all services, "
+        "counts the sums.",
     )
     rows = [Row(**each) for each in result["rows"]]
     for (fault, replicas), found in itertools.groupby(

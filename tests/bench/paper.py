@@ -35,8 +35,10 @@ def jobs(seed: int, quick: bool) -> list[campaign.Job]:
     ]
 
 
-def draw(found: dict[str, Any], played: Sequence[trials.Played], others: Sequence[Any], seed: int, folder: Path) -> None:
-    """All pictures with their data."""
+def draw(
+    found: dict[str, Any], played: Sequence[trials.Played], others: Sequence[Any], run: results.Result, folder: Path
+) -> None:
+    """All pictures with their data. run: what is told of the run."""
     passage, haptic, response = others
     shown = {
         "table": found,
@@ -48,9 +50,9 @@ def draw(found: dict[str, Any], played: Sequence[trials.Played], others: Sequenc
     for name, data in shown.items():
         pictures.DRAWN[name](data, folder / f"{name}.png")
         if data is not found:
-            results.write(folder / f"{name}.json", data)
+            results.write(folder / f"{name}.json", {**data, "run": run})
     frames = curves.examples(passage)
-    pictures.examples(trial.passage(seed), frames, folder / "examples.png")
+    pictures.examples(trial.passage(run["seed"]), frames, folder / "examples.png")
     results.write(folder / "examples.json", frames)
 
 
@@ -68,7 +70,7 @@ def main(options: flags.Options) -> int:
     with campaign.bar(Console(stderr=True)) as progress:
         others = campaign.run(jobs(options.seed, options.quick), folder / "runs", options.jobs, progress, "curves")
         found, played = table1.measure(options, folder / "runs", progress)
-    draw(found, played, others, options.seed, folder)
+    draw(found, played, others, report.run, folder)
     report.save({**found, "wall_s": round(time.monotonic() - started, 1)})
     page.write(found, folder, folder / "index.html", options.quick)
     report.show(tables)
