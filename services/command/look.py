@@ -18,7 +18,7 @@ import zenoh
 from click.shell_completion import CompletionItem
 
 from penumbra.services import flags
-from penumbra.services.launcher import runs
+from penumbra.services.command import runs
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.report import TopicReport

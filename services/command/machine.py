@@ -18,9 +18,9 @@ import psutil
 from click.shell_completion import CompletionItem
 
 from penumbra.services import flags
+from penumbra.services.command import runs
 from penumbra.services.command.look import open_session
-from penumbra.services.launcher import runs
-from penumbra.services.launcher.runs import Run
+from penumbra.services.command.runs import Run
 from penumbra.shared.contract import report, topics
 from penumbra.shared.contract.processes import LAUNCHER
 from penumbra.shared.runtime import bus

@@ -15,7 +15,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from penumbra.services.launcher import runs
+from penumbra.services.command import runs
 from penumbra.services.launcher.forkserver import import_path
 from penumbra.shared.runtime import bus
 

@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.live import Live
 
 from penumbra.services import flags
-from penumbra.services.command import check
-from penumbra.services.launcher import background, display, runs
+from penumbra.services.command import check, runs
+from penumbra.services.launcher import background, display
 from penumbra.services.launcher.fleet import Fleet, Kind
 from penumbra.services.launcher.forkserver import ForkServer
 from penumbra.services.launcher.supervised import ProcessRow, Supervised

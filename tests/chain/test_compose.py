@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -26,13 +27,17 @@ SERVICES = {"router", "emulator", "segmentation", "search", "haptics", "fusion"}
 SECURE = ("-f", "compose.yaml", "-f", "docker/secure.yaml")
 
 
+def docker(*arguments: str, stdin: str | None = None) -> str:
+    return subprocess.run(["docker", *arguments], input=stdin, check=True, capture_output=True, text=True).stdout
+
+
 def compose(*arguments: str) -> str:
-    return subprocess.run(["docker", "compose", *arguments], check=True, capture_output=True, text=True).stdout
+    return docker("compose", *arguments)
 
 
 def containers(service: str) -> list[dict]:
     ids = compose("ps", "-aq", service).split()
-    return json.loads(subprocess.run(["docker", "inspect", *ids], check=True, capture_output=True, text=True).stdout)
+    return json.loads(docker("inspect", *ids))
 
 
 @contextmanager
@@ -86,8 +91,7 @@ def test_no_container_can_write_its_image_or_runs_as_root(running):
 
 def test_only_the_router_is_in_a_network_with_a_way_out(running):
     def has_a_way_out(network: str) -> bool:
-        described = subprocess.run(["docker", "network", "inspect", network], check=True, capture_output=True, text=True).stdout
-        return not json.loads(described)[0]["Internal"]
+        return not json.loads(docker("network", "inspect", network))[0]["Internal"]
 
     for service in SERVICES:
         for container in containers(service):
@@ -126,7 +130,7 @@ def certificates(tmp_path, monkeypatch):
 
 
 def test_with_certificates_the_cell_is_tracked_and_nobody_without_one_sees_it(certificates):
-    """Last, because it starts the containers anew."""
+    """Starts the containers anew, and removes them."""
     secured = bus.Connection(connect=("tls/127.0.0.1:7447",), secure=certificates)
     with up(*SECURE):
         with bus.open_session(secured, threading.Event(), lambda: None, 20.0) as session:
@@ -136,3 +140,40 @@ def test_with_certificates_the_cell_is_tracked_and_nobody_without_one_sees_it(ce
         for service in SERVICES:
             listed = compose(*SECURE, "exec", "-T", service, "ls", "/certs").split()
             assert set(listed) == {"ca.pem", f"{service}.pem", f"{service}-key.pem"}
+
+
+STACK = "penumbra-stack"
+"""Another name than the one of `docker compose`, whose networks a stack of the same name would take."""
+
+
+@pytest.fixture
+def stack():
+    """The cell by `docker stack deploy`, on a swarm of this one node."""
+    if docker("info", "--format", "{{.Swarm.LocalNodeState}}").strip() != "inactive":
+        pytest.skip("this machine is part of a swarm already")
+    docker("swarm", "init", "--advertise-addr", "127.0.0.1")
+    try:
+        compose("build")
+        described = subprocess.run(
+            [sys.executable, "docker/stack.py"], input=compose("config"), check=True, capture_output=True, text=True
+        ).stdout
+        docker("stack", "deploy", "--resolve-image", "never", "--detach=true", "--compose-file", "-", STACK, stdin=described)
+        yield
+        docker("stack", "rm", STACK)
+        wait_for(lambda: STACK not in docker("network", "ls"), 60, "the stack's networks gone")
+    finally:
+        docker("swarm", "leave", "--force")
+
+
+def test_a_swarm_tracks_with_the_same_compose_file(stack):
+    """Last, where no other containers take the cores."""
+
+    def is_tracked() -> bool:
+        for container in docker("ps", "-q", "--filter", f"label=com.docker.swarm.service.name={STACK}_fusion").split():
+            asked = ["docker", "exec", container, "penumbra", "pose", "--json"]
+            answer = subprocess.run(asked, capture_output=True, text=True, timeout=30)
+            if answer.returncode == 0 and json.loads(answer.stdout)["state"] == "tracking":
+                return True
+        return False
+
+    wait_for(is_tracked, 180, "a tracked pose from the stack", 1.0)

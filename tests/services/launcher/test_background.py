@@ -6,8 +6,7 @@ import os
 import psutil
 import pytest
 
-from penumbra.services.command import cli, machine
-from penumbra.services.launcher import runs
+from penumbra.services.command import cli, machine, runs
 from penumbra.shared.contract.processes import PROCESSES
 from penumbra.tests.support.live import free_port, wait_for
 
