@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.contour import MEASURED, Model, normal_equations
+from penumbra.services.search.contour import MEASURED, POINT, Equations, Model, Points, normal_equations
 from penumbra.services.search.evidence import Evidence, Intrinsics, compare
 from penumbra.services.search.mask_fit import Fit, Limits, marginal, with_prior
 from penumbra.shared.geometry import rigid
@@ -136,7 +136,7 @@ def fit_image(
 @dataclass(frozen=True)
 class _Pass:
     """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
-    square of the offsets left [px] and the share of the roll that is believed. points (n, 8) of the contour, and their
+    square of the offsets left [px] and the share of the roll that is believed. points (n,) of the contour, and
     equations: what gives the normal equations of their offsets (n,)."""
 
     T: Array
@@ -146,12 +146,12 @@ class _Pass:
     length: float
     rms: float
     rolls: float
-    points: Array
-    equations: Callable[[Array], tuple[Array, Array, float, float, float, float, float]]
+    points: Points
+    equations: Callable[[Array], Equations]
 
     def waves(self, size: float) -> Array:
         """The right sides (7, k) of `ImageSettings.wave` of this size [px]."""
-        return np.stack([self.equations(size * wave)[1] for wave in _waves(self.points, self.T)], axis=1)
+        return np.stack([self.equations(size * wave).g for wave in _waves(self.points, self.T)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -203,14 +203,15 @@ class _Picture:
         points = found.points
         believed = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
         r, sigma, kind = offsets(points, self.image, evidence.guarded, found.r, found.kind, *believed)
-        weight = points[:, 7] / (settings.correlation * (sigma**2 + settings.edge**2))
+        weight = points["length"] / (settings.correlation * (sigma**2 + settings.edge**2))
 
-        def equations(r: Array) -> tuple[Array, Array, float, float, float, float, float]:
+        def equations(r: Array) -> Equations:
             return normal_equations(points, r, kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False)
 
-        H, g, length, square, _, _, rolls = equations(r - moved[6])
-        rms = math.sqrt(square / length) if length > 0 else math.inf
-        return _Pass(T, moved, H, g, length, rms, rolls, points, equations)
+        found_by = equations(r - moved[6])
+        length = found_by.length
+        rms = math.sqrt(found_by.square / length) if length > 0 else math.inf
+        return _Pass(T, moved, found_by.H, found_by.g, length, rms, found_by.rolls, points, equations)
 
 
 def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:
@@ -244,12 +245,13 @@ def _through(pictures: list[_Picture], T: Array) -> _Pass:
     return found
 
 
-def _waves(points: Array, T: Array) -> list[Array]:
+def _waves(points: Points, T: Array) -> list[Array]:
     """Shapes (n,) that an error of the contour may have: on either side of the limb, straight and bent along it."""
     axis = T[:3, 0]
-    along = (points[:, :3] - T[:3, 3]) @ axis
+    along = (points["position"] - T[:3, 3]) @ axis
     s = 2.0 * (along - along.min(initial=0.0)) / max(float(np.ptp(along)) if len(along) else 0.0, 1e-6) - 1.0
-    across = points[:, 5] * axis[1] - points[:, 6] * axis[0] > 0.0
+    normal = points["normal"]
+    across = normal[:, 0] * axis[1] - normal[:, 1] * axis[0] > 0.0
     return [np.where(across == side, shape, 0.0) for side in (False, True) for shape in (s, 1.5 * s**2 - 0.5)]
 
 
@@ -268,7 +270,7 @@ _MIXED = 3
 
 
 def offsets(
-    points: Array,
+    points: Points,
     image: NDArray[np.uint8],
     guarded: NDArray[np.uint8],
     by_mask: Array,
@@ -288,7 +290,7 @@ def offsets(
     return r, sigma, kind
 
 
-@kernel("f8[n, 8], u1[h, w, 3], u1[h, w], f8[n], u1[n], f8, f8, f8, f8, f8, out f8[n], out f8[n], out u1[n]")
+@kernel("POINT[n], u1[h, w, 3], u1[h, w], f8[n], u1[n], f8, f8, f8, f8, f8, out f8[n], out f8[n], out u1[n]", POINT=POINT)
 def _offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped, temperature, mask_sigma, r, sigma, kind):
     n = len(points)
     colours = np.empty((n, _SAMPLES, 3), np.float32)
@@ -310,10 +312,12 @@ def _offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped
         if first[i] > LINE - NEAREST or last[i] < LINE + NEAREST:
             continue
         side[:] = 0.0
+        here = points[i]
         for j in range(n):
-            du, dv = points[j, 3] - points[i, 3], points[j, 4] - points[i, 4]
+            other = points[j]
+            du, dv = other.pixel[0] - here.pixel[0], other.pixel[1] - here.pixel[1]
             d2 = du * du + dv * dv
-            if d2 < reach2 and points[j, 5] * points[i, 5] + points[j, 6] * points[i, 6] > 0.5:
+            if d2 < reach2 and other.normal[0] * here.normal[0] + other.normal[1] * here.normal[1] > 0.5:
                 w = math.exp(-0.5 * d2 / (pooling * pooling))
                 for a in range(2):
                     for b in range(10):
@@ -367,7 +371,7 @@ def _read(point, image, guarded, colours):
     first, last = LINE + 1, LINE - 1
     for way in (1, -1):
         for t in range(0 if way == 1 else 1, LINE + 1):
-            u, v = point[3] + way * t * point[5], point[4] + way * t * point[6]
+            u, v = point.pixel[0] + way * t * point.normal[0], point.pixel[1] + way * t * point.normal[1]
             x, y = int(math.floor(u)), int(math.floor(v))
             if x < 0 or y < 0 or x >= w - 1 or y >= h - 1 or guarded[int(v + 0.5), int(u + 0.5)] != 0:
                 break

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.contour import Model, normal_equations
+from penumbra.services.search.contour import Equations, Model, Points, normal_equations
 from penumbra.services.search.evidence import Evidence
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
@@ -114,7 +114,7 @@ class _Pass:
 
     T: Array
     moved: Array
-    points: Array
+    points: Points
     r: Array
     kind: NDArray[np.uint8]
     H: Array
@@ -131,17 +131,18 @@ class _Problem:
         evidence = self.evidence
         found = self.model.matched(T, evidence, SPACING_PX, reach)
         r, both, free = found.r - moved[6], found.both, found.free
-        H, g, _, _, counted, cost, _ = self.normal_equations(T, found.points, r, found.kind, huber, True)
+        equations = self.normal_equations(T, found.points, r, found.kind, huber, True)
         # parts of the mask that no contour is near pull at nothing, but must not look cheap; nor may points pay by dropping out
         unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
-        cost = cost * evidence.boundary_px / max(counted, 1.0) + unexplained + float(np.dot(moved, self.regular @ moved))
-        return _Pass(T, moved, found.points, r, found.kind, H, g, cost, (both, evidence.seen_px + free, free))
+        cost = equations.cost * evidence.boundary_px / max(equations.counted, 1.0) + unexplained
+        cost += float(np.dot(moved, self.regular @ moved))
+        return _Pass(T, moved, found.points, r, found.kind, equations.H, equations.g, cost, (both, evidence.seen_px + free, free))
 
     def normal_equations(
-        self, T: Array, points: Array, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
-    ) -> tuple[Array, Array, float, float, float, float, float]:
+        self, T: Array, points: Points, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
+    ) -> Equations:
         noise, k = self.noise, self.evidence.intrinsics
-        weights = points[:, 7] / (noise.correlation * noise.edge**2)
+        weights = points["length"] / (noise.correlation * noise.edge**2)
         return normal_equations(points, r, kind, weights, T[:3, 3], T[:3, 0], k.fx, k.fy, huber, bounded)
 
     def coarse(self, T: Array, moved: Array) -> tuple[Array, Array]:
@@ -214,13 +215,13 @@ def fit(
 
     # the pose is final: only what was measured informs
     moved = here.moved
-    H, g, length, square, _, _, rolls = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False)
-    rms = math.sqrt(square / length) if length > 0 else math.inf
+    measured = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False)
+    length = measured.length
+    rms = math.sqrt(measured.square / length) if length > 0 else math.inf
     misfit = here.cost / independent
     # a mask or a fit worse than expected: believe the residuals
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
-    H, g = H * trust, g * trust
-    T, covariance = marginal(here.T, moved, H, g, regular, rolls, limits)
+    T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, measured.rolls, limits)
     return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
 
 

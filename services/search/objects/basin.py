@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.search import evidence
-from penumbra.services.search.contour import DROPPED, NEAR, Model
+from penumbra.services.search.contour import DROPPED, NEAR, Model, Points
 from penumbra.services.search.evidence import COVERED, FREE, TARGET, Evidence, Intrinsics
 from penumbra.services.search.mask_fit import Noise
 from penumbra.shared.geometry import rigid
@@ -205,19 +205,20 @@ def _moments(mask: Bool) -> Moments:
 
 @dataclass(frozen=True)
 class Contour:
-    """The contour at a pose: points (n, 8) as in `contour.Matched`, offsets r (n,) to the boundary and their kinds (n,)."""
+    """The contour at a pose: points (n,) as in `contour.Matched`, offsets r (n,) to the boundary and their kinds (n,)."""
 
-    points: Array
+    points: Points
     r: Array
     kind: NDArray[np.uint8]
 
     def jacobian(self, T: Array, k: Intrinsics) -> Array:
         """How the contour moves along its normal (n, 7) [px] by a pose error at T [m, rad] and by the mask's dilation [px]."""
-        X, Y, Z, nx, ny = self.points[:, 0], self.points[:, 1], self.points[:, 2], self.points[:, 5], self.points[:, 6]
+        position, normal = self.points["position"], self.points["normal"]
+        (X, Y, Z), (nx, ny) = position.T, normal.T
         J = np.empty((len(X), 7))
         J[:, 0], J[:, 1] = nx * k.fx / Z, ny * k.fy / Z
         J[:, 2] = -(J[:, 0] * X + J[:, 1] * Y) / Z
-        J[:, 3:6] = np.cross(self.points[:, :3] - T[:3, 3], J[:, :3])  # a rotation vector w moves the point by w x (X - origin)
+        J[:, 3:6] = np.cross(position - T[:3, 3], J[:, :3])  # a rotation vector w moves the point by w x (X - origin)
         J[:, 6] = 1.0
         return J
 
@@ -236,7 +237,7 @@ def robust(r: Array, width: float) -> Array:
 def information(found: Contour, at: Level, T: Array, width: float, noise: Noise) -> tuple[Array, Array]:
     """Of the pose error at T: the information (6, 6) and its right side (6,), of points that count less and less beyond `width`
     [px of the image]. The mask's dilation is marginalised (Schur complement)."""
-    weights = found.points[:, 7] * robust(found.r, width / at.scale) * (found.kind != DROPPED)
+    weights = found.points["length"] * robust(found.r, width / at.scale) * (found.kind != DROPPED)
     weights *= at.scale**3 / (noise.edge**2 * noise.correlation)
     J = found.jacobian(T, at.evidence.intrinsics)
     weighted = J * weights[:, None]

@@ -132,7 +132,7 @@ def judged(
         T, covariance = _on_picture(shape, masks, T, covariance, best, noise, picture)
     if prior.cost(T) > ONE_IN_10_000:  # nothing that the start allows explains the mask
         return _lost(T, best.overlap)
-    state = _state(best, contour.points[contour.kind == MEASURED, 7].sum() * at.scale)
+    state = _state(best, contour.points["length"][contour.kind == MEASURED].sum() * at.scale)
     if state == "lost":
         return _lost(T, best.overlap)
     return ObjectEstimate(T, covariance, best.overlap, state)
