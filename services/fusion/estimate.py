@@ -40,7 +40,7 @@ class Refused(ValueError):
 @dataclass(frozen=True)
 class Estimate:
     """The target at one moment. `T` (4, 4); `velocity` (6,): linear [m/s], angular [rad/s]; `covariance` (6, 6) of the pose error
-    (`shared.geometry.rigid`); `state`: tracking, coasting or lost; `sources`: the senses heard so far."""
+    (`shared.geometry.rigid`); `state`: tracking, coasting or lost; `sources`: those that have sent something."""
 
     T: rigid.Array
     velocity: Array
@@ -108,28 +108,28 @@ class Counts:
 
 
 class Log:
-    """Counts per source, and since when each was heard [ns]. names: of the senses."""
+    """Counts per source, and the stamp [ns] of the first measurement of each. names: of the senses."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.counts = {name: Counts() for name in names}
-        self.heard_ns: dict[str, int] = {}
+        self.first_ns: dict[str, int] = {}
 
     def check(self, source: str) -> None:
         """Raises ValueError for a source that is not known."""
         if source not in self.counts:
             raise ValueError(f"source: expected one of {', '.join(self.counts)}, got {source!r}")
 
-    def heard(self, source: str, stamp_ns: int) -> None:
-        """Notes that a sense is there."""
+    def received(self, source: str, stamp_ns: int) -> None:
+        """Notes that a sense has sent something."""
         self.check(source)
-        self.heard_ns.setdefault(source, stamp_ns)
+        self.first_ns.setdefault(source, stamp_ns)
 
-    def took(self, source: str, stamp_ns: int, fate: int) -> None:
+    def count(self, source: str, stamp_ns: int, fate: int) -> None:
         """Counts a measurement by what became of it (which of FATES)."""
         if fate >= FUTURE:
             self.refused(source, FATES[fate])
             return
-        self.heard(source, stamp_ns)
+        self.received(source, stamp_ns)
         if fate != NOTHING:
             counts, name = self.counts[source], FATES[fate]
             setattr(counts, name, getattr(counts, name) + 1)
@@ -150,7 +150,7 @@ class Log:
         if fate:
             self.refused(source, FATES[fate])
             raise refusal(fate, stamp_ns, T, information, now_ns)
-        self.heard(source, stamp_ns)
+        self.received(source, stamp_ns)
         return T, 0.5 * (information + information.T)
 
 

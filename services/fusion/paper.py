@@ -121,7 +121,7 @@ class PaperObserver:
         self._ahead: list[_State] = []  # the state at the newest measurement, and as far ahead as somebody asked
         self._covariance = self._home_covariance
         self._weights: dict[str, float] = {}
-        self.log.heard_ns.clear()
+        self.log.first_ns.clear()
 
     def measure(
         self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None, now_ns: int | None = None
@@ -163,7 +163,7 @@ class PaperObserver:
     def estimate(self, stamp_ns: int) -> Estimate:
         """The pose at a stamp, not before the newest measurement. Disturbs nothing."""
         sources = {}
-        for name, since_ns in self.log.heard_ns.items():
+        for name, since_ns in self.log.first_ns.items():
             newest_ns = self._held[name].stamp_ns if name in self._held else since_ns
             in_use = name in self._held and stamp_ns - newest_ns <= self._hold_ns[name]
             sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), self._weights.get(name, 0.0) if in_use else 0.0)
@@ -179,7 +179,7 @@ class PaperObserver:
 
     @property
     def earliest_ns(self) -> int:
-        """The first stamp at which the pose can be told: that of the newest measurement."""
+        """The first stamp for which the pose is known: that of the newest measurement."""
         return self._newest_ns() if self._held else 0
 
     def R_v(self, hidden: float) -> Array:

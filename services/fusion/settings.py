@@ -1,4 +1,4 @@
-"""Settings of the default observer, whose filter is in `filter.py`, and how they are handed to it."""
+"""Settings of the default observer, and the records that its compiled filter (`filter.py`) reads."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Settings:
     learning : step of all of them per measurement, at most, and per second.
     patience : after refusing everything of all senses for so long [s], start again from the newest measurement.
     source_patience : after refusing one sense for so long [s] while another is believed, doubt the state.
-    witness : a refused measurement teaches nothing while another sense, heard within so long [s], is less surprising.
+    agreement_time : age [s] up to which the last measurement of another sense decides whether a surprising one is an outlier.
     refusals : and at least so many measurements refused, so that two outliers after a pause do not count as persistence.
     unobserved : a direction with a standard deviation beyond this, in UNITS, is taken as not observed.
     horizon : length of the history [s]: vision is 30 to 100 ms late, more when the machine is busy.
@@ -43,7 +43,7 @@ class Settings:
     learning: tuple[float, float] = (0.1, 5.0)
     patience: float = 0.5
     source_patience: float = 1.0
-    witness: float = 0.25
+    agreement_time: float = 0.25
     refusals: int = 5
     unobserved: float = 2.0
     horizon: float = 1.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from penumbra.services.fusion import filter
+from penumbra.services.fusion import history
 from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, Refused
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver
@@ -212,7 +212,7 @@ def test_without_measurements_the_covariance_grows_and_the_state_goes_from_track
 @pytest.mark.parametrize("make", OBSERVERS)
 def test_before_the_first_measurement_the_target_is_lost_at_home(make: type) -> None:
     observer = make(HOME, SPREAD)
-    observer.log.heard("vision", ns(0.0))
+    observer.log.received("vision", ns(0.0))
     estimate = observer.estimate(ns(1.0))
     np.testing.assert_array_equal(estimate.T, HOME)
     np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), np.repeat(SPREAD, 3))
@@ -361,7 +361,7 @@ def test_the_compiled_filter_does_what_its_source_says(monkeypatch: pytest.Monke
 
     fast = played()
     for name in ("clear_all", "measure_all", "estimate_all"):
-        monkeypatch.setattr(filter, name, interpreted(getattr(filter, name)))
+        monkeypatch.setattr(history, name, interpreted(getattr(history, name)))
     slow = played()
     # compiled code joins multiplications and additions: the last digits differ
     np.testing.assert_allclose(fast.T, slow.T, atol=1e-11)
