@@ -26,7 +26,8 @@ ACCEPTED, GATED, LATE, DUPLICATE, NOTHING, FUTURE, POSE_FAULT, INFORMATION_FAULT
 NO_CLOCK = (1 << 63) - 1
 """The latest stamp where nobody looks at a clock."""
 ROUNDING = 1e-6
-"""What a rotation or a symmetric matrix without negative eigenvalues may be off by, relative to its largest entry."""
+"""What a rotation or a symmetric matrix without negative eigenvalues may be off by, relative to its largest entry. Chosen,
+not measured."""
 
 
 class Refused(ValueError):
@@ -68,10 +69,11 @@ class Estimate:
 class Limits:
     """Where tracking ends.
 
-    tracking_age : a measurement older than this [s] is not tracking any more: three camera periods and the delay of vision.
+    tracking_age : age [s] of the newest measurement above which the target is not tracked: three periods of a camera at 20 Hz and
+        the delay of vision.
     tracking_sigma, lost_sigma : standard deviation of the position [m] along its worst direction. A forearm is 8 cm thick: beyond
         that the estimate no longer overlaps it; beyond 15 cm it is no help as a place to look at.
-    lost_age : without a measurement for so long [s], nothing is known about a limb.
+    lost_age : time [s] without a measurement after which nothing is known about a limb. Chosen, not measured.
     """
 
     tracking_age: float = 0.25

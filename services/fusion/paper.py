@@ -39,6 +39,7 @@ from penumbra.shared.contract.messages import FusedPose, Source
 from penumbra.shared.geometry import rigid
 
 STEP_S = 0.01
+"""Longest step [s] of the integration. Chosen: the backward Euler step is stable for any."""
 SENSES = {"vision": slice(0, 6), "haptic": slice(6, 12)}
 """Rows of y, g, z and C, and blocks of R: the paper's two senses. This observer takes no others, whatever the table has."""
 C = np.vstack([np.eye(6), np.eye(6)])
@@ -63,9 +64,10 @@ class PaperSettings:
     omega_n, zeta : low-pass on the pose [rad/s] and its damping (the same section).
     floor : least hidden share: 1.25e-5 of W_v is (1 cm)^2 and (1.4 degrees)^2.
     rate : lambda [1/s] in Q = lambda^2 W_v: one camera period.
-    velocity_time : smoothing of u [s].
+    velocity_time : time constant of the smoothing of u [s]. Chosen, not measured.
     hold : for how long a measurement of each sense is used [s]: its delay and two of its periods.
-    acceleration : by which the published covariance grows with age, density [m^2/s^3] and [rad^2/s^3].
+    acceleration : by which the published covariance grows with age, density [m^2/s^3] and [rad^2/s^3]. Chosen,
+        not measured.
     """
 
     W_v: tuple[float, ...] = (8.0, 8.0, 8.0, 16 * np.pi, 16 * np.pi, 16 * np.pi)

@@ -27,10 +27,10 @@ NAME = "fusion"
 OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
 PERIOD_S = 1.0 / topics.FUSED.rate_hz
 SILENCE_S = 0.025
-"""A replica publishes after the one before it in rank has been silent for so long: a frozen process counts as alive for another
-second."""
+"""A replica publishes after the one before it in rank has been silent for so long [s], five periods: a frozen process counts as
+alive for another second."""
 SET_BACK_S = 0.05
-"""A clock that goes back by more was set, by less it is kept together with others."""
+"""A clock that goes back by more than this [s] was set; by less, it is being synchronised. Chosen, not measured."""
 
 
 FLAGS = (
