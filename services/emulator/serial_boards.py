@@ -44,6 +44,7 @@ IDLE_S = 0.05
 TOLERANCE = 0.01
 """Of the coils' inductance, as a standard deviation: every board has its own resonance."""
 CHUNK = 4096
+"""Largest number of bytes read at once."""
 PATIENCE_S = 30.0
 """Longest start of the boards' process."""
 

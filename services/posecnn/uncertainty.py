@@ -21,6 +21,7 @@ KINDS = ("depth", "lateral", "turn", "tilt", "roll")
 BOUNDS = {"depth": (0.01, 0.5), "lateral": (0.005, 1.0), "turn": (0.01, 1.0), "tilt": (0.02, 1.0), "roll": (0.05, 1.5)}
 """Of the standard deviations: a few hundred pictures say nothing about smaller and larger ones."""
 LENGTH_PX = 100.0
+"""Apparent length [px] to which others are compared: there its logarithm is zero."""
 
 
 @dataclass(frozen=True)

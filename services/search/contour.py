@@ -20,20 +20,20 @@ Array = NDArray[np.float64]
 NEAR = 0.05
 """Edges nearer to the camera than this are left out [m]."""
 BESIDE = 1.5
-"""Contours of two parts that are nearer than this [px] are told apart by nothing."""
+"""Distance [px] below which the contours of two parts cannot be distinguished in a mask."""
 FINE = 2
-"""The silhouette that tells the outer contour from the inner has so many pixels on each of the mask's: fingers far away are as
-wide as one."""
+"""Pixels, per pixel of the mask and direction, of the silhouette that separates the outer contour from the inner: distant fingers
+are as wide as one pixel of the mask."""
 ACROSS = 0.35
-"""Distance [px] on both sides of the contour at which it is looked up."""
+"""Distance [px] on both sides of the contour at which the silhouette is looked up."""
 COLUMN = 8
-"""Width of the columns [px] in which they are looked for, at least BESIDE."""
+"""Width of the columns [px] in which neighbouring points are looked for, at least BESIDE."""
 APART = 0.01
 """Two points of the contour whose depths differ by more than this [m] belong to two parts."""
 SHAPE = 0.006
-"""How well the mesh's cross-section is known [m]."""
+"""Error of the mesh's cross-section [m]: levers shorter than this say nothing about the roll."""
 MOST = 4096
-"""Points of a contour, at most: more than any that fits in an image."""
+"""Maximum number of points of a contour: more than fit in an image."""
 CREASE = 0.8
 """Facets that meet at a larger angle [rad] are a crease of the body, and not a sample of a round surface."""
 
@@ -71,7 +71,7 @@ class Model:
         self.faces = np.ascontiguousarray(mesh.faces, np.int32)
         self.edges = _edges(self.faces)
         self.closed = bool((self.edges[:, 3] >= 0).all())
-        # what a pass writes into: as large for every pose, so that its kernel's arguments are checked once
+        # the output of a pass: as large for every pose, so that its kernel's arguments are checked once
         self._memory = np.empty(MOST, POINT), np.empty(MOST), np.empty(MOST, np.uint8), np.empty(2, np.int64)
 
     def in_camera(self, T: Array) -> Array:
@@ -315,7 +315,7 @@ def _nearest(image, u, v):
 
 
 LEVELS = (0.2, 0.7)
-"""Bounds of the value of a field that is taken for a boundary."""
+"""Bounds of the value of a field that counts as a boundary."""
 DROPPED, MEASURED, BOUNDED = 0, 1, 2
 """What became of a contour point. BOUNDED: on the way to the boundary something covers the view, which only says that the contour
 has to move at least that far."""

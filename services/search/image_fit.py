@@ -34,14 +34,15 @@ OFFSETS = 8
 BLUR = 0.7
 """Width of the edge [px]: a step through this camera is 0.5 - 0.5 tanh(x / BLUR)."""
 NEAREST = 1
-"""The pixel on the contour shows both sides; from this distance on [px] they teach, for a limb darkens towards its contour."""
+"""The pixel on the contour shows both sides; from this distance on [px] the colours of its sides are learned, because a limb
+darkens towards its contour."""
 
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """How a picture's colours are believed. `passes`: at most; `spacing` of contour points [px]; `pooling`: standard deviation of
-    the pooling along the contour [px]; `floor`: least standard deviation of a colour [of 255]; `clipped`: squared Mahalanobis
-    distance that a pixel counts at most; `temperature`: pixels of a line that say the same; `mask`: standard deviation of the
+    """Noise of a picture's colours. `passes`: at most; `spacing` of contour points [px]; `pooling`: standard deviation of
+    the pooling along the contour [px]; `floor`: least standard deviation of a colour [of 255]; `clipped`: largest squared
+    Mahalanobis distance of a pixel; `temperature`: number of a line's pixels that count as one; `mask`: standard deviation of the
     mask's boundary on a line [px]; `huber` [px]; `edge`: standard deviation that an offset has at least [px]; `correlation`:
     length of contour over which offsets err together [px]; `dilation`: of the whole contour [px]; `wave`: of errors that change
     slowly along each side of the limb, as its shading does [px]: with one side hidden they look like another distance."""
@@ -256,9 +257,10 @@ def _waves(points: Points, T: Array) -> list[Array]:
 
 
 TYPICAL = 0.2
-"""Offsets left [px] up to which the covariance is that of the settings; of larger ones it grows with their fourth power."""
+"""Root mean square [px] of the offsets left up to which the covariance is that of the settings; above, it grows with its fourth
+power."""
 SHARP = 0.3
-"""Offsets of the image's edges left [px], each counted up to `ImageSettings.huber`, with which a pose is believed."""
+"""Root mean square [px] of the offsets left, each limited to `ImageSettings.huber`, below which a pose is accepted."""
 MAX_STEP = np.array([0.02, 0.02, 0.05, 0.1, 0.1, 0.1])
 """Largest step of a pass [m, rad]."""
 CONVERGED = 2e-4

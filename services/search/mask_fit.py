@@ -27,7 +27,7 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 SPACING_PX = 3.0
-"""Distance of the sampled contour points: closer ones bring no new information."""
+"""Distance [px] of the sampled contour points: closer ones bring no new information."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class Noise:
     """How a mask's boundary errs, in pixels of the mask.
 
     `edge`: standard deviation along the normal; `correlation`: length along the contour over which errors are one error;
-    `dilation`: standard deviation of the whole mask's being too large or small. Defaults: a trained network's masks.
+    `dilation`: standard deviation of the whole mask's being too large or small. Defaults: a trained network's
+    masks, chosen and not measured.
     """
 
     edge: float = 0.5
@@ -65,15 +66,15 @@ COARSE = (24.0, 5.0, 4)
 FINE = (8.0, 2.0, 8)
 """The same of the passes that end a fit."""
 CONVERGED = 1e-3
-"""Step [m] below which a fit ends that nothing finer follows."""
+"""Step [m] below which a fit ends where no refinement on the image follows."""
 ROUGH = 4e-3
-"""Step [m] below which a fit ends that the image refines: a pixel or two."""
+"""Step [m] below which a fit ends where the image refines it: a pixel or two."""
 MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
 """Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
 DAMPING = (1e-3, 10.0, 1e2)
-"""Marquardt's factor at the start, its change after a pass that gained or lost, and where the search gives up."""
+"""Marquardt's factor at the start, its change after a pass that gained or lost, and the factor at which the passes end."""
 KEPT = 0.05
-"""Share of the prior's information that stays in the measurement: without any, what the contour hardly shows would be
+"""Share of the prior's information that stays in the measurement: without any, directions that the contour hardly shows would be
 extrapolated far beyond where the problem is linear."""
 GOOD = 2.0
 """`Fit.misfit` below which nearly every right fit is."""
@@ -132,7 +133,7 @@ class _Problem:
         found = self.model.matched(T, evidence, SPACING_PX, reach)
         r, both, free = found.r - moved[6], found.both, found.free
         equations = self.normal_equations(T, found.points, r, found.kind, huber, True)
-        # parts of the mask that no contour is near pull at nothing, but must not look cheap; nor may points pay by dropping out
+        # parts of the mask without a contour near by exert no force, but must not lower the cost; nor may points that drop out
         unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
         cost = equations.cost * evidence.boundary_px / max(equations.counted, 1.0) + unexplained
         cost += float(np.dot(moved, self.regular @ moved))
@@ -219,7 +220,7 @@ def fit(
     length = measured.length
     rms = math.sqrt(measured.square / length) if length > 0 else math.inf
     misfit = here.cost / independent
-    # a mask or a fit worse than expected: believe the residuals
+    # a mask or a fit worse than expected: the residuals give the noise
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
     T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, measured.rolls, limits)
     return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
@@ -228,11 +229,11 @@ def fit(
 def marginal(
     T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float, limits: Limits, waves: Array | None = None
 ) -> tuple[Array, Array]:
-    """The pose and covariance (6, 6) that the measurement alone says, from the normal equations of pose error and dilation at T,
+    """The pose and covariance (6, 6) of the measurement alone, from the normal equations of pose error and dilation at T,
     which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out but for KEPT, the dilation marginalised (Schur
     complement).
 
-    `rolls`: share of the information about the roll that is believed, see `normal_equations`; `waves` (7, k): right sides of
+    `rolls`: share of the information about the roll that is used, see `normal_equations`; `waves` (7, k): right sides of
     errors that all of the contour shares, of one standard deviation each.
     """
     gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
@@ -242,7 +243,7 @@ def marginal(
     if waves is not None:
         bent = covariance @ (waves[:6] - np.outer(gain, waves[6]))
         covariance = covariance + bent @ bent.T
-    # the roll that a nearly round section shows is doubted, and with it all that leans on it
+    # the roll that a nearly round section shows is uncertain, and so is all that is correlated with it
     c = covariance[:, 3:] @ T[:3, 0]
     roll = float(T[:3, 0] @ c[3:])
     doubt = min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll)

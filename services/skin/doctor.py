@@ -29,6 +29,7 @@ from penumbra.shared.skin.faults import MENDS, MISFIT, Fault, Look, Watch, likel
 from penumbra.shared.skin.layout import Skin, link_names
 
 PATIENCE_S = 1.0
+"""Longest wait for the router [s]."""
 NEAR_NS = 15_000_000
 """Pose and joints belong to a batch of voltages when their stamps are no farther apart."""
 IN_REACH_V = (0.005, 0.4)

@@ -17,12 +17,13 @@ import zenoh
 from penumbra.shared.runtime.traffic import Traffic
 
 CLOCK_S = 1.0
-"""Over which messages are counted to tell whether a process has another time than all others."""
+"""Period [s] over which messages are counted to find whether a process's clock differs from all others."""
 CLOCK_MESSAGES = 10
+"""Least number of messages refused for their stamps in it. Chosen, not measured."""
 PACE_SHARE = 0.5
-"""Of the newest look in what is known of how late a process comes: three late ones in a row tell."""
+"""Weight of the newest look in the smoothed lateness of a process: three late looks in a row suffice."""
 PACE_LOST = 0.5
-"""A process that loses so large a share of its time is slower than none."""
+"""Share of its time whose loss makes a process withdraw: the next replica is faster. Chosen, not measured."""
 
 
 class Reader(Protocol):

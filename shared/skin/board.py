@@ -21,6 +21,7 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry.rigid import Array
 
 BAUD = 500_000
+"""Rate of the serial line [bit/s]."""
 BYTE_S = 10 / BAUD
 """A byte on the line: eight bits, a start and a stop."""
 CLOCK_HZ = 120e6
@@ -30,14 +31,15 @@ SAMPLE_HZ = 400e3
 ELECTRODE_HZ = 100e3
 """Frequency [Hz] of the excitation after power-on."""
 CHANNELS = 6
-COMMAND_BYTES = 16
-HEAD_BYTES = 16
-"""Of a reply, before its sums."""
+"""Channels of the converter."""
+COMMAND_BYTES, HEAD_BYTES = 16, 16
+"""Length of a command, and of a reply before its sums."""
 SAMPLES_PER_CYCLE = range(2, 10)
 """What a board can do: beyond it the firmware stops."""
 BLOCK = 128
 """Samples that a board takes in one go: the number of cycles grows in steps of about BLOCK / samples_per_cycle."""
 MOST_MEASURES = 65_504
+"""Largest number of cycles in a command that a board answers."""
 FULL_SCALE = 4095
 """The largest value of one sample, 12 bits."""
 UNUSED = 0xFFFF_FFFF

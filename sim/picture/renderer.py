@@ -23,6 +23,7 @@ from penumbra.sim.picture.appearance import CUFF, GLOSS, TEXTURE_FIELDS, Appeara
 from penumbra.sim.picture.distortion import Distortion
 
 SHADOW_PX = 256
+"""Width and height of the picture that the light sees, for shadows."""
 CREASE = math.cos(math.radians(50.0))
 """Faces that meet at a sharper angle than this are shaded as an edge."""
 

@@ -28,6 +28,7 @@ from penumbra.sim.world.person import Person, frame
 
 CELLS = ("table", "arm")
 PERIOD_S = 0.05
+"""Time [s] between frames: that of a camera at 20 Hz."""
 ASTRAY = 0.12
 """Share of sequences whose window lies anywhere in the frame."""
 ARM_PX = (8.0, 120.0)

@@ -61,6 +61,7 @@ IN_BAND = 0.75
 SIZE = 0.12
 """How much longer and thicker than the median man, or less, a person is."""
 SPEED_M_S = (0.15, 0.40)
+"""Bounds of the mean speed of a reach."""
 DIRECTION = np.radians([12.0, 8.0])
 """How far the camera stands, to both sides, from the direction of the built-in one: around the vertical, and up and down."""
 PASSAGE = ((0.0, 0.0), (1.3, 0.2), (2.6, 0.5), (3.9, 0.85), (5.2, 1.0), (6.5, 0.0))
@@ -70,6 +71,7 @@ PASSAGE_S, PASSAGE_WITHIN = 8.0, 0.10
 COARSE_PX = 160
 """Width of the pictures in which hidden shares are counted."""
 TRIES = 400
+"""Runs that are drawn at most until one keeps to its bands."""
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from penumbra.sim.skin.field import PadField, limb
 
 GAPS_M = np.arange(2, 41) * 0.005
 ANGLES_DEG = np.arange(10) * 10.0
+"""Gaps and angles of a scan."""
 PLANE_M = 0.01
 """How far the plane lies above what is scanned."""
 MARGIN_M = (0.06, 0.08)
@@ -31,6 +32,7 @@ OVER_M = 0.03
 ALONG = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """R_limb_pad: the pad above the limb looks down on it, which lies along its y."""
 EMPTY_SAMPLES = 1000
+"""Least number of samples of the scene without a limb."""
 
 
 @dataclass(frozen=True)

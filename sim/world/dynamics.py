@@ -48,6 +48,7 @@ TICK_S = 0.02
 STEPS = 4
 """Steps of Bullet in a tick: 200 Hz."""
 GRAVITY = 9.81
+"""Acceleration of gravity [m/s^2]."""
 KEPT = 15_000
 """Ticks that can be asked for again: five minutes."""
 

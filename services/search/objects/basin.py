@@ -29,24 +29,25 @@ from penumbra.shared.native import kernel
 Bool = NDArray[np.bool_]
 
 COARSE_PX, FINE_PX = 45.0, 200.0
-"""Square root of the mask's area [px] that a picture is made smaller for."""
+"""Square root of the mask's area [px] in the small and in the full picture, which are scaled down to it."""
 TURNS = (14.0, 28.0)
 """Angles [deg] by which the starts are turned."""
 AXES = 16
 """Number of axes about which the starts are turned."""
 SURVIVORS = (14, 5)
-"""Hypotheses that go on after the alignment, and to the full picture."""
+"""Number of hypotheses kept after the alignment, and for the full picture."""
 SAME = (0.01, 0.06)
 """Hypotheses nearer than this [m, rad] are one."""
 NOISE = Noise(edge=2.0, correlation=40.0, dilation=0.7)
-"""How a network's mask of any object errs [px of the image]."""
+"""Errors of a network's mask of any object [px of the image]."""
 FARTHEST_PX = 8.0
-"""A pixel further from the mask's boundary than this [px of the image] counts no more: a missing part is one mistake."""
+"""Largest distance from the mask's boundary [px of the image] that a pixel counts with: a missing part is one mistake."""
 PIECE = 0.2
 """Least share of the mask that a piece of it has, to be taken for the whole object."""
 AROUND = 0.5
-"""Diagonals of the mask around it that are looked at."""
+"""Margin around the mask that is searched, in diagonals of the mask."""
 DAMPING = 0.02
+"""Share added to the diagonal of the normal equations (Marquardt)."""
 STILL = (3e-4, 1.5e-3)
 """A step smaller than this [m, rad] is the last."""
 MAX_STEP = np.array([0.08, 0.08, 0.15, 0.3, 0.3, 0.3])
@@ -289,6 +290,8 @@ def pyramid(state: NDArray[np.uint8], k: Intrinsics) -> Pyramid:
 COARSE_WIDTHS = (16.0, 12.0, 10.0, 8.0, 8.0)
 MORE_WIDTHS = (8.0, 6.0, 6.0, 5.0, 5.0)
 FINE_WIDTHS = (5.0, 4.0, 4.0, 3.0, 3.0, 3.0)
+"""Widths [px of the image] of the successive steps, see `descend`: on the small picture for all hypotheses, there for the best, and
+on the full picture."""
 
 
 def search(shape: Shape, masks: Pyramid, prior: Prior, noise: Noise = NOISE) -> list[tuple[Score, Array]]:

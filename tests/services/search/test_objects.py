@@ -163,7 +163,7 @@ def test_a_damaged_mesh_gives_the_pose_of_the_whole_one(kind):
 def test_a_mended_mesh_looks_like_the_one_it_was_made_of():
     for name in ("mug", "scissors", "drill"):
         one = thing(name, 3)
-        mended = meshes.mend(mesh_of(one), 4000)
+        mended = meshes.repaired(mesh_of(one), 4000)
         assert len(mended.faces) < 6000
         T = bench.drawn_pose(np.random.default_rng(1))
         other = Thing(name, trimesh.Trimesh(mended.vertices, mended.faces, process=False), one.symmetries)
