@@ -38,8 +38,8 @@ class Trainer(ABC, Generic[N, D]):
     """A network `net` that learns from data, its optimiser, and the running average of its weights, which is exported.
 
     SETTINGS: the dataclass of the network's settings. step, minutes (of the processor's time): so many so far, over all runs.
-    warm_from: the step at which the optimiser knew nothing. started_from: what the card of the weights told that it began with,
-    None where it began with nothing.
+    warm_from: the step at which the optimiser was empty. started_from: the entry in the card of the weights that it began with,
+    None where it began with none.
     """
 
     SETTINGS: ClassVar[type]
@@ -143,7 +143,7 @@ def begun(options: SimpleNamespace) -> Path | None:
 
 def complete(trainer: Trainer[Any, D], data: D, options: SimpleNamespace) -> bool:
     """Trains as the flags of `services.flags.training` ask, on one thread, and closes the data. False where Ctrl-C or SIGTERM
-    ended it: the checkpoint is written then, and the user told how to go on."""
+    ended it: the checkpoint is written then, and the log says how to go on."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     torch.set_num_threads(1)
     try:

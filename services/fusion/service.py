@@ -138,7 +138,7 @@ class Fusion:
         for sense in senses:
             node.subscribe(sense.topic, partial(self.on_measurement, sense), target=target)
         node.answer(topics.current_pose(node.cell.name, target), self.answer)
-        node.tell(target, self.describe)
+        node.add_report(target, self.describe)
 
     def on_measurement(self, sense: Sense, message: Any, names: dict[str, str]) -> None:
         """Hands a measurement on to the observer, or the fact that a sense runs but observes nothing; what is refused is

@@ -26,7 +26,7 @@ LENGTH_PX = 100.0
 
 @dataclass(frozen=True)
 class Signs:
-    """What tells how good an estimate is. hidden: share of the target that is not seen; length_px: its apparent length in the
+    """Signs of how good an estimate is. hidden: share of the target that is not seen; length_px: its apparent length in the
     image; spread [rad]: of the votes for its centre; share: of its pixels that agree with the vote."""
 
     hidden: float

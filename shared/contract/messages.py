@@ -24,7 +24,7 @@ from msgspec.structs import force_setattr
 
 VERSION = 1
 """Of the wire format: it counts up with every change of a message's fields or of their meaning. Every version keeps it under
-`version` in a map, so that also a reader of another one can tell what it got."""
+`version` in a map, so that a reader of another one recognises it."""
 MAX_FUTURE_S = 0.5
 """A stamp further ahead of the reader's clock than this is refused: clocks of one cell are kept closer than that."""
 MAX_PAST_S = 5.0
@@ -237,7 +237,7 @@ FusedState = Literal["tracking", "coasting", "lost"]
 
 class FusedPose(Message, frozen=True, kw_only=True):
     """The one pose. `velocity`: linear [m/s] and angular [rad/s] along the frame's axes. `sources` by name (of the
-    table of senses); a sense that was never heard is absent."""
+    table of senses); a sense that has sent nothing is absent."""
 
     target: Name
     frame: Name

@@ -1,6 +1,6 @@
 """Structured logs: a sentence and its fields, as key=value text or as one JSON object a line, on standard error.
 
-A line of JSON is `{time, level, service, instance, message, fields}`, and `trace` where an exception is told.
+A line of JSON is `{time, level, service, instance, message, fields}`, and `trace` where an exception is logged.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class Inbox:
     """What a reader is declared with.
 
     expression: the key expression that is subscribed to. depth: samples that are kept while nobody takes them. streams: every
-    concrete key that the cell knows; a sample on any other key is refused and counted in `strangers`, so that nobody can grow the
+    concrete key that the cell knows; a sample on any other key is refused and counted in `unknown`, so that nobody can grow the
     table. now_ns: the clock that stamps are compared with. refused: called with the first bad message of each kind on a key.
     failed: called with every exception of a handler. from_others: leaves out what this session publishes itself.
     """
@@ -60,7 +60,7 @@ class Inbox:
     refused: Callable[[str, BadMessage], None]
     failed: Callable[[str, Exception], None]
     from_others: bool = False
-    strangers: Traffic = field(default_factory=lambda: Traffic(math.inf))
+    unknown: Traffic = field(default_factory=lambda: Traffic(math.inf))
 
     def subscribe(self, session: zenoh.Session) -> zenoh.Subscriber[Any]:
         """A subscription with a ring: a Python callback or the default channel would let one slow reader hold up every other
@@ -91,7 +91,7 @@ class Inbox:
     def refuse(self, key: str, error: BadMessage) -> None:
         """Counts a bad message; the first of its kind on its key is reported."""
         stream = self.streams.get(key)
-        bad = (self.strangers if stream is None else stream.traffic).bad
+        bad = (self.unknown if stream is None else stream.traffic).bad
         bad[error.kind] = bad.get(error.kind, 0) + 1
         if bad[error.kind] == 1:
             self.refused(key, error)
@@ -129,11 +129,11 @@ class Reader:
             stream, publisher, payload = inbox.admit(sample, now_s)
             message = self._decode(payload)
             check_stamp(inbox.topic.message, message.stamp_ns, now_ns, self._oldest_s)
-            stream.guard.believe(publisher, message.stamp_ns, now_s, getattr(message, "camera", ""))
+            stream.guard.accept(publisher, message.stamp_ns, now_s, getattr(message, "camera", ""))
         except BadMessage as error:
             inbox.refuse(inbox.key_of(sample), error)
             return
-        stream.traffic.took(message.stamp_ns, now_ns)
+        stream.traffic.record(message.stamp_ns, now_ns)
         try:
             with self._turn:
                 self._handler(message, stream.names_with(publisher))
@@ -205,11 +205,11 @@ class Latest(Generic[M]):
             stream, publisher, payload = inbox.admit(sample, now_s)
             found = head(kind, payload)
             check_stamp(kind, found.stamp_ns, now_ns, inbox.topic.oldest_s)
-            stream.guard.believe(publisher, found.stamp_ns, now_s, found.camera)
+            stream.guard.accept(publisher, found.stamp_ns, now_s, found.camera)
         except BadMessage as error:
             inbox.refuse(inbox.key_of(sample), error)
             return
-        stream.traffic.took(found.stamp_ns, None)
+        stream.traffic.record(found.stamp_ns, None)
         self._newest[inbox.key_of(sample)].payload = payload
         self.count += 1
 

@@ -1,6 +1,6 @@
-"""The replicas of a service: which of them live, which stream is whose, and who is not fit to have any.
+"""The replicas of a service: which of them live, which of them owns a stream, and which are not fit to own any.
 
-Each replica that can do its part holds a liveliness token; whoever sees the same tokens finds the same owner for a stream.
+Each replica that can work holds a liveliness token; all that see the same tokens find the same owner for a stream.
 """
 
 from __future__ import annotations
@@ -79,12 +79,12 @@ class Replicas:
         return len(self._living)
 
     def wait(self) -> None:
-        """It owns nothing before it knows whether others do."""
+        """Owns nothing until the other replicas are known."""
         with self._lock:
             self._living, self._ranks = frozenset(), {}
 
     def watch(self, session: zenoh.Session) -> None:
-        """Follows who comes and goes, until the session is closed."""
+        """Follows the liveliness tokens until the session is closed."""
         expression = f"{self._key.rpartition('/')[0]}/*"
         tokens = session.liveliness().declare_subscriber(expression, zenoh.handlers.FifoChannel(256), history=True)
         living: set[str] = set()
@@ -100,7 +100,7 @@ class Replicas:
                 return
 
     def join(self, session: zenoh.Session) -> None:
-        """The last step of coming alive: from now on it has its part."""
+        """Declares the liveliness token: from now on this replica owns streams."""
         with self._lock:
             if self._token is None:
                 self._token = session.liveliness().declare_token(self._key)
@@ -121,7 +121,7 @@ class Replicas:
             share.follow(any(map(self.owns, share.streams)))
 
     def leave(self) -> list[Reader]:
-        """Takes nothing over any more, whoever goes; what reads its streams now."""
+        """Takes over no more streams; returns the readers of those that it owns."""
         with self._lock:
             shares, self._shares = self._shares, []
             return [share.reader for share in shares if share.reader is not None]
@@ -143,7 +143,7 @@ class Replicas:
         return rank
 
     def _count(self) -> None:
-        """This one counts as soon as the others know of it, or where there are none."""
+        """This replica counts as soon as the others know of it, or where there are none."""
         self._ranks = {}
         self._living = self.others if self._token is None and self.others else self.others | {self._instance}
         self._ranks = {}  # again: another thread may have put a rank among the old ones into the first
@@ -152,8 +152,8 @@ class Replicas:
 
 
 class Clock:
-    """Tells by what is refused whether this process has another time than those that it hears. fault: what is wrong, empty where
-    nothing is."""
+    """Detects, by the messages that are refused, a clock that differs from those of all publishers. fault: in words, empty where
+    there is none."""
 
     def __init__(self) -> None:
         self._since_s = -math.inf
@@ -173,8 +173,8 @@ class Clock:
 
 
 class Pace:
-    """Tells by how late this process comes to look that it does not get its time: it is stopped again and again, or the machine
-    is overloaded, where fewer replicas do more. One long stop tells nothing: it is over."""
+    """Detects, by how late a periodic look of this process is, that it does not get its time: it is stopped again and again, or
+    the machine is overloaded, where fewer replicas do more. One long stop does not count: it is over."""
 
     def __init__(self) -> None:
         self._lost = 0.0

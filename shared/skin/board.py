@@ -3,7 +3,7 @@
 A board excites its pad's ring with a sine of `electrode_hz`, takes `samples_per_cycle` samples of each of its six channels in
 every cycle, and adds up each of these samples over many cycles. The amplitude of a channel is the first Fourier component of
 the mean cycle. There is no header, no checksum and no sequence number: a reply's size and what is possible in it are all there
-is to tell whether it is whole. Only bytes and arrays here: `services/skin` has the serial port, `sim.skin.board` the emulated
+is to find whether it is whole. Only bytes and arrays here: `services/skin` has the serial port, `sim.skin.board` the emulated
 board.
 """
 

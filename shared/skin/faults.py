@@ -1,4 +1,4 @@
-"""Whether a pad's electrodes can be believed, told from their voltages; and what a pad whose voltages do not fit is likely to be.
+"""Whether a pad's electrodes work, by their voltages; and the likely reason where a pad's voltages do not fit.
 
 `Watch` sees one pad alone. What it cannot see there (a pad turned on its mount, a calibration from another pad) `likely` finds by
 comparing what the pad reads with what the field model says for a pose that the other pads and cameras know.
@@ -63,7 +63,7 @@ MENDS: dict[Kind, str] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """Why an electrode is not to be believed; `text` says what was expected and what came."""
+    """Why an electrode is not used; `text` says what was expected and what came."""
 
     kind: Kind
     text: str
@@ -83,7 +83,8 @@ class Look:
 
 class Watch:
     """Finds faults of one pad's electrodes as its samples come; `pad` is its place in `skin`. False alarms with white noise: see
-    the thresholds. Saturation and death are told within BLOCK samples, the others after a look, a drift after LASTS of them."""
+    the thresholds. Saturated and dead ones are reported within BLOCK samples, the others after a look, a drift after LASTS
+    looks."""
 
     def __init__(self, skin: Skin, pad: int):
         own = skin.of(pad)

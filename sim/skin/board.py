@@ -3,7 +3,7 @@
 Behind the bytes are two electrodes on six channels: a sine around half of the converter's reference, its amplitude a function of
 time, through the resonance of the excitation's coil and capacitors, with the noise of the pad and a converter of 12 bits. The
 firmware's quirks are part of it: numbers of cycles in steps, requests that are overtaken or never answered, phases that slip,
-a stop above nine samples a cycle. It has no clock of its own: whoever feeds it tells the time.
+a stop above nine samples a cycle. It has no clock of its own: its caller gives the time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from penumbra.shared.skin.board import Command, Kind
 OVERHEAD_S = 0.48e-3
 """What the firmware takes for a request beside cycles and line: it makes 231 replies a second at 128 cycles, 298 at 32."""
 SAMPLE_S = 1e-3
-"""The time of which a pad's noise is told: 100 cycles at 100 kHz."""
+"""Duration [s] of the sample that a pad's noise is given for: 100 cycles at 100 kHz."""
 CONVERTER_NOISE = 1.0
 """Standard deviation of a channel's own noise in a sample [steps]; the rest of a pad's noise is its electrode's, on all of its
 channels alike."""

@@ -30,7 +30,7 @@ class Placed:
 
 
 class Actor:
-    """A target in motion. The cell's `sim` tells where its first target moves and where that person's shoulder is; everybody
+    """A target in motion. The cell's `sim` says where its first target moves and where that person's shoulder is; everybody
     else does the same as far from it as the homes are apart. near: the pads that it may come near.
 
     Raises CellError where the region cannot be moved in.

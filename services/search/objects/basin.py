@@ -290,8 +290,8 @@ def pyramid(state: NDArray[np.uint8], k: Intrinsics) -> Pyramid:
 COARSE_WIDTHS = (16.0, 12.0, 10.0, 8.0, 8.0)
 MORE_WIDTHS = (8.0, 6.0, 6.0, 5.0, 5.0)
 FINE_WIDTHS = (5.0, 4.0, 4.0, 3.0, 3.0, 3.0)
-"""Widths [px of the image] of the successive steps, see `descend`: on the small picture for all hypotheses, there for the best, and
-on the full picture."""
+"""Widths [px of the image] of the successive steps, see `descend`: on the small picture for all hypotheses, there for the best,
+and on the full picture."""
 
 
 def search(shape: Shape, masks: Pyramid, prior: Prior, noise: Noise = NOISE) -> list[tuple[Score, Array]]:

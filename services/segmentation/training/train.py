@@ -275,7 +275,7 @@ class Trainer(training.Trainer[PredNet, Data]):
 
     @classmethod
     def begin(cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None) -> Trainer:
-        """A trainer that starts from weights with a card, grown to more channels where these are given; the card it writes tells
+        """A trainer that starts from weights with a card, grown to more channels where these are given; the card it writes says
         of them. Raises ValueError where they are fewer."""
         net, card = prednet.load(path)
         if channels is not None:

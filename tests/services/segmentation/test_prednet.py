@@ -426,7 +426,7 @@ def test_a_replica_that_waits_has_compiled_for_the_window_of_now():
     poses = [nodes.pose(stamp_ns, x=0.2) for stamp_ns in range(1_000_000_000, 2_000_000_000, 100_000_000)]
     replay.run((topics.FUSED, {"target": "forearm"}, pose) for pose in poses)
     lookout = Lookout(cell, "front")
-    lookout.hear(poses[-1])
+    lookout.add(poses[-1])
     wait_for(lambda: segmenter.is_prepared(lookout.look(poses[-1].stamp_ns)), 60, "the network compiled ahead")
     assert node.is_warm()
 

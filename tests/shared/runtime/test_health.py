@@ -81,8 +81,8 @@ def test_a_process_with_nothing_to_say_is_ok_and_one_off_the_bus_is_down():
 def test_every_reason_names_what_is_missing_and_since_when():
     never, old, fresh = (Traffic(0.3) for _ in range(3))
     now_ns = 10**12
-    old.took(now_ns - 3_210_000_000, now_ns)
-    fresh.took(now_ns, now_ns)
+    old.record(now_ns - 3_210_000_000, now_ns)
+    fresh.record(now_ns, now_ns)
     received = {f"penumbra/table/skin/{pad}/voltages": traffic for pad, traffic in zip("abc", (never, old, fresh), strict=True)}
     grown = {("penumbra/table/skin/c/voltages", "past"): 2, ("", "ValueError at x.py:3"): 1}
     assert health.judge("", received, grown, ["fusion: waiting"], now_ns) == (
@@ -103,7 +103,7 @@ def test_missing_inputs_of_one_kind_are_one_reason():
     pads["penumbra/arm/skin/*/voltages"] = Traffic(math.inf)  # counts what is on no pad of the cell
     assert health.judge("", pads, {}, [], now_ns) == ("degraded", ["nothing received on skin/*/voltages (8) yet"])
     for k, traffic in enumerate(list(pads.values())[:8]):
-        traffic.took(now_ns - (k + 1) * 100_000_000, now_ns)
+        traffic.record(now_ns - (k + 1) * 100_000_000, now_ns)
     fused = {"penumbra/arm/target/forearm/pose/fused": Traffic(0.1)}
     expected = ["no skin/*/voltages (7 of 8) for 0.8 s", "nothing received on target/forearm/pose/fused yet"]
     assert health.judge("", pads | fused, {}, [], now_ns)[1] == expected
@@ -137,7 +137,7 @@ def test_an_input_is_waited_for_while_its_publisher_starts_and_missing_when_it_s
         return waiting.why(traffic)
 
     assert why(1.0) == "haptics is not there yet"
-    assert why(progress.NOBODY_S + 1.0) == "", "nobody runs it"
+    assert why(progress.ABSENT_S + 1.0) == "", "nobody runs it"
     answers["haptics"] = [Report("haptics", "a", "starting", progress="compiling 12 of 40")]
     assert why(20.0) == "haptics is compiling 12 of 40"
     answers["haptics"] = None
