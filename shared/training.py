@@ -1,4 +1,4 @@
-"""How networks are trained: a trainer with checkpoints, the loop of so many steps, or minutes over all runs.
+"""How networks are trained: a trainer with checkpoints, the loop over steps or minutes of all runs.
 
 A training may last days, in the background of other work: time counts as the processor's, so that a process that is stopped
 (SIGSTOP) or waits loses nothing, checkpoints are replaced whole, and beside the exact checkpoint a compact one can be written,
@@ -173,7 +173,7 @@ def run(
     compact: Path | None = None,
     save_every_s: float = 120.0,
 ) -> dict[str, float]:
-    """Train up to so many steps, or minutes (over all runs); shows a progress bar, or, where nobody looks, prints a line with
+    """Train up to so many steps, or minutes (over all runs); shows a progress bar, or, without a terminal, prints a line with
     every checkpoint. Returns the loss's parts, smoothed."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     total = steps if steps is not None else int(minutes * 60)

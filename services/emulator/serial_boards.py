@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 IDLE_S = 0.05
 """How long the boards wait for bytes before they look whether they are to end."""
 TOLERANCE = 0.01
-"""Of the coils' inductance, as a standard deviation: every board has its own resonance."""
+"""Relative standard deviation of the coils' inductance: every board has its own resonance."""
 CHUNK = 4096
 """Largest number of bytes read at once."""
 PATIENCE_S = 30.0

@@ -131,8 +131,8 @@ def _front(V, faces, closed, out):
 def _lean(V, edge, N, X, Y, Z):
     """How far behind (X, Y, Z) of a silhouette edge, along the line of sight, the round surface is seen edge-on [m].
 
-    A facet's edge turns with the body, the contour of a round limb does not: without this, eighteen flat sides pretend that
-    the whole forearm shows its roll. Between two facets the normal turns evenly; a crease of the body itself stays where it is.
+    A facet's edge turns with the body, the contour of a round limb does not: without this, the roll would be measured on the
+    eighteen flat sides of the mesh. Between two facets the normal turns evenly; a crease of the body itself stays where it is.
     """
     i, j, f, g = edge[0], edge[1], edge[2], edge[3]
     turn = math.acos(min(1.0, max(-1.0, N[f, 0] * N[g, 0] + N[f, 1] * N[g, 1] + N[f, 2] * N[g, 2])))

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 LINE = 5
 """Reach of the line on both sides of the contour [px], read at every pixel's distance."""
 OFFSETS = 8
-"""Offsets of the edge on the line: so many half pixels on both sides."""
+"""Largest offset of the edge on the line, to both sides [half pixels]."""
 BLUR = 0.7
 """Width of the edge [px]: a step through this camera is 0.5 - 0.5 tanh(x / BLUR)."""
 NEAREST = 1
@@ -137,7 +137,7 @@ def fit_image(
 @dataclass(frozen=True)
 class _Pass:
     """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
-    square of the offsets left [px] and the share of the roll that is believed. points (n,) of the contour, and
+    square of the offsets left [px] and the share of the roll that is used. points (n,) of the contour, and
     equations: what gives the normal equations of their offsets (n,)."""
 
     T: Array
@@ -202,8 +202,8 @@ class _Picture:
         evidence, settings, k = self.evidence, self.settings, self.evidence.intrinsics
         found = self.model.matched(T, evidence, settings.spacing, LINE)
         points = found.points
-        believed = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
-        r, sigma, kind = offsets(points, self.image, evidence.guarded, found.r, found.kind, *believed)
+        noise = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
+        r, sigma, kind = offsets(points, self.image, evidence.guarded, found.r, found.kind, *noise)
         weight = points["length"] / (settings.correlation * (sigma**2 + settings.edge**2))
 
         def equations(r: Array) -> Equations:
@@ -287,8 +287,8 @@ def offsets(
     (DROPPED, MEASURED). The arguments after `mask_kind` are those of `ImageSettings`."""
     n = len(points)
     r, sigma, kind = np.zeros(n), np.ones(n), np.zeros(n, np.uint8)
-    believed = (pooling, floor, clipped, temperature, mask_sigma)
-    _offsets(points, image, guarded, by_mask, mask_kind, *believed, r, sigma, kind)
+    noise = (pooling, floor, clipped, temperature, mask_sigma)
+    _offsets(points, image, guarded, by_mask, mask_kind, *noise, r, sigma, kind)
     return r, sigma, kind
 
 

@@ -105,7 +105,7 @@ class Fit:
 
     @property
     def overlap(self) -> float:
-        """Of the pixels that are scored: those of both the mask's target and the silhouette, as a share of those of either."""
+        """Intersection over union of the mask's target and the silhouette, of the pixels that are scored."""
         return self.both / self.either if self.either else 0.0
 
 

@@ -1,4 +1,4 @@
-"""The numbers of the search of a target that somebody may want to change."""
+"""The settings of the search of a target."""
 
 from __future__ import annotations
 

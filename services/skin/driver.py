@@ -8,7 +8,7 @@ A row of a pad, about 230 times a second:
 4. a board that failed is brought back, and the row is left out
 
 Bringing back, the cheapest first: a damaged reply shows that the board receives commands: wait until the line is quiet. One that
-did not come, or in which the phase has jumped: end what the board believes to be reading, and find out by a stream of probes
+did not come, or in which the phase has jumped: end the command that the board is reading, and find out by a stream of probes
 where its commands begin and at which frequency it is (`shared.skin.board.realign_probes`). No answer: a BREAK, and the probes
 again. Still none: `BoardSilent`.
 """

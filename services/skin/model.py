@@ -60,7 +60,7 @@ HIDDEN, HIDDEN_BACKED = 128, 32
 STEPS, STEPS_BACKED, BATCH = 250_000, 10_000, 512
 """Units of the hidden layers and steps of the training, of a pad alone and of what a link behind it changes; samples per step."""
 NEAR_GAP = 0.05
-"""Nearer [m] the networks err more."""
+"""Gap [m] below which the networks err more."""
 FAINTEST = 1e-5
 """Changes below this [fF] are numerical errors: a limb behind the link."""
 HELD_OUT_SEED = 1_000_003

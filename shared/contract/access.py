@@ -31,7 +31,7 @@ EVERYTHING = ("put", "delete", "declare_subscriber", "query", "reply", "declare_
 
 
 def holder(service: str, is_router: bool) -> str:
-    """Whose certificate a process shows: what is no service only looks."""
+    """The holder of the certificate that a process shows: what is no service only reads."""
     if is_router:
         return ROUTER
     return service if service in (*SERVICES, DRIVER, OPERATOR) else VIEWER

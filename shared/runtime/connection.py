@@ -19,12 +19,12 @@ SECURE_ENDPOINT = "tls/127.0.0.1:7447"
 SECURE_PROTOCOLS = ("tls",)
 PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 POOL_BYTES = 4 << 20
-"""Of shared memory, at least: four frames of a small camera."""
+"""Least size of the shared memory: four frames of a small camera."""
 SHARED_BYTES = 100_000
 """Frames go by shared memory; what is smaller takes no longer through a socket, and leaves its readers nothing behind where its
 publisher dies: they keep its pool for as long as they live."""
 ATTEMPT_MS = 500
-"""How long one attempt to reach the router may block inside Zenoh, where no signal is handled."""
+"""Longest time [ms] of one attempt to reach the router, inside Zenoh, where no signal is handled."""
 
 
 class BusError(RuntimeError):
@@ -33,12 +33,12 @@ class BusError(RuntimeError):
 
 @dataclass(frozen=True)
 class Connection:
-    """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
-    tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise; `secure`: a
-    folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part; `service`: who
-    this is, and so whose certificate it shows; `slow`: a router's links that carry little; `pool_bytes`: of shared memory, by
-    which what is large goes to processes of the same host. Readers keep the pool of a publisher that is gone for as long as they
-    live, so it is no larger than it must be."""
+    """How a session connects to the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such
+    as tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise;
+    `secure`: a folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part;
+    `service`: who this is, and so whose certificate it shows; `slow`: a router's links that carry little; `pool_bytes`: of shared
+    memory, by which what is large goes to processes of the same host. Readers keep the pool of a publisher that is gone for as
+    long as they live, so it is no larger than it must be."""
 
     mode: str | None = None
     connect: tuple[str, ...] = ()

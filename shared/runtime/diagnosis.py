@@ -72,7 +72,7 @@ def _who_listens(endpoint: str, link: socket.socket, host: str, secure: Path | N
 
 
 def _context(secure: Path | None) -> ssl.SSLContext:
-    """Of a client; without certificates it accepts every router, only to see whether it speaks TLS."""
+    """The TLS context of a client; without certificates it accepts every router, only to see whether it uses TLS."""
     context = ssl.create_default_context()
     if secure is None:
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE

@@ -29,7 +29,7 @@ SEEN = (1 << WINDOW) - 1
 NUMBERS = 1 << 32
 """Publishers count modulo this: at 200 Hz it comes around after eight months."""
 IDENTITY_BYTES, NUMBER_BYTES = 12, 4
-"""Of what is attached to a message: its publisher, drawn at random, and its number, little-endian."""
+"""Sizes of the attachment of a message: its publisher, drawn at random, and its number, little-endian."""
 
 
 class Numbering:

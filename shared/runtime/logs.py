@@ -74,8 +74,8 @@ def _on_thread(log: Log | None, ends_process: bool, failed: threading.ExceptHook
 
 
 def _on_unraisable(failed: sys.UnraisableHookArgs) -> None:
-    """The hook for an exception that nobody can catch, such as that of a thread without the memory to begin: its starter would
-    wait for ever."""
+    """The hook for an exception that cannot be caught, such as that of a thread without the memory to begin: its starter would
+    wait without end."""
     try:
         sys.__unraisablehook__(failed)
     finally:

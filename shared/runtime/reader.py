@@ -1,4 +1,4 @@
-"""What reads a subscription: `Reader` hands every message to a handler, `Latest` keeps the newest until somebody looks at it.
+"""What reads a subscription: `Reader` hands every message to a handler, `Latest` keeps the newest until it is read.
 
 Both judge a sample alike: its key, its size, the publisher's number and rate (`shared.runtime.guard`), its version and its stamp.
 What is done for each message is done at most 200 times a second and finds no cache warm: each function of another library that
@@ -46,10 +46,10 @@ class Stream:
 class Inbox:
     """What a reader is declared with.
 
-    expression: the key expression that is subscribed to. depth: samples that are kept while nobody takes them. streams: every
-    concrete key that the cell knows; a sample on any other key is refused and counted in `unknown`, so that nobody can grow the
-    table. now_ns: the clock that stamps are compared with. refused: called with the first bad message of each kind on a key.
-    failed: called with every exception of a handler. from_others: leaves out what this session publishes itself.
+    expression: the key expression that is subscribed to. depth: samples that are kept while none is taken. streams: every
+    concrete key that the cell knows; a sample on any other key is refused and counted in `unknown`, so that no publisher can make
+    the table grow. now_ns: the clock that stamps are compared with. refused: called with the first bad message of each kind on a
+    key. failed: called with every exception of a handler. from_others: leaves out what this session publishes itself.
     """
 
     topic: Topic
@@ -148,9 +148,9 @@ class _Newest(Generic[M]):
 
 
 class Latest(Generic[M]):
-    """The newest message of each key of a topic, for whoever looks rarely at what comes often: nothing wakes up when a message
-    comes, and only a message that is looked at is decoded. The others are taken from the ring by `drain`, which looks at their
-    number, version and stamp, and counts them. Several threads may look at once.
+    """The newest message of each key of a topic, for a caller that reads less often than messages arrive: no thread wakes up when
+    a message arrives, and only a message that is read is decoded. The others are taken from the ring by `drain`, which looks at
+    their number, version and stamp, and counts them. Several threads may look at once.
 
     `drain` must be called every LOOK_S at least, or the ring overflows; the node does so.
     """

@@ -127,11 +127,11 @@ class Replicas:
             return [share.reader for share in shares if share.reader is not None]
 
     def owns(self, stream: str) -> bool:
-        """As `rank`: whether it is 0."""
+        """Whether `rank` is 0."""
         return self.rank(stream) == 0
 
     def rank(self, stream: str) -> float:
-        """How many living replicas of this service are before this one to handle `stream`: 0 for its owner, 1 for the one that
+        """Number of living replicas of this service before this one to handle `stream`: 0 for its owner, 1 for the one that
         will own it when the owner goes away; infinity where this one has no part yet. Rendezvous hashing (Thaler and
         Ravishankar 1998, doi:10.1109/90.663936): a replica that comes or goes moves only its own streams."""
         rank = self._ranks.get(stream)

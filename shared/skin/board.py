@@ -222,11 +222,11 @@ def readers(pad: cells.Pad, pad_type: cells.PadType) -> tuple[cells.SensingBoard
 
 
 FILLER = b"\xff"
-"""A byte that is the start of no command. 16 of them end whatever command a board believes to be reading."""
+"""A byte that is the start of no command. 16 of them end any command that a board is reading."""
 
 
 def realign_probes(attempt: int = 0) -> list[bytes]:
-    """16 pieces of a stream in which a board finds exactly one command, wherever in a command it believes to be: each is one byte
+    """16 pieces of a stream in which a board finds exactly one command, wherever in a command it is: each is one byte
     longer than a command. Each asks to keep the frequencies, and carries its number and that of the attempt (modulo 8) in
     `measures`, which the board's answer repeats. All else in the stream is unknown to a board. Between the pieces a board needs
     time to answer."""
@@ -234,7 +234,7 @@ def realign_probes(attempt: int = 0) -> list[bytes]:
 
 
 def realign_answer(data: bytes, attempt: int = 0) -> tuple[int, Command] | None:
-    """The first answer to `realign_probes` of this attempt in what came: the number of the piece that the board has understood,
+    """The first answer to `realign_probes` of this attempt in received bytes: the number of the piece that the board understood,
     and the answer; None without. When `sent` pieces were sent, (number - sent) % 16 fillers set the board right."""
     answers = {_probe(attempt, number).pack()[:8]: number for number in range(COMMAND_BYTES)}
     for at in range(len(data) - COMMAND_BYTES + 1):

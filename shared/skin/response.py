@@ -110,7 +110,7 @@ class Network:
 
     @staticmethod
     def of(data) -> Network:  # type: ignore[no-untyped-def]
-        """From what `arrays` gave."""
+        """The inverse of `arrays`."""
         points = np.ascontiguousarray(data["points"], dtype=np.float32)
         weights, biases = (
             tuple(np.ascontiguousarray(data[f"{kind}{i}"], dtype=float) for i in range(3)) for kind in ("weight", "bias")

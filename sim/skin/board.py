@@ -28,7 +28,7 @@ CONVERTER_NOISE = 1.0
 """Standard deviation of a channel's own noise in a sample [steps]; the rest of a pad's noise is its electrode's, on all of its
 channels alike."""
 PHASE = 0.35
-"""Of the sine at resonance [rad], against the converter's first sample."""
+"""Phase of the sine at resonance [rad], against the converter's first sample."""
 LONGEST = 0xFFFF
 """Ticks of the firmware's timer: a frequency that asks for a longer period gets this one."""
 FAULTS = {
@@ -85,7 +85,7 @@ class Board:
         self.power_on()
 
     def power_on(self) -> None:
-        """As after its supply came: standard frequencies, nothing pending."""
+        """The state after power-on: standard frequencies, nothing pending."""
         self._ticks = board.period(board.ELECTRODE_HZ)
         self._sample_ticks = board.period(board.SAMPLE_HZ)
         self._stopped = False
@@ -110,7 +110,7 @@ class Board:
         self._due[kind] += 1
 
     def receive(self, data: bytes, time_s: float) -> None:
-        """Bytes that somebody began to send at time_s."""
+        """Bytes whose sending began at time_s."""
         self.send(time_s)
         if data and self._happens("lost"):
             data = data[: len(data) // 2] + data[len(data) // 2 + 1 :]

@@ -236,7 +236,7 @@ def robust(r: Array, width: float) -> Array:
 
 
 def information(found: Contour, at: Level, T: Array, width: float, noise: Noise) -> tuple[Array, Array]:
-    """Of the pose error at T: the information (6, 6) and its right side (6,), of points that count less and less beyond `width`
+    """The information (6, 6) about the pose error at T and its right side (6,), of points that count less and less beyond `width`
     [px of the image]. The mask's dilation is marginalised (Schur complement)."""
     weights = found.points["length"] * robust(found.r, width / at.scale) * (found.kind != DROPPED)
     weights *= at.scale**3 / (noise.edge**2 * noise.correlation)

@@ -1,7 +1,7 @@
 """One pose of any rigid mesh on any mask (`find_pose`), and a sequence of them (`Tracker`).
 
 The start counts as a weak measurement beside the mask: a mask that is a few per cent too large says less about the depth than a
-start that is a few centimetres off. The covariance is that of both together. How much the mask is believed is measured on the
+start that is a few centimetres off. The covariance is that of both together. The mask's noise is measured on the
 mask itself, by how far the contour stays away from its boundary.
 """
 

@@ -34,7 +34,7 @@ SAME_GAP = 1e-4
 CLIPPED = 0.1
 """Share of the samples at an end of the converter above which a gap is left out."""
 SURE = 6.0
-"""Standard errors of a difference that is believed."""
+"""Difference, in standard errors, from which it is significant."""
 MIXED = 0.25
 """Share of the way there that the signal may go back with the gap before its polarity is unclear."""
 
