@@ -140,7 +140,7 @@ def test_asking_changes_nothing() -> None:
         np.testing.assert_allclose(asked.estimate(ns(0.52)).T, quiet.estimate(ns(0.52)).T, atol=1e-13)
 
 
-def test_two_cameras_that_expose_together_are_both_heard_in_either_order() -> None:
+def test_two_cameras_that_expose_together_are_both_accepted_in_either_order() -> None:
     first, second = ErrorStateObserver(HOME, SPREAD), ErrorStateObserver(HOME, SPREAD)
     left, right = perturb(HOME, [0.004, 0, 0, 0, 0, 0]), perturb(HOME, [-0.004, 0, 0, 0, 0, 0])
     for k in range(5):
@@ -186,7 +186,7 @@ def test_a_limb_that_jumps_is_found_again_within_three_quarters_of_a_second(make
     assert estimate.state == "tracking"
 
 
-def test_a_sense_that_disagrees_for_long_is_heard_again_beside_one_that_is_believed() -> None:
+def test_a_sense_that_disagrees_for_long_is_used_again_beside_one_that_is_accepted() -> None:
     observer = ErrorStateObserver(HOME, SPREAD)
     wrong = perturb(HOME, [0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
     for k in range(250):
@@ -332,7 +332,7 @@ def test_a_storm_of_measurements_shortens_the_history_and_nothing_else() -> None
     np.testing.assert_allclose(observer.estimate(ns(0.1)).T, HOME, atol=1e-9)
 
 
-def test_no_measurement_is_believed_beyond_the_floor() -> None:
+def test_no_measurement_is_trusted_beyond_the_floor() -> None:
     observer = ErrorStateObserver(HOME, SPREAD)
     observer.measure("vision", ns(0.0), HOME, 1e18 * np.eye(6))
     floor = SENSES[0].errors.floor

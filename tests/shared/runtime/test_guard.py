@@ -97,7 +97,7 @@ def test_with_numbers_an_older_stamp_is_taken():
         guard.accept("two cameras", stamp_ns, 0.1 * number)
 
 
-def test_a_measurement_that_another_publisher_has_told_is_not_taken_again():
+def test_a_measurement_that_another_publisher_has_published_is_not_accepted_again():
     guard = Guard(50.0)
     for number, (stamp_ns, camera) in enumerate(((100, "front"), (100, "side"), (200, "front"))):
         guard.admit("search", number, 0.0)
