@@ -30,7 +30,7 @@ ROUNDING = 1e-6
 not measured."""
 
 
-class Refused(ValueError):
+class RefusedMeasurement(ValueError):
     """A measurement that was refused for a fault of its own. `kind` groups equal faults, so that they can be counted."""
 
     def __init__(self, kind: str, text: str):
@@ -144,8 +144,9 @@ class Log:
     def admitted(
         self, source: str, stamp_ns: int, T: Array, information: Array, now_ns: int | None = None
     ) -> tuple[Array, Array]:
-        """A measurement's pose (4, 4) and information (6, 6), symmetric. Raises Refused, having counted it, where something is
-        wrong with them, and ValueError on an unknown source. now_ns: the reader's clock, where the stamp is to be compared."""
+        """A measurement's pose (4, 4) and information (6, 6), symmetric. Raises RefusedMeasurement, having counted it, where
+        something is wrong with them, and ValueError on an unknown source. now_ns: the reader's clock, where the stamp is to be
+        compared."""
         self.check(source)
         T, information = shaped(T, (4, 4)), shaped(information, (6, 6))
         fate = fault(stamp_ns, T, information, latest(now_ns))
@@ -201,7 +202,7 @@ def fault(stamp_ns, T, information, latest_ns):  # type: ignore[no-untyped-def]
     return INFORMATION_FAULT if high < 0.0 or low < -ROUNDING * high else 0
 
 
-def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int | None) -> Refused:
+def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int | None) -> RefusedMeasurement:
     """What is wrong with a measurement that has a `fault`, in words."""
     if fate == FUTURE:
         ahead = f"{1e-9 * (stamp_ns - (now_ns or 0)):.3f} s; check the clocks of its publisher and of fusion (chrony, ptp4l)"
@@ -215,12 +216,12 @@ def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int 
     else:
         low, high = np.linalg.eigvalsh(information)[[0, -1]]
         text = f"information: expected no negative eigenvalue, got {low:.3g} beside {high:.3g}"
-    return Refused(FATES[fate], text)
+    return RefusedMeasurement(FATES[fate], text)
 
 
 def measured(message: Message, measures: Measures) -> tuple[Array, Array]:
     """The pose (4, 4) that a message of a sense reports, and its information (6, 6), zero along what is not observed. Raises
-    Refused where its covariance is not symmetric and positive definite."""
+    RefusedMeasurement where its covariance is not symmetric and positive definite."""
     of: Any = message
     match measures:
         case Measures.POSE:
@@ -234,10 +235,10 @@ def measured(message: Message, measures: Measures) -> tuple[Array, Array]:
 
 
 def information(covariance: Array) -> Array:
-    """The inverse (n, n) of a covariance. Raises Refused where it is not symmetric and positive definite."""
+    """The inverse (n, n) of a covariance. Raises RefusedMeasurement where it is not symmetric and positive definite."""
     eigenvalues, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     low, high = eigenvalues[[0, -1]]
     if np.abs(covariance - covariance.T).max() > ROUNDING * high or low <= 1e-14 * high:
         text = f"covariance: expected symmetric and positive definite, got eigenvalues {low:.3g} to {high:.3g}"
-        raise Refused("covariance", text)
+        raise RefusedMeasurement("covariance", text)
     return (vectors / eigenvalues) @ vectors.T

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from penumbra.services.fusion import history
 from penumbra.services.fusion.estimate import ACCEPTED, FUTURE, STATES, Array, Estimate, Log, latest, refusal, shaped
 from penumbra.services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, SENSE_ESTIMATE, History, size
-from penumbra.services.fusion.settings import Settings, model, sense_models
+from penumbra.services.fusion.settings import FusionSettings, model, sense_models
 from penumbra.shared.contract.messages import FusedPose, Source
 from penumbra.shared.contract.senses import SENSES, Sense
 from penumbra.shared.geometry import rigid
@@ -30,10 +30,10 @@ class Bank:
         self,
         homes: Array,
         spreads: Sequence[tuple[float, float]],
-        settings: Settings | None = None,
+        settings: FusionSettings | None = None,
         senses: Sequence[Sense] = SENSES,
     ):
-        self.settings = settings or Settings()
+        self.settings = settings or FusionSettings()
         self.names = tuple(sense.name for sense in senses)
         self.logs = [Log(self.names) for _ in homes]
         self._models = np.array([model(self.settings, *given) for given in zip(homes, spreads, strict=True)], MODEL)
@@ -140,7 +140,7 @@ class ErrorStateObserver:
         self,
         home: rigid.Array,
         spread: tuple[float, float],
-        settings: Settings | None = None,
+        settings: FusionSettings | None = None,
         senses: Sequence[Sense] = SENSES,
     ):
         self._join(Bank(np.asarray(home)[None], [spread], settings, senses), 0)
@@ -162,9 +162,9 @@ class ErrorStateObserver:
         """Takes a pose T (4, 4) with its information (6, 6, zero along what is not observed). True if it was accepted.
 
         `hidden` is not used: the information says how good the measurement is. `now_ns` is the reader's clock, where the stamp is
-        to be compared with it. Raises Refused, which is counted and leaves the state as it is, for a pose that is no rigid
-        transform, an information that is not symmetric and positive semi-definite, and a stamp from the future; ValueError on an
-        unknown source.
+        to be compared with it. Raises RefusedMeasurement, which is counted and leaves the state as it is, for a pose that is no
+        rigid transform, an information that is not symmetric and positive semi-definite, and a stamp from the future; ValueError
+        on an unknown source.
         """
         self.log.check(source)
         T, information = shaped(T, (4, 4)), shaped(information, (POSE, POSE))

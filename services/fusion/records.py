@@ -25,7 +25,7 @@ def size(senses: int) -> int:
 
 MODEL = np.dtype(
     [
-        *((name, "f8", 2) for name in ("acceleration", "velocity_spread", "agility", "learning")),  # as in Settings
+        *((name, "f8", 2) for name in ("acceleration", "velocity_spread", "agility", "learning")),  # as in FusionSettings
         *((name, "f8") for name in ("velocity_time", "doubt", "patience", "source_patience", "refusals", "unobserved")),
         ("agreement_time", "f8"),
         *((name, "f8") for name in ("horizon", "weight_time", "lost_age")),

@@ -14,7 +14,7 @@ import numpy as np
 
 from penumbra.services import flags
 from penumbra.services.fusion import paper
-from penumbra.services.fusion.estimate import Estimate, Refused, latest, measured
+from penumbra.services.fusion.estimate import Estimate, RefusedMeasurement, latest, measured
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver
 from penumbra.shared.cell import description
@@ -110,11 +110,11 @@ class Publishers:
         self._publishers: dict[str, tuple[str, float]] = {}
 
     def check(self, stream: str, publisher: str, now_s: float, silence_s: float) -> None:
-        """Raises Refused for a publisher while another one of this stream has published in the last silence_s. now_s: of a clock
-        that nobody sets."""
+        """Raises RefusedMeasurement for a publisher while another one of this stream has published in the last silence_s. now_s:
+        of a clock that nobody sets."""
         known, received_s = self._publishers.get(stream, (publisher, now_s))
         if known != publisher and now_s - received_s < silence_s:
-            raise Refused(
+            raise RefusedMeasurement(
                 "publisher",
                 f"{stream}: expected one publisher, got {publisher} beside {known}: two processes publish the same poses; "
                 "end one of them",
@@ -148,7 +148,7 @@ class Fusion:
             self._check_origin(sense, message, names["publisher"])
             is_usable = sense.usable is None or message.state == sense.usable
             found = measured(message, sense.measures) if is_usable else None
-        except Refused as error:
+        except RefusedMeasurement as error:
             log.refused(sense.name, error.kind)
             self._log(sense.name, error)
             return
@@ -160,20 +160,20 @@ class Fusion:
             hidden = getattr(message, "hidden", None)  # the share by which the paper's observer weighs the camera
             try:
                 self.observer.measure(sense.name, message.stamp_ns, *found, hidden, now_ns)
-            except Refused as error:
+            except RefusedMeasurement as error:
                 self._log(sense.name, error)
 
     def _check_origin(self, sense: Sense, message: Any, publisher: str) -> None:
-        """Raises Refused for a message of another target, frame or part of the cell, and for a second publisher."""
+        """Raises RefusedMeasurement for a message of another target, frame or part of the cell, and for a second publisher."""
         expected, got = (self.target, self.node.cell.frame), (message.target, message.frame)
         if got != expected:
-            raise Refused("frame", f"{sense.name}: expected target and frame {expected}, got {got!r:.120}")
+            raise RefusedMeasurement("frame", f"{sense.name}: expected target and frame {expected}, got {got!r:.120}")
         stream = sense.name
         if sense.part is not None:
             part, known = getattr(message, sense.part), getattr(self.node.cell, f"{sense.part}s")
             if part not in known:
                 text = f"{sense.name}: expected a {sense.part} of the cell ({', '.join(known)}), got {part!r:.60}"
-                raise Refused(sense.part, text)
+                raise RefusedMeasurement(sense.part, text)
             stream = f"{sense.name} of {sense.part} {part}"
         self._publishers.check(stream, publisher, time.monotonic(), sense.topic.stale_s)
 
@@ -190,7 +190,7 @@ class Fusion:
                 if message.stamp_ns <= latest(self.group.now_ns()):
                     self.observer.adopt(message)
 
-    def _log(self, source: str, error: Refused) -> None:
+    def _log(self, source: str, error: RefusedMeasurement) -> None:
         if (source, error.kind) not in self._logged:
             self._logged.add((source, error.kind))
             why = "measurement refused; more of this kind are only counted"

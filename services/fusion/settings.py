@@ -15,7 +15,7 @@ from penumbra.shared.contract.senses import Sense
 
 
 @dataclass(frozen=True)
-class Settings:
+class FusionSettings:
     """Settings of the filter. Every field states its unit and where its value comes from. Those of a sense are in
     `shared/contract/senses.py`.
 
@@ -72,7 +72,7 @@ class Settings:
     limits: Limits = Limits()
 
 
-def model(settings: Settings, home: Array, spread: tuple[float, float]) -> NDArray[np.void]:
+def model(settings: FusionSettings, home: Array, spread: tuple[float, float]) -> NDArray[np.void]:
     """A MODEL of a target expected at the pose home (4, 4) with standard deviations spread (position [m], rotation [rad])."""
     out = np.zeros((), MODEL)
     values = vars(settings) | {"lost_age": settings.limits.lost_age, "limits": astuple(settings.limits), "home": home}

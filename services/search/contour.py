@@ -13,9 +13,8 @@ from penumbra.services.search.evidence import COVERED, LEAST_KNOWN, TAPS, Eviden
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.raster import draw_silhouette
+from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
-
-Array = NDArray[np.float64]
 
 NEAR = 0.05
 """Edges nearer to the camera than this are left out [m]."""

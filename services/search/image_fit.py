@@ -23,9 +23,8 @@ from penumbra.services.search.contour import MEASURED, POINT, Equations, Model, 
 from penumbra.services.search.evidence import Evidence, Intrinsics, compare
 from penumbra.services.search.mask_fit import Fit, Limits, marginal, with_prior
 from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
-
-Array = NDArray[np.float64]
 
 LINE = 5
 """Reach of the line on both sides of the contour [px], read at every pixel's distance."""

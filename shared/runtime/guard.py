@@ -44,7 +44,7 @@ class Numbering:
         return self._identity + (next(self._numbers) % NUMBERS).to_bytes(NUMBER_BYTES, "little")
 
 
-class Window:
+class SequenceWindow:
     """Which of a publisher's numbers were here: the sliding window of RFC 4303, section 3.4.3 (doi:10.17487/RFC4303)."""
 
     def __init__(self, number: int):
@@ -92,7 +92,7 @@ class Bucket:
 class _Publisher:
     bucket: Bucket
     received_s: float
-    window: Window | None = None
+    window: SequenceWindow | None = None
     stamp_ns: int | None = None
 
 
@@ -114,7 +114,7 @@ class Guard:
         missing = None
         if number is not None:
             if found.window is None:
-                found.window, missing = Window(number), 0
+                found.window, missing = SequenceWindow(number), 0
             else:
                 missing = found.window.take(number)
         if not found.bucket.take(now_s):

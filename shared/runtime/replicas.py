@@ -26,7 +26,7 @@ PACE_LOST = 0.5
 """Share of its time whose loss makes a process withdraw: the next replica is faster. Chosen, not measured."""
 
 
-class Reader(Protocol):
+class ReaderThread(Protocol):
     """What reads a subscription."""
 
     thread: threading.Thread
@@ -40,8 +40,8 @@ class Share:
 
     streams: tuple[str, ...]
     traffic: list[Traffic]
-    read: Callable[[], Reader]
-    reader: Reader | None = None
+    read: Callable[[], ReaderThread]
+    reader: ReaderThread | None = None
 
     def follow(self, is_own: bool) -> None:
         """Opens or closes the subscription where that has changed."""
@@ -120,7 +120,7 @@ class Replicas:
             self._shares.append(share)
             share.follow(any(map(self.owns, share.streams)))
 
-    def leave(self) -> list[Reader]:
+    def leave(self) -> list[ReaderThread]:
         """Takes over no more streams; returns the readers of those that it owns."""
         with self._lock:
             shares, self._shares = self._shares, []

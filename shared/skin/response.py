@@ -24,9 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from penumbra.shared.body import urdf
 from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
-
-Array = NDArray[np.float64]
 
 FOLDER = "skin"
 """Beside a cell file: where its fitted networks are."""

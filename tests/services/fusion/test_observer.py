@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from penumbra.services.fusion import history
-from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, Refused
+from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, RefusedMeasurement
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver
-from penumbra.services.fusion.settings import Settings
+from penumbra.services.fusion.settings import FusionSettings
 from penumbra.shared.contract.messages import MAX_FUTURE_S
 from penumbra.shared.contract.senses import SENSES
 from penumbra.shared.geometry import rigid, so3
@@ -257,7 +257,7 @@ def test_what_is_no_measurement_is_refused_with_the_reason_counted_and_changes_n
     observer = make(HOME, SPREAD)
     still(observer, HOME, 0.0, 1.0)
     before = observer.estimate(ns(1.1))
-    with pytest.raises(Refused) as caught:
+    with pytest.raises(RefusedMeasurement) as caught:
         observer.measure("vision", ns(1.0 + ahead), T, seen, 0.0, now_ns=ns(1.0))
     assert caught.value.kind == kind and text in str(caught.value)
     assert observer.log.counts["vision"].refused == {kind: 1}
@@ -322,7 +322,7 @@ def test_a_bank_takes_what_is_good_beside_what_is_bad() -> None:
 
 
 def test_a_storm_of_measurements_shortens_the_history_and_nothing_else() -> None:
-    observer = ErrorStateObserver(HOME, SPREAD, Settings(capacity=8))
+    observer = ErrorStateObserver(HOME, SPREAD, FusionSettings(capacity=8))
     for k in range(100):
         observer.measure("haptic", ns(0.001 * k), HOME, VISION)
     assert observer.measure("vision", ns(0.0905), HOME, VISION)

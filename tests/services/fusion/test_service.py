@@ -14,7 +14,7 @@ import pytest
 
 from penumbra.services import flags
 from penumbra.services.fusion import service
-from penumbra.services.fusion.estimate import Refused, information
+from penumbra.services.fusion.estimate import RefusedMeasurement, information
 from penumbra.shared.cell import description
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.runtime import bus
@@ -262,10 +262,12 @@ def test_another_publisher_of_a_stream_is_accepted_after_the_silence_of_the_firs
     publishers.check("front", "a", 0.0, 0.3)
     publishers.check("side", "b", 0.1, 0.3)
     publishers.check("front", "a", 0.2, 0.3)
-    with pytest.raises(Refused, match="front: expected one publisher, got b beside a: two processes publish the same poses"):
+    with pytest.raises(
+        RefusedMeasurement, match="front: expected one publisher, got b beside a: two processes publish the same poses"
+    ):
         publishers.check("front", "b", 0.4, 0.3)
     publishers.check("front", "b", 0.6, 0.3)
-    with pytest.raises(Refused, match="got a beside b"):
+    with pytest.raises(RefusedMeasurement, match="got a beside b"):
         publishers.check("front", "a", 0.7, 0.3)
 
 

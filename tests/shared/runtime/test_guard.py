@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from penumbra.shared.contract.messages import BadMessage
-from penumbra.shared.runtime.guard import FORGET_S, NUMBERS, PUBLISHERS, RATE_TIMES, WINDOW, Bucket, Guard, Window
+from penumbra.shared.runtime.guard import FORGET_S, NUMBERS, PUBLISHERS, RATE_TIMES, WINDOW, Bucket, Guard, SequenceWindow
 
 
 def refusal(call, *arguments) -> str:
@@ -17,7 +17,7 @@ def refusal(call, *arguments) -> str:
 
 @given(st.integers(0, NUMBERS - 1), st.lists(st.integers(-2 * WINDOW, 2 * WINDOW), max_size=200))
 def test_no_number_is_taken_twice_and_what_is_missing_is_counted(first, steps):
-    window, taken, missing, highest = Window(first), {0}, 0, 0
+    window, taken, missing, highest = SequenceWindow(first), {0}, 0, 0
     for step in steps:
         number = highest + step  # on an endless count from the first
         was_here = number in taken or number <= max(0, highest - WINDOW) or number <= 0
@@ -31,13 +31,13 @@ def test_no_number_is_taken_twice_and_what_is_missing_is_counted(first, steps):
 
 
 def test_numbers_come_around_after_the_last_one():
-    window = Window(NUMBERS - 2)
+    window = SequenceWindow(NUMBERS - 2)
     assert [window.take(number) for number in (NUMBERS - 1, 1, 0)] == [0, 1, -1]
     assert refusal(window.take, NUMBERS - 1) == "replayed"
 
 
 def test_a_jump_of_half_the_count_is_taken_for_an_old_number():
-    assert refusal(Window(7).take, (7 + NUMBERS // 2) % NUMBERS) == "replayed"
+    assert refusal(SequenceWindow(7).take, (7 + NUMBERS // 2) % NUMBERS) == "replayed"
 
 
 @given(st.floats(1.0, 1000.0), st.lists(st.floats(0.0, 0.1), min_size=1, max_size=300))
