@@ -183,7 +183,7 @@ def measure_all(
     models, sense_models, measurements, states, senses, P, rings,
     targets, sources, stamps_ns, T, information, latest_ns, fates, taken, PHt,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
-    """`Bank.measure`, one after the other. taken, PHt : room for the measurement under way, and for `step`."""
+    """`Bank.measure`, one after the other. taken, PHt : memory for the measurement under way, and for `step`."""
     m = taken[0]
     for r in range(len(targets)):
         i = targets[r]

@@ -124,7 +124,7 @@ class History(NamedTuple):
 
     @classmethod
     def empty(cls, targets: int, capacity: int, senses: int) -> History:
-        """Room for histories, not yet cleared."""
+        """Memory for histories, not yet cleared."""
         n, shape = size(senses), (targets, capacity)
         return cls(
             np.zeros(shape, MEASUREMENT),

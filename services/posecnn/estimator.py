@@ -34,7 +34,7 @@ HIDDEN = 0.92
 COVERED = 0.5
 """Covered share of the predicted silhouette from which the target is occluded and not lost."""
 COVERS = (Label.ROBOT, Label.TORSO, Label.UPPER_ARM, Label.OCCLUDER)
-TOO_SMALL, ROOM = 0.45, 1.8
+TOO_SMALL, WIDER = 0.45, 1.8
 """Where nothing is known of the target and its pixels extend over less than this share of the patch, a second patch is taken: a
 square larger than that extent by this factor."""
 FEWEST = 8
@@ -132,7 +132,7 @@ class PoseCNN:
             return None
         fx, fy, cx, cy = self._intrinsics
         middle = ((low + high) / 2.0 - square.centre) / square.focal * [fx, fy] + [cx, cy]
-        return middle, ROOM * extent / square.focal * fx
+        return middle, WIDER * extent / square.focal * fx
 
     @property
     def _intrinsics(self) -> Array:

@@ -8,6 +8,5 @@ statistics); `image_fit.py` goes on from there on the image itself, by the colou
 `detect.py` finds the target without a prediction, `verdict.py` judges the pose, and `tracker.py` puts them together; its numbers
 are in `settings.py`. `objects/` does the same for any rigid mesh and mask files (`search refine`, `search track`).
 
-A constant whose docstring names no origin was chosen by hand and not measured; `penumbra bench search` (`bench objects` for
-`objects/`) shows what a change does.
+`penumbra bench search` (`bench objects` for `objects/`) shows what a change of a constant does.
 """

@@ -96,8 +96,8 @@ class _Step:
     def _convolution(self, name: str, x: Any) -> Any:
         """A convolution of stride 1 that keeps the size."""
         kernel, bias = self._weights[f"{name}.weight"], self._weights.get(f"{name}.bias")
-        room = [kernel.shape[-1] // 2] * 2
-        found = op.convolution(x, op.constant(kernel), [1, 1], room, room, [1, 1])
+        padding = [kernel.shape[-1] // 2] * 2
+        found = op.convolution(x, op.constant(kernel), [1, 1], padding, padding, [1, 1])
         return found if bias is None else op.add(found, op.constant(bias.reshape(1, -1, 1, 1)))
 
     def _scaled(self, name: str, x: Any, gain: str, offset: str | None = None) -> Any:

@@ -128,8 +128,8 @@ def contour_offsets(found: NDArray[np.bool_], truth: NDArray[np.uint8]) -> NDArr
     rows, columns = np.flatnonzero(target.any(1)), np.flatnonzero(target.any(0))
     if not len(rows):
         return np.empty(0)
-    room = int(NEAR_PX) + 2
-    box = (slice(max(rows[0] - room, 0), rows[-1] + room + 1), slice(max(columns[0] - room, 0), columns[-1] + room + 1))
+    margin = int(NEAR_PX) + 2
+    box = (slice(max(rows[0] - margin, 0), rows[-1] + margin + 1), slice(max(columns[0] - margin, 0), columns[-1] + margin + 1))
     found, target, own = found[box], target[box], own[box]
     if found.all() or not found.any():
         return np.empty(0)
