@@ -35,7 +35,7 @@ CHANNELS = 6
 COMMAND_BYTES, HEAD_BYTES = 16, 16
 """Length of a command, and of a reply before its sums."""
 SAMPLES_PER_CYCLE = range(2, 10)
-"""What a board can do: beyond it the firmware stops."""
+"""Samples per cycle that a board can do: beyond them the firmware stops."""
 BLOCK = 128
 """Samples that a board takes in one go: the number of cycles grows in steps of about BLOCK / samples_per_cycle."""
 MOST_MEASURES = 65_504
@@ -59,7 +59,7 @@ class PacketError(ValueError):
 
 
 class Kind(IntEnum):
-    """What a command asks for."""
+    """The content of a command."""
 
     SEND_MEASURES = 0
     SET_FREQ = 1

@@ -248,9 +248,9 @@ MISFIT = 4.0
 SUSPECT = 0.5
 """Mean squared residual, in variances, from which a pad does not fit where a reason is found that explains it."""
 EXPLAINED = 0.4
-"""What an explanation must leave of the misfit at most."""
+"""Largest share of the misfit that an explanation may leave."""
 MODEL_ERROR = 0.05
-"""What the predicted signals are wrong by, as a share: the field model."""
+"""Relative error of the predicted signals: that of the field model."""
 CONTRAST = 0.3
 """Share of the pose's error that reaches the electrodes of a pad each in its own way."""
 LASTING = 0.5

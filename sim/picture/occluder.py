@@ -100,7 +100,7 @@ class Panel:
     SIZE = 0.45
     """Width and height [m]: more than the picture of a forearm with hand, drawn back to DEPTH."""
     MARGIN = 0.02
-    """How far [m] the edge stands beyond a target that is to be hidden wholly: the measured picture may lag by a frame."""
+    """Distance [m] of the edge beyond a target that is hidden wholly: the measured picture may lag by a frame."""
     WHOLLY = 0.95
     """Level from which everything is hidden."""
 

@@ -187,7 +187,7 @@ class _Faces:
 
 
 def _quantile(x: Array, share: float) -> float:
-    """What numpy's quantile says, to the last bit, in a seventh of its time."""
+    """numpy's quantile, to the last bit, in a seventh of its time."""
     where = (x.size - 1) * share
     low = int(where)
     high, t = min(low + 1, x.size - 1), where - low

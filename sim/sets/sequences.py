@@ -34,7 +34,7 @@ ASTRAY = 0.12
 ARM_PX = (8.0, 120.0)
 """Bounds of the forearm's width in the picture [px] where sequences are drawn as real cameras may show them."""
 ARM_M = 0.085
-"""Width of a forearm [m] by which it gets there."""
+"""Width of a forearm [m] that the focal length is chosen by."""
 
 
 @dataclass(frozen=True)

@@ -46,32 +46,32 @@ BINNING: dict[Distance, int] = {"short": 2, "medium": 1, "long": 1}
 STEP_PX = 8
 """Multiple [px] at which the region that is read begins and ends."""
 HOME_SIGMAS = 1.0
-"""The region shows the limb also so far from home, where a search may look for it."""
+"""Distance from home, in standard deviations, within which the region shows the limb: a search may look for it there."""
 
 LEAD_S, SECONDS = 0.8, 2.6
 """Before the occluder comes, not scored; and in all."""
 HOLD_S = (0.5, 1.0)
-"""How long the occluder stays before it slides to another place."""
+"""Bounds of the time [s] that the occluder stays in a place before it slides to the next."""
 MARGIN = 0.03
-"""The share hidden is aimed at so far from the borders of its band: it drifts while the limb turns."""
+"""Distance of the intended share hidden from the borders of its band: it drifts while the limb turns."""
 LEAD_HIDDEN = 0.33
 """Largest share hidden before the occluder comes: by the robot."""
 IN_BAND = 0.75
 """Least share of the frames after the lead-in whose share hidden lies in the band."""
 SIZE = 0.12
-"""How much longer and thicker than the median man, or less, a person is."""
+"""Largest deviation of a person's length and girth from the median man, as a share."""
 SPEED_M_S = (0.15, 0.40)
 """Bounds of the mean speed of a reach."""
 DIRECTION = np.radians([12.0, 8.0])
-"""How far the camera stands, to both sides, from the direction of the built-in one: around the vertical, and up and down."""
+"""Largest deviation [rad] of the camera's direction from the built-in one: around the vertical, and up and down."""
 PASSAGE = ((0.0, 0.0), (1.3, 0.2), (2.6, 0.5), (3.9, 0.85), (5.2, 1.0), (6.5, 0.0))
 """Times [s] and the shares hidden from then on in a `passage`."""
 PASSAGE_S, PASSAGE_WITHIN = 8.0, 0.10
-"""How long it takes, and how far the share hidden may be from that."""
+"""Duration [s] of a passage, and largest deviation of the share hidden from that."""
 COARSE_PX = 160
 """Width of the pictures in which hidden shares are counted."""
 TRIES = 400
-"""Runs that are drawn at most until one keeps to its bands."""
+"""Maximum number of runs that are drawn until one keeps to its bands."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from penumbra.shared.skin import board
 from penumbra.shared.skin.board import Command, Kind
 
 OVERHEAD_S = 0.48e-3
-"""What the firmware takes for a request beside cycles and line: it makes 231 replies a second at 128 cycles, 298 at 32."""
+"""Time [s] of the firmware for a request, beside cycles and line: from 231 replies a second at 128 cycles, 298 at 32."""
 SAMPLE_S = 1e-3
 """Duration [s] of the sample that a pad's noise is given for: 100 cycles at 100 kHz."""
 CONVERTER_NOISE = 1.0
@@ -55,7 +55,7 @@ class Tank:
         return float(1.0 / (2.0 * np.pi * np.sqrt(self.coil * (self.capacitor + self.ring))))
 
     def response(self, hz: float) -> complex:
-        """What is left of an amplitude at a frequency, and its phase: 1 at resonance."""
+        """Gain of an amplitude at a frequency, and its phase: 1 at resonance."""
         ratio = hz / self.resonance_hz
         return 1.0 / (1.0 + 1j * self.quality * (ratio - 1.0 / ratio))
 

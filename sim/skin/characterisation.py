@@ -24,7 +24,7 @@ GAPS_M = np.arange(2, 41) * 0.005
 ANGLES_DEG = np.arange(10) * 10.0
 """Gaps and angles of a scan."""
 PLANE_M = 0.01
-"""How far the plane lies above what is scanned."""
+"""Height [m] of the plane above what is scanned."""
 MARGIN_M = (0.06, 0.08)
 """Lengths [m] by which a scan goes beyond its part of the limb, along the limb and across it."""
 OVER_M = 0.03

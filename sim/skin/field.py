@@ -40,7 +40,7 @@ ACCURACY = 1e-5
 RING, GROUND, BARE = -1, -2, -3
 """Owners of panels beside the electrodes, which are 0, 1, 2 …: excitation ring, ground, and dielectric without copper."""
 CLEAR = 0.003
-"""What of the link behind a pad is nearer than this [m] to the board's volume is left out: the board is mounted there."""
+"""Distance [m] to the board's volume within which parts of the link behind are left out: the board is mounted there."""
 
 
 class Panels:

@@ -63,7 +63,7 @@ class Actor:
         self._limb = LimbMotion(here.motion, seed, clearance)
 
     def at(self, scene_s: float, speed: float) -> Placed:
-        """Where it is at a time of the scene, which runs so fast."""
+        """The pose at a time of the scene, which runs at this speed."""
         pose, rate = self._limb.at(scene_s)
         velocity = speed * np.concatenate([rate[:3], angular_velocity(pose[3:], rate[3:])])
         return Placed(rigid.from_rpy(pose[:3], pose[3:]), pose, velocity)

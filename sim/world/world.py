@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from penumbra.sim.world.dynamics import Robots
 
 FAR = 10.0
-"""What the truth calls the gap [m] where the cell has no pads."""
+"""Gap [m] in the truth of a cell without pads."""
 FAINTEST = 1e-9
 """Least change of capacitance [fF]: a pad without anything near has a logarithm too."""
 MAX_SPEED = 4.0
