@@ -121,7 +121,7 @@ def _weakest(m, first, vectors):  # type: ignore[no-untyped-def]
 
 @inner
 def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
-    """Advances a state to a measurement: predicts it to its stamp, and updates it unless the gate refuses. PHt (size, 6): memory."""
+    """Advances a state to a measurement: predicts it, and updates it unless the gate refuses. PHt (size, 6): memory."""
     one, now, sense = model.one, state.now, state.senses[m.source]
     fresh = m.stamp_ns - now.accepted_ns > one.lost_age * 1e9
     if fresh:
