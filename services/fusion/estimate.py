@@ -126,7 +126,7 @@ class Log:
         self.check(source)
         self.first_ns.setdefault(source, stamp_ns)
 
-    def count(self, source: str, stamp_ns: int, fate: int) -> None:
+    def record(self, source: str, stamp_ns: int, fate: int) -> None:
         """Counts a measurement by what became of it (which of FATES)."""
         if fate >= FUTURE:
             self.refused(source, FATES[fate])

@@ -72,7 +72,7 @@ class Bank:
         )
         columns = (each.tolist() for each in (targets, sources, stamps_ns, fates))
         for target, source, stamp_ns, fate in zip(*columns, strict=True):
-            self.logs[target].count(self.names[source], stamp_ns, fate)
+            self.logs[target].record(self.names[source], stamp_ns, fate)
         return fates
 
     def adopt(self, target: int, message: FusedPose) -> None:
