@@ -33,12 +33,12 @@ class BusError(RuntimeError):
 
 @dataclass(frozen=True)
 class Connection:
-    """How a session connects to the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such
-    as tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise;
-    `secure`: a folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part;
-    `service`: who this is, and so whose certificate it shows; `slow`: a router's links that carry little; `pool_bytes`: of shared
-    memory, by which what is large goes to processes of the same host. Readers keep the pool of a publisher that is gone for as
-    long as they live, so it is no larger than it must be."""
+    """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
+    tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise; `secure`: a
+    folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part; `service`: who
+    this is, and so whose certificate it shows; `slow`: a router's links that carry little; `pool_bytes`: of shared memory, by
+    which what is large goes to processes of the same host. Readers keep the pool of a publisher that is gone for as long as they
+    live, so it is no larger than it must be."""
 
     mode: str | None = None
     connect: tuple[str, ...] = ()
