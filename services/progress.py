@@ -9,7 +9,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 LINE_S = 10.0
-"""Between two lines."""
+"""Time [s] between two lines."""
 
 
 def track(items: Collection[T], what: str) -> Iterator[T]:

@@ -8,7 +8,7 @@ QUANTILES = {
     0.999: (10.8275661706627, 13.8155105579643, 16.2662361962381, 18.4668269529032, 20.5150056524329, 22.4577444848253),
     0.9999: (15.1367052266234, 18.4206807439524, 21.1075134661602, 23.5127424449908, 25.7448319590559, 27.8563412360139),
 }
-"""By the share of squares that are below, for 1 to 6 degrees of freedom."""
+"""Quantiles by probability, for 1 to 6 degrees of freedom."""
 
 
 def quantile(share: float, rank: int) -> float:

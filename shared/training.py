@@ -1,4 +1,4 @@
-"""How networks are trained: a trainer with checkpoints, the loop of so many steps, or minutes over all runs.
+"""How networks are trained: a trainer with checkpoints, the loop over steps or minutes of all runs.
 
 A training may last days, in the background of other work: time counts as the processor's, so that a process that is stopped
 (SIGSTOP) or waits loses nothing, checkpoints are replaced whole, and beside the exact checkpoint a compact one can be written,
@@ -38,8 +38,8 @@ class Trainer(ABC, Generic[N, D]):
     """A network `net` that learns from data, its optimiser, and the running average of its weights, which is exported.
 
     SETTINGS: the dataclass of the network's settings. step, minutes (of the processor's time): so many so far, over all runs.
-    warm_from: the step at which the optimiser knew nothing. started_from: what the card of the weights told that it began with,
-    None where it began with nothing.
+    warm_from: the step at which the optimiser was empty. started_from: the entry in the card of the weights that it began with,
+    None where it began with none.
     """
 
     SETTINGS: ClassVar[type]
@@ -143,7 +143,7 @@ def begun(options: SimpleNamespace) -> Path | None:
 
 def complete(trainer: Trainer[Any, D], data: D, options: SimpleNamespace) -> bool:
     """Trains as the flags of `services.flags.training` ask, on one thread, and closes the data. False where Ctrl-C or SIGTERM
-    ended it: the checkpoint is written then, and the user told how to go on."""
+    ended it: the checkpoint is written then, and the log says how to go on."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     torch.set_num_threads(1)
     try:
@@ -173,7 +173,7 @@ def run(
     compact: Path | None = None,
     save_every_s: float = 120.0,
 ) -> dict[str, float]:
-    """Train up to so many steps, or minutes (over all runs); shows a progress bar, or, where nobody looks, prints a line with
+    """Train up to so many steps, or minutes (over all runs); shows a progress bar, or, without a terminal, prints a line with
     every checkpoint. Returns the loss's parts, smoothed."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     total = steps if steps is not None else int(minutes * 60)

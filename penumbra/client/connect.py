@@ -19,9 +19,9 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.connection import connect_by_environment, secure_by_environment
 
 ANSWER_S = 1.0
-"""How long one question for the description may take."""
+"""Longest wait [s] for the answer to one query for the description."""
 AGAIN_S = 0.1
-"""Between two questions, while the cell is not there yet."""
+"""Time [s] between two queries while the cell does not answer yet."""
 PATIENCE_S = 3.0
 
 

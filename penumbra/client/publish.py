@@ -24,7 +24,7 @@ from penumbra.shared.runtime.sender import Sender
 LARGEST_ANGLE = 100.0
 """Joint angles [rad] beyond this, sixteen turns, are taken for degrees."""
 PERIOD_NS = 1_000_000
-"""Between samples of a pad where no stamps say otherwise: sensing boards give a thousand a second."""
+"""Time [ns] between samples of a pad without stamps of their own: sensing boards give a thousand a second."""
 UNEVEN = 0.5
 """How far a row's stamp may be from an even spacing, in periods."""
 

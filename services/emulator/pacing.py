@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable
 
 SMOOTHING = 0.25
-"""Weight of the newest turn in the mean of how long preparing takes: one that was held up must not thin out the next ones."""
+"""Weight of the newest turn in the mean of how long preparing takes: a single slow one must not reduce the rate of the next
+ones."""
 
 SET_NS = 1_000_000
-"""By so much the wall clock may run away from the steady one before it counts as set."""
+"""Difference [ns] of the wall clock from the steady one from which it counts as set."""
 
 
 class Time:

@@ -42,14 +42,15 @@ if TYPE_CHECKING:
 IDLE_S = 0.05
 """How long the boards wait for bytes before they look whether they are to end."""
 TOLERANCE = 0.01
-"""Of the coils' inductance, as a standard deviation: every board has its own resonance."""
+"""Relative standard deviation of the coils' inductance: every board has its own resonance."""
 CHUNK = 4096
+"""Largest number of bytes read at once."""
 PATIENCE_S = 30.0
 """Longest start of the boards' process."""
 
 
 class Feed:
-    """What the skin feels at any time, from what was told of some instants, `tick_s` apart."""
+    """What the skin feels at any time, interpolated between instants `tick_s` apart."""
 
     def __init__(self, skin: Skin, tick_s: float):
         self._skin, self._tick_s = skin, tick_s
@@ -62,7 +63,7 @@ class Feed:
         self._faults = faults
 
     def amplitude(self, pad: int, time_s: float) -> Array:
-        """(e,) [V] of one pad without noise, at rest as long as nothing was told. Between ticks logs are interpolated; after the
+        """(e,) [V] of one pad without noise, at rest before the first instant. Between ticks logs are interpolated; after the
         last one the skin feels what it felt then."""
         own, change = self._skin.of(pad), np.zeros(len(self._skin))
         if self._logs:
@@ -85,7 +86,7 @@ class Terminals:
             master, slave = os.openpty()
             tty.setraw(slave)
             os.set_blocking(master, False)
-            fcntl.ioctl(master, termios.TIOCPKT, struct.pack("i", 1))  # tells when the other end empties its queue
+            fcntl.ioctl(master, termios.TIOCPKT, struct.pack("i", 1))  # reports when the other end empties its queue
             self.devices[name], self._names[master] = os.ttyname(slave), name
             self._slaves.append(slave)
 
@@ -153,7 +154,7 @@ def _chosen(feed: Feed, pad: int, own: list[int], time_s: float) -> Array:
 
 def _serve(link: Connection, cell: cells.Cell, pads: Sequence[str], seed: int, began_ns: int, tick_s: float) -> None:
     """The boards' process, until the emulator closes its end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the emulator's to hear
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator handles Ctrl-C
     feed = Feed(Skin(cell), tick_s)
     terminals = Terminals(pad_boards(cell, pads, seed, feed), lambda: (time.monotonic_ns() - began_ns) * 1e-9)
     link.send(terminals.devices)
@@ -172,7 +173,7 @@ def _serve(link: Connection, cell: cells.Cell, pads: Sequence[str], seed: int, b
 
 class SerialBoards:
     """The emulator's end. pads: whose boards are served; folder: where links to their devices are made; began_ns: time zero of
-    the world by the steady clock; tick_s: how often the boards are told what the skin feels; ahead_s: how long before it does.
+    the world by the steady clock; tick_s: how often the boards receive what the skin feels; ahead_s: how long before it does.
 
     devices: the paths of the pseudo-terminals by name, such as p0-2 for the third board of pad p0. Raises CellError for an
     unknown pad, OSError where a link cannot be made.
@@ -192,7 +193,7 @@ class SerialBoards:
             raise OSError(f"the boards' process did not start within {PATIENCE_S:g} s")
         self.devices: dict[str, str] = self._link.recv()
         self._links = _linked(self.devices, folder) if folder is not None else []
-        self._told = -1
+        self._sent = -1
 
     def fault(self, words: str) -> None:
         """`PAD-NUMBER FAULT`: let a fault happen on a board's line. Raises ValueError that says what is possible."""
@@ -203,14 +204,14 @@ class SerialBoards:
         self._send(words)
 
     def serve(self, stopping: threading.Event) -> None:
-        """Tells the boards what the skin feels, until the emulator stops."""
+        """Sends the boards what the skin feels, until the emulator stops."""
         try:
             while not stopping.wait(self._tick_s):
                 now_s = (time.monotonic_ns() - self._began_ns) * 1e-9
-                for k in range(max(self._told + 1, int(now_s / self._tick_s)), int((now_s + self._ahead_s) / self._tick_s) + 1):
+                for k in range(max(self._sent + 1, int(now_s / self._tick_s)), int((now_s + self._ahead_s) / self._tick_s) + 1):
                     log_change = np.log(self._world.change(self._world.state(k * self._tick_s)))
                     self._send((k, log_change, self._world.skin_faults))
-                    self._told = k
+                    self._sent = k
         finally:
             self.close()
 

@@ -26,10 +26,11 @@ ACCEPTED, GATED, LATE, DUPLICATE, NOTHING, FUTURE, POSE_FAULT, INFORMATION_FAULT
 NO_CLOCK = (1 << 63) - 1
 """The latest stamp where nobody looks at a clock."""
 ROUNDING = 1e-6
-"""What a rotation or a symmetric matrix without negative eigenvalues may be off by, relative to its largest entry."""
+"""What a rotation or a symmetric matrix without negative eigenvalues may be off by, relative to its largest entry. Chosen,
+not measured."""
 
 
-class Refused(ValueError):
+class RefusedMeasurement(ValueError):
     """A measurement that was refused for a fault of its own. `kind` groups equal faults, so that they can be counted."""
 
     def __init__(self, kind: str, text: str):
@@ -40,7 +41,7 @@ class Refused(ValueError):
 @dataclass(frozen=True)
 class Estimate:
     """The target at one moment. `T` (4, 4); `velocity` (6,): linear [m/s], angular [rad/s]; `covariance` (6, 6) of the pose error
-    (`shared.geometry.rigid`); `state`: tracking, coasting or lost; `sources`: the senses heard so far."""
+    (`shared.geometry.rigid`); `state`: tracking, coasting or lost; `sources`: those that have sent something."""
 
     T: rigid.Array
     velocity: Array
@@ -68,10 +69,11 @@ class Estimate:
 class Limits:
     """Where tracking ends.
 
-    tracking_age : a measurement older than this [s] is not tracking any more: three camera periods and the delay of vision.
+    tracking_age : age [s] of the newest measurement above which the target is not tracked: three periods of a camera at 20 Hz and
+        the delay of vision.
     tracking_sigma, lost_sigma : standard deviation of the position [m] along its worst direction. A forearm is 8 cm thick: beyond
         that the estimate no longer overlaps it; beyond 15 cm it is no help as a place to look at.
-    lost_age : without a measurement for so long [s], nothing is known about a limb.
+    lost_age : time [s] without a measurement after which nothing is known about a limb. Chosen, not measured.
     """
 
     tracking_age: float = 0.25
@@ -108,28 +110,28 @@ class Counts:
 
 
 class Log:
-    """Counts per source, and since when each was heard [ns]. names: of the senses."""
+    """Counts per source, and the stamp [ns] of the first measurement of each. names: of the senses."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.counts = {name: Counts() for name in names}
-        self.heard_ns: dict[str, int] = {}
+        self.first_ns: dict[str, int] = {}
 
     def check(self, source: str) -> None:
         """Raises ValueError for a source that is not known."""
         if source not in self.counts:
             raise ValueError(f"source: expected one of {', '.join(self.counts)}, got {source!r}")
 
-    def heard(self, source: str, stamp_ns: int) -> None:
-        """Notes that a sense is there."""
+    def received(self, source: str, stamp_ns: int) -> None:
+        """Notes that a sense has sent something."""
         self.check(source)
-        self.heard_ns.setdefault(source, stamp_ns)
+        self.first_ns.setdefault(source, stamp_ns)
 
-    def took(self, source: str, stamp_ns: int, fate: int) -> None:
+    def record(self, source: str, stamp_ns: int, fate: int) -> None:
         """Counts a measurement by what became of it (which of FATES)."""
         if fate >= FUTURE:
             self.refused(source, FATES[fate])
             return
-        self.heard(source, stamp_ns)
+        self.received(source, stamp_ns)
         if fate != NOTHING:
             counts, name = self.counts[source], FATES[fate]
             setattr(counts, name, getattr(counts, name) + 1)
@@ -142,15 +144,16 @@ class Log:
     def admitted(
         self, source: str, stamp_ns: int, T: Array, information: Array, now_ns: int | None = None
     ) -> tuple[Array, Array]:
-        """A measurement's pose (4, 4) and information (6, 6), symmetric. Raises Refused, having counted it, where something is
-        wrong with them, and ValueError on an unknown source. now_ns: the reader's clock, where the stamp is to be compared."""
+        """A measurement's pose (4, 4) and information (6, 6), symmetric. Raises RefusedMeasurement, having counted it, where
+        something is wrong with them, and ValueError on an unknown source. now_ns: the reader's clock, where the stamp is to be
+        compared."""
         self.check(source)
         T, information = shaped(T, (4, 4)), shaped(information, (6, 6))
         fate = fault(stamp_ns, T, information, latest(now_ns))
         if fate:
             self.refused(source, FATES[fate])
             raise refusal(fate, stamp_ns, T, information, now_ns)
-        self.heard(source, stamp_ns)
+        self.received(source, stamp_ns)
         return T, 0.5 * (information + information.T)
 
 
@@ -199,7 +202,7 @@ def fault(stamp_ns, T, information, latest_ns):  # type: ignore[no-untyped-def]
     return INFORMATION_FAULT if high < 0.0 or low < -ROUNDING * high else 0
 
 
-def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int | None) -> Refused:
+def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int | None) -> RefusedMeasurement:
     """What is wrong with a measurement that has a `fault`, in words."""
     if fate == FUTURE:
         ahead = f"{1e-9 * (stamp_ns - (now_ns or 0)):.3f} s; check the clocks of its publisher and of fusion (chrony, ptp4l)"
@@ -213,12 +216,12 @@ def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int 
     else:
         low, high = np.linalg.eigvalsh(information)[[0, -1]]
         text = f"information: expected no negative eigenvalue, got {low:.3g} beside {high:.3g}"
-    return Refused(FATES[fate], text)
+    return RefusedMeasurement(FATES[fate], text)
 
 
 def measured(message: Message, measures: Measures) -> tuple[Array, Array]:
     """The pose (4, 4) that a message of a sense reports, and its information (6, 6), zero along what is not observed. Raises
-    Refused where its covariance is not symmetric and positive definite."""
+    RefusedMeasurement where its covariance is not symmetric and positive definite."""
     of: Any = message
     match measures:
         case Measures.POSE:
@@ -232,10 +235,10 @@ def measured(message: Message, measures: Measures) -> tuple[Array, Array]:
 
 
 def information(covariance: Array) -> Array:
-    """The inverse (n, n) of a covariance. Raises Refused where it is not symmetric and positive definite."""
+    """The inverse (n, n) of a covariance. Raises RefusedMeasurement where it is not symmetric and positive definite."""
     eigenvalues, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     low, high = eigenvalues[[0, -1]]
     if np.abs(covariance - covariance.T).max() > ROUNDING * high or low <= 1e-14 * high:
         text = f"covariance: expected symmetric and positive definite, got eigenvalues {low:.3g} to {high:.3g}"
-        raise Refused("covariance", text)
+        raise RefusedMeasurement("covariance", text)
     return (vectors / eigenvalues) @ vectors.T

@@ -1,28 +1,22 @@
 """The default observer's filter, compiled: an error-state Kalman filter that knows that the errors of a sense last.
 
 State: position p, rotation R, linear and angular velocity, and a bias of every sense. Errors are along fixed axes, the rotation's
-applied from the left (`shared.geometry.rigid.perturb`). Velocities are constant but for white acceleration, and slowly forgotten.
+applied from the left (`shared.geometry.rigid.perturb`). Velocities are constant but for white acceleration, and decay slowly.
 
 A sense is wrong by nearly the same amount from one measurement to the next: a mask a pixel too large is a forearm 2 cm too near
-for as long as nobody moves. A filter that takes 100 such measurements a second for independent believes in a tenth of the error
-that they have, and then no longer listens to the other sense. So the error of every measurement is split: a share `lasting` of
+for as long as nobody moves. A filter that takes 100 such measurements a second for independent assumes a tenth of the error
+that they have, and then ignores the other sense. So the error of every measurement is split: a share `lasting` of
 its variance belongs to the sense's bias, a first-order Gauss-Markov process that the filter estimates, the rest is white. The
 bias is kept in units of the measurement's own standard deviation, which changes with distance and occlusion: a measurement of
 covariance L L' reads pose + sqrt(lasting) L bias + white noise.
 
-Numbers are learned from the innovations on the way, all from whether each resembles the one before of the same sense.
-Innovations that resemble each other mean that the filter lags behind the limb: more process noise, linear and angular each on its
-own, or a limb that turns would make way for a sense that is wrong about where it is. Innovations that are too large
-and do not resemble each other mean that the sense is noisier than it says: less belief in it, never more than it asks for.
+Two numbers adapt to the innovations, by whether each resembles the one before of the same sense. Innovations that resemble each
+other mean that the filter lags behind the limb: the process noise grows, linear and angular each on its own, because otherwise a
+limb that turns would let a sense that is wrong about its position pass. Innovations that are too large and do not resemble each
+other mean that the sense is noisier than it says: its covariance grows, and is never less than what it says.
 
-Measurements come late and out of order: the filter goes back to the stamp, applies, and replays what came after. The result
-depends on the measurements and their stamps alone, never on the order of arrival (within the horizon): the whole state of the
-filter, what it refused included, is a function of the state before and the measurement. A history is a ring of measurements in
-the order of stamp, source and position, each with the state after it. Its first entry is the newest one that is older than the
-horizon: nothing is inserted before it. `ring` (2,) holds the slot of the first entry and the number of entries.
-
-Everything works in place on the records of `records.py`; `measure_all`, `adopt` and `estimate_all` are called from outside, for
-as many targets as there are. The number of senses is that of the records. Functions write what they find to their last arguments.
+Everything works in place on the records of `records.py`; `history.py` calls `reduce`, `step` and `move`. The number of senses is
+that of the records. Functions write what they find to their last arguments.
 
 Sources: error-state filter on SO(3): Sola, "Quaternion kinematics for the error-state Kalman filter" (2017), arXiv:1711.02508;
 coloured measurement noise by state augmentation: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
@@ -37,28 +31,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, GATED, LATE, LOST, NOTHING, fault, state_of
-from penumbra.services.fusion.records import (
-    ESTIMATE,
-    MEASUREMENT,
-    MODEL,
-    MOTION,
-    NEVER,
-    POSE,
-    SENSE_ESTIMATE,
-    SENSE_MODEL,
-    SENSE_STATE,
-    STATE,
-    UNITS,
-)
+from penumbra.services.fusion.records import MOTION, NEVER, POSE, UNITS
 from penumbra.shared.geometry import so3
-from penumbra.shared.native import inner, kernel
+from penumbra.shared.native import inner
 
-HASTE = 4.0
-"""So many times as fast a measurement that is refused teaches that the limb is faster: while it is, all are refused."""
-ODD = 2.0
-"""From so large a squared Mahalanobis distance a direction, 1 expected, a measurement is not heard on how fast the limb is while
-another sense is less surprising: a sense that is wrong by little drags the state along."""
+REFUSED_RATE = 4.0
+"""Factor on the rate at which the process noise grows while measurements are refused: all are, until the filter has caught up
+with the limb. Chosen, not measured."""
+SURPRISING = 2.0
+"""Squared Mahalanobis distance per direction (1 expected) from which a measurement does not change the process noise while
+another sense agrees better with the state: a sense with a small bias would make the state follow it. Chosen, not measured."""
 
 
 class State(NamedTuple):
@@ -67,16 +49,6 @@ class State(NamedTuple):
     now: Any
     senses: Any
     P: Any
-
-
-class Entries(NamedTuple):
-    """The history of one target: as `records.History`, without the first dimension."""
-
-    measurements: Any
-    states: Any
-    senses: Any
-    P: Any
-    ring: Any
 
 
 class Model(NamedTuple):
@@ -88,7 +60,7 @@ class Model(NamedTuple):
 
 @inner
 def forget(state):  # type: ignore[no-untyped-def]
-    """Makes a state that knows nothing."""
+    """Makes a state without any information."""
     now = state.now
     now.stamp_ns = now.accepted_ns = NEVER
     now.passed = now.rank = 0
@@ -98,7 +70,7 @@ def forget(state):  # type: ignore[no-untyped-def]
         now.velocity[i] = 0.0
     for s in range(len(state.senses)):
         sense = state.senses[s]
-        sense.came_ns = sense.heard_ns = sense.believed_ns = sense.refused_ns = NEVER
+        sense.measured_ns = sense.learned_ns = sense.accepted_ns = sense.refused_ns = NEVER
         sense.refused = sense.has_innovation = 0
         sense.gain, sense.doubt = 0.0, 1.0
         for i in range(POSE):
@@ -149,7 +121,7 @@ def _weakest(m, first, vectors):  # type: ignore[no-untyped-def]
 
 @inner
 def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
-    """Takes a state on to a measurement: predicted to its stamp, and updated unless the gate refuses it. PHt (size, 6): room."""
+    """Advances a state to a measurement: predicts it, and updates it unless the gate refuses. PHt (size, 6): memory."""
     one, now, sense = model.one, state.now, state.senses[m.source]
     fresh = m.stamp_ns - now.accepted_ns > one.lost_age * 1e9
     if fresh:
@@ -164,13 +136,13 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
             break
         distance = so3.dot(innovation, innovation)
         now.distance, now.rank = distance, m.rank
-        sense.surprise, sense.came_ns = distance / m.rank, m.stamp_ns
+        sense.surprise, sense.measured_ns = distance / m.rank, m.stamp_ns
         contradicted = _is_contradicted(one, state, m)
         passes = distance <= model.senses[m.source].threshold[1 if contradicted else 0, m.rank]
         if not passes and not contradicted:
-            learn(model, state, m, innovation, HASTE)
+            learn(model, state, m, innovation, REFUSED_RATE)
         elif passes:
-            learn(model, state, m, innovation, 0.0 if contradicted and distance > ODD * m.rank else 1.0)
+            learn(model, state, m, innovation, 0.0 if contradicted and distance > SURPRISING * m.rank else 1.0)
         if passes:
             break
         if sense.refused == 0:
@@ -192,12 +164,12 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
 
 @inner
 def _is_contradicted(one, state, m):  # type: ignore[no-untyped-def]
-    """Whether another sense, heard lately, is less surprising, believed or not: then a surprising measurement is wrong rather
-    than the state. What it would teach is that the limb is faster, until it passes the gate."""
+    """Whether another sense with a recent measurement, accepted or not, agrees better with the state: then the measurement is
+    wrong rather than the state. To adapt to it would raise the process noise until it passes the gate."""
     surprise = state.senses[m.source].surprise
     for s in range(len(state.senses)):
         other = state.senses[s]
-        if m.stamp_ns - other.came_ns < one.witness * 1e9 and other.surprise < surprise:
+        if m.stamp_ns - other.measured_ns < one.agreement_time * 1e9 and other.surprise < surprise:
             return True
     return False
 
@@ -274,15 +246,15 @@ def start(one, state, m, p, R, covariance):  # type: ignore[no-untyped-def]
     so3.product_transposed(product, wide, covariance)
     forget(state)
     now = state.now
-    now.stamp_ns = now.accepted_ns = state.senses[m.source].heard_ns = m.stamp_ns
+    now.stamp_ns = now.accepted_ns = state.senses[m.source].learned_ns = m.stamp_ns
     for i in range(3):
         now.p[i] = p[i]
     so3.copy(R, now.R)
-    _spread(one, state, covariance)
+    spread(one, state, covariance)
 
 
 @inner
-def _spread(one, state, covariance):  # type: ignore[no-untyped-def]
+def spread(one, state, covariance):  # type: ignore[no-untyped-def]
     """Sets the covariance of all errors where only the pose's (6, 6) is known."""
     P = state.P
     for i in range(len(P)):
@@ -402,7 +374,7 @@ def linearised(model, state, m, z, H):  # type: ignore[no-untyped-def]
     derivative = np.empty((POSE, POSE))
     error(state.now.p, state.now.R, m, z, derivative)
     for i in range(m.rank):
-        # what no covariance tells, the floor, is a calibration: all of it lasts
+        # the floor, which no covariance contains, is an error of calibration: all of it lasts
         lasting = math.sqrt(sense.doubt * (of.lasting * m.sigma[i] ** 2 + of.floor**2))
         z[i] = -z[i]
         for j in range(POSE):
@@ -443,13 +415,13 @@ def innovated(model, state, m, z, H, PHt, S_inverse, innovation):  # type: ignor
 
 
 @inner
-def learn(model, state, m, innovation, haste):  # type: ignore[no-untyped-def]
-    """Adapts the agilities, `haste` times as fast as usual, and the doubt to an innovation (6,)."""
+def learn(model, state, m, innovation, factor):  # type: ignore[no-untyped-def]
+    """Adapts the agilities, `factor` times as fast as usual, and the doubt to an innovation (6,)."""
     now, sense, bounds = state.now, state.senses[m.source], model.one.agility
     length = math.sqrt(so3.dot(innovation, innovation) / m.rank)
-    scale = min(1.0, 2.0 / max(length, 1e-9))  # an outlier teaches no more than two sigma do
+    scale = min(1.0, 2.0 / max(length, 1e-9))  # an outlier counts no more than two sigma do
     if sense.has_innovation:
-        rate = min(model.one.learning[0], model.one.learning[1] * (m.stamp_ns - sense.heard_ns) * 1e-9)
+        rate = min(model.one.learning[0], model.one.learning[1] * (m.stamp_ns - sense.learned_ns) * 1e-9)
         alike = scale * so3.dot(innovation, sense.innovation) / m.rank  # 0 expected
         unlike = scale * scale * so3.dot(innovation, innovation) / m.rank - alike  # 1 expected
         for half in range(2):
@@ -459,10 +431,10 @@ def learn(model, state, m, innovation, haste):  # type: ignore[no-untyped-def]
                 for k in range(m.rank):
                     share += m.directions[k, i] ** 2
             if share > 1e-3:
-                faster = now.agility[half] * math.exp(haste * rate * along / share)
+                faster = now.agility[half] * math.exp(factor * rate * along / share)
                 now.agility[half] = min(max(faster, bounds[0]), bounds[1])
         sense.doubt = min(max(sense.doubt * math.exp(0.5 * rate * (unlike - 1.25)), 1.0), model.one.doubt)
-    sense.heard_ns, sense.has_innovation = m.stamp_ns, 1
+    sense.learned_ns, sense.has_innovation = m.stamp_ns, 1
     for i in range(POSE):
         sense.innovation[i] = scale * innovation[i]
 
@@ -502,7 +474,7 @@ def update(state, m, z, PHt, S_inverse):  # type: ignore[no-untyped-def]
     so3.turn(turn, now.R, 0)
     so3.orthonormalise(now.R)
     sense.gain += 0.5 * (before - _log_volume(P))
-    now.accepted_ns = sense.believed_ns = m.stamp_ns
+    now.accepted_ns = sense.accepted_ns = m.stamp_ns
     sense.refused, sense.refused_ns = 0, NEVER
     now.passed = 1
 
@@ -520,206 +492,3 @@ def _log_volume(P):  # type: ignore[no-untyped-def]
             L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
         volume += 2.0 * math.log(L[i, i])
     return volume
-
-
-@inner
-def clear(history):  # type: ignore[no-untyped-def]
-    """Makes a history of one entry, which is older than all and knows nothing."""
-    history.ring[0], history.ring[1] = 0, 1
-    first = history.measurements[0]
-    first.stamp_ns, first.source = NEVER, -1
-    forget(State(history.states[0], history.senses[0], history.P[0]))
-
-
-@inner
-def insert(model, history, m, PHt):  # type: ignore[no-untyped-def]
-    """Takes a measurement: ACCEPTED or GATED, LATE (older than the history: not applied) or DUPLICATE (not applied). A full ring
-    gives up its oldest entry before the horizon does."""
-    measurements, ring = history.measurements, history.ring
-    size, horizon_ns = len(measurements), np.int64(model.one.horizon * 1e9)
-    at = ring[1]  # where it belongs: seldom far from the end
-    while at > 0 and _is_after(measurements[(ring[0] + at - 1) % size], m):
-        at -= 1
-    newest_ns = measurements[(ring[0] + ring[1] - 1) % size].stamp_ns
-    if at == 0 or m.stamp_ns < newest_ns - horizon_ns:
-        return LATE
-    if not _is_after(m, measurements[(ring[0] + at - 1) % size]):
-        return DUPLICATE
-    if ring[1] == size:
-        if at == 1:
-            return LATE
-        _drop_first(ring, size)
-        at -= 1
-    for j in range(ring[1], at, -1):
-        measurements[(ring[0] + j) % size] = measurements[(ring[0] + j - 1) % size]
-    measurements[(ring[0] + at) % size] = m
-    ring[1] += 1
-    for j in range(at, ring[1]):
-        slot = (ring[0] + j) % size
-        _copy_state(history, (ring[0] + j - 1) % size, slot)
-        step(model, State(history.states[slot], history.senses[slot], history.P[slot]), measurements[slot], PHt)
-    passed = history.states[(ring[0] + at) % size].passed
-    newest_ns = max(newest_ns, m.stamp_ns)
-    while ring[1] > 1 and measurements[(ring[0] + 1) % size].stamp_ns < newest_ns - horizon_ns:
-        _drop_first(ring, size)
-    return ACCEPTED if passed else GATED
-
-
-@inner
-def _copy_state(history, source, slot):  # type: ignore[no-untyped-def]
-    history.states[slot] = history.states[source]
-    for s in range(history.senses.shape[1]):
-        history.senses[slot, s] = history.senses[source, s]
-    so3.copy(history.P[source], history.P[slot])
-
-
-@inner
-def find(history, stamp_ns):  # type: ignore[no-untyped-def]
-    """The slot of the state after the newest measurement not after `stamp_ns`; of the oldest one that knows something, if all are
-    later."""
-    states, ring = history.states, history.ring
-    size, at = len(states), ring[1] - 1
-    while at > 0 and states[(ring[0] + at) % size].stamp_ns > stamp_ns:
-        at -= 1
-    if at == 0 and ring[1] > 1 and states[ring[0]].stamp_ns == NEVER:
-        at = 1
-    return (ring[0] + at) % size
-
-
-@inner
-def _is_after(a, b):  # type: ignore[no-untyped-def]
-    """Whether a measurement comes after another: by stamp, source, and position, as of two cameras that expose together."""
-    if a.stamp_ns != b.stamp_ns:
-        return a.stamp_ns > b.stamp_ns
-    if a.source != b.source:
-        return a.source > b.source
-    for i in range(3):
-        if a.p[i] != b.p[i]:
-            return a.p[i] > b.p[i]
-    return False
-
-
-@inner
-def _drop_first(ring, size):  # type: ignore[no-untyped-def]
-    ring[0] = (ring[0] + 1) % size
-    ring[1] -= 1
-
-
-@kernel(
-    "out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], out i8[t, 2]",
-    MEASUREMENT=MEASUREMENT,
-    STATE=STATE,
-    SENSE_STATE=SENSE_STATE,
-)
-def clear_all(measurements, states, senses, P, rings):  # type: ignore[no-untyped-def]
-    """Clears the histories of all targets."""
-    for i in range(len(rings)):
-        clear(Entries(measurements[i], states[i], senses[i], P[i], rings[i]))
-
-
-@kernel(
-    "MODEL[t], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], out i8[t, 2], "
-    "i8, i8, f8[4, 4], f8[6], f8[6, 6], SENSE_ESTIMATE[n]",
-    MODEL=MODEL,
-    MEASUREMENT=MEASUREMENT,
-    STATE=STATE,
-    SENSE_STATE=SENSE_STATE,
-    SENSE_ESTIMATE=SENSE_ESTIMATE,
-)
-def adopt(models, measurements, states, senses, P, rings, target, stamp_ns, T, velocity, covariance, known):  # type: ignore[no-untyped-def]
-    """Makes a history of one entry: a pose T (4, 4) at a stamp, with velocity (6,), the pose's covariance (6, 6), and what is
-    known of the senses. The velocity may be off by as much as one that is unknown."""
-    history = Entries(measurements[target], states[target], senses[target], P[target], rings[target])
-    clear(history)
-    state = State(history.states[0], history.senses[0], history.P[0])
-    now, first = state.now, history.measurements[0]
-    first.stamp_ns = now.stamp_ns = stamp_ns
-    for i in range(3):
-        now.p[i] = T[i, 3]
-    so3.copy(T, now.R)
-    so3.orthonormalise(now.R)
-    _spread(models[target], state, covariance)
-    for i in range(POSE):
-        now.velocity[i] = velocity[i]
-    for s in range(len(known)):
-        sense = state.senses[s]
-        sense.believed_ns, sense.gain = known[s].believed_ns, known[s].weight
-        now.accepted_ns = max(now.accepted_ns, known[s].believed_ns)
-
-
-@kernel(
-    "MODEL[t], SENSE_MODEL[n], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], "
-    "out i8[t, 2], i8[m], i8[m], i8[m], f8[m, 4, 4], f8[m, 6, 6], i8, out i8[m], out MEASUREMENT[1], out f8[size, 6]",
-    MODEL=MODEL,
-    SENSE_MODEL=SENSE_MODEL,
-    MEASUREMENT=MEASUREMENT,
-    STATE=STATE,
-    SENSE_STATE=SENSE_STATE,
-)
-def measure_all(
-    models, sense_models, measurements, states, senses, P, rings,
-    targets, sources, stamps_ns, T, information, latest_ns, fates, taken, PHt,
-):  # type: ignore[no-untyped-def]  # fmt: skip
-    """`Bank.measure`, one after the other. taken, PHt : room for the measurement under way, and for `step`."""
-    m = taken[0]
-    for r in range(len(targets)):
-        i = targets[r]
-        fates[r] = fault(stamps_ns[r], T[r], information[r], latest_ns)
-        if fates[r] == 0:
-            model = Model(models[i], sense_models)
-            reduce(model, sources[r], stamps_ns[r], T[r], information[r], m)
-            history = Entries(measurements[i], states[i], senses[i], P[i], rings[i])
-            fates[r] = insert(model, history, m, PHt) if m.rank else NOTHING
-
-
-@kernel(
-    "MODEL[t], MEASUREMENT[t, c], STATE[t, c], SENSE_STATE[t, c, n], f8[t, c, size, size], i8[t, 2], i8, "
-    "out ESTIMATE[t], out SENSE_ESTIMATE[t, n]",
-    MODEL=MODEL,
-    MEASUREMENT=MEASUREMENT,
-    STATE=STATE,
-    SENSE_STATE=SENSE_STATE,
-    ESTIMATE=ESTIMATE,
-    SENSE_ESTIMATE=SENSE_ESTIMATE,
-)
-def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, shares):  # type: ignore[no-untyped-def]
-    """`Bank.estimate`, one after the other."""
-    p, R, velocity, covariance = np.empty(3), np.empty((3, 3)), np.empty(POSE), np.empty((MOTION, MOTION))
-    for n in range(len(out)):
-        history = Entries(measurements[n], states[n], senses[n], P[n], rings[n])
-        one, slot, found = models[n], find(history, stamp_ns), out[n]
-        now, of_senses = states[n, slot], senses[n, slot]
-        if now.stamp_ns == NEVER:
-            for i in range(3):
-                p[i] = one.home[i, 3]
-            so3.copy(one.home, R)
-            for i in range(POSE):
-                velocity[i] = 0.0
-                for j in range(POSE):
-                    covariance[i, j] = one.home_covariance[i, j]
-            found.state = LOST
-        else:
-            for i in range(3):
-                p[i] = now.p[i]
-            so3.copy(now.R, R)
-            so3.copy(P[n, slot], covariance)
-            for i in range(POSE):
-                velocity[i] = now.velocity[i]
-            dt = max(0.0, (stamp_ns - now.stamp_ns) * 1e-9)
-            move(one, dt, p, R, velocity, covariance, now.agility)
-            found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)
-        for i in range(3):
-            for j in range(3):
-                found.pose[i, j] = R[i, j]
-            found.pose[i, 3], found.pose[3, i] = p[i], 0.0
-        found.pose[3, 3] = 1.0
-        so3.copy(covariance, found.covariance)
-        total = 0.0
-        for i in range(POSE):
-            found.velocity[i] = velocity[i]
-        for s in range(len(of_senses)):
-            total += of_senses[s].gain
-        for s in range(len(of_senses)):
-            share = shares[n, s]
-            share.believed_ns = of_senses[s].believed_ns
-            share.weight = of_senses[s].gain / total if total > 0.0 else 0.0

@@ -1,6 +1,6 @@
 """The default observer: takes poses of any rank, late and in any order, and answers with the pose at any moment.
 
-The arithmetic, the going back and the replaying are in `filter.py`, compiled: a call does it for as many targets as it is given.
+The arithmetic is compiled (`filter.py`, `history.py`): a call does it for as many targets as it is given.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.fusion import filter
+from penumbra.services.fusion import history
 from penumbra.services.fusion.estimate import ACCEPTED, FUTURE, STATES, Array, Estimate, Log, latest, refusal, shaped
 from penumbra.services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, SENSE_ESTIMATE, History, size
-from penumbra.services.fusion.settings import Settings, model, sense_models
+from penumbra.services.fusion.settings import FusionSettings, model, sense_models
 from penumbra.shared.contract.messages import FusedPose, Source
 from penumbra.shared.contract.senses import SENSES, Sense
 from penumbra.shared.geometry import rigid
@@ -30,26 +30,26 @@ class Bank:
         self,
         homes: Array,
         spreads: Sequence[tuple[float, float]],
-        settings: Settings | None = None,
+        settings: FusionSettings | None = None,
         senses: Sequence[Sense] = SENSES,
     ):
-        self.settings = settings or Settings()
+        self.settings = settings or FusionSettings()
         self.names = tuple(sense.name for sense in senses)
         self.logs = [Log(self.names) for _ in homes]
         self._models = np.array([model(self.settings, *given) for given in zip(homes, spreads, strict=True)], MODEL)
         self._sense_models = sense_models(senses)
         self._history = History.empty(len(homes), self.settings.capacity * len(senses), len(senses))
         self._room = np.empty(1, MEASUREMENT), np.empty((size(len(senses)), POSE))
-        filter.clear_all(*self._history)
+        history.clear_all(*self._history)
 
     def __len__(self) -> int:
         return len(self.logs)
 
     def forget(self, targets: slice = slice(None)) -> None:
         """Begins anew with every target, or with some of them; their counts go on."""
-        filter.clear_all(*self._history.of(targets))
+        history.clear_all(*self._history.of(targets))
         for log in self.logs[targets]:
-            log.heard_ns.clear()
+            log.first_ns.clear()
 
     def measure(
         self,
@@ -66,13 +66,13 @@ class Bank:
         `ErrorStateObserver.measure`. What is refused is counted, and the others are taken.
         """
         fates = np.empty(len(targets), np.int64)
-        filter.measure_all(
+        history.measure_all(
             *(self._models, self._sense_models, *self._history),
             *(targets, sources, stamps_ns, T, information, latest(now_ns), fates, *self._room),
         )
         columns = (each.tolist() for each in (targets, sources, stamps_ns, fates))
         for target, source, stamp_ns, fate in zip(*columns, strict=True):
-            self.logs[target].took(self.names[source], stamp_ns, fate)
+            self.logs[target].record(self.names[source], stamp_ns, fate)
         return fates
 
     def adopt(self, target: int, message: FusedPose) -> None:
@@ -80,10 +80,10 @@ class Bank:
         known = np.array([(NEVER, 0.0)] * len(self.names), SENSE_ESTIMATE)
         for record, name in zip(known, self.names, strict=True):
             if (source := message.sources.get(name)) is not None:
-                record["believed_ns"], record["weight"] = message.stamp_ns - int(1e9 * source.age_s), source.weight
-                self.logs[target].heard(name, int(record["believed_ns"]))
+                record["accepted_ns"], record["weight"] = message.stamp_ns - int(1e9 * source.age_s), source.weight
+                self.logs[target].received(name, int(record["accepted_ns"]))
         T = rigid.transform(message.position, message.orientation)
-        filter.adopt(
+        history.adopt(
             *(self._models, *self._history, target),
             *(message.stamp_ns, T, message.velocity, message.covariance, known),
         )
@@ -93,7 +93,7 @@ class Bank:
         otherwise as `ErrorStateObserver.estimate`."""
         models = self._models[targets]
         out, senses = np.empty(len(models), ESTIMATE), np.empty((len(models), len(self.names)), SENSE_ESTIMATE)
-        filter.estimate_all(models, *self._history.of(targets), stamp_ns, out, senses)
+        history.estimate_all(models, *self._history.of(targets), stamp_ns, out, senses)
         return out, senses
 
     def earliest_ns(self, target: int) -> int:
@@ -121,9 +121,9 @@ class Bank:
         columns = (found["pose"], found["velocity"], found["covariance"], found["state"].tolist(), senses.tolist())
         for T, velocity, covariance, state, known, log in zip(*columns, self.logs[targets], strict=True):
             sources = {}
-            for name, (believed_ns, weight) in zip(self.names, known, strict=True):
-                if name in log.heard_ns:
-                    newest_ns = believed_ns if believed_ns != NEVER else log.heard_ns[name]
+            for name, (accepted_ns, weight) in zip(self.names, known, strict=True):
+                if name in log.first_ns:
+                    newest_ns = accepted_ns if accepted_ns != NEVER else log.first_ns[name]
                     sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), weight)
             out.append(Estimate(T, velocity, covariance, STATES[state], sources))
         return out
@@ -140,7 +140,7 @@ class ErrorStateObserver:
         self,
         home: rigid.Array,
         spread: tuple[float, float],
-        settings: Settings | None = None,
+        settings: FusionSettings | None = None,
         senses: Sequence[Sense] = SENSES,
     ):
         self._join(Bank(np.asarray(home)[None], [spread], settings, senses), 0)
@@ -162,9 +162,9 @@ class ErrorStateObserver:
         """Takes a pose T (4, 4) with its information (6, 6, zero along what is not observed). True if it was accepted.
 
         `hidden` is not used: the information says how good the measurement is. `now_ns` is the reader's clock, where the stamp is
-        to be compared with it. Raises Refused, which is counted and leaves the state as it is, for a pose that is no rigid
-        transform, an information that is not symmetric and positive semi-definite, and a stamp from the future; ValueError on an
-        unknown source.
+        to be compared with it. Raises RefusedMeasurement, which is counted and leaves the state as it is, for a pose that is no
+        rigid transform, an information that is not symmetric and positive semi-definite, and a stamp from the future; ValueError
+        on an unknown source.
         """
         self.log.check(source)
         T, information = shaped(T, (4, 4)), shaped(information, (POSE, POSE))
@@ -190,7 +190,7 @@ class ErrorStateObserver:
 
     @property
     def earliest_ns(self) -> int:
-        """The first stamp at which the pose can be told: that of the oldest measurement kept."""
+        """The first stamp for which the pose is known: that of the oldest measurement kept."""
         return self._bank.earliest_ns(self._target)
 
     def estimate(self, stamp_ns: int) -> Estimate:

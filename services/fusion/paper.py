@@ -39,6 +39,7 @@ from penumbra.shared.contract.messages import FusedPose, Source
 from penumbra.shared.geometry import rigid
 
 STEP_S = 0.01
+"""Longest step [s] of the integration. Chosen: the backward Euler step is stable for any."""
 SENSES = {"vision": slice(0, 6), "haptic": slice(6, 12)}
 """Rows of y, g, z and C, and blocks of R: the paper's two senses. This observer takes no others, whatever the table has."""
 C = np.vstack([np.eye(6), np.eye(6)])
@@ -63,9 +64,10 @@ class PaperSettings:
     omega_n, zeta : low-pass on the pose [rad/s] and its damping (the same section).
     floor : least hidden share: 1.25e-5 of W_v is (1 cm)^2 and (1.4 degrees)^2.
     rate : lambda [1/s] in Q = lambda^2 W_v: one camera period.
-    velocity_time : smoothing of u [s].
+    velocity_time : time constant of the smoothing of u [s]. Chosen, not measured.
     hold : for how long a measurement of each sense is used [s]: its delay and two of its periods.
-    acceleration : by which the published covariance grows with age, density [m^2/s^3] and [rad^2/s^3].
+    acceleration : by which the published covariance grows with age, density [m^2/s^3] and [rad^2/s^3]. Chosen,
+        not measured.
     """
 
     W_v: tuple[float, ...] = (8.0, 8.0, 8.0, 16 * np.pi, 16 * np.pi, 16 * np.pi)
@@ -121,15 +123,15 @@ class PaperObserver:
         self._ahead: list[_State] = []  # the state at the newest measurement, and as far ahead as somebody asked
         self._covariance = self._home_covariance
         self._weights: dict[str, float] = {}
-        self.log.heard_ns.clear()
+        self.log.first_ns.clear()
 
     def measure(
         self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None, now_ns: int | None = None
     ) -> bool:
         """Takes a pose T (4, 4) with its information (6, 6). True if it is newer than the one before of this source.
 
-        source : `vision` (R_v from the share `hidden`) or `haptic` (R_c from the information). Raises Refused, which is
-        counted, for a pose that is no rigid transform, an information that is not symmetric and positive semi-definite, and a
+        source : `vision` (R_v from the share `hidden`) or `haptic` (R_c from the information). Raises RefusedMeasurement, which
+        is counted, for a pose that is no rigid transform, an information that is not symmetric and positive semi-definite, and a
         stamp ahead of the reader's clock `now_ns` (where it is given); ValueError on an unknown source.
         """
         T, information = self.log.admitted(source, stamp_ns, T, information, now_ns)
@@ -163,7 +165,7 @@ class PaperObserver:
     def estimate(self, stamp_ns: int) -> Estimate:
         """The pose at a stamp, not before the newest measurement. Disturbs nothing."""
         sources = {}
-        for name, since_ns in self.log.heard_ns.items():
+        for name, since_ns in self.log.first_ns.items():
             newest_ns = self._held[name].stamp_ns if name in self._held else since_ns
             in_use = name in self._held and stamp_ns - newest_ns <= self._hold_ns[name]
             sources[name] = Source(max(0.0, (stamp_ns - newest_ns) * 1e-9), self._weights.get(name, 0.0) if in_use else 0.0)
@@ -179,7 +181,7 @@ class PaperObserver:
 
     @property
     def earliest_ns(self) -> int:
-        """The first stamp at which the pose can be told: that of the newest measurement."""
+        """The first stamp for which the pose is known: that of the newest measurement."""
         return self._newest_ns() if self._held else 0
 
     def R_v(self, hidden: float) -> Array:

@@ -1,4 +1,4 @@
-"""The records that the default observer's filter, `filter.py`, works on: settings, a measurement, a state, an estimate.
+"""The records that the default observer, `filter.py` and `history.py`, works on: settings, a measurement, a state, an estimate.
 
 What there is of every sense is a record in an array (n,) of its own, in the order of the table of senses, so that the compiled
 filter serves any number of them.
@@ -25,9 +25,9 @@ def size(senses: int) -> int:
 
 MODEL = np.dtype(
     [
-        *((name, "f8", 2) for name in ("acceleration", "velocity_spread", "agility", "learning")),  # as in Settings
+        *((name, "f8", 2) for name in ("acceleration", "velocity_spread", "agility", "learning")),  # as in FusionSettings
         *((name, "f8") for name in ("velocity_time", "doubt", "patience", "source_patience", "refusals", "unobserved")),
-        ("witness", "f8"),
+        ("agreement_time", "f8"),
         *((name, "f8") for name in ("horizon", "weight_time", "lost_age")),
         ("limits", "f8", 4),  # as in Limits
         ("home", "f8", (4, 4)),
@@ -78,10 +78,10 @@ STATE = np.dtype(
 
 SENSE_STATE = np.dtype(
     [
-        ("came_ns", "i8"),  # stamp of the last measurement
-        ("surprise", "f8"),  # its squared Mahalanobis distance a direction
-        ("heard_ns", "i8"),  # stamp of the last measurement that taught something
-        ("believed_ns", "i8"),  # and of the last accepted one
+        ("measured_ns", "i8"),  # stamp of the last measurement
+        ("surprise", "f8"),  # its squared Mahalanobis distance per direction
+        ("learned_ns", "i8"),  # stamp of the last measurement that agility and doubt were adapted to
+        ("accepted_ns", "i8"),  # and of the last accepted one
         ("refused", "i8"),  # how many were refused since
         ("refused_ns", "i8"),  # stamp of the first of them
         # information that it brought [nats], fading: by how much it made the logarithm of the volume of the pose's uncertainty
@@ -105,15 +105,15 @@ ESTIMATE = np.dtype(
 )
 """What is answered for one target: `estimate.Estimate` in arrays."""
 
-SENSE_ESTIMATE = np.dtype([("believed_ns", "i8"), ("weight", "f8")])
+SENSE_ESTIMATE = np.dtype([("accepted_ns", "i8"), ("weight", "f8")])
 """The same of one sense; its stamp is that of its last accepted measurement, NEVER where there is none."""
 
 
 class History(NamedTuple):
-    """The histories of targets (t,), each a ring of c entries, with n senses; see `filter.py`.
+    """The histories of targets (t,), each a ring of c entries, with n senses; see `history.py`.
 
     measurements (t, c) : MEASUREMENT. states (t, c) : STATE. senses (t, c, n) : SENSE_STATE. P (t, c, size, size) : covariances
-    of the errors of position, rotation, their velocities, and the bias of each sense. rings (t, 2) : see `filter.py`.
+    of the errors of position, rotation, their velocities, and the bias of each sense. rings (t, 2) : see `history.py`.
     """
 
     measurements: NDArray[np.void]
@@ -124,7 +124,7 @@ class History(NamedTuple):
 
     @classmethod
     def empty(cls, targets: int, capacity: int, senses: int) -> History:
-        """Room for histories, not yet cleared."""
+        """Memory for histories, not yet cleared."""
         n, shape = size(senses), (targets, capacity)
         return cls(
             np.zeros(shape, MEASUREMENT),

@@ -14,7 +14,7 @@ import numpy as np
 
 from penumbra.services import flags
 from penumbra.services.fusion import paper
-from penumbra.services.fusion.estimate import Estimate, Refused, latest, measured
+from penumbra.services.fusion.estimate import Estimate, RefusedMeasurement, latest, measured
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver
 from penumbra.shared.cell import description
@@ -27,9 +27,10 @@ NAME = "fusion"
 OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
 PERIOD_S = 1.0 / topics.FUSED.rate_hz
 SILENCE_S = 0.025
-"""A replica speaks for the one before it in rank after so long a silence: a frozen process counts as alive for another second."""
+"""A replica publishes after the one before it in rank has been silent for so long [s], five periods: a frozen process counts as
+alive for another second."""
 SET_BACK_S = 0.05
-"""A clock that goes back by more was set, by less it is kept together with others."""
+"""A clock that goes back by more than this [s] was set; by less, it is being synchronised. Chosen, not measured."""
 
 
 FLAGS = (
@@ -83,8 +84,8 @@ class Group:
             self.observers = [ErrorStateObserver.of(self._bank, i) for i in range(len(targets))]
 
     def now_ns(self) -> int:
-        """The time, asked with the lock held. Where the clock was set back, all that is known is of a time to come, of which
-        nothing can be told now: it is forgotten. Where it was set forward, it is too old."""
+        """The time, asked with the lock held. Where the clock was set back, all that is known is of the future and
+        says nothing of the present: it is forgotten. Where it was set forward, it is too old."""
         stamp_ns = self._now_ns()
         if stamp_ns < self._last_ns - SET_BACK_S * 1e9:
             for observer in self.observers:
@@ -102,85 +103,85 @@ class Group:
 
 
 class Publishers:
-    """Who may speak for a stream: one process at a time. Two that do not know of each other would count every error twice. A
-    replica that takes over is heard as soon as the one before it has been silent for a while."""
+    """The publisher of each stream: one process at a time. Two that do not know of each other would count every error twice. A
+    replica that takes over is accepted as soon as the one before it has been silent for a while."""
 
     def __init__(self) -> None:
-        self._speaks: dict[str, tuple[str, float]] = {}
+        self._publishers: dict[str, tuple[str, float]] = {}
 
     def check(self, stream: str, publisher: str, now_s: float, silence_s: float) -> None:
-        """Raises Refused for a publisher while another one of this stream was heard in the last silence_s. now_s: the time of a
-        clock that nobody sets."""
-        speaker, heard_s = self._speaks.get(stream, (publisher, now_s))
-        if speaker != publisher and now_s - heard_s < silence_s:
-            raise Refused(
+        """Raises RefusedMeasurement for a publisher while another one of this stream has published in the last silence_s. now_s:
+        of a clock that nobody sets."""
+        known, received_s = self._publishers.get(stream, (publisher, now_s))
+        if known != publisher and now_s - received_s < silence_s:
+            raise RefusedMeasurement(
                 "publisher",
-                f"{stream}: expected one publisher, got {publisher} beside {speaker}: two processes publish the same poses; "
+                f"{stream}: expected one publisher, got {publisher} beside {known}: two processes publish the same poses; "
                 "end one of them",
             )
-        self._speaks[stream] = publisher, now_s
+        self._publishers[stream] = publisher, now_s
 
 
 class Fusion:
-    """One target: its observer, what it hears and what it says. Every replica listens, the stream's owner publishes, and the next
-    in rank where it is silent. One that knows nothing yet goes on from what the others publish."""
+    """One target: its observer, its measurements and its pose. Every replica receives the measurements, the stream's owner
+    publishes, and the next in rank where it is silent. One that has no pose yet goes on from what the others publish."""
 
     def __init__(
         self, node: ServiceNode, target: str, group: Group, observer: ErrorStateObserver | PaperObserver, senses: Sequence[Sense]
     ):
         self.node, self.target, self.group, self.observer = node, target, group, observer
         self._publishers = Publishers()
-        self._told: set[tuple[str, str]] = set()
+        self._logged: set[tuple[str, str]] = set()
         self.state = "lost"
         self._others = node.latest(topics.FUSED, from_others=True, target=target)
-        self._others_count, self._heard_s = 0, time.monotonic()
+        self._others_count, self._others_s = 0, time.monotonic()
         for sense in senses:
             node.subscribe(sense.topic, partial(self.on_measurement, sense), target=target)
         node.answer(topics.current_pose(node.cell.name, target), self.answer)
-        node.tell(target, self.describe)
+        node.add_report(target, self.describe)
 
     def on_measurement(self, sense: Sense, message: Any, names: dict[str, str]) -> None:
-        """Hands a measurement on to the observer, or the news that a sense is there but has nothing to say; what is refused is
+        """Hands a measurement on to the observer, or the fact that a sense runs but observes nothing; what is refused is
         counted, and the first of each kind is logged."""
         log = self.observer.log
         try:
             self._check_origin(sense, message, names["publisher"])
             is_usable = sense.usable is None or message.state == sense.usable
             found = measured(message, sense.measures) if is_usable else None
-        except Refused as error:
+        except RefusedMeasurement as error:
             log.refused(sense.name, error.kind)
-            self._tell(sense.name, error)
+            self._log(sense.name, error)
             return
         with self.group.lock:
             now_ns = self.group.now_ns()
             if found is None:
-                log.heard(sense.name, message.stamp_ns)
+                log.received(sense.name, message.stamp_ns)
                 return
             hidden = getattr(message, "hidden", None)  # the share by which the paper's observer weighs the camera
             try:
                 self.observer.measure(sense.name, message.stamp_ns, *found, hidden, now_ns)
-            except Refused as error:
-                self._tell(sense.name, error)
+            except RefusedMeasurement as error:
+                self._log(sense.name, error)
 
     def _check_origin(self, sense: Sense, message: Any, publisher: str) -> None:
-        """Raises Refused for a message of another target, frame or part of the cell, and for a second publisher."""
+        """Raises RefusedMeasurement for a message of another target, frame or part of the cell, and for a second publisher."""
         expected, got = (self.target, self.node.cell.frame), (message.target, message.frame)
         if got != expected:
-            raise Refused("frame", f"{sense.name}: expected target and frame {expected}, got {got!r:.120}")
+            raise RefusedMeasurement("frame", f"{sense.name}: expected target and frame {expected}, got {got!r:.120}")
         stream = sense.name
         if sense.part is not None:
             part, known = getattr(message, sense.part), getattr(self.node.cell, f"{sense.part}s")
             if part not in known:
                 text = f"{sense.name}: expected a {sense.part} of the cell ({', '.join(known)}), got {part!r:.60}"
-                raise Refused(sense.part, text)
+                raise RefusedMeasurement(sense.part, text)
             stream = f"{sense.name} of {sense.part} {part}"
         self._publishers.check(stream, publisher, time.monotonic(), sense.topic.stale_s)
 
-    def _hear_others(self) -> None:
-        """Notes when another replica spoke last, and takes over the pose that it knows where this one knows none."""
+    def _follow_others(self) -> None:
+        """Notes when another replica published last, and takes over its pose where this one has none."""
         if (count := self._others.drain()) == self._others_count:
             return
-        self._others_count, self._heard_s = count, time.monotonic()
+        self._others_count, self._others_s = count, time.monotonic()
         if self.state != "lost" or self.node.owns(self.target):
             return
         message: messages.FusedPose | None = self._others.get(target=self.target)
@@ -189,9 +190,9 @@ class Fusion:
                 if message.stamp_ns <= latest(self.group.now_ns()):
                     self.observer.adopt(message)
 
-    def _tell(self, source: str, error: Refused) -> None:
-        if (source, error.kind) not in self._told:
-            self._told.add((source, error.kind))
+    def _log(self, source: str, error: RefusedMeasurement) -> None:
+        if (source, error.kind) not in self._logged:
+            self._logged.add((source, error.kind))
             why = "measurement refused; more of this kind are only counted"
             self.node.log.warning(why, target=self.target, source=source, kind=error.kind, why=str(error))
 
@@ -201,9 +202,9 @@ class Fusion:
 
     def publish(self, stamp_ns: int, estimate: Estimate) -> None:
         """Publishes an estimate, where it is this replica's turn."""
-        self._hear_others()
+        self._follow_others()
         changed, self.state = (estimate.state == "lost") != (self.state == "lost"), estimate.state
-        if time.monotonic() - self._heard_s < self.node.rank(self.target) * SILENCE_S:
+        if time.monotonic() - self._others_s < self.node.rank(self.target) * SILENCE_S:
             return
         self.node.publish(topics.FUSED, estimate.message(stamp_ns, self.target, self.node.cell.frame), target=self.target)
         if changed:

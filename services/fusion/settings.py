@@ -1,4 +1,4 @@
-"""Settings of the default observer, whose filter is in `filter.py`, and how they are handed to it."""
+"""Settings of the default observer, and the records that its compiled filter (`filter.py`) reads."""
 
 from __future__ import annotations
 
@@ -15,44 +15,64 @@ from penumbra.shared.contract.senses import Sense
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Numbers of the filter, with the reasons for their defaults. Those of a sense are in `shared/contract/senses.py`.
+class FusionSettings:
+    """Settings of the filter. Every field states its unit and where its value comes from. Those of a sense are in
+    `shared/contract/senses.py`.
 
-    acceleration : density of the white acceleration, linear [m^2/s^3] and angular [rad^2/s^3]: an arm that reaches 0.25 m/s.
-    velocity_time : after which a velocity is forgotten [s]: limbs reach to places and stop there.
-    velocity_spread : standard deviation of an unknown velocity, linear [m/s] and angular [rad/s].
-    agility : bounds of the factors on `acceleration` that are learned: from a resting arm to a hand at 2 m/s.
-    doubt : largest factor on the covariance of a sense that is learned.
-    learning : step of all of them per measurement, at most, and per second.
-    patience : after refusing everything of all senses for so long [s], start again from the newest measurement.
-    source_patience : after refusing one sense for so long [s] while another is believed, doubt the state.
-    witness : a refused measurement teaches nothing while another sense, heard within so long [s], is less surprising.
-    refusals : and at least so many measurements refused, so that two outliers after a pause do not count as persistence.
-    unobserved : a direction with a standard deviation beyond this, in UNITS, is taken as not observed.
-    horizon : length of the history [s]: vision is 30 to 100 ms late, more when the machine is busy.
-    capacity : measurements that the history holds at most, for each sense on average: that of two is twice what 100 Hz and 20 Hz
-        bring within the horizon. A storm of measurements shortens the history and costs no memory.
-    weight_time : over which a source's weight remembers [s].
+    "Chosen" means by hand; `penumbra bench fusion` shows what a change does. "By the NEES" means so that on its simulated limbs
+    the errors are as large as the covariance says.
     """
 
+    # ---- How a limb moves
+
     acceleration: tuple[float, float] = (0.1, 1.5)
+    """Density of the white acceleration, linear [m^2/s^3] and angular [rad^2/s^3], before it is adapted. By the NEES."""
     velocity_time: float = 0.35
+    """Time constant [s] with which a velocity decays: limbs reach to places and stop there. By the NEES."""
     velocity_spread: tuple[float, float] = (0.4, 1.0)
+    """Standard deviation of an unknown velocity, linear [m/s] and angular [rad/s]. Chosen, not measured."""
+
+    # ---- What is learned from the innovations
+
     agility: tuple[float, float] = (0.08, 30.0)
+    """Bounds of the learned factors on `acceleration`: from a resting arm to a hand at 2 m/s. Chosen; the lower one by
+    the NEES."""
     doubt: float = 100.0
+    """Largest learned factor on the covariance of a sense. Chosen, not measured."""
     learning: tuple[float, float] = (0.1, 5.0)
+    """Learning rate of these factors' logarithms: largest per measurement, and per second [1/s]. Chosen, not measured."""
+
+    # ---- What is refused, and until when
+
+    agreement_time: float = 0.25
+    """Age [s] up to which the last measurement of another sense decides whether a surprising one is an outlier. Chosen, not
+    measured."""
     patience: float = 0.5
+    """Time [s] for which all measurements of all senses are refused before the filter starts again from the newest one. Chosen,
+    not measured."""
     source_patience: float = 1.0
-    witness: float = 0.25
+    """Time [s] for which one sense is refused, while another is accepted, before the covariance of the state is enlarged. Chosen,
+    not measured."""
     refusals: int = 5
+    """Least number of measurements refused in both cases, so that two outliers after a pause do not suffice. Chosen, not
+    measured."""
     unobserved: float = 2.0
+    """Standard deviation, in UNITS, from which a direction counts as not observed: 20 cm or 2 rad. Chosen, not measured."""
+
+    # ---- What is remembered
+
     horizon: float = 1.0
+    """Length of the history [s]: vision is 30 to 100 ms late, more when the machine is busy."""
     capacity: int = 128
+    """Largest number of measurements in the history, for each sense on average: that of two is twice what 100 Hz and 20 Hz bring
+    within the horizon. A storm of measurements shortens the history and takes no memory."""
     weight_time: float = 0.5
+    """Time constant [s] with which the information that a sense has brought decays in its published weight. Chosen, not
+    measured."""
     limits: Limits = Limits()
 
 
-def model(settings: Settings, home: Array, spread: tuple[float, float]) -> NDArray[np.void]:
+def model(settings: FusionSettings, home: Array, spread: tuple[float, float]) -> NDArray[np.void]:
     """A MODEL of a target expected at the pose home (4, 4) with standard deviations spread (position [m], rotation [rad])."""
     out = np.zeros((), MODEL)
     values = vars(settings) | {"lost_age": settings.limits.lost_age, "limits": astuple(settings.limits), "home": home}

@@ -150,7 +150,7 @@ class Misfits:
                 now = float(squares[own][used].mean())
                 before = self._means.get(pad, now)
                 self._means[pad] = before + SHARE * (now - before)
-                self._node.tell(f"misfit/{pad}", partial(self._told, pad))
+                self._node.add_report(f"misfit/{pad}", partial(self._told, pad))
 
     def _told(self, pad: str) -> float:
         return round(self._means[pad], 2)

@@ -60,8 +60,8 @@ class Launcher:
         self._keep_going, self._notify, self._hint = keep_going, notify, hint
         self._first: list[Supervised] = []
         self.watch = display.Watch(node)
-        node.tell("processes", self._processes)
-        node.worry(self._worries)
+        node.add_report("processes", self._processes)
+        node.add_reasons(self._reasons)
         node.answer(topics.launcher(node.cell.name), fleet.answer)
         self._looping: set[str] = set()
 
@@ -167,7 +167,7 @@ class Launcher:
             for process in self.fleet.processes
         }
 
-    def _worries(self) -> list[str]:
+    def _reasons(self) -> list[str]:
         return [f"{each.name} {each.state}: {each.note}" for each in self.fleet.processes if each.state in ("waiting", "failed")]
 
     def _rows(self) -> list[ProcessRow]:

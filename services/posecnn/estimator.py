@@ -28,19 +28,19 @@ SMALLEST = 24
 AGREEING = 0.6
 """Share of the pixels that must agree with the vote."""
 FITS = 0.5
-"""Overlap of the target's pixels and the mesh at the pose below which this is not the pose."""
+"""Least overlap of the target's pixels and the mesh at a right pose."""
 HIDDEN = 0.92
-"""A larger hidden share leaves too little to measure a pose."""
+"""Largest hidden share with which a pose is measured."""
 COVERED = 0.5
-"""Share of the predicted picture covered by something from which on the target is occluded and not lost."""
+"""Covered share of the predicted silhouette from which the target is occluded and not lost."""
 COVERS = (Label.ROBOT, Label.TORSO, Label.UPPER_ARM, Label.OCCLUDER)
-TOO_SMALL, ROOM = 0.45, 1.8
-"""When nothing is known of the target and its pixels extend over less than this share of the patch, it is looked at again in a
-square so many times as large as that extent."""
+TOO_SMALL, WIDER = 0.45, 1.8
+"""Where nothing is known of the target and its pixels extend over less than this share of the patch, a second patch is taken: a
+square larger than that extent by this factor."""
 FEWEST = 8
-"""Pixels, counted at the network's stride, that are looked at again."""
+"""Least number of pixels, at the network's stride, for a second patch."""
 TILED, TILE = 2.0, 0.6
-"""A window wider than so many patches, when nothing is known of the target, is also looked at in four tiles, of this share."""
+"""A window wider than so many patches, where nothing is known of the target, is also read in four tiles of this share of it."""
 UNKNOWN = np.diag([1.0**2] * 3 + [1.5**2] * 3)
 """Covariance of a pose that says nothing, [m^2, rad^2]."""
 
@@ -132,7 +132,7 @@ class PoseCNN:
             return None
         fx, fy, cx, cy = self._intrinsics
         middle = ((low + high) / 2.0 - square.centre) / square.focal * [fx, fy] + [cx, cy]
-        return middle, ROOM * extent / square.focal * fx
+        return middle, WIDER * extent / square.focal * fx
 
     @property
     def _intrinsics(self) -> Array:

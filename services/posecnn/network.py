@@ -34,7 +34,7 @@ REACH = 0.75
 BINS, SAMPLES = 8, 16
 """A side of the pooled region, and samples that are pooled."""
 PROPORTIONS = (-0.29, -0.11, 0.186, -0.1, 0.1)
-"""Of the mean body's forearm and hand (`proportions`)."""
+"""Proportions of the mean body's forearm and hand (`proportions`)."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
         camera = names["camera"]
         for target in lookouts[camera].targets:
             if (pose := fused.get(target=target)) is not None:
-                lookouts[camera].hear(pose)
+                lookouts[camera].add(pose)
         window = lookouts[camera].look(frame.stamp_ns)
         image = undistort[camera](frame.image)
         for (own, target), estimator in estimators.items():

@@ -19,13 +19,14 @@ from penumbra.shared.geometry.rigid import Array
 KINDS = ("depth", "lateral", "turn", "tilt", "roll")
 """Depth by the distance, lateral by the target's length, the others in radians."""
 BOUNDS = {"depth": (0.01, 0.5), "lateral": (0.005, 1.0), "turn": (0.01, 1.0), "tilt": (0.02, 1.0), "roll": (0.05, 1.5)}
-"""Of the standard deviations: a few hundred pictures say nothing about smaller and larger ones."""
+"""Bounds of the standard deviations: a few hundred pictures say nothing about smaller and larger ones."""
 LENGTH_PX = 100.0
+"""Apparent length [px] to which others are compared: there its logarithm is zero."""
 
 
 @dataclass(frozen=True)
 class Signs:
-    """What tells how good an estimate is. hidden: share of the target that is not seen; length_px: its apparent length in the
+    """Signs of how good an estimate is. hidden: share of the target that is not seen; length_px: its apparent length in the
     image; spread [rad]: of the votes for its centre; share: of its pixels that agree with the vote."""
 
     hidden: float
@@ -91,7 +92,7 @@ def errors(T_true: Array, T: Array, length: float) -> dict[str, Array]:
 
 def fitted(signs: list[Signs], missed: list[dict[str, Array]]) -> Uncertainty:
     """The uncertainty under which errors (`errors`) are most probable, with a weak prior against steep coefficients. Outliers
-    count in full: the observer shall rather believe too little than too much."""
+    count in full: too large a covariance does less harm than too small a one."""
     from scipy.optimize import minimize  # here, because estimating needs none of it
 
     features = np.array([one.features for one in signs])

@@ -20,8 +20,9 @@ AGREES_RAD = 0.2
 NEAR_PX = 3.0
 """Pixels nearer to the centre than this cannot say much about its direction: there a ray agrees that misses by this at most."""
 MARGIN = 1.0
-"""The centre is looked for up to so many sides of the picture outside of it, for it may be cut off or covered."""
+"""Margin around the picture in which the centre is searched, in sides of the picture: it may be cut off or covered."""
 ROUNDS = 4
+"""Number of times that the centre is solved for from the rays that agree with it. Chosen, not measured."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,37 +13,49 @@ from penumbra.services.search.evidence import COVERED, LEAST_KNOWN, TAPS, Eviden
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.raster import draw_silhouette
+from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
-
-Array = NDArray[np.float64]
 
 NEAR = 0.05
 """Edges nearer to the camera than this are left out [m]."""
 BESIDE = 1.5
-"""Contours of two parts that are nearer than this [px] are told apart by nothing."""
+"""Distance [px] below which the contours of two parts cannot be distinguished in a mask."""
 FINE = 2
-"""The silhouette that tells the outer contour from the inner has so many pixels on each of the mask's: fingers far away are as
-wide as one."""
+"""Pixels, per pixel of the mask and direction, of the silhouette that separates the outer contour from the inner: distant fingers
+are as wide as one pixel of the mask."""
 ACROSS = 0.35
-"""Distance [px] on both sides of the contour at which it is looked up."""
+"""Distance [px] on both sides of the contour at which the silhouette is looked up."""
 COLUMN = 8
-"""Width of the columns [px] in which they are looked for, at least BESIDE."""
+"""Width of the columns [px] in which neighbouring points are looked for, at least BESIDE."""
 APART = 0.01
 """Two points of the contour whose depths differ by more than this [m] belong to two parts."""
 SHAPE = 0.006
-"""How well the mesh's cross-section is known [m]."""
+"""Error of the mesh's cross-section [m]: levers shorter than this say nothing about the roll."""
 MOST = 4096
-"""Points of a contour, at most: more than any that fits in an image."""
+"""Maximum number of points of a contour: more than fit in an image."""
 CREASE = 0.8
 """Facets that meet at a larger angle [rad] are a crease of the body, and not a sample of a round surface."""
 
 
+POINT = np.dtype(
+    [
+        ("position", "f8", 3),  # X, Y, Z in the camera's frame [m]
+        ("pixel", "f8", 2),  # u, v [px]
+        ("normal", "f8", 2),  # the contour's outward unit normal in the image
+        ("length", "f8"),  # of the contour that the point stands for [px]
+    ]
+)
+"""A point of a contour."""
+Points = NDArray[np.void]
+"""An array (n,) of POINT."""
+
+
 @dataclass(frozen=True)
 class Matched:
-    """A contour beside a mask: `points` (n, 8) of it (`_trace`), their offsets r (n,) [px] along the outward normal to the mask's
-    boundary and their `kind` (n,) (`_match`); `both`, `free`: see `evidence.compare`."""
+    """A contour beside a mask: its `points` (n,), their offsets r (n,) [px] along the outward normal to the mask's boundary and
+    their `kind` (n,) (`_match`); `both`, `free`: see `evidence.compare`."""
 
-    points: Array
+    points: Points
     r: Array
     kind: NDArray[np.uint8]
     both: int
@@ -57,8 +70,8 @@ class Model:
         self.faces = np.ascontiguousarray(mesh.faces, np.int32)
         self.edges = _edges(self.faces)
         self.closed = bool((self.edges[:, 3] >= 0).all())
-        # what a pass writes into: as large for every pose, so that its kernel's arguments are checked once
-        self._memory = np.empty((MOST, 8)), np.empty(MOST), np.empty(MOST, np.uint8), np.empty(2, np.int64)
+        # the output of a pass: as large for every pose, so that its kernel's arguments are checked once
+        self._memory = np.empty(MOST, POINT), np.empty(MOST), np.empty(MOST, np.uint8), np.empty(2, np.int64)
 
     def in_camera(self, T: Array) -> Array:
         """The vertices (n, 3) [m] in the camera's frame."""
@@ -70,9 +83,9 @@ class Model:
         front = np.empty_like(self.faces)
         return raster.silhouette(V, front[: _front(V, self.faces, self.closed, front)], (k.fx, k.fy, k.cx, k.cy), window)
 
-    def outline(self, V: Array, k: Intrinsics, shape: tuple[int, ...], spacing: float) -> Array:
-        """Points (n, 8) of the outer contour (`_trace`) in a window (h, w) of vertices (n, 3) [m] in the camera's frame."""
-        points = np.empty((MOST, 8))
+    def outline(self, V: Array, k: Intrinsics, shape: tuple[int, ...], spacing: float) -> Points:
+        """Points (n,) of the outer contour (`_trace`) in a window (h, w) of vertices (n, 3) [m] in the camera's frame."""
+        points = np.empty(MOST, POINT)
         intrinsics = np.array([k.fx, k.fy, k.cx, k.cy])
         return points[: _outline(V, self.faces, self.edges, self.closed, intrinsics, *shape, spacing, points)]
 
@@ -117,8 +130,8 @@ def _front(V, faces, closed, out):
 def _lean(V, edge, N, X, Y, Z):
     """How far behind (X, Y, Z) of a silhouette edge, along the line of sight, the round surface is seen edge-on [m].
 
-    A facet's edge turns with the body, the contour of a round limb does not: without this, eighteen flat sides pretend that
-    the whole forearm shows its roll. Between two facets the normal turns evenly; a crease of the body itself stays where it is.
+    A facet's edge turns with the body, the contour of a round limb does not: without this, the roll would be measured on the
+    eighteen flat sides of the mesh. Between two facets the normal turns evenly; a crease of the body itself stays where it is.
     """
     i, j, f, g = edge[0], edge[1], edge[2], edge[3]
     turn = math.acos(min(1.0, max(-1.0, N[f, 0] * N[g, 0] + N[f, 1] * N[g, 1] + N[f, 2] * N[g, 2])))
@@ -133,7 +146,7 @@ def _lean(V, edge, N, X, Y, Z):
 
 @inner
 def _contour(V, faces, front, edges, k, h, w, spacing, points):
-    """Writes the points (m, 8) of the outer contour in a window (h, w), as many as there is room for, and returns their number.
+    """Writes the points (m,) of the outer contour in a window (h, w), as many as there is room for, and returns their number.
     front (n, 3): of the faces (f, 3), those that may be seen."""
     fx, fy, cx, cy = k
     left, right, top, bottom = math.inf, -math.inf, math.inf, -math.inf
@@ -153,7 +166,7 @@ def _contour(V, faces, front, edges, k, h, w, spacing, points):
     return _trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing, points)
 
 
-@kernel("f8[v, 3], i4[n, 3], i4[e, 4], b1, f8[4], i8, i8, f8, out f8[m, 8] -> i8")
+@kernel("f8[v, 3], i4[n, 3], i4[e, 4], b1, f8[4], i8, i8, f8, out POINT[m] -> i8", POINT=POINT)
 def _outline(V, faces, edges, closed, k, h, w, spacing, points):
     """See `Model.outline`."""
     front = np.empty_like(faces)
@@ -163,7 +176,8 @@ def _outline(V, faces, edges, closed, k, h, w, spacing, points):
 
 @kernel(
     """f8[v, 3], i4[n, 3], i4[e, 4], b1, f8[4], u1[h, w], f4[h, w], u1[h, w], f4[a, b], f8, f8,
-    out f8[m, 8], out f8[m], out u1[m], out i8[2] -> i8"""
+    out POINT[m], out f8[m], out u1[m], out i8[2] -> i8""",
+    POINT=POINT,
 )
 def _matched(V, faces, edges, closed, k, state, field, guarded, known, spacing, reach, points, r, kind, counts):
     """A pass of a search over a mask: silhouette, contour and offsets in one call. Writes and returns what `Matched` holds."""
@@ -178,10 +192,9 @@ def _matched(V, faces, edges, closed, k, state, field, guarded, known, spacing, 
     return n
 
 
-@kernel("f8[v, 3], i4[n, 3], i4[e, 4], f8, f8, f8, f8, b1[a, b], i8, i8, i8, i8, f8, out f8[m, 8] -> i8")
+@kernel("f8[v, 3], i4[n, 3], i4[e, 4], f8, f8, f8, f8, b1[a, b], i8, i8, i8, i8, f8, out POINT[m] -> i8", POINT=POINT)
 def _trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing, points):
-    """Writes points of the outer occluding contour (m, 8), as many as there is room for, and returns their number: rows of X, Y,
-    Z in the camera's frame [m], u, v, outward normal (2) and the length of contour [px] that the point stands for. V (v, 3) [m];
+    """Writes points (m,) of the outer occluding contour, as many as there is room for, and returns their number. V (v, 3) [m];
     fine (a, b): silhouette of the same pose with FINE x FINE pixels on each of the window's, from pixel (x0, y0) on; w, h: size
     of the window.
 
@@ -204,7 +217,7 @@ def _trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing, points)
         z = max(V[i, 2], 1e-9)
         P[i, 0] = fx * V[i, 0] / z + cx
         P[i, 1] = fy * V[i, 1] / z + cy
-    out = np.empty((len(points), 8))
+    out = np.empty_like(points)
     outer = np.empty(len(points), np.bool_)
     n = 0
     for e in range(len(edges)):
@@ -234,14 +247,17 @@ def _trace(V, faces, edges, fx, fy, cx, cy, fine, x0, y0, w, h, spacing, points)
             if g >= 0:
                 scale = 1.0 + _lean(V, edges[e], N, x, y, z) / math.sqrt(x * x + y * y + z * z)
                 x, y, z = x * scale, y * scale, z * scale
-            out[n, 0], out[n, 1], out[n, 2] = x, y, z
-            out[n, 3], out[n, 4], out[n, 5], out[n, 6], out[n, 7] = u, v, nx, ny, length / count
+            point = out[n]
+            point.position[0], point.position[1], point.position[2] = x, y, z
+            point.pixel[0], point.pixel[1] = u, v
+            point.normal[0], point.normal[1] = nx, ny
+            point.length = length / count
             n += 1
     # chains of points by column, so that each is compared with its neighbours only
     columns = w // COLUMN + 1
     last, previous = np.full(columns, -1), np.empty(n, np.int64)
     for i in range(n):
-        c = min(max(int(out[i, 3]) // COLUMN, 0), columns - 1)
+        c = min(max(int(out[i].pixel[0]) // COLUMN, 0), columns - 1)
         previous[i], last[c] = last[c], i
     kept = 0
     for i in range(n):
@@ -261,13 +277,16 @@ def _lookup(fine, u, v):
 @inner
 def _beside(points, i, last, previous):
     """Whether another part's contour runs along point i."""
-    u, v, nx, ny, z = points[i, 3], points[i, 4], points[i, 5], points[i, 6], points[i, 2]
+    point = points[i]
+    u, v, nx, ny, z = point.pixel[0], point.pixel[1], point.normal[0], point.normal[1], point.position[2]
     column = min(max(int(u) // COLUMN, 0), len(last) - 1)
     for c in range(max(column - 1, 0), min(column + 2, len(last))):
         k = last[c]
         while k >= 0:
-            du, dv = points[k, 3] - u, points[k, 4] - v
-            if abs(points[k, 2] - z) >= APART and max(abs(du), abs(dv)) <= BESIDE and points[k, 5] * nx + points[k, 6] * ny > 0.5:
+            other = points[k]
+            du, dv = other.pixel[0] - u, other.pixel[1] - v
+            alike = other.normal[0] * nx + other.normal[1] * ny
+            if abs(other.position[2] - z) >= APART and max(abs(du), abs(dv)) <= BESIDE and alike > 0.5:
                 return True
             k = previous[k]
     return False
@@ -295,7 +314,7 @@ def _nearest(image, u, v):
 
 
 LEVELS = (0.2, 0.7)
-"""Bounds of the value of a field that is taken for a boundary."""
+"""Bounds of the value of a field that counts as a boundary."""
 DROPPED, MEASURED, BOUNDED = 0, 1, 2
 """What became of a contour point. BOUNDED: on the way to the boundary something covers the view, which only says that the contour
 has to move at least that far."""
@@ -340,7 +359,8 @@ def _match(points, field, guarded, shown, state, known, reach, r, kind):
     one, less on a finger's, which blurring makes smaller.
     """
     for i in range(len(points)):
-        u, v, nx, ny = points[i, 3], points[i, 4], points[i, 5], points[i, 6]
+        point = points[i]
+        u, v, nx, ny = point.pixel[0], point.pixel[1], point.normal[0], point.normal[1]
         r[i], kind[i] = 0.0, DROPPED
         before = _bilinear(field, u, v)
         if before < 0.0 or _nearest(guarded, u, v) != 0:
@@ -365,8 +385,25 @@ def _match(points, field, guarded, shown, state, known, reach, r, kind):
             before = value
 
 
+class Equations(NamedTuple):
+    """The normal equations of a contour's offsets, of the pose error along the camera's axes and the dilation.
+
+    H (7, 7) : information. g (7,) : its right side. length : of the contour that was measured [px]. square : sum of length times
+    Huber-limited squared offset [px^3]. counted : length that costs [px]. cost : Huber's (chi^2 where all is within `huber`).
+    rolls : share of the information about the roll that comes from levers longer than SHAPE.
+    """
+
+    H: Array
+    g: Array
+    length: float
+    square: float
+    counted: float
+    cost: float
+    rolls: float
+
+
 def normal_equations(
-    points: Array,
+    points: Points,
     r: Array,
     kind: NDArray[np.uint8],
     weights: Array,
@@ -376,10 +413,8 @@ def normal_equations(
     fy: float,
     huber: float,
     bounded: bool,
-) -> tuple[Array, Array, float, float, float, float, float]:
-    """Of the pose error along the camera's axes and the dilation: the 7 x 7 information, its right side (7,), the length of
-    contour measured [px], the sum of length times Huber-limited squared offset [px^3], the length that costs, Huber's cost (chi^2
-    where all is within `huber`), and the share of the information about the roll that comes from levers longer than SHAPE.
+) -> Equations:
+    """The normal equations of the offsets r (n,) [px] of contour points (n,), of a `kind` (n,) each (`_match`).
 
     `weights` (n,) [1/px^2] of the points; `origin` (3,) [m] and `axis` (3,) of the target; `bounded`: whether BOUNDED points
     inform, beside that they cost.
@@ -387,11 +422,10 @@ def normal_equations(
     H, g, sums = np.zeros((7, 7)), np.zeros(7), np.empty(5)
     origin, axis = np.ascontiguousarray(origin), np.ascontiguousarray(axis)
     _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bounded, H, g, sums)
-    length, square, counted, cost, rolls = sums.tolist()
-    return H, g, length, square, counted, cost, rolls
+    return Equations(H, g, *sums.tolist())
 
 
-@kernel("f8[n, 8], f8[n], u1[n], f8[n], f8[3], f8[3], f8, f8, f8, b1, out f8[7, 7], out f8[7], out f8[5]")
+@kernel("POINT[n], f8[n], u1[n], f8[n], f8[3], f8[3], f8, f8, f8, b1, out f8[7, 7], out f8[7], out f8[5]", POINT=POINT)
 def _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bounded, H, g, sums):
     """Adds to H and g, and writes the five numbers after them: see `normal_equations`."""
     J = np.empty(7)
@@ -400,7 +434,8 @@ def _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bou
     for i in range(len(points)):
         if kind[i] == DROPPED:
             continue
-        X, Y, Z, nx, ny = points[i, 0], points[i, 1], points[i, 2], points[i, 5], points[i, 6]
+        point = points[i]
+        X, Y, Z, nx, ny = point.position[0], point.position[1], point.position[2], point.normal[0], point.normal[1]
         # motion of the contour along its normal by a motion of its point: n' d(projection)/dX
         J[0] = nx * fx / Z
         J[1] = ny * fy / Z
@@ -411,10 +446,10 @@ def _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bou
         J[5] = J[1] * x - J[0] * y
         J[6] = 1.0
         if kind[i] == MEASURED:
-            length += points[i, 7]
-            square += points[i, 7] * min(r[i] * r[i], huber * huber)
+            length += point.length
+            square += point.length * min(r[i] * r[i], huber * huber)
         weight = weights[i]
-        counted += points[i, 7]
+        counted += point.length
         if abs(r[i]) <= huber:
             cost += weight * r[i] * r[i]
         else:

@@ -18,9 +18,9 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 SMALLEST_PX = 150
-"""A region of fewer pixels has no shape to start from."""
+"""Least number of pixels of a region whose shape can be used."""
 MOST_PARTS = 3
-"""Regions tried, from the largest: a network that errs about a piece of furniture shall not hide the target."""
+"""Maximum number of regions tried, from the largest: a piece of furniture that a network takes for the target may be larger."""
 TILTS = (-0.6, -0.3, 0.0, 0.3, 0.6)
 """Samples of the axis's angle out of the image plane [rad]."""
 ROLLS = (0.0, np.pi)
@@ -114,9 +114,9 @@ def mirrored(T: Array) -> list[Array]:
 
 
 def _directions(evidence: Evidence, rows: NDArray[np.intp], columns: NDArray[np.intp], axis: Array) -> list[Array]:
-    """The axis (2,) in the image, pointing to the hand; both ways where the hand is not told apart."""
+    """The axis (2,) in the image, pointing to the hand; both ways where the hand is not recognised."""
     is_hand = evidence.hand[rows, columns] != 0
-    if not 0.02 < is_hand.mean() < 0.75:  # where nearly all is called a hand, the network guesses
+    if not 0.02 < is_hand.mean() < 0.75:  # where nearly all is labelled as hand, the labels say nothing
         return [axis, -axis]
     pixels = np.column_stack([columns, rows])
     lead = (pixels[is_hand].mean(axis=0) - pixels[~is_hand].mean(axis=0)) @ axis

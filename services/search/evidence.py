@@ -1,4 +1,4 @@
-"""What each pixel of a mask tells about the target: seen, not there, or hidden by something."""
+"""The evidence of a mask: whether each pixel shows the target, shows that it is not there, or is hidden by something."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ SMOOTHING_PX = 1.0
 TAPS = (0.000133831, 0.004431862, 0.053991128, 0.241971445, 0.398943469, 0.241971445, 0.053991128, 0.004431862, 0.000133831)
 """Weights of that blur along a row and along a column, as OpenCV's."""
 LEAST_KNOWN = 1e-3
-"""Smoothed share of what is known below which a pixel shows nothing."""
+"""Smoothed share of known pixels below which a pixel counts as unknown."""
 NOTHING_COVERED = np.empty((0, 0), np.float32)
 """`Evidence.known` where everything is known."""
 INNER = 0.84
-"""Smoothed share that a pixel's distance from a straight boundary raises it to: one such pixel a pixel of length."""
+"""Smoothed share of the target below which a pixel of it is on a boundary. At a straight boundary this is one pixel per pixel of
+its length."""
 GUARD_PX = 2
 """Within this distance of a covered pixel a boundary may be the occluder's and not the target's."""
 DEPTH_MARGIN = 0.05

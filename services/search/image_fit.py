@@ -19,29 +19,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.contour import MEASURED, Model, normal_equations
+from penumbra.services.search.contour import MEASURED, POINT, Equations, Model, Points, normal_equations
 from penumbra.services.search.evidence import Evidence, Intrinsics, compare
 from penumbra.services.search.mask_fit import Fit, Limits, marginal, with_prior
 from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
-
-Array = NDArray[np.float64]
 
 LINE = 5
 """Reach of the line on both sides of the contour [px], read at every pixel's distance."""
 OFFSETS = 8
-"""Offsets of the edge on the line: so many half pixels on both sides."""
+"""Largest offset of the edge on the line, to both sides [half pixels]."""
 BLUR = 0.7
 """Width of the edge [px]: a step through this camera is 0.5 - 0.5 tanh(x / BLUR)."""
 NEAREST = 1
-"""The pixel on the contour shows both sides; from this distance on [px] they teach, for a limb darkens towards its contour."""
+"""The pixel on the contour shows both sides; from this distance on [px] the colours of its sides are learned, because a limb
+darkens towards its contour."""
 
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """How a picture's colours are believed. `passes`: at most; `spacing` of contour points [px]; `pooling`: standard deviation of
-    the pooling along the contour [px]; `floor`: least standard deviation of a colour [of 255]; `clipped`: squared Mahalanobis
-    distance that a pixel counts at most; `temperature`: pixels of a line that say the same; `mask`: standard deviation of the
+    """Noise of a picture's colours. `passes`: at most; `spacing` of contour points [px]; `pooling`: standard deviation of
+    the pooling along the contour [px]; `floor`: least standard deviation of a colour [of 255]; `clipped`: largest squared
+    Mahalanobis distance of a pixel; `temperature`: number of a line's pixels that count as one; `mask`: standard deviation of the
     mask's boundary on a line [px]; `huber` [px]; `edge`: standard deviation that an offset has at least [px]; `correlation`:
     length of contour over which offsets err together [px]; `dilation`: of the whole contour [px]; `wave`: of errors that change
     slowly along each side of the limb, as its shading does [px]: with one side hidden they look like another distance."""
@@ -136,7 +136,7 @@ def fit_image(
 @dataclass(frozen=True)
 class _Pass:
     """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
-    square of the offsets left [px] and the share of the roll that is believed. points (n, 8) of the contour, and their
+    square of the offsets left [px] and the share of the roll that is used. points (n,) of the contour, and
     equations: what gives the normal equations of their offsets (n,)."""
 
     T: Array
@@ -146,12 +146,12 @@ class _Pass:
     length: float
     rms: float
     rolls: float
-    points: Array
-    equations: Callable[[Array], tuple[Array, Array, float, float, float, float, float]]
+    points: Points
+    equations: Callable[[Array], Equations]
 
     def waves(self, size: float) -> Array:
         """The right sides (7, k) of `ImageSettings.wave` of this size [px]."""
-        return np.stack([self.equations(size * wave)[1] for wave in _waves(self.points, self.T)], axis=1)
+        return np.stack([self.equations(size * wave).g for wave in _waves(self.points, self.T)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -201,16 +201,17 @@ class _Picture:
         evidence, settings, k = self.evidence, self.settings, self.evidence.intrinsics
         found = self.model.matched(T, evidence, settings.spacing, LINE)
         points = found.points
-        believed = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
-        r, sigma, kind = offsets(points, self.image, evidence.guarded, found.r, found.kind, *believed)
-        weight = points[:, 7] / (settings.correlation * (sigma**2 + settings.edge**2))
+        noise = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
+        r, sigma, kind = offsets(points, self.image, evidence.guarded, found.r, found.kind, *noise)
+        weight = points["length"] / (settings.correlation * (sigma**2 + settings.edge**2))
 
-        def equations(r: Array) -> tuple[Array, Array, float, float, float, float, float]:
+        def equations(r: Array) -> Equations:
             return normal_equations(points, r, kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False)
 
-        H, g, length, square, _, _, rolls = equations(r - moved[6])
-        rms = math.sqrt(square / length) if length > 0 else math.inf
-        return _Pass(T, moved, H, g, length, rms, rolls, points, equations)
+        found_by = equations(r - moved[6])
+        length = found_by.length
+        rms = math.sqrt(found_by.square / length) if length > 0 else math.inf
+        return _Pass(T, moved, found_by.H, found_by.g, length, rms, found_by.rolls, points, equations)
 
 
 def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:
@@ -244,19 +245,21 @@ def _through(pictures: list[_Picture], T: Array) -> _Pass:
     return found
 
 
-def _waves(points: Array, T: Array) -> list[Array]:
+def _waves(points: Points, T: Array) -> list[Array]:
     """Shapes (n,) that an error of the contour may have: on either side of the limb, straight and bent along it."""
     axis = T[:3, 0]
-    along = (points[:, :3] - T[:3, 3]) @ axis
+    along = (points["position"] - T[:3, 3]) @ axis
     s = 2.0 * (along - along.min(initial=0.0)) / max(float(np.ptp(along)) if len(along) else 0.0, 1e-6) - 1.0
-    across = points[:, 5] * axis[1] - points[:, 6] * axis[0] > 0.0
+    normal = points["normal"]
+    across = normal[:, 0] * axis[1] - normal[:, 1] * axis[0] > 0.0
     return [np.where(across == side, shape, 0.0) for side in (False, True) for shape in (s, 1.5 * s**2 - 0.5)]
 
 
 TYPICAL = 0.2
-"""Offsets left [px] up to which the covariance is that of the settings; of larger ones it grows with their fourth power."""
+"""Root mean square [px] of the offsets left up to which the covariance is that of the settings; above, it grows with its fourth
+power."""
 SHARP = 0.3
-"""Offsets of the image's edges left [px], each counted up to `ImageSettings.huber`, with which a pose is believed."""
+"""Root mean square [px] of the offsets left, each limited to `ImageSettings.huber`, below which a pose is accepted."""
 MAX_STEP = np.array([0.02, 0.02, 0.05, 0.1, 0.1, 0.1])
 """Largest step of a pass [m, rad]."""
 CONVERGED = 2e-4
@@ -268,7 +271,7 @@ _MIXED = 3
 
 
 def offsets(
-    points: Array,
+    points: Points,
     image: NDArray[np.uint8],
     guarded: NDArray[np.uint8],
     by_mask: Array,
@@ -283,12 +286,12 @@ def offsets(
     (DROPPED, MEASURED). The arguments after `mask_kind` are those of `ImageSettings`."""
     n = len(points)
     r, sigma, kind = np.zeros(n), np.ones(n), np.zeros(n, np.uint8)
-    believed = (pooling, floor, clipped, temperature, mask_sigma)
-    _offsets(points, image, guarded, by_mask, mask_kind, *believed, r, sigma, kind)
+    noise = (pooling, floor, clipped, temperature, mask_sigma)
+    _offsets(points, image, guarded, by_mask, mask_kind, *noise, r, sigma, kind)
     return r, sigma, kind
 
 
-@kernel("f8[n, 8], u1[h, w, 3], u1[h, w], f8[n], u1[n], f8, f8, f8, f8, f8, out f8[n], out f8[n], out u1[n]")
+@kernel("POINT[n], u1[h, w, 3], u1[h, w], f8[n], u1[n], f8, f8, f8, f8, f8, out f8[n], out f8[n], out u1[n]", POINT=POINT)
 def _offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped, temperature, mask_sigma, r, sigma, kind):
     n = len(points)
     colours = np.empty((n, _SAMPLES, 3), np.float32)
@@ -310,10 +313,12 @@ def _offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped
         if first[i] > LINE - NEAREST or last[i] < LINE + NEAREST:
             continue
         side[:] = 0.0
+        here = points[i]
         for j in range(n):
-            du, dv = points[j, 3] - points[i, 3], points[j, 4] - points[i, 4]
+            other = points[j]
+            du, dv = other.pixel[0] - here.pixel[0], other.pixel[1] - here.pixel[1]
             d2 = du * du + dv * dv
-            if d2 < reach2 and points[j, 5] * points[i, 5] + points[j, 6] * points[i, 6] > 0.5:
+            if d2 < reach2 and other.normal[0] * here.normal[0] + other.normal[1] * here.normal[1] > 0.5:
                 w = math.exp(-0.5 * d2 / (pooling * pooling))
                 for a in range(2):
                     for b in range(10):
@@ -367,7 +372,7 @@ def _read(point, image, guarded, colours):
     first, last = LINE + 1, LINE - 1
     for way in (1, -1):
         for t in range(0 if way == 1 else 1, LINE + 1):
-            u, v = point[3] + way * t * point[5], point[4] + way * t * point[6]
+            u, v = point.pixel[0] + way * t * point.normal[0], point.pixel[1] + way * t * point.normal[1]
             x, y = int(math.floor(u)), int(math.floor(v))
             if x < 0 or y < 0 or x >= w - 1 or y >= h - 1 or guarded[int(v + 0.5), int(u + 0.5)] != 0:
                 break

@@ -21,13 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.contour import Model, normal_equations
+from penumbra.services.search.contour import Equations, Model, Points, normal_equations
 from penumbra.services.search.evidence import Evidence
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 SPACING_PX = 3.0
-"""Distance of the sampled contour points: closer ones bring no new information."""
+"""Distance [px] of the sampled contour points: closer ones bring no new information."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class Noise:
     """How a mask's boundary errs, in pixels of the mask.
 
     `edge`: standard deviation along the normal; `correlation`: length along the contour over which errors are one error;
-    `dilation`: standard deviation of the whole mask's being too large or small. Defaults: a trained network's masks.
+    `dilation`: standard deviation of the whole mask's being too large or small. Defaults: a trained network's
+    masks, chosen and not measured.
     """
 
     edge: float = 0.5
@@ -65,15 +66,15 @@ COARSE = (24.0, 5.0, 4)
 FINE = (8.0, 2.0, 8)
 """The same of the passes that end a fit."""
 CONVERGED = 1e-3
-"""Step [m] below which a fit ends that nothing finer follows."""
+"""Step [m] below which a fit ends where no refinement on the image follows."""
 ROUGH = 4e-3
-"""Step [m] below which a fit ends that the image refines: a pixel or two."""
+"""Step [m] below which a fit ends where the image refines it: a pixel or two."""
 MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
 """Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
 DAMPING = (1e-3, 10.0, 1e2)
-"""Marquardt's factor at the start, its change after a pass that gained or lost, and where the search gives up."""
+"""Marquardt's factor at the start, its change after a pass that gained or lost, and the factor at which the passes end."""
 KEPT = 0.05
-"""Share of the prior's information that stays in the measurement: without any, what the contour hardly shows would be
+"""Share of the prior's information that stays in the measurement: without any, directions that the contour hardly shows would be
 extrapolated far beyond where the problem is linear."""
 GOOD = 2.0
 """`Fit.misfit` below which nearly every right fit is."""
@@ -104,7 +105,7 @@ class Fit:
 
     @property
     def overlap(self) -> float:
-        """Of the pixels that are scored: those of both the mask's target and the silhouette, as a share of those of either."""
+        """Intersection over union of the mask's target and the silhouette, of the pixels that are scored."""
         return self.both / self.either if self.either else 0.0
 
 
@@ -114,7 +115,7 @@ class _Pass:
 
     T: Array
     moved: Array
-    points: Array
+    points: Points
     r: Array
     kind: NDArray[np.uint8]
     H: Array
@@ -131,17 +132,18 @@ class _Problem:
         evidence = self.evidence
         found = self.model.matched(T, evidence, SPACING_PX, reach)
         r, both, free = found.r - moved[6], found.both, found.free
-        H, g, _, _, counted, cost, _ = self.normal_equations(T, found.points, r, found.kind, huber, True)
-        # parts of the mask that no contour is near pull at nothing, but must not look cheap; nor may points pay by dropping out
+        equations = self.normal_equations(T, found.points, r, found.kind, huber, True)
+        # parts of the mask without a contour near by exert no force, but must not lower the cost; nor may points that drop out
         unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
-        cost = cost * evidence.boundary_px / max(counted, 1.0) + unexplained + float(np.dot(moved, self.regular @ moved))
-        return _Pass(T, moved, found.points, r, found.kind, H, g, cost, (both, evidence.seen_px + free, free))
+        cost = equations.cost * evidence.boundary_px / max(equations.counted, 1.0) + unexplained
+        cost += float(np.dot(moved, self.regular @ moved))
+        return _Pass(T, moved, found.points, r, found.kind, equations.H, equations.g, cost, (both, evidence.seen_px + free, free))
 
     def normal_equations(
-        self, T: Array, points: Array, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
-    ) -> tuple[Array, Array, float, float, float, float, float]:
+        self, T: Array, points: Points, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
+    ) -> Equations:
         noise, k = self.noise, self.evidence.intrinsics
-        weights = points[:, 7] / (noise.correlation * noise.edge**2)
+        weights = points["length"] / (noise.correlation * noise.edge**2)
         return normal_equations(points, r, kind, weights, T[:3, 3], T[:3, 0], k.fx, k.fy, huber, bounded)
 
     def coarse(self, T: Array, moved: Array) -> tuple[Array, Array]:
@@ -214,24 +216,24 @@ def fit(
 
     # the pose is final: only what was measured informs
     moved = here.moved
-    H, g, length, square, _, _, rolls = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False)
-    rms = math.sqrt(square / length) if length > 0 else math.inf
+    measured = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False)
+    length = measured.length
+    rms = math.sqrt(measured.square / length) if length > 0 else math.inf
     misfit = here.cost / independent
-    # a mask or a fit worse than expected: believe the residuals
+    # a mask or a fit worse than expected: the residuals give the noise
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
-    H, g = H * trust, g * trust
-    T, covariance = marginal(here.T, moved, H, g, regular, rolls, limits)
+    T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, measured.rolls, limits)
     return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
 
 
 def marginal(
     T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float, limits: Limits, waves: Array | None = None
 ) -> tuple[Array, Array]:
-    """The pose and covariance (6, 6) that the measurement alone says, from the normal equations of pose error and dilation at T,
+    """The pose and covariance (6, 6) of the measurement alone, from the normal equations of pose error and dilation at T,
     which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out but for KEPT, the dilation marginalised (Schur
     complement).
 
-    `rolls`: share of the information about the roll that is believed, see `normal_equations`; `waves` (7, k): right sides of
+    `rolls`: share of the information about the roll that is used, see `normal_equations`; `waves` (7, k): right sides of
     errors that all of the contour shares, of one standard deviation each.
     """
     gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
@@ -241,7 +243,7 @@ def marginal(
     if waves is not None:
         bent = covariance @ (waves[:6] - np.outer(gain, waves[6]))
         covariance = covariance + bent @ bent.T
-    # the roll that a nearly round section shows is doubted, and with it all that leans on it
+    # the roll that a nearly round section shows is uncertain, and so is all that is correlated with it
     c = covariance[:, 3:] @ T[:3, 0]
     roll = float(T[:3, 0] @ c[3:])
     doubt = min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll)

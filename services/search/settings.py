@@ -1,4 +1,4 @@
-"""The numbers of the search of a target that somebody may want to change."""
+"""The settings of the search of a target."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class SearchSettings:
     wrong_misfit: float = 6.0
     """Misfit from which a pose is wrong whatever its overlap. Chosen: twice what one right pose in a hundred exceeds."""
     gate: float = ONE_IN_10_000
-    """Squared Mahalanobis distance between the prediction and another pose, above which the other pose is not believed."""
+    """Squared Mahalanobis distance between the prediction and another pose, above which the other pose is rejected."""
 
     # ---- Whether enough of the target shows
 
@@ -50,19 +50,19 @@ class SearchSettings:
     """Share of the silhouette that must be covered, or outside the picture, for a target that does not show enough to be called
     occluded. Otherwise it is lost. Chosen."""
 
-    # ---- What the prediction tells
+    # ---- What the prediction says
 
     sure: float = 0.05
     """Largest standard deviation of the position [m], along its worst direction, of a prediction that is called sure. Chosen."""
     expected: float = ONE_IN_10
     """Squared Mahalanobis distance up to which a pose is where the prediction says."""
     prior_inflation: float = 2.0
-    """Factor on the prediction's standard deviations before the fit leans on it. Chosen: the prediction shall only keep the fit
-    from wandering off."""
+    """Factor on the prediction's standard deviations before it regularises the fit. Chosen: the prediction shall only keep the
+    fit from diverging."""
     prior_floor: tuple[float, float] = (0.02, 0.09)
     """Standard deviations [m, rad] added to the prediction's for the same reason. Chosen."""
     joint_margin: float = 0.02
-    """Length [m] beyond the limb's predicted near end in which the mask is still believed. Chosen: the prediction may be off."""
+    """Length [m] beyond the limb's predicted near end in which the mask is still used. Chosen: the prediction may be off."""
 
     # ---- Finding the target again
 
@@ -70,7 +70,7 @@ class SearchSettings:
     """Reach of a region of the mask, in lengths of the target: what is nearer belongs to the region. Chosen above one, because
     the region may show either end."""
     home_gate: float = ONE_IN_100
-    """Squared Mahalanobis distance from the target's home above which a shape is not believed to be the target."""
+    """Squared Mahalanobis distance from the target's home above which a shape is not taken for the target."""
     detect_every_ns: dict[str, int] = field(default_factory=lambda: {"lost": 250_000_000, "doubtful": 1_000_000_000})
     """Least time [ns] between two detections, while the target is lost and while its pose is only doubtful. Chosen: a detection
     takes as long as twenty tracked frames."""

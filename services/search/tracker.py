@@ -125,7 +125,7 @@ class Search:
         """The pose near the prediction, and whether no other need be looked for. The fit to the mask is rough where an image
         comes after it; what the image does not confirm is tried again from mirror images, and behind an unknown occluder."""
         seen = self._gather(mask, T_start, joints, limb=T_start)
-        prior = self._leaning(prior_covariance)
+        prior = self._regularising(prior_covariance)
         first = self._fit(seen, T_start, T_start, prior, CONVERGED if image is None else ROUGH)
         best = self._closer(seen, first, T_start, prior, image)
         if not best.sharp:
@@ -157,7 +157,7 @@ class Search:
         return closer if closer.sharp and closer.overlap >= least_overlap(is_expected, self.settings) else found
 
     def _gather(self, mask: Mask, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None) -> Evidence:
-        """`limb`: T_camera_target of the limb, where it is known; beyond its near end nothing is believed."""
+        """`limb`: T_camera_target of the limb, where it is known; beyond its near end the mask is not used."""
         k = Intrinsics.of_window(self._camera, mask.x0, mask.y0, mask.scale)
         depth = self._robots.render(joints, k, mask.labels.shape) if joints else None
         z = self._model.in_camera(T)[:, 2]
@@ -178,13 +178,13 @@ class Search:
         covariance = np.zeros((6, 6)) if prior_covariance is None else self._axes.T @ prior_covariance @ self._axes
         return covariance, floor
 
-    def _leaning(self, prior_covariance: Array | None) -> Array:
-        """The information (6, 6) about the prediction that the solve leans on."""
+    def _regularising(self, prior_covariance: Array | None) -> Array:
+        """The information (6, 6) about the prediction that regularises the solve."""
         covariance, floor = self._predicted(prior_covariance)
         return np.asarray(np.linalg.inv(self.settings.prior_inflation**2 * covariance + floor), np.float64)
 
     def _settled(self, seen: Evidence, first: Fit, T_prior: Array, prior: Array) -> Fit:
-        """A fit, or where it is bad a better one beside it: what went wrong is mostly the roll, or the tilt's sign."""
+        """A fit, or where it is bad a better one beside it: the error is mostly in the roll, or in the tilt's sign."""
         if seen.seen_px < detect.SMALLEST_PX or first.misfit <= MISFIT:
             return first
         beside = [self._fit(seen, T, T_prior, prior) for T in detect.mirrored(first.T_searched)]

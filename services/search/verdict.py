@@ -1,4 +1,4 @@
-"""What is said of a fitted pose: tracking, occluded or lost, and why."""
+"""The verdict on a fitted pose: tracking, occluded or lost, and why."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Findings:
 
 
 def verdict(found: Findings, settings: SearchSettings) -> Verdict:
-    """Judges a fitted pose. A small piece of a target is believed only where a sure prediction expects it."""
+    """Judges a fitted pose. A small piece of a target is accepted only where a sure prediction expects it."""
     largest_hidden = settings.hidden if found.is_expected else settings.recognised
     shortest_px = settings.shortest_px if found.is_expected else settings.recognised_px
     if found.hidden > largest_hidden or found.contour_px < shortest_px:

@@ -21,7 +21,9 @@ from penumbra.shared.contract.labels import COLOURS, TARGET_LABELS, Label
 from penumbra.shared.perception.lookout import STEP, Window, whole_frame
 
 SETTLE = 4
+"""Number of times that a picture without a predecessor is shown to the network. Chosen, not measured."""
 PERIOD_NS = 50_000_000
+"""Time [ns] between pictures that have no stamps: that of the cameras which the network is trained on."""
 
 
 class FileError(ValueError):

@@ -48,23 +48,23 @@ class _Step:
     def forward(self, image: Any, state: list[Any]) -> tuple[Any, list[Any]]:
         """(class logits, new state) of an image and the old state."""
         n = len(self._settings.channels)
-        old, heard = state[:n], state[n:]  # with delays: E_l of the step before
+        old, delayed = state[:n], state[n:]  # with delays: E_l of the step before
         errors: list[Any] = []
         arriving = op.space_to_depth(image, "depth_first", FOLD)
         for i in range(n):
             difference = op.subtract(arriving, self._convolution(f"predict.{i}", old[i]))
             errors.append(op.relu(op.concat([difference, op.negative(difference)], 1)))
             if i + 1 < n:
-                up = self._convolution(f"ascend.{i}", heard[i] if heard else errors[i])
+                up = self._convolution(f"ascend.{i}", delayed[i] if delayed else errors[i])
                 arriving = op.relu(_pooled(up) if i > 0 else up)
         new: list[Any] = []
         for i in reversed(range(n)):
             drive = self._convolution(f"drive.{i}", errors[i])
             if i + 1 < n:
-                down = self._convolution(f"descend.{i}", old[i + 1] if heard else new[0])
+                down = self._convolution(f"descend.{i}", old[i + 1] if delayed else new[0])
                 drive = op.add(drive, _enlarged(down, 2, "nearest") if i > 0 else down)
             new.insert(0, getattr(self, f"_{self._settings.cell}")(f"cells.{i}", drive, old[i]))
-        return self._decoded(new), [*new, *(errors if heard else ())]
+        return self._decoded(new), [*new, *(errors if delayed else ())]
 
     def _decoded(self, representations: list[Any]) -> Any:
         total = self._convolution("decode.0", representations[1])
@@ -96,8 +96,8 @@ class _Step:
     def _convolution(self, name: str, x: Any) -> Any:
         """A convolution of stride 1 that keeps the size."""
         kernel, bias = self._weights[f"{name}.weight"], self._weights.get(f"{name}.bias")
-        room = [kernel.shape[-1] // 2] * 2
-        found = op.convolution(x, op.constant(kernel), [1, 1], room, room, [1, 1])
+        padding = [kernel.shape[-1] // 2] * 2
+        found = op.convolution(x, op.constant(kernel), [1, 1], padding, padding, [1, 1])
         return found if bias is None else op.add(found, op.constant(bias.reshape(1, -1, 1, 1)))
 
     def _scaled(self, name: str, x: Any, gain: str, offset: str | None = None) -> Any:

@@ -20,7 +20,8 @@ from penumbra.shared.perception.lookout import Window
 
 WEIGHTS = Path(__file__).parent / "weights" / "prednet.npz"
 MAX_GAP_S = 0.5
-"""After a longer silence the picture has little to do with what the state remembers."""
+"""Longest gap [s] between frames after which the recurrent state is kept: after a longer one it has little to do with the
+picture. Chosen, not measured."""
 
 
 class Segmenter:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FOLD = 2
-"""Pixels a side that one position of the first layer sees."""
+"""Width and height [px] of what one position of the first layer sees."""
 CELLS = ("hgru", "convlstm", "conv")
 """What may update a layer's representation; `prednet.py` describes them."""
 

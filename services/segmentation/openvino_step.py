@@ -1,6 +1,6 @@
 """The network as OpenVINO runs it: compiled from stored weights, without torch and without a file in between.
 
-It is compiled for every size of the picture apart: for all sizes at once a step takes three quarters longer, as little can be
+It is compiled for each size of the picture: for all sizes at once a step takes three quarters longer, as little can be
 fused. A size costs some 0.13 s of the processor's time and 22 MB, so sizes that will soon be needed are compiled ahead, in a
 thread. A size that is not there yet is waited for: what comes out depends on pictures alone and not on time.
 """
@@ -22,7 +22,7 @@ State = tuple[NDArray[Any], ...]
 or bfloat16, of which numpy knows nothing and sees the bits as uint16: zero is zero in both."""
 
 MOST = 12
-"""Sizes that are kept; a minute of a moving arm needs seven to ten."""
+"""Maximum number of compiled sizes; a minute of a moving arm needs seven to ten."""
 
 
 class Compiled:
@@ -116,7 +116,7 @@ class Compiled:
     def _compile(self, height: int, width: int) -> Any:
         settings = {
             "INFERENCE_NUM_THREADS": 1,
-            "NUM_STREAMS": 0,  # the caller's thread computes: no two more a size, that wait for ever
+            "NUM_STREAMS": 0,  # the caller's thread computes: not two more threads per size, which would only wait
             "ENABLE_CPU_PINNING": False,  # two processes would be tied to the same core
             "INFERENCE_PRECISION_HINT": self._precision,
         }

@@ -132,11 +132,11 @@ class PredNet(nn.Module):
     def forward(self, image: Tensor, state: State) -> tuple[Tensor, list[Tensor], State]:
         """One time step: (class logits (batch, classes, h, w), mean absolute prediction error of each layer, new state).
 
-        With axonal delays a layer hears its neighbours' activity of the step before: layer l learns of a picture l steps late.
+        With axonal delays a layer receives its neighbours' activity of the step before: layer l learns of a picture l steps late.
         """
         n = len(self.settings.channels)
         old = state[:n]
-        heard = state[n:]  # with delays: E_l of the step before
+        delayed = state[n:]  # with delays: E_l of the step before
         errors: list[Tensor] = []
         missed: list[Tensor] = []
         arriving = F.pixel_unshuffle(image, FOLD)
@@ -145,16 +145,16 @@ class PredNet(nn.Module):
             errors.append(F.relu(torch.cat([difference, -difference], 1)))
             missed.append(difference.abs().mean())
             if i + 1 < n:
-                up = self.ascend[i](heard[i] if heard else errors[i])
+                up = self.ascend[i](delayed[i] if delayed else errors[i])
                 arriving = F.relu(F.max_pool2d(up, 2) if i > 0 else up)  # the folding is the first layer's pooling
         new: list[Tensor] = []
         for i in reversed(range(n)):
             drive = self.drive[i](errors[i])
             if i + 1 < n:
-                down = self.descend[i](old[i + 1] if heard else new[0])
+                down = self.descend[i](old[i + 1] if delayed else new[0])
                 drive = drive + (F.interpolate(down, scale_factor=2, mode="nearest") if i > 0 else down)
             new.insert(0, self.cells[i](drive, old[i]))
-        return self._decode(new), missed, (*new, *(errors if heard else ()))
+        return self._decode(new), missed, (*new, *(errors if delayed else ()))
 
     def _decode(self, representations: list[Tensor]) -> Tensor:
         total = self.decode[0](representations[1])
@@ -169,8 +169,9 @@ def stored(net: PredNet) -> Model:
 
 
 def grown(net: PredNet, settings: Settings) -> PredNet:
-    """A network with more channels that gives the masks of `net`: its own channels come first and do not hear of the new ones,
-    which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641). Raises ValueError where it would not be larger."""
+    """A network with more channels that gives the masks of `net`: its own channels come first and receive nothing from the
+    new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641). Raises ValueError where it would not
+    be larger."""
     old = net.settings
     same = replace(settings, channels=old.channels) == old
     if not same or any(new < before for new, before in zip(settings.channels, old.channels, strict=True)):

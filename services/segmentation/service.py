@@ -18,9 +18,9 @@ from penumbra.shared.runtime.node import ServiceNode
 
 NAME = "segmentation"
 FOLLOW_S = 0.2
-"""How often it looks where the next frames will be looked at, also those that are another replica's."""
+"""Period [s] of the prediction of the next windows, also of those that are another replica's."""
 AHEAD_S = 0.4
-"""How far ahead: where targets go on as they move, what the network needs for a window is compiled by then."""
+"""Time [s] ahead of that prediction: in it the network is compiled for a window's size."""
 
 
 FLAGS = (
@@ -57,7 +57,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
         """A camera's lookout that knows the newest poses; to be called with its lock held."""
         for target in lookouts[name].targets:
             if (pose := fused[target].get(target=target)) is not None:
-                lookouts[name].hear(pose)
+                lookouts[name].add(pose)
         return lookouts[name]
 
     def is_ready(names: Iterable[str]) -> bool:

@@ -1,4 +1,4 @@
-"""`penumbra doctor --skin`: listens to the pads of a running cell and says what is wrong with them, and how to mend it.
+"""`penumbra doctor --skin`: listens to the pads of a running cell and says what is wrong with them, and how to repair it.
 
 Faults of an electrode show in its voltages (`shared.skin.faults.Watch`). A pad that is mounted wrongly, or calibrated as another
 one, reads what a limb gives, only not what this limb gives: that shows beside the field model's signals at the fused pose.
@@ -29,6 +29,7 @@ from penumbra.shared.skin.faults import MENDS, MISFIT, Fault, Look, Watch, likel
 from penumbra.shared.skin.layout import Skin, link_names
 
 PATIENCE_S = 1.0
+"""Longest wait for the router [s]."""
 NEAR_NS = 15_000_000
 """Pose and joints belong to a batch of voltages when their stamps are no farther apart."""
 IN_REACH_V = (0.005, 0.4)
@@ -41,7 +42,7 @@ TOGETHER = 25
 LEAST = 4
 """Such means in reach that a comparison takes."""
 LEAST_EMPTY = 25
-"""Moments with nothing near from which an offset is told."""
+"""Moments with nothing near from which an offset is estimated."""
 NOTHING_V = 5e-4
 """Predicted signal [V] below which a scene counts as empty."""
 OFFSET_V = 3e-3
@@ -50,7 +51,7 @@ OFFSET_V = 3e-3
 
 @dataclass
 class Pad:
-    """What was heard of one pad: its watch, its looks, faults that were seen, and moments: predicted and measured signals (e,)
+    """What was received of one pad: its watch, its looks, faults that were seen, and moments: predicted and measured signals (e,)
     [V], the latter's variance (e,) [V^2], and the former's error for the pose's, as a share."""
 
     watch: Watch
@@ -218,7 +219,7 @@ def examine(cell: cells.Cell, connection: bus.Connection, seconds: float, progre
 
 
 def _misfits(answers: list[bytes]) -> dict[str, float]:
-    """Mean squared residuals [variances] by pad, as the haptics service tells them in its health."""
+    """Mean squared residuals [variances] by pad, as the haptics service reports them in its health."""
     out: dict[str, float] = {}
     for answer in answers:
         for name, value in report.read(answer).report.items():

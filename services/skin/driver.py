@@ -7,8 +7,8 @@ A row of a pad, about 230 times a second:
 3. amplitude of an electrode: mean over its channels of the first Fourier component's length; stamp: the middle of the integration
 4. a board that failed is brought back, and the row is left out
 
-Bringing back, the cheapest first: a reply that came damaged shows that the board hears us: wait until the line is quiet. One that
-did not come, or in which the phase has jumped: end what the board believes to be reading, and find out by a stream of probes
+Bringing back, the cheapest first: a damaged reply shows that the board receives commands: wait until the line is quiet. One that
+did not come, or in which the phase has jumped: end the command that the board is reading, and find out by a stream of probes
 where its commands begin and at which frequency it is (`shared.skin.board.realign_probes`). No answer: a BREAK, and the probes
 again. Still none: `BoardSilent`.
 """
@@ -36,13 +36,13 @@ OVERHEAD_S = 0.5e-3
 PATIENCE_S = 14e-3
 """How much later than possible an answer may come: a USB converter and the machine hold it up."""
 PACE_S = 0.7e-3
-"""Between probes: a board takes up a command half a millisecond after it came, if no other has come until then."""
+"""Between probes: a board starts on a command half a millisecond after it arrived, if no other has arrived until then."""
 PROBE_S = 3e-3
 """Time [s] for which the answer to the last probe of a round is waited for."""
 LAST_PACE_S = 0.015
 """Time [s] between probes, and for their answers, in the round before a board is given up."""
 QUIET_S = 2e-3
-"""A line on which nothing comes for so long is quiet: USB hands over what came once a millisecond."""
+"""A line without bytes for so long is quiet: USB delivers once a millisecond."""
 TURN = np.radians(2.0)
 """A phase that jumps by more, and by more than six times its noise, has slipped."""
 FOLLOW = 0.1
@@ -122,17 +122,17 @@ class Line:
         """The middle of the integration on the port's clock [ns] and the Fourier components (6,) [steps] of what was asked for;
         None after a fault, and then `recover` comes first."""
         data = self._read(self._size, self._asked_ns, self._least_s() + PATIENCE_S)
-        came_ns = self.port.now_ns()
+        received_ns = self.port.now_ns()
         components, self._fault = self._judge(data)
         if self._fault:
             self.count.faults[self._fault] += 1
             self._is_cut = True
             return None
         if self._is_cut:
-            self.count.longest_s = max(self.count.longest_s, (came_ns - self._answered_ns) * 1e-9)
+            self.count.longest_s = max(self.count.longest_s, (received_ns - self._answered_ns) * 1e-9)
         self.count.replies += 1
-        self._answered_ns, self._is_cut = came_ns, False
-        return self._middle_ns(came_ns), components
+        self._answered_ns, self._is_cut = received_ns, False
+        return self._middle_ns(received_ns), components
 
     def _judge(self, data: bytes) -> tuple[Components, str]:
         """What a reply says, and which fault it has, if any."""
@@ -167,19 +167,19 @@ class Line:
         data = b""
         while len(data) < size + (len(board.OVERRUN) if board.OVERRUN in data else 0):
             left_s = within_s - (self.port.now_ns() - since_ns) * 1e-9
-            came = self.port.read(max(0.0, left_s))
-            if not came:
+            received = self.port.read(max(0.0, left_s))
+            if not received:
                 break
-            data += came
+            data += received
         return data
 
     def _least_s(self) -> float:
         return board.reply_s(self.cycles, self.electrode_hz, self.samples_per_cycle) + OVERHEAD_S
 
-    def _middle_ns(self, came_ns: int) -> int:
+    def _middle_ns(self, received_ns: int) -> int:
         """The middle of the integration: half of what is least left over beside line and cycles comes before it. What a reply
         takes longer it waited here, or on its way."""
-        slack = came_ns - self._asked_ns - round(1e9 * board.reply_s(self.cycles, self.electrode_hz, self.samples_per_cycle))
+        slack = received_ns - self._asked_ns - round(1e9 * board.reply_s(self.cycles, self.electrode_hz, self.samples_per_cycle))
         self._slack.append(max(0, slack))
         before_s = board.COMMAND_BYTES * board.BYTE_S + 0.5 * self.cycles / self.electrode_hz
         return self._asked_ns + round(1e9 * before_s) + min(self._slack) // 2

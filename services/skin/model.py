@@ -58,11 +58,13 @@ PIECES = (40, 18)
 """Rows and columns of the limb's pieces."""
 HIDDEN, HIDDEN_BACKED = 128, 32
 STEPS, STEPS_BACKED, BATCH = 250_000, 10_000, 512
+"""Units of the hidden layers and steps of the training, of a pad alone and of what a link behind it changes; samples per step."""
 NEAR_GAP = 0.05
-"""Nearer [m] the networks err more."""
+"""Gap [m] below which the networks err more."""
 FAINTEST = 1e-5
 """Changes below this [fF] are numerical errors: a limb behind the link."""
 HELD_OUT_SEED = 1_000_003
+"""Seed of the limbs on which a network is scored, and which it is not trained on."""
 BANDS = (0.005, 0.015, 0.03, 0.06, 0.12, 0.17, 0.25, 0.5)
 """Gaps [m] between which errors are reported apart."""
 

@@ -17,6 +17,7 @@ from penumbra.shared.skin import board
 BREAK_S = 1e-3
 """Fifty bytes long: a receiver takes a low line for a BREAK from one byte on."""
 CHUNK = 4096
+"""Largest number of bytes read at once."""
 
 
 class SerialPort:

@@ -26,7 +26,7 @@ NAME = "skin"
 BACKOFF_S = (0.2, 5.0)
 """Waiting before a board is opened again: at first, and at most."""
 TOLD_EVERY = 20
-"""Attempts after which a board that is still missing is told of again."""
+"""Attempts after which a board that is still missing is logged again."""
 
 
 FLAGS = (
@@ -56,7 +56,7 @@ def start(node: Node, options: flags.Options) -> None:
         raise cells.CellError(f"--cycles: expected 1 to 60000, got {options.cycles}")
     for pad, readers in pads(node.cell, options.device, options.pad).items():
         session = Session(node, pad, readers, options.cycles)
-        node.tell(pad, session.describe)
+        node.add_report(pad, session.describe)
         node.every(BACKOFF_S[0], partial(Session.run, session), math.inf)
 
 

@@ -178,7 +178,7 @@ class Electrode(_Model):
 
     @cached_property
     def centroid(self) -> tuple[float, float]:
-        """Of its area [m]."""
+        """The centroid of its area [m]."""
         if self.arc is None:
             return self.centre
         (inner, outer), half = self.arc, np.radians(self.half_angle)
@@ -488,7 +488,8 @@ class Cell(_Model):
         return [(f"targets.{name}.mesh", f"expected a mesh, got no file {path}; {remedy}") for name, path in missing.items()]
 
     def _robot_faults(self) -> list[tuple[str, str]]:
-        """Of URDFs that cannot be read, and of joints, limits, and links of pads and payloads that a robot does not have."""
+        """Faults of URDFs that cannot be read, and of joints, limits, and links of pads and payloads that a robot does not
+        have."""
         faults: list[tuple[str, str]] = []
         links: dict[str, tuple[str, ...]] = {}
         limits: list[tuple[str, float, float]] = []
@@ -538,7 +539,7 @@ class Cell(_Model):
 
 
 def _bound_faults(sim: Sim, limits: Sequence[tuple[str, float, float]]) -> list[tuple[str, str]]:
-    """Of the emulator's bounds of joints, given each one's name and limits in the URDF."""
+    """Faults of the emulator's bounds of joints, given each one's name and limits in the URDF."""
     wrong = [name for name in ("joints_low", "joints_high") if len(getattr(sim, name)) != len(limits)]
     if wrong:
         names = ", ".join(joint for joint, _, _ in limits) or "no robot moves"

@@ -1,6 +1,6 @@
 """Who may say what on a secured bus: the router's rules, from the tables of topics and of processes.
 
-A certificate's common name is the name of its holder. Sensors and methods publish what the table says, speak for nobody's health
+A certificate's common name is the name of its holder. Sensors and methods publish what the table says, report no health
 but their own, and read everything; a viewer only reads and asks; an operator also steers the emulator and the launcher. What no
 rule allows, the router drops, without an answer to the sender.
 """
@@ -31,7 +31,7 @@ EVERYTHING = ("put", "delete", "declare_subscriber", "query", "reply", "declare_
 
 
 def holder(service: str, is_router: bool) -> str:
-    """Whose certificate a process shows: what is no service only looks."""
+    """The holder of the certificate that a process shows: what is no service only reads."""
     if is_router:
         return ROUTER
     return service if service in (*SERVICES, DRIVER, OPERATOR) else VIEWER
@@ -40,7 +40,7 @@ def holder(service: str, is_router: bool) -> str:
 def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES) -> dict[str, Any]:
     """Zenoh's `access_control` of a router, as JSON: allowed is what a rule names, on keys that lie within the rule's.
 
-    table: the topics. services: the holders that publish, answer and tell of their health.
+    table: the topics. services: the holders that publish, answer and report their health.
     """
     table, services = tuple(table), tuple(services)
     keys = [topic.at() for topic in table]

@@ -28,4 +28,4 @@ COLOURS: dict[Label, tuple[int, int, int]] = {
 }
 """The colour [RGB, of 255] of each class where a mask is shown over its picture; the background stays as it is."""
 UNLABELLED = 255
-"""What masks to learn from hold where nobody knows the class: neither losses nor scores look there."""
+"""Value in the masks of training data where the class is not known: losses and scores leave it out."""

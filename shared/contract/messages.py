@@ -23,8 +23,8 @@ import numpy as np
 from msgspec.structs import force_setattr
 
 VERSION = 1
-"""Of the wire format: it counts up with every change of a message's fields or of their meaning. Every version keeps it under
-`version` in a map, so that also a reader of another one can tell what it got."""
+"""Version of the wire format: it counts up with every change of a message's fields or of their meaning. Every version keeps it
+under `version` in a map, so that a reader of another one recognises it."""
 MAX_FUTURE_S = 0.5
 """A stamp further ahead of the reader's clock than this is refused: clocks of one cell are kept closer than that."""
 MAX_PAST_S = 5.0
@@ -47,8 +47,8 @@ UNIT_TOLERANCE = 1e-3
 ROUNDING = 1e-6
 """What shares and matrices may be off by rounding, relative."""
 SMALL = 64
-"""Up to so many numbers Python makes a norm as fast as NumPy, and several times faster where NumPy's code is in no cache, as
-with a message every few milliseconds."""
+"""Largest number of entries for which Python computes a norm as fast as NumPy, and several times faster where NumPy's code is in
+no cache, as with a message every few milliseconds."""
 LONGEST_TEXT, MOST_SOURCES = 256, 32
 """Characters of a name, and senses of a pose: more than any message needs, less than fills a memory."""
 
@@ -237,7 +237,7 @@ FusedState = Literal["tracking", "coasting", "lost"]
 
 class FusedPose(Message, frozen=True, kw_only=True):
     """The one pose. `velocity`: linear [m/s] and angular [rad/s] along the frame's axes. `sources` by name (of the
-    table of senses); a sense that was never heard is absent."""
+    table of senses); a sense that has sent nothing is absent."""
 
     target: Name
     frame: Name

@@ -1,4 +1,4 @@
-"""The health report: what a process says of itself when it is asked, as JSON on the bus and typed here."""
+"""The health report: the answer of a process to the health query, as JSON on the bus and typed here."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Report:
     hangs, in words, empty where nothing does. progress: what it does before it can work and how far it is, as in `compiling 12 of
     40`; empty where it is ready to work. uptime_s: since it began [s]. cpu: in use [cores]. memory_mb: resident [MB]. replicas:
     living instances of the service. topics, published: by key. stale: keys of missing inputs. faults: exceptions by kind and
-    place. report: what the service tells besides, by name.
+    place. report: what the service adds, by name.
     """
 
     service: str
@@ -62,7 +62,7 @@ class Report:
     report: dict[str, Any] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """The report as JSON objects; `report` is left out where the service tells nothing."""
+        """The report as JSON objects; `report` is left out where the service adds nothing."""
         out = dataclasses.asdict(self)
         if not self.report:
             del out["report"]

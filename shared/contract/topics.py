@@ -1,4 +1,4 @@
-"""The one table of topics. The bus, `penumbra topics`, the health check and the recorder all read it."""
+"""The one table of topics. The bus, `penumbra topics`, the health check and the access rules all read it."""
 
 from __future__ import annotations
 

@@ -29,6 +29,7 @@ SQUARE = 1.25
 """Largest ratio of the two focal lengths. Pixels of sensors are square to 1 %."""
 NEWTON_STEPS = 20
 CONVERGED_PX = 1e-6
+"""The inverse of the distortion takes at most this number of Newton steps, and ends where the error is below this [px]."""
 RADII = 2000
 """Number of radii at which the distortion is tested for a fold."""
 

@@ -17,6 +17,7 @@ from penumbra.shared.native import inner, kernel
 NEAR = 0.02
 """Nothing closer to the camera than this [m] is drawn."""
 SUBPIXEL = 256
+"""Coordinates are rounded to this fraction of a pixel, so that the edge functions are exact in integers."""
 EMPTY = 255
 """The id of a pixel that shows nothing."""
 _FAR_PX = 16384.0  # coordinates beyond are clamped, which keeps the edge functions within 64 bits

@@ -1,4 +1,4 @@
-"""Rigid-body geometry in the house's conventions.
+"""Rigid-body geometry in the project's conventions.
 
 A transform `T_a_b` is a 4 x 4 float64 matrix that maps coordinates in frame b to frame a. Quaternions are (x, y, z, w).
 A pose error is a 6-vector (translation, rotation vector), both along the axes of the fixed frame: `T_true = perturb(T, error)`

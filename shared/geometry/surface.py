@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
-
-Array = NDArray[np.float64]
 
 
 class Surface:

@@ -20,13 +20,14 @@ STEP = 8
 SIZE_STEP = 32
 """Sizes are rounded up to this, so that the size seldom changes while the target turns."""
 MAX_PIXELS = 224 * 224
-"""Of a window around targets: what a step has time for. A larger target is looked at with a coarser scale."""
+"""Largest window around targets: what a step has time for. A larger target is shown at a coarser scale."""
 MAX_PIXELS_WIDE = 320 * 240
-"""Of the whole frame, or of all around the targets' homes, when nobody knows where one of them is."""
+"""Largest window of the whole frame, or around all targets' homes, while one of the targets is lost."""
 HOME_SIGMAS = 2.0
-"""A lost target is looked for so many standard deviations around its home: further away it would not be believed to be it."""
+"""Distance from its home, in standard deviations, within which a lost target is looked for: further away nothing would be
+taken for it."""
 MARGIN_M = 0.04
-"""Room around the target [m]: the prediction's error, and the surroundings that tell the contour."""
+"""Margin around the target [m]: the prediction's error, and the surroundings that show the contour."""
 NEAR_M = 0.1
 """A target with a part nearer to the camera than this is not projected."""
 
@@ -97,7 +98,7 @@ class Lookout:
         self.targets = tuple(self._boxes)
         self._window = self._wide()
 
-    def hear(self, pose: FusedPose) -> None:
+    def add(self, pose: FusedPose) -> None:
         """Takes the newest fused pose of a target; of one that it cannot see nothing is kept."""
         if pose.target in self._boxes:
             self._poses[pose.target] = pose
@@ -137,7 +138,7 @@ def window_around(
     camera: Camera, targets: Iterable[tuple[Array, Array]], previous: Window | None = None, most: int = MAX_PIXELS
 ) -> Window | None:
     """The window of at most `most` pixels that holds targets, given as (T_world_target (4, 4), corners (8, 3) of their box), with
-    MARGIN_M of room.
+    a margin of MARGIN_M.
 
     The previous window is kept while it holds them and is not much too large: the less it moves, the more the recurrent state
     is worth. None where no target is in the picture, or one is too near to the camera to say.

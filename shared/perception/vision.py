@@ -1,4 +1,4 @@
-"""What every vision process finds of a target in a frame, and how it is told to fusion."""
+"""What every vision process finds of a target in a frame, and the message that fusion receives of it."""
 
 from __future__ import annotations
 

@@ -19,12 +19,12 @@ SECURE_ENDPOINT = "tls/127.0.0.1:7447"
 SECURE_PROTOCOLS = ("tls",)
 PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 POOL_BYTES = 4 << 20
-"""Of shared memory, at least: four frames of a small camera."""
+"""Least size of the shared memory: four frames of a small camera."""
 SHARED_BYTES = 100_000
 """Frames go by shared memory; what is smaller takes no longer through a socket, and leaves its readers nothing behind where its
 publisher dies: they keep its pool for as long as they live."""
 ATTEMPT_MS = 500
-"""How long one attempt to reach the router may block inside Zenoh, where no signal is heard."""
+"""Longest time [ms] of one attempt to reach the router, inside Zenoh, where no signal is handled."""
 
 
 class BusError(RuntimeError):
@@ -110,7 +110,7 @@ def configuration(connection: Connection) -> zenoh.Config:
     elif mode == "router" and connection.config is None:
         settings["listen/endpoints"] = [connection.default]
     defaults = {
-        # one attempt is short, because Ctrl-C is not heard inside it; `open_session` repeats it, and later Zenoh itself does
+        # one attempt is short, because Ctrl-C has no effect inside it; `open_session` repeats it, and later Zenoh itself does
         "connect/timeout_ms": ATTEMPT_MS,
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 200, "period_increase_factor": 1},
@@ -126,7 +126,7 @@ def configuration(connection: Connection) -> zenoh.Config:
         settings["transport/link/tx/lease"] = 1000  # ms after which a frozen process is no longer alive
     for endpoint in (*connection.connect, *connection.listen):
         protocols = SECURE_PROTOCOLS if connection.secure else PROTOCOLS
-        if endpoint.partition("/")[0] not in protocols:  # Zenoh would try it for ever
+        if endpoint.partition("/")[0] not in protocols:  # Zenoh would try it without end
             raise BusError(
                 f"endpoint: expected PROTOCOL/ADDRESS, as in {connection.default}, got {endpoint!r}; "
                 f"protocols{' with --secure' if connection.secure else ''}: {', '.join(protocols)}"

@@ -62,7 +62,7 @@ def _who_listens(endpoint: str, link: socket.socket, host: str, secure: Path | N
             f"no router at {endpoint} with a certificate of the CA in {secure} for {host} ({error.verify_message}): use the "
             "folder of that router's `penumbra certs`, or name the host with --hosts"
         )
-    except OSError:  # it speaks no TLS, or does not answer
+    except OSError:  # no TLS, or no answer
         if secure is not None or endpoint.startswith("tls/"):
             return f"no router at {endpoint} that speaks TLS: leave --secure out, or start it with --secure"
         return f"no router at {endpoint}: what listens there does not answer as a Zenoh router: give another --connect"
@@ -72,7 +72,7 @@ def _who_listens(endpoint: str, link: socket.socket, host: str, secure: Path | N
 
 
 def _context(secure: Path | None) -> ssl.SSLContext:
-    """Of a client; without certificates it accepts every router, only to see whether it speaks TLS."""
+    """The TLS context of a client; without certificates it accepts every router, only to see whether it uses TLS."""
     context = ssl.create_default_context()
     if secure is None:
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE

@@ -15,9 +15,9 @@ from penumbra.shared.runtime.replicas import Clock, Pace, Replicas
 from penumbra.shared.runtime.traffic import Traffic
 
 LOOK_S = 0.2
-"""Between two looks whether this replica is fit for its part."""
+"""Period [s] of the checks whether this replica is fit for its part."""
 UNWATCHED_S = 5.0
-"""Without a look for so long the watchdog itself is blocked, as where it wants a thread that has no memory to begin."""
+"""Time [s] without a check after which the watchdog itself is blocked, as where there is no memory for a thread."""
 
 
 class Fitness:

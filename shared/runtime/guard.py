@@ -1,7 +1,7 @@
 """What a reader takes from a publisher: every message once, and no more of them than belong to its topic.
 
 A replayed message carries a number that was here before, or a stamp too old for its topic (`Topic.oldest_s`). A publisher is
-forgotten only when whatever it has sent is too old by its stamp. What another publisher says again, as where two replicas both
+forgotten only when whatever it has sent is too old by its stamp. What another publisher repeats, as where two replicas both
 take themselves for the owner, carries a stamp that was here before.
 """
 
@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from penumbra.shared.contract.messages import MAX_FUTURE_S, MAX_PAST_S, BadMessage
 
 RATE_TIMES = 5.0
-"""A publisher may send so many times its topic's rate, and a second's worth of that at once."""
+"""Largest multiple of its topic's rate at which a publisher may send; a second's worth of that may come at once."""
 PUBLISHERS = 16
-"""Publishers of one key that are known at a time."""
+"""Maximum number of publishers of one key at a time."""
 FORGET_S = MAX_PAST_S + MAX_FUTURE_S
 WINDOW = 64
-"""Numbers that may arrive out of order."""
+"""Number of messages of a publisher that may arrive out of order."""
 MEASUREMENTS = 64
 """Measurements of a key that are remembered: of the slowest stream more than its oldest that is taken."""
 SEEN = (1 << WINDOW) - 1
@@ -29,7 +29,7 @@ SEEN = (1 << WINDOW) - 1
 NUMBERS = 1 << 32
 """Publishers count modulo this: at 200 Hz it comes around after eight months."""
 IDENTITY_BYTES, NUMBER_BYTES = 12, 4
-"""Of what is attached to a message: its publisher, drawn at random, and its number, little-endian."""
+"""Sizes of the attachment of a message: its publisher, drawn at random, and its number, little-endian."""
 
 
 class Numbering:
@@ -44,7 +44,7 @@ class Numbering:
         return self._identity + (next(self._numbers) % NUMBERS).to_bytes(NUMBER_BYTES, "little")
 
 
-class Window:
+class SequenceWindow:
     """Which of a publisher's numbers were here: the sliding window of RFC 4303, section 3.4.3 (doi:10.17487/RFC4303)."""
 
     def __init__(self, number: int):
@@ -91,8 +91,8 @@ class Bucket:
 @dataclass
 class _Publisher:
     bucket: Bucket
-    heard_s: float
-    window: Window | None = None
+    received_s: float
+    window: SequenceWindow | None = None
     stamp_ns: int | None = None
 
 
@@ -109,22 +109,22 @@ class Guard:
         """How many more numbers of this publisher are missing than before; None where it does not count. `now_s` must not run
         backwards. Raises BadMessage: replayed, rate, or publishers where there are too many."""
         found = self._publishers.get(publisher)
-        if found is None or now_s - found.heard_s > FORGET_S:
+        if found is None or now_s - found.received_s > FORGET_S:
             found = self._newcomer(publisher, now_s)
         missing = None
         if number is not None:
             if found.window is None:
-                found.window, missing = Window(number), 0
+                found.window, missing = SequenceWindow(number), 0
             else:
                 missing = found.window.take(number)
         if not found.bucket.take(now_s):
             raise BadMessage("rate", f"expected at most {self._limit_hz:g} messages a second of a publisher, got more")
         return missing
 
-    def believe(self, publisher: Hashable, stamp_ns: int, now_s: float, camera: str = "") -> None:
-        """Takes a good message that was admitted; camera: of whose picture it tells, where it tells of one. Raises BadMessage for
-        a measurement that somebody has told already, and where a publisher that does not number its messages sends one that is
-        not newer; one that does may, as where a pose of one camera is older than the last of another."""
+    def accept(self, publisher: Hashable, stamp_ns: int, now_s: float, camera: str = "") -> None:
+        """Takes a good message that was admitted; camera: the one that it is measured with, if any. Raises BadMessage for a
+        measurement that was received from another publisher already, and where a publisher that does not number its messages
+        sends one that is not newer; one that does may, as where a pose of one camera is older than the last of another."""
         found = self._publishers[publisher]
         if found.window is None:
             if found.stamp_ns is not None and stamp_ns <= found.stamp_ns:
@@ -137,10 +137,10 @@ class Guard:
         elif (stamp_ns, camera) in self._measurements:
             raise BadMessage("repeated", f"expected every measurement once, got that of stamp {stamp_ns} again")
         self._measurements.append((stamp_ns, camera))
-        found.heard_s = now_s
+        found.received_s = now_s
 
     def _newcomer(self, publisher: Hashable, now_s: float) -> _Publisher:
-        self._publishers = {name: known for name, known in self._publishers.items() if now_s - known.heard_s <= FORGET_S}
+        self._publishers = {name: known for name, known in self._publishers.items() if now_s - known.received_s <= FORGET_S}
         if len(self._publishers) >= PUBLISHERS:
             raise BadMessage("publishers", f"expected at most {PUBLISHERS} publishers of a key, got another one")
         return self._publishers.setdefault(publisher, _Publisher(Bucket(self._limit_hz, now_s), now_s))

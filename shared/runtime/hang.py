@@ -6,11 +6,11 @@ import time
 from types import TracebackType
 
 HANG_S = 1.0
-"""A handler hangs that takes so much longer than usual."""
+"""Time [s] beyond the usual after which a handler hangs."""
 FIRST_S = 2.0
-"""What is taken for usual before anything is known: the first calls compile, and fill caches."""
+"""Usual duration [s] before any is known: the first calls compile, and fill caches."""
 SHARE = 0.05
-"""Of one call in what is usual: twenty calls are remembered."""
+"""Weight of one call in the usual duration: twenty calls are remembered."""
 
 
 class Turn:
@@ -34,7 +34,7 @@ class Turn:
         self._began_s = None
 
     def hangs_s(self, now_s: float) -> float:
-        """For how long the call under way has been, where that is too long; else 0. `now_s`: of time.monotonic."""
+        """Duration [s] of the call under way, where that is too long; else 0. `now_s`: of time.monotonic."""
         began_s = self._began_s
         lasts_s = 0.0 if began_s is None else now_s - began_s
         return lasts_s if lasts_s > self._patience_s + self._usual_s else 0.0

@@ -1,6 +1,6 @@
-"""How a process fares, in one word and its reasons.
+"""The status of a process and its reasons.
 
-ok: nothing to say. starting: it prepares its work, or waits for a process that does. degraded: it works, but not as it should.
+ok: no fault. starting: it prepares its work, or waits for a process that does. degraded: it works, but not as it should.
 down: it is cut off from the others.
 """
 
@@ -15,7 +15,7 @@ from penumbra.shared.runtime.traffic import Traffic
 
 STATUSES = ("ok", "starting", "degraded", "down")
 LATELY_S = 30.0
-"""What happened longer ago than this says nothing about now."""
+"""Time [s] for which a fault counts."""
 
 
 class Lately:
@@ -57,8 +57,8 @@ def judge(
     waits: Callable[[Traffic], str] = lambda traffic: "",
 ) -> tuple[str, list[str]]:
     """Status and reasons. away: why the others cannot be reached, empty where they can. received: what is read, by key. grown:
-    which of `counts` grew lately. own: what the service itself suffers from. progress: what it does before it can work. waits:
-    why an input that was never heard is not a fault yet, empty where it is one."""
+    which of `counts` grew lately. own: the service's own reasons. progress: what it does before it can work. waits:
+    why an input that was never received is not a fault yet, empty where it is one."""
     missing: defaultdict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)  # by what is wrong, and pattern of keys
     known: Counter[str] = Counter()
     for key, traffic in sorted(received.items()):

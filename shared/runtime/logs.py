@@ -1,6 +1,6 @@
 """Structured logs: a sentence and its fields, as key=value text or as one JSON object a line, on standard error.
 
-A line of JSON is `{time, level, service, instance, message, fields}`, and `trace` where an exception is told.
+A line of JSON is `{time, level, service, instance, message, fields}`, and `trace` where an exception is logged.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def _on_thread(log: Log | None, ends_process: bool, failed: threading.ExceptHook
 
 
 def _on_unraisable(failed: sys.UnraisableHookArgs) -> None:
-    """The hook for an exception that nobody can catch, such as that of a thread without the memory to begin: its starter would
-    wait for ever."""
+    """The hook for an exception that cannot be caught, such as that of a thread without the memory to begin: its starter would
+    wait without end."""
     try:
         sys.__unraisablehook__(failed)
     finally:

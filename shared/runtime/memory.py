@@ -8,7 +8,7 @@ import ctypes
 KEPT_BYTES, SPARE_BYTES = 16 << 20, 32 << 20
 """Blocks of memory up to the first size come from what the process has, and stay there; beyond the second it gives some back."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Of malloc.h."""
+"""Numbers of these options in malloc.h."""
 
 
 def keep() -> None:

@@ -1,6 +1,6 @@
 """Metrics in Prometheus' format, made of health reports alone: what `Node.health` says, in other words.
 
-Counters are of the process that tells them and start anew with it, which is what Prometheus expects.
+Counters belong to the process that reports them and start anew with it, which is what Prometheus expects.
 """
 
 from __future__ import annotations

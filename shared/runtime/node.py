@@ -7,9 +7,9 @@ def start(node, options):                     # wires; nothing is received befor
 node.run()                                    # until SIGINT or SIGTERM
 
 Threads. Each subscription calls its handler in a thread of its own, one message after another: two handlers of one service run
-at the same time, and so do timers (`every`), answers (`answer`) and whatever the health report calls (`tell`, `worry`). What two
-of them share is owned by one of them and only read by the others as a whole (an attribute or a dictionary's value that is
-replaced, never a container that changes while somebody iterates over it), or has a lock. `latest` may be looked at from any
+at the same time, and so do timers (`every`), answers (`answer`) and what the health report calls (`add_report`, `add_reasons`).
+What two of them share is owned by one of them and only read by the others as a whole (an attribute or a dictionary's value that
+is replaced, never a container that changes while another thread iterates over it), or has a lock. `latest` may be read from any
 thread.
 """
 
@@ -56,13 +56,13 @@ from penumbra.shared.runtime.streams import Handler, Streams
 __all__ = ["CLOSE_S", "LatestMessages", "Node", "ServiceNode"]
 
 FRAMES_UNDER_WAY = 3
-"""Of each camera, in shared memory: one that is written and two that are read."""
+"""Number of frames of each camera in shared memory: one that is written and two that are read."""
 NEWS_S = 0.2
-"""Within this a session has heard which replicas there are."""
+"""Time [s] within which a session knows the living replicas."""
 WARM_UP_S = 2.0
-"""How long a replica that joins others may listen before it takes its share."""
+"""Longest time [s] that a replica which joins others only receives, before it takes its share."""
 ASK_S = 0.5
-"""How long the publishers of a missing input may take to say how far they are."""
+"""Longest wait [s] for the progress of the publishers of a missing input."""
 
 
 class LatestMessages(Protocol):
@@ -72,7 +72,7 @@ class LatestMessages(Protocol):
         """The newest message of the key with these names, None where there was none."""
 
     def drain(self) -> int:
-        """Takes in what has come; the number of good messages so far."""
+        """Decodes what was received; the number of good messages so far."""
 
 
 class ServiceNode(Protocol):
@@ -93,16 +93,16 @@ class ServiceNode(Protocol):
     def owns(self, stream: str) -> bool: ...
     def rank(self, stream: str) -> float: ...
     def progress(self, what: str, done: int, total: int) -> None: ...
-    def tell(self, name: str, function: Callable[[], Any]) -> None: ...
-    def worry(self, function: Callable[[], Sequence[str]]) -> None: ...
+    def add_report(self, name: str, function: Callable[[], Any]) -> None: ...
+    def add_reasons(self, function: Callable[[], Sequence[str]]) -> None: ...
     def warm_when(self, function: Callable[[], bool]) -> None: ...
 
 
 class Node:
     """One service instance: a session, its subscriptions, timers and queryables, their counters, and a log.
 
-    Whatever is declared before `open` (which `run` calls) is declared on the bus when it opens; what is published before that is
-    dropped, as it is where nobody listens. Use `with` where the node does not `run`.
+    What is declared before `open` (which `run` calls) is declared on the bus when it opens; what is published before that is
+    dropped, as it is where there is no subscriber. Use `with` where the node does not `run`.
 
     service: name of the service. cell: the cell. connection: how to reach the others.
     """
@@ -126,8 +126,8 @@ class Node:
         self._waiting = Waiting(lambda name: self.query(topics.health(cell.name, name), timeout_s=ASK_S))
         self._faults: dict[str, int] = {}
         self._lately = health.Lately()
-        self._tells: dict[str, Callable[[], Any]] = {}
-        self._worries: list[Callable[[], Sequence[str]]] = []
+        self._reports: dict[str, Callable[[], Any]] = {}
+        self._reasons: list[Callable[[], Sequence[str]]] = []
         self._warm: list[Callable[[], bool]] = []
         self._process = psutil.Process()
         self._cpu = 0.0
@@ -156,7 +156,7 @@ class Node:
         self._link.declare_all()
         self._come_alive()
         self._process.cpu_percent()
-        self.every(1.0, self._keep_house, HANG_S + len(topics.TOPICS) * ASK_S)
+        self.every(1.0, self._update, HANG_S + len(topics.TOPICS) * ASK_S)
         self._link.spawn(self._watch_fitness, "watch fitness")
         self.log.info("on the bus", at=", ".join(self.connection.listen) or self.connection.where)
         return self
@@ -170,7 +170,7 @@ class Node:
             self._queries.serve(session, topics.health(self.cell.name, self.service, self.instance), self._answer_health)
 
     def _announce_early(self) -> None:
-        """Lets others see how far a process is that is not open yet."""
+        """Reports the progress of a process that is not open yet."""
         try:
             if not self.stopping.is_set():
                 self._announce(self._link.open(float("inf")))
@@ -182,8 +182,8 @@ class Node:
         self._fitness.watch(self.stopping, lambda: list(received.values()), self._come_alive, self._streams.look)
 
     def _come_alive(self) -> None:
-        """The last step: who is alive can be asked, is listening, and owns streams. Beside living replicas a service warms up
-        first, for at most WARM_UP_S; alone, a cold one is better than none."""
+        """The last step of opening: a living replica answers queries, subscribes, and owns streams. Beside other replicas a
+        service warms up first, for at most WARM_UP_S; alone, it starts cold."""
         session = self.session
         if session is None:
             return
@@ -206,7 +206,7 @@ class Node:
             try:
                 self.open()
             except bus.BusError:
-                if not self.stopping.is_set():  # else: told to stop before the router came
+                if not self.stopping.is_set():  # else: stopped before the router was there
                     raise
             self.stopping.wait()
 
@@ -256,8 +256,8 @@ class Node:
     ) -> None:
         """Calls `handler(message, names)` for every good message, in a thread of this subscription.
 
-        names: fix some of the topic's {names}; the others take every value that the cell has. The handler is told them all, and
-        as `publisher` who sent the message (empty where nobody says), which tells two processes on one key apart. While the
+        names: fix some of the topic's {names}; the others take every value that the cell has. The handler receives them all, and
+        as `publisher` the sender's identity (empty where it has none), which distinguishes two processes on one key. While the
         handler is busy the newest `topic.depth` messages per key are kept. Bad messages are counted and logged once per kind; so
         are exceptions of the handler. Raises CellError for a name that the cell does not have.
 
@@ -268,9 +268,9 @@ class Node:
         self._streams.subscribe(topic, handler, streams, from_others, names)
 
     def latest(self, topic: Topic, from_others: bool = False, **names: str) -> Latest[Any]:
-        """The newest message of each key, for whoever looks less often than messages come: only those that are looked at are
-        decoded, and nothing wakes up when one comes. They are guarded, counted and missed like those of `subscribe`, except for
-        their delay, which nobody knows. names, from_others: as in `subscribe`."""
+        """The newest message of each key, for a service that reads less often than messages arrive: only those that are read are
+        decoded, and no thread wakes up when one arrives. They are guarded, counted and missed like those of `subscribe`, except
+        for their delay, which is not known. names, from_others: as in `subscribe`."""
         return self._streams.latest(topic, from_others, names)
 
     def keys(self, topic: Topic, names: dict[str, str]) -> dict[str, dict[str, str]]:
@@ -282,7 +282,7 @@ class Node:
 
     def answer(self, key: str, function: Answer) -> None:
         """Answers queries on `key` with `function(parameters, payload)`: bytes, or bytes and their encoding. A ValueError becomes
-        an error reply with its text. While it warms up, or is unfit, beside others, it leaves the answers to them."""
+        an error reply with its text. A replica that warms up, or is unfit, leaves the answers to the others."""
 
         def answer(parameters: dict[str, str], payload: bytes) -> bytes | tuple[bytes, str]:
             if not self.replicas.has_joined and self.replicas.others:
@@ -292,13 +292,13 @@ class Node:
         self._queries.answer(key, answer)
 
     def query(self, key: str, parameters: str = "", payload: bytes | None = None, timeout_s: float = 1.0) -> list[bytes]:
-        """The payloads of all answers; none where nobody answers. Raises bus.Refused where the only answers are errors."""
+        """The payloads of all answers, which may be none. Raises bus.Refused where the only answers are errors."""
         return self._queries.ask(key, parameters, payload, timeout_s)
 
     # ---- time and replicas
 
     def every(self, period_s: float, function: Callable[[], None], patience_s: float = HANG_S) -> None:
-        """Calls `function` every `period_s` in a thread of its own; turns that are missed are left out, not made up for. A turn
+        """Calls `function` every `period_s` in a thread of its own; turns that are missed are left out. A turn
         hangs that takes `patience_s` longer than usual: infinite for one that returns when the node stops."""
         what = f"timer {getattr(getattr(function, 'func', function), '__name__', '')} of {period_s} s"
         turn = self._fitness.turn(what, patience_s)
@@ -316,40 +316,40 @@ class Node:
         self._link.declare(lambda _: self._link.spawn(loop, f"every {period_s} s"))
 
     def owns(self, stream: str) -> bool:
-        """Whether this replica is the one of the living replicas of its service that handles `stream`. While the news of a
-        replica's coming or going is under way two may own a stream, or none."""
+        """Whether this replica is the one of the living replicas of its service that handles `stream`. Shortly after a
+        replica comes or goes two may own a stream, or none."""
         return self.replicas.owns(stream)
 
     def rank(self, stream: str) -> float:
-        """How many living replicas are before this one to handle `stream`; infinity where this one has no part now."""
+        """Number of living replicas before this one to handle `stream`; infinity where this one has no part now."""
         return self.replicas.rank(stream)
 
-    # ---- what a service says of itself
+    # ---- the health report
 
     def progress(self, what: str, done: int, total: int) -> None:
         """Says how far the service is with what it must do before it can work, as in `progress("compiling", 12, 40)`; the last
         step ends it. Until then its status is `starting` with the reason `compiling 12 of 40`, on the bus also before the node is
-        open, and so is that of whoever waits for it; the log has a line every 2 s."""
+        open, and so is that of the services that wait for it; the log has a line every 2 s."""
         self._progress.set(what, done, total)
         if not self._is_early and not self._is_open:
             self._is_early = True
             atexit.register(self.close)  # where `start` fails, too: Zenoh aborts a process that ends with an open session
             self._link.spawn(self._announce_early, "announce")
 
-    def tell(self, name: str, function: Callable[[], Any]) -> None:
+    def add_report(self, name: str, function: Callable[[], Any]) -> None:
         """Adds what `function` returns, as JSON, to the health report under `report` and this name."""
-        self._tells[name] = function
+        self._reports[name] = function
 
-    def worry(self, function: Callable[[], Sequence[str]]) -> None:
+    def add_reasons(self, function: Callable[[], Sequence[str]]) -> None:
         """Adds the reasons that `function` returns, in words: while there are any, the status is `degraded`."""
-        self._worries.append(function)
+        self._reasons.append(function)
 
     def warm_when(self, function: Callable[[], bool]) -> None:
-        """Has a replica join the others only when `function` says that it could go on with what another one does."""
+        """Lets a replica join the others only when `function` returns that it could continue another one's work."""
         self._warm.append(function)
 
     def is_warm(self) -> bool:
-        """Whether this replica could go on with what another one does."""
+        """Whether this replica could continue another one's work."""
         return all(function() for function in self._warm)
 
     def thin_out(self, slow: SlowLinks) -> None:
@@ -357,7 +357,7 @@ class Node:
         self._link.connection = replace(self.connection, slow=slow)
 
     def report(self) -> Report:
-        """What this instance is and how it fares."""
+        """The health report of this instance."""
         self._streams.drain()
         now_ns = self.now_ns()
         status, reasons = self._judge(self._look(), now_ns)
@@ -382,7 +382,7 @@ class Node:
             published={key: traffic.report(now_ns) for key, traffic in sorted(published.items())},
             stale=sorted(key for key, traffic in received.items() if traffic.is_stale(now_ns)),
             faults=dict(self._faults),
-            report={name: function() for name, function in list(self._tells.items())},
+            report={name: function() for name, function in list(self._reports.items())},
         )
 
     def health(self) -> dict[str, Any]:
@@ -390,8 +390,8 @@ class Node:
         return self.report().as_json()
 
     def fault(self, where: str, error: Exception) -> None:
-        """Counts an exception; the first of its kind and place is logged with its trace. Raises a MemoryError again: what is out
-        of memory does nothing well any more, and ends to begin anew (`services.run.serve`)."""
+        """Counts an exception; the first of its kind and place is logged with its trace. Raises a MemoryError again: a
+        process out of memory ends and is started again (`services.run.serve`)."""
         if isinstance(error, MemoryError):
             raise error
         frames = traceback.extract_tb(error.__traceback__)
@@ -405,18 +405,18 @@ class Node:
         return json.dumps(self.health()).encode()
 
     def _judge(self, grown: Counter[tuple[str, str]], now_ns: int) -> tuple[str, list[str]]:
-        """Status and reasons; grown: what happened lately."""
+        """Status and reasons; grown: counters that grew lately."""
         if not self._is_open and self.session is not None:  # early on the bus: nothing is read yet
             return health.judge("", {}, grown, [], now_ns, str(self._progress) or "not ready yet")
-        own = [*self._fitness.faults(), *(reason for worry in self._worries for reason in worry())]
+        own = [*self._fitness.faults(), *(reason for reasons in self._reasons for reason in reasons())]
         progress = str(self._progress)
         return health.judge(self._link.away(), self._streams.received, grown, own, now_ns, progress, self._waiting.why)
 
     def _look(self) -> Counter[tuple[str, str]]:
         return self._lately.look(health.counts(self._streams.received, self._faults), time.monotonic())
 
-    def _keep_house(self) -> None:
-        """Once a second: CPU, what should not happen, the state of the link, and the heartbeat file that a container's health
+    def _update(self) -> None:
+        """Once a second: CPU, the counters of faults, the state of the link, and the heartbeat file that a container's health
         check reads: the status and its reasons, in words."""
         self._cpu = self._process.cpu_percent() / 100
         grown = self._look()
@@ -430,7 +430,7 @@ class Node:
             status, reasons = self._judge(grown, self.now_ns())
             fresh = Path(f"{heartbeat}.new")
             fresh.write_text(": ".join([status, "; ".join(reasons)]).removesuffix(": ") + "\n")
-            fresh.replace(heartbeat)  # nobody reads half of it
+            fresh.replace(heartbeat)  # at once: it is never read half written
 
 
 def _safe(text: str) -> str:

@@ -1,4 +1,4 @@
-"""What a process does before it can work, and whether those that it waits for do so too."""
+"""The progress of a process that is starting, and of those whose messages it waits for."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from penumbra.shared.runtime.logs import Log
 from penumbra.shared.runtime.traffic import Traffic
 
 LOG_S = 2.0
-"""Between two lines of the log about one task."""
-NOBODY_S = 10.0
-"""A publisher that does not answer yet may still be on its way to the bus for so long after this process began."""
+"""Time [s] between two lines of the log about one task."""
+ABSENT_S = 10.0
+"""Time [s] after the start of this process in which a publisher that does not answer may still be starting."""
 SETTLE_S = 2.0
-"""A publisher that has just become ready may take so long for its first message."""
+"""Time [s] that a publisher which has become ready may take for its first message."""
 STARTING_S = 120.0
-"""After so long an input that was never heard is a fault, whatever its publishers say."""
+"""Time [s] after which an input that was never received is a fault, whatever its publishers report."""
 
 
 class Progress:
@@ -54,7 +54,7 @@ class Progress:
 
 
 class Waiting:
-    """Why an input that was never heard is not a fault yet: its publishers are starting, or were a moment ago.
+    """Why an input that was never received is not a fault yet: its publishers are starting, or were a moment ago.
 
     ask: the answers to the health query of a service; raises bus.Refused where it is there and too busy to answer. `look` asks,
     and may block for as long as that takes; `why` does not.
@@ -67,7 +67,7 @@ class Waiting:
         self._settled_s: dict[str, float] = {}  # since when a service answers that it is not
 
     def look(self, received: Iterable[Traffic], now_ns: int) -> None:
-        """Asks the publishers of inputs that were never heard how far they are."""
+        """Asks the publishers of inputs that were never received for their progress."""
         missing = [traffic for traffic in received if traffic.stamp_ns is None and traffic.is_stale(now_ns)]
         now_s = time.monotonic()
         if now_s - self._began_s > STARTING_S:
@@ -95,7 +95,7 @@ class Waiting:
                 self._settled_s.pop(service, None)
 
     def why(self, traffic: Traffic) -> str:
-        """What its publishers do, in words; empty where it should have been heard by now."""
+        """What its publishers do, in words; empty where it should have been received by now."""
         now_s = time.monotonic()
         if now_s - self._began_s > STARTING_S:
             return ""
@@ -105,4 +105,4 @@ class Waiting:
         settled_s = [self._settled_s[service] for service in traffic.publishers if service in self._settled_s]
         if settled_s:
             return f"{' or '.join(traffic.publishers)} has just started" if now_s - min(settled_s) < SETTLE_S else ""
-        return f"{' or '.join(traffic.publishers)} is not there yet" if now_s - self._began_s < NOBODY_S else ""
+        return f"{' or '.join(traffic.publishers)} is not there yet" if now_s - self._began_s < ABSENT_S else ""

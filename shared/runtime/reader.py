@@ -1,4 +1,4 @@
-"""What reads a subscription: `Reader` hands every message to a handler, `Latest` keeps the newest until somebody looks at it.
+"""What reads a subscription: `Reader` hands every message to a handler, `Latest` keeps the newest until it is read.
 
 Both judge a sample alike: its key, its size, the publisher's number and rate (`shared.runtime.guard`), its version and its stamp.
 What is done for each message is done at most 200 times a second and finds no cache warm: each function of another library that
@@ -46,10 +46,10 @@ class Stream:
 class Inbox:
     """What a reader is declared with.
 
-    expression: the key expression that is subscribed to. depth: samples that are kept while nobody takes them. streams: every
-    concrete key that the cell knows; a sample on any other key is refused and counted in `strangers`, so that nobody can grow the
-    table. now_ns: the clock that stamps are compared with. refused: called with the first bad message of each kind on a key.
-    failed: called with every exception of a handler. from_others: leaves out what this session publishes itself.
+    expression: the key expression that is subscribed to. depth: samples that are kept while none is taken. streams: every
+    concrete key that the cell knows; a sample on any other key is refused and counted in `unknown`, so that no publisher can make
+    the table grow. now_ns: the clock that stamps are compared with. refused: called with the first bad message of each kind on a
+    key. failed: called with every exception of a handler. from_others: leaves out what this session publishes itself.
     """
 
     topic: Topic
@@ -60,7 +60,7 @@ class Inbox:
     refused: Callable[[str, BadMessage], None]
     failed: Callable[[str, Exception], None]
     from_others: bool = False
-    strangers: Traffic = field(default_factory=lambda: Traffic(math.inf))
+    unknown: Traffic = field(default_factory=lambda: Traffic(math.inf))
 
     def subscribe(self, session: zenoh.Session) -> zenoh.Subscriber[Any]:
         """A subscription with a ring: a Python callback or the default channel would let one slow reader hold up every other
@@ -91,7 +91,7 @@ class Inbox:
     def refuse(self, key: str, error: BadMessage) -> None:
         """Counts a bad message; the first of its kind on its key is reported."""
         stream = self.streams.get(key)
-        bad = (self.strangers if stream is None else stream.traffic).bad
+        bad = (self.unknown if stream is None else stream.traffic).bad
         bad[error.kind] = bad.get(error.kind, 0) + 1
         if bad[error.kind] == 1:
             self.refused(key, error)
@@ -129,11 +129,11 @@ class Reader:
             stream, publisher, payload = inbox.admit(sample, now_s)
             message = self._decode(payload)
             check_stamp(inbox.topic.message, message.stamp_ns, now_ns, self._oldest_s)
-            stream.guard.believe(publisher, message.stamp_ns, now_s, getattr(message, "camera", ""))
+            stream.guard.accept(publisher, message.stamp_ns, now_s, getattr(message, "camera", ""))
         except BadMessage as error:
             inbox.refuse(inbox.key_of(sample), error)
             return
-        stream.traffic.took(message.stamp_ns, now_ns)
+        stream.traffic.record(message.stamp_ns, now_ns)
         try:
             with self._turn:
                 self._handler(message, stream.names_with(publisher))
@@ -148,9 +148,9 @@ class _Newest(Generic[M]):
 
 
 class Latest(Generic[M]):
-    """The newest message of each key of a topic, for whoever looks rarely at what comes often: nothing wakes up when a message
-    comes, and only a message that is looked at is decoded. The others are taken from the ring by `drain`, which looks at their
-    number, version and stamp, and counts them. Several threads may look at once.
+    """The newest message of each key of a topic, for a caller that reads less often than messages arrive: no thread wakes up when
+    a message arrives, and only a message that is read is decoded. The others are taken from the ring by `drain`, which looks at
+    their number, version and stamp, and counts them. Several threads may look at once.
 
     `drain` must be called every LOOK_S at least, or the ring overflows; the node does so.
     """
@@ -205,11 +205,11 @@ class Latest(Generic[M]):
             stream, publisher, payload = inbox.admit(sample, now_s)
             found = head(kind, payload)
             check_stamp(kind, found.stamp_ns, now_ns, inbox.topic.oldest_s)
-            stream.guard.believe(publisher, found.stamp_ns, now_s, found.camera)
+            stream.guard.accept(publisher, found.stamp_ns, now_s, found.camera)
         except BadMessage as error:
             inbox.refuse(inbox.key_of(sample), error)
             return
-        stream.traffic.took(found.stamp_ns, None)
+        stream.traffic.record(found.stamp_ns, None)
         self._newest[inbox.key_of(sample)].payload = payload
         self.count += 1
 

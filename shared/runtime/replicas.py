@@ -1,6 +1,6 @@
-"""The replicas of a service: which of them live, which stream is whose, and who is not fit to have any.
+"""The replicas of a service: which of them live, which of them owns a stream, and which are not fit to own any.
 
-Each replica that can do its part holds a liveliness token; whoever sees the same tokens finds the same owner for a stream.
+Each replica that can work holds a liveliness token; all that see the same tokens find the same owner for a stream.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ import zenoh
 from penumbra.shared.runtime.traffic import Traffic
 
 CLOCK_S = 1.0
-"""Over which messages are counted to tell whether a process has another time than all others."""
+"""Period [s] over which messages are counted to find whether a process's clock differs from all others."""
 CLOCK_MESSAGES = 10
+"""Least number of messages refused for their stamps in it. Chosen, not measured."""
 PACE_SHARE = 0.5
-"""Of the newest look in what is known of how late a process comes: three late ones in a row tell."""
+"""Weight of the newest look in the smoothed lateness of a process: three late looks in a row suffice."""
 PACE_LOST = 0.5
-"""A process that loses so large a share of its time is slower than none."""
+"""Share of its time whose loss makes a process withdraw: the next replica is faster. Chosen, not measured."""
 
 
-class Reader(Protocol):
+class ReaderThread(Protocol):
     """What reads a subscription."""
 
     thread: threading.Thread
@@ -39,8 +40,8 @@ class Share:
 
     streams: tuple[str, ...]
     traffic: list[Traffic]
-    read: Callable[[], Reader]
-    reader: Reader | None = None
+    read: Callable[[], ReaderThread]
+    reader: ReaderThread | None = None
 
     def follow(self, is_own: bool) -> None:
         """Opens or closes the subscription where that has changed."""
@@ -78,12 +79,12 @@ class Replicas:
         return len(self._living)
 
     def wait(self) -> None:
-        """It owns nothing before it knows whether others do."""
+        """Owns nothing until the other replicas are known."""
         with self._lock:
             self._living, self._ranks = frozenset(), {}
 
     def watch(self, session: zenoh.Session) -> None:
-        """Follows who comes and goes, until the session is closed."""
+        """Follows the liveliness tokens until the session is closed."""
         expression = f"{self._key.rpartition('/')[0]}/*"
         tokens = session.liveliness().declare_subscriber(expression, zenoh.handlers.FifoChannel(256), history=True)
         living: set[str] = set()
@@ -99,7 +100,7 @@ class Replicas:
                 return
 
     def join(self, session: zenoh.Session) -> None:
-        """The last step of coming alive: from now on it has its part."""
+        """Declares the liveliness token: from now on this replica owns streams."""
         with self._lock:
             if self._token is None:
                 self._token = session.liveliness().declare_token(self._key)
@@ -119,18 +120,18 @@ class Replicas:
             self._shares.append(share)
             share.follow(any(map(self.owns, share.streams)))
 
-    def leave(self) -> list[Reader]:
-        """Takes nothing over any more, whoever goes; what reads its streams now."""
+    def leave(self) -> list[ReaderThread]:
+        """Takes over no more streams; returns the readers of those that it owns."""
         with self._lock:
             shares, self._shares = self._shares, []
             return [share.reader for share in shares if share.reader is not None]
 
     def owns(self, stream: str) -> bool:
-        """As `rank`: whether it is 0."""
+        """Whether `rank` is 0."""
         return self.rank(stream) == 0
 
     def rank(self, stream: str) -> float:
-        """How many living replicas of this service are before this one to handle `stream`: 0 for its owner, 1 for the one that
+        """Number of living replicas of this service before this one to handle `stream`: 0 for its owner, 1 for the one that
         will own it when the owner goes away; infinity where this one has no part yet. Rendezvous hashing (Thaler and
         Ravishankar 1998, doi:10.1109/90.663936): a replica that comes or goes moves only its own streams."""
         rank = self._ranks.get(stream)
@@ -142,7 +143,7 @@ class Replicas:
         return rank
 
     def _count(self) -> None:
-        """This one counts as soon as the others know of it, or where there are none."""
+        """This replica counts as soon as the others know of it, or where there are none."""
         self._ranks = {}
         self._living = self.others if self._token is None and self.others else self.others | {self._instance}
         self._ranks = {}  # again: another thread may have put a rank among the old ones into the first
@@ -151,8 +152,8 @@ class Replicas:
 
 
 class Clock:
-    """Tells by what is refused whether this process has another time than those that it hears. fault: what is wrong, empty where
-    nothing is."""
+    """Detects, by the messages that are refused, a clock that differs from those of all publishers. fault: in words, empty where
+    there is none."""
 
     def __init__(self) -> None:
         self._since_s = -math.inf
@@ -172,8 +173,8 @@ class Clock:
 
 
 class Pace:
-    """Tells by how late this process comes to look that it does not get its time: it is stopped again and again, or the machine
-    is overloaded, where fewer replicas do more. One long stop tells nothing: it is over."""
+    """Detects, by how late a periodic look of this process is, that it does not get its time: it is stopped again and again, or
+    the machine is overloaded, where fewer replicas do more. One long stop does not count: it is over."""
 
     def __init__(self) -> None:
         self._lost = 0.0

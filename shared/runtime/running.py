@@ -10,6 +10,7 @@ from penumbra.shared.contract import report, topics
 from penumbra.shared.runtime import bus
 
 ANSWER_S = 1.0
+"""Longest wait [s] for the answer of an instance."""
 
 
 @dataclass(frozen=True)

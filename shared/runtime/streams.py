@@ -1,4 +1,4 @@
-"""The messages of a node: the keys of a topic in its cell, who publishes and who reads on them, and their counters."""
+"""The messages of a node: the keys of a topic in its cell, their publishers and readers, and their counters."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class _Publisher(NamedTuple):
 
 
 class Streams:
-    """What a node reads and publishes.
+    """The topics that a node reads and publishes.
 
     link: the session. replicas: who owns what. now_ns: the clock of stamps. turn: makes the watch of a new handler. failed:
     called with the place and the exception of a handler that fails. received, published: the counters by key.
@@ -74,7 +74,7 @@ class Streams:
             if self._link.session is not None:  # else: closed meanwhile
                 raise
             return
-        found.traffic.took(message.stamp_ns, self._now_ns())
+        found.traffic.record(message.stamp_ns, self._now_ns())
 
     def subscribe(self, topic: Topic, handler: Handler, owned: Sequence[str], from_others: bool, names: dict[str, str]) -> None:
         """As `Node.subscribe`; owned: the streams that this replica must own one of."""
@@ -131,7 +131,7 @@ class Streams:
         }
         inbox = Inbox(topic, expression, depth(len(keys)), streams, self._now_ns, self._refused, self._failed, from_others)
         if len(keys) > 1:
-            self.received.setdefault(expression, inbox.strangers)
+            self.received.setdefault(expression, inbox.unknown)
         return inbox
 
     def _declare_publisher(self, session: zenoh.Session, topic: Topic, names: dict[str, str]) -> _Publisher:
@@ -167,7 +167,7 @@ class Streams:
         return traffic
 
     def _refused(self, key: str, error: BadMessage) -> None:
-        """Told of the first bad message of each kind on a key. Another release speaks on many keys at once: it is told once."""
+        """Logs the first bad message of each kind on a key. Another release publishes on many keys at once: it is logged once."""
         if error.kind == "version" and next(self._other_versions):
             return
         self._log.warning("message refused; more of this kind are only counted", key=key, kind=error.kind, why=str(error))

@@ -52,7 +52,7 @@ class Traffic:
     is_read: bool = True
     rate: Rate = field(default_factory=Rate)
 
-    def took(self, stamp_ns: int, now_ns: int | None) -> None:
+    def record(self, stamp_ns: int, now_ns: int | None) -> None:
         """Counts a good message. now_ns: when it came by the clock of stamps, None where that is not known."""
         self.count += 1
         self.stamp_ns = stamp_ns

@@ -3,7 +3,7 @@
 A board excites its pad's ring with a sine of `electrode_hz`, takes `samples_per_cycle` samples of each of its six channels in
 every cycle, and adds up each of these samples over many cycles. The amplitude of a channel is the first Fourier component of
 the mean cycle. There is no header, no checksum and no sequence number: a reply's size and what is possible in it are all there
-is to tell whether it is whole. Only bytes and arrays here: `services/skin` has the serial port, `sim.skin.board` the emulated
+is to find whether it is whole. Only bytes and arrays here: `services/skin` has the serial port, `sim.skin.board` the emulated
 board.
 """
 
@@ -21,6 +21,7 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry.rigid import Array
 
 BAUD = 500_000
+"""Rate of the serial line [bit/s]."""
 BYTE_S = 10 / BAUD
 """A byte on the line: eight bits, a start and a stop."""
 CLOCK_HZ = 120e6
@@ -30,14 +31,15 @@ SAMPLE_HZ = 400e3
 ELECTRODE_HZ = 100e3
 """Frequency [Hz] of the excitation after power-on."""
 CHANNELS = 6
-COMMAND_BYTES = 16
-HEAD_BYTES = 16
-"""Of a reply, before its sums."""
+"""Channels of the converter."""
+COMMAND_BYTES, HEAD_BYTES = 16, 16
+"""Length of a command, and of a reply before its sums."""
 SAMPLES_PER_CYCLE = range(2, 10)
-"""What a board can do: beyond it the firmware stops."""
+"""Samples per cycle that a board can do: beyond them the firmware stops."""
 BLOCK = 128
 """Samples that a board takes in one go: the number of cycles grows in steps of about BLOCK / samples_per_cycle."""
 MOST_MEASURES = 65_504
+"""Largest number of cycles in a command that a board answers."""
 FULL_SCALE = 4095
 """The largest value of one sample, 12 bits."""
 UNUSED = 0xFFFF_FFFF
@@ -57,7 +59,7 @@ class PacketError(ValueError):
 
 
 class Kind(IntEnum):
-    """What a command asks for."""
+    """The content of a command."""
 
     SEND_MEASURES = 0
     SET_FREQ = 1
@@ -220,11 +222,11 @@ def readers(pad: cells.Pad, pad_type: cells.PadType) -> tuple[cells.SensingBoard
 
 
 FILLER = b"\xff"
-"""A byte that is the start of no command. 16 of them end whatever command a board believes to be reading."""
+"""A byte that is the start of no command. 16 of them end any command that a board is reading."""
 
 
 def realign_probes(attempt: int = 0) -> list[bytes]:
-    """16 pieces of a stream in which a board finds exactly one command, wherever in a command it believes to be: each is one byte
+    """16 pieces of a stream in which a board finds exactly one command, wherever in a command it is: each is one byte
     longer than a command. Each asks to keep the frequencies, and carries its number and that of the attempt (modulo 8) in
     `measures`, which the board's answer repeats. All else in the stream is unknown to a board. Between the pieces a board needs
     time to answer."""
@@ -232,7 +234,7 @@ def realign_probes(attempt: int = 0) -> list[bytes]:
 
 
 def realign_answer(data: bytes, attempt: int = 0) -> tuple[int, Command] | None:
-    """The first answer to `realign_probes` of this attempt in what came: the number of the piece that the board has understood,
+    """The first answer to `realign_probes` of this attempt in received bytes: the number of the piece that the board understood,
     and the answer; None without. When `sent` pieces were sent, (number - sent) % 16 fillers set the board right."""
     answers = {_probe(attempt, number).pack()[:8]: number for number in range(COMMAND_BYTES)}
     for at in range(len(data) - COMMAND_BYTES + 1):

@@ -1,4 +1,4 @@
-"""Whether a pad's electrodes can be believed, told from their voltages; and what a pad whose voltages do not fit is likely to be.
+"""Whether a pad's electrodes work, by their voltages; and the likely reason where a pad's voltages do not fit.
 
 `Watch` sees one pad alone. What it cannot see there (a pad turned on its mount, a calibration from another pad) `likely` finds by
 comparing what the pad reads with what the field model says for a pose that the other pads and cameras know.
@@ -23,13 +23,16 @@ BLOCK = 20
 LOOK_S = 1.0
 """Samples of one look: 50 and 60 Hz are apart in it, and a mean is known to 0.08 mV."""
 LEAST_SAMPLES = 100
+"""Least number of samples of a look, whatever their rate."""
 MAINS_HZ = (50.0, 60.0)
+"""Frequencies of the mains."""
 BESIDE_HZ = (-6.0, -3.5, 3.5, 6.0)
 """Where nothing may be beside a line of the mains: a moving limb leaves something at all of them."""
 QUIET = 0.25
 """Share of the calibrated noise below which an electrode is dead: 6 standard deviations of an estimate from 800 degrees of
 freedom lie at 0.7, the rest is for a calibration that was noisy."""
 NOISY = 4.0
+"""Multiple of the calibrated noise (variance) above which an electrode is noisy. Chosen, not measured."""
 RIPPLE = 0.01
 """Noise as a share of the signal that is no fault: a hand is never quite still."""
 LINE = 25.0
@@ -40,13 +43,14 @@ HUM_V = 5e-4
 """Mains below this [V] harms nothing."""
 BELOW_V = 1.5e-3
 """A signal so far below zero [V] is no limb: a body takes field lines away, it adds none."""
-ALONE_V = 3e-3
 ALONE = (4.0, 10.0)
-"""An electrode this many times above all others of its pad, and by ALONE_V more, feels nothing that they do not: the first for
-signals up to FAR_V, as from 5 cm away, where a limb gives all nearly the same; the second above it."""
+ALONE_V = 3e-3
 FAR_V = 0.03
+"""An electrode whose signal is this many times that of all others of its pad, and by ALONE_V [V] larger, is faulty: the first
+factor for signals up to FAR_V [V], as from a limb 5 cm away, which gives all nearly the same; the second above it. Chosen, not
+measured."""
 LASTS = 3
-"""Looks in a row that see a drift before it is told."""
+"""Looks in a row that find a drift before it is reported."""
 
 MENDS: dict[Kind, str] = {
     "saturated": "turn the amplifier's potentiometer down, or take away what touches the pad",
@@ -59,7 +63,7 @@ MENDS: dict[Kind, str] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """Why an electrode is not to be believed; `text` says what was expected and what came."""
+    """Why an electrode is not used; `text` says what was expected and what came."""
 
     kind: Kind
     text: str
@@ -79,7 +83,8 @@ class Look:
 
 class Watch:
     """Finds faults of one pad's electrodes as its samples come; `pad` is its place in `skin`. False alarms with white noise: see
-    the thresholds. Saturation and death are told within BLOCK samples, the others after a look, a drift after LASTS of them."""
+    the thresholds. Saturated and dead ones are reported within BLOCK samples, the others after a look, a drift after LASTS
+    looks."""
 
     def __init__(self, skin: Skin, pad: int):
         own = skin.of(pad)
@@ -243,9 +248,9 @@ MISFIT = 4.0
 SUSPECT = 0.5
 """Mean squared residual, in variances, from which a pad does not fit where a reason is found that explains it."""
 EXPLAINED = 0.4
-"""What an explanation must leave of the misfit at most."""
+"""Largest share of the misfit that an explanation may leave."""
 MODEL_ERROR = 0.05
-"""What the predicted signals are wrong by, as a share: the field model."""
+"""Relative error of the predicted signals: that of the field model."""
 CONTRAST = 0.3
 """Share of the pose's error that reaches the electrodes of a pad each in its own way."""
 LASTING = 0.5

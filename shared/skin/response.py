@@ -24,9 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from penumbra.shared.body import urdf
 from penumbra.shared.cell import description as cells
+from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
-
-Array = NDArray[np.float64]
 
 FOLDER = "skin"
 """Beside a cell file: where its fitted networks are."""
@@ -110,7 +109,7 @@ class Network:
 
     @staticmethod
     def of(data) -> Network:  # type: ignore[no-untyped-def]
-        """From what `arrays` gave."""
+        """The inverse of `arrays`."""
         points = np.ascontiguousarray(data["points"], dtype=np.float32)
         weights, biases = (
             tuple(np.ascontiguousarray(data[f"{kind}{i}"], dtype=float) for i in range(3)) for kind in ("weight", "bias")

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from penumbra.shared.contract.labels import Label
 
 PLAIN, BLOTCHES, STRIPES, CHECKS, WOOD, PICTURE = range(6)
+"""Patterns of a texture."""
 TEXTURE_FIELDS = 20
 CUFF, GLOSS = 18, 19
 """A row of a body's texture: two of Texture.fields (nine numbers each: its own and its sleeve's), cuff, gloss."""
 NO_CUFF = -1e9
+"""Where a sleeve ends [m] of a body without one: before all of it."""
 
 Colour = tuple[float, float, float]
 

@@ -10,7 +10,7 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry.lens import Lens
 
 WIDEST = 3.0
-"""A pinhole picture of at most so many widths and heights of the camera's is rendered for it; what lies further out is repeated
+"""Largest pinhole picture that is rendered, in widths and heights of the camera's; what lies further out is repeated
 from the edge."""
 
 

@@ -15,7 +15,7 @@ from penumbra.shared.geometry.rigid import Array
 PALM = 0.54
 """Length of the palm as a share of the hand's."""
 FINGERS = ((0.36, 0.40), (0.12, 0.44), (-0.12, 0.41), (-0.35, 0.33))
-"""Of index to little finger: where it begins across the palm, as a share of its breadth; length as a share of the hand's."""
+"""Index to little finger: where it begins across the palm, as a share of its breadth; length as a share of the hand's."""
 PHALANXES = (0.47, 0.3, 0.23)
 """Lengths of a finger's bones as shares of the finger's."""
 SEGMENTS = 8

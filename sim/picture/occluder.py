@@ -55,7 +55,7 @@ class OcclusionSchedule:
         self._commands: list[tuple[float, float | None, float]] = [(0.0, None, AWAY)]  # from when, level or automatic, level then
 
     def command(self, time_s: float, level: float | None) -> None:
-        """From a time on hold a level in [0, 1] (0: away), or follow the schedule (None)."""
+        """Holds a level in [0, 1] (0: away) from a time on, or follows the schedule (None)."""
         self._commands.append((time_s, None if level is None else level or AWAY, self.at(time_s)))
 
     @property
@@ -98,11 +98,11 @@ class Panel:
     DEPTH = 0.55
     """Share of the way from the camera to the target at which it stands: well before the robot."""
     SIZE = 0.45
-    """Its extent [m]: more than the picture of a forearm with hand, drawn back to DEPTH."""
+    """Width and height [m]: more than the picture of a forearm with hand, drawn back to DEPTH."""
     MARGIN = 0.02
-    """How far [m] the edge stands beyond a target that is to be hidden wholly: the measured picture may lag by a frame."""
+    """Distance [m] of the edge beyond a target that is hidden wholly: the measured picture may lag by a frame."""
     WHOLLY = 0.95
-    """From this level on everything is hidden."""
+    """Level from which everything is hidden."""
 
     def __init__(self, seed: int):
         angle = np.random.default_rng([seed, 4]).uniform(0.0, 2.0 * np.pi)

@@ -23,6 +23,7 @@ from penumbra.sim.picture.appearance import CUFF, GLOSS, TEXTURE_FIELDS, Appeara
 from penumbra.sim.picture.distortion import Distortion
 
 SHADOW_PX = 256
+"""Width and height of the picture that the light sees, for shadows."""
 CREASE = math.cos(math.radians(50.0))
 """Faces that meet at a sharper angle than this are shaded as an edge."""
 
@@ -186,7 +187,7 @@ class _Faces:
 
 
 def _quantile(x: Array, share: float) -> float:
-    """What numpy's quantile says, to the last bit, in a seventh of its time."""
+    """numpy's quantile, to the last bit, in a seventh of its time."""
     where = (x.size - 1) * share
     low = int(where)
     high, t = min(low + 1, x.size - 1), where - low

@@ -28,12 +28,13 @@ from penumbra.sim.world.person import Person, frame
 
 CELLS = ("table", "arm")
 PERIOD_S = 0.05
+"""Time [s] between frames: that of a camera at 20 Hz."""
 ASTRAY = 0.12
 """Share of sequences whose window lies anywhere in the frame."""
 ARM_PX = (8.0, 120.0)
 """Bounds of the forearm's width in the picture [px] where sequences are drawn as real cameras may show them."""
 ARM_M = 0.085
-"""Width of a forearm [m] by which it gets there."""
+"""Width of a forearm [m] that the focal length is chosen by."""
 
 
 @dataclass(frozen=True)

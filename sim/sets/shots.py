@@ -41,9 +41,9 @@ LENS = math.radians(60.0)
 """Horizontal field of view."""
 PERIOD_S = sequences.PERIOD_S
 BORDER_PX = 8
-"""The target keeps so far from the border of the picture."""
+"""Least distance [px] of the target from the border of the picture."""
 WITHIN = 0.02
-"""How far the hidden share may be from that asked for."""
+"""Largest deviation of the hidden share from the one asked for."""
 UPPER_ARM = 0.08
 """Hidden share that counts as none: the upper arm's rounded end covers some of the elbow."""
 FOREIGN = 0.003

@@ -35,7 +35,7 @@ Occlusion = Literal["light", "medium", "heavy"]
 GAP_M: dict[Reach, tuple[float, float]] = {"inside": (0.02, 0.15), "outside": (0.25, np.inf)}
 """Distance [m] from the nearest electrode to the limb's skin, in every scored frame."""
 DISTANCE_M: dict[Distance, tuple[float, float]] = {"short": (1.5, 3.0), "medium": (3.0, 6.0), "long": (6.0, 10.0)}
-"""From the camera to the middle of the motion [m]; nearer than 1.5 m the limb's motion does not fit into the picture."""
+"""Distance from the camera to the middle of the motion [m]; nearer than 1.5 m the limb's motion does not fit into the picture."""
 HIDDEN: dict[Occlusion, tuple[float, float]] = {"light": (0.0, 0.33), "medium": (0.33, 0.66), "heavy": (0.66, 1.0)}
 """Share of the limb's pixels that something covers."""
 
@@ -44,32 +44,34 @@ SENSOR_PX, FOCAL_PX, RATE_HZ = (4096, 3000), 7246.0, 20.0
 BINNING: dict[Distance, int] = {"short": 2, "medium": 1, "long": 1}
 """Pixels of the sensor along a side of one that is read."""
 STEP_PX = 8
-"""The region that is read begins and ends at multiples of so many pixels."""
+"""Multiple [px] at which the region that is read begins and ends."""
 HOME_SIGMAS = 1.0
-"""The region shows the limb also so far from home, where a search may look for it."""
+"""Distance from home, in standard deviations, within which the region shows the limb: a search may look for it there."""
 
 LEAD_S, SECONDS = 0.8, 2.6
 """Before the occluder comes, not scored; and in all."""
 HOLD_S = (0.5, 1.0)
-"""How long the occluder stays before it slides to another place."""
+"""Bounds of the time [s] that the occluder stays in a place before it slides to the next."""
 MARGIN = 0.03
-"""The share hidden is aimed at so far from the borders of its band: it drifts while the limb turns."""
+"""Distance of the intended share hidden from the borders of its band: it drifts while the limb turns."""
 LEAD_HIDDEN = 0.33
 """Largest share hidden before the occluder comes: by the robot."""
 IN_BAND = 0.75
-"""Of the frames after the lead-in, those whose share hidden must lie in the band."""
+"""Least share of the frames after the lead-in whose share hidden lies in the band."""
 SIZE = 0.12
-"""How much longer and thicker than the median man, or less, a person is."""
+"""Largest deviation of a person's length and girth from the median man, as a share."""
 SPEED_M_S = (0.15, 0.40)
+"""Bounds of the mean speed of a reach."""
 DIRECTION = np.radians([12.0, 8.0])
-"""How far the camera stands, to both sides, from the direction of the built-in one: around the vertical, and up and down."""
+"""Largest deviation [rad] of the camera's direction from the built-in one: around the vertical, and up and down."""
 PASSAGE = ((0.0, 0.0), (1.3, 0.2), (2.6, 0.5), (3.9, 0.85), (5.2, 1.0), (6.5, 0.0))
-"""From when [s] which share is hidden in a `passage`."""
+"""Times [s] and the shares hidden from then on in a `passage`."""
 PASSAGE_S, PASSAGE_WITHIN = 8.0, 0.10
-"""How long it takes, and how far the share hidden may be from that."""
+"""Duration [s] of a passage, and largest deviation of the share hidden from that."""
 COARSE_PX = 160
 """Width of the pictures in which hidden shares are counted."""
 TRIES = 400
+"""Maximum number of runs that are drawn until one keeps to its bands."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ VOLUMES: dict[tuple[str, Reach], Volume] = {
     ("arm", "inside"): Volume((-0.06, -0.22, 0.50), (0.14, -0.06, 0.74)),
     ("arm", "outside"): Volume((-0.06, -0.60, 0.50), (0.14, -0.36, 0.74), (0.0, -0.29, 0.0)),
 }
-"""By built-in cell."""
+"""Volumes of the motion by built-in cell and reach."""
 PASSAGE_VOLUME = Volume((-0.06, -0.20, 0.62), (0.10, -0.10, 0.74))
 """Above the robot's forearm, as the camera sees it: the robot alone does not hide much there."""
 
@@ -126,7 +128,7 @@ class Trial:
 
     @cached_property
     def world(self) -> World:
-        """Its world, with all commands given."""
+        """The trial's world, with all commands given."""
         world = World(self.cell, self.seed)
         world.occlude(0.0, 0.0)
         for time_s, level in self.occlusion:
@@ -140,12 +142,12 @@ class Trial:
 
     @property
     def distance_m(self) -> float:
-        """From the camera to the middle of the motion."""
+        """Distance from the camera to the middle of the motion."""
         target = next(iter(self.cell.targets.values()))
         return float(np.linalg.norm(np.subtract(self.camera.position, target.home.position)))
 
     def record(self, seconds: float = SECONDS) -> Iterator[tuple[Topic, dict[str, str], Message]]:
-        """Its messages, in the order of their stamps."""
+        """The trial's messages, in the order of their stamps."""
         return stream(self.world, seconds)
 
 

@@ -3,7 +3,7 @@
 Behind the bytes are two electrodes on six channels: a sine around half of the converter's reference, its amplitude a function of
 time, through the resonance of the excitation's coil and capacitors, with the noise of the pad and a converter of 12 bits. The
 firmware's quirks are part of it: numbers of cycles in steps, requests that are overtaken or never answered, phases that slip,
-a stop above nine samples a cycle. It has no clock of its own: whoever feeds it tells the time.
+a stop above nine samples a cycle. It has no clock of its own: its caller gives the time.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from penumbra.shared.skin import board
 from penumbra.shared.skin.board import Command, Kind
 
 OVERHEAD_S = 0.48e-3
-"""What the firmware takes for a request beside cycles and line: it makes 231 replies a second at 128 cycles, 298 at 32."""
+"""Time [s] of the firmware for a request, beside cycles and line: from 231 replies a second at 128 cycles, 298 at 32."""
 SAMPLE_S = 1e-3
-"""The time of which a pad's noise is told: 100 cycles at 100 kHz."""
+"""Duration [s] of the sample that a pad's noise is given for: 100 cycles at 100 kHz."""
 CONVERTER_NOISE = 1.0
 """Standard deviation of a channel's own noise in a sample [steps]; the rest of a pad's noise is its electrode's, on all of its
 channels alike."""
 PHASE = 0.35
-"""Of the sine at resonance [rad], against the converter's first sample."""
+"""Phase of the sine at resonance [rad], against the converter's first sample."""
 LONGEST = 0xFFFF
 """Ticks of the firmware's timer: a frequency that asks for a longer period gets this one."""
 FAULTS = {
@@ -55,7 +55,7 @@ class Tank:
         return float(1.0 / (2.0 * np.pi * np.sqrt(self.coil * (self.capacitor + self.ring))))
 
     def response(self, hz: float) -> complex:
-        """What is left of an amplitude at a frequency, and its phase: 1 at resonance."""
+        """Gain of an amplitude at a frequency, and its phase: 1 at resonance."""
         ratio = hz / self.resonance_hz
         return 1.0 / (1.0 + 1j * self.quality * (ratio - 1.0 / ratio))
 
@@ -85,7 +85,7 @@ class Board:
         self.power_on()
 
     def power_on(self) -> None:
-        """As after its supply came: standard frequencies, nothing pending."""
+        """The state after power-on: standard frequencies, nothing pending."""
         self._ticks = board.period(board.ELECTRODE_HZ)
         self._sample_ticks = board.period(board.SAMPLE_HZ)
         self._stopped = False
@@ -110,7 +110,7 @@ class Board:
         self._due[kind] += 1
 
     def receive(self, data: bytes, time_s: float) -> None:
-        """Bytes that somebody began to send at time_s."""
+        """Bytes whose sending began at time_s."""
         self.send(time_s)
         if data and self._happens("lost"):
             data = data[: len(data) // 2] + data[len(data) // 2 + 1 :]

@@ -22,8 +22,9 @@ from penumbra.sim.skin.field import PadField, limb
 
 GAPS_M = np.arange(2, 41) * 0.005
 ANGLES_DEG = np.arange(10) * 10.0
+"""Gaps and angles of a scan."""
 PLANE_M = 0.01
-"""How far the plane lies above what is scanned."""
+"""Height [m] of the plane above what is scanned."""
 MARGIN_M = (0.06, 0.08)
 """Lengths [m] by which a scan goes beyond its part of the limb, along the limb and across it."""
 OVER_M = 0.03
@@ -31,6 +32,7 @@ OVER_M = 0.03
 ALONG = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """R_limb_pad: the pad above the limb looks down on it, which lies along its y."""
 EMPTY_SAMPLES = 1000
+"""Least number of samples of the scene without a limb."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,10 @@ KINDS = {
 """Every fault, and what it means. `turned` and `mirrored` are of a whole pad."""
 SIZES = {"drift": 0.05, "hum": 0.01, "gain": 1.5}
 LARGEST = {"drift": 1.0, "hum": 1.0, "gain": 10.0}
+"""Default and largest SIZE of a drift [V], of a hum [V], and of a gain."""
 ARRANGEMENTS = {"turned": "turned by 180 degrees", "mirrored": "mirrored left to right"}
 MAINS_HZ = 50.0
+"""Frequency of the hum."""
 WARMS_S = 30.0
 """Time constant of a drift."""
 

@@ -34,13 +34,13 @@ PARTS = 6
 """Number of panels side by side across a piece of copper. Panels of half the size in both directions alter a change of
 capacitance by 3 %."""
 NEAR = 2.5
-"""A body's panel nearer to the pad than so many times its own size counts as nine points instead of one."""
+"""Distance to the pad, in sizes of a body's panel, below which the panel counts as nine points instead of one."""
 ACCURACY = 1e-5
 """Relative change at which the charges of pad and body agree."""
 RING, GROUND, BARE = -1, -2, -3
 """Owners of panels beside the electrodes, which are 0, 1, 2 …: excitation ring, ground, and dielectric without copper."""
 CLEAR = 0.003
-"""What of the link behind a pad is nearer than this [m] to the board's volume is left out: the board is mounted there."""
+"""Distance [m] to the board's volume within which parts of the link behind are left out: the board is mounted there."""
 
 
 class Panels:
@@ -191,7 +191,7 @@ class PadField:
         self.plate_pF = float((self._inverse @ (~bare).astype(float)).sum() * FEMTOFARAD * 1e-3)
 
     def change(self, body: Body, T_pad_body: Array) -> Array:
-        """By how much [fF] a body at T_pad_body (4, 4) lowers the capacitance between the ring and each electrode (e,)."""
+        """Decrease [fF], by a body at T_pad_body (4, 4), of the capacitance between the ring and each electrode (e,)."""
         R, t = T_pad_body[:3, :3], T_pad_body[:3, 3]
         at_body, along_body, at_pad = self._coupling(body.points @ R.T + t, body.panels.normals @ R.T, body.size)
         seen = at_body if body.conductor else along_body

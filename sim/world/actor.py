@@ -30,7 +30,7 @@ class Placed:
 
 
 class Actor:
-    """A target in motion. The cell's `sim` tells where its first target moves and where that person's shoulder is; everybody
+    """A target in motion. The cell's `sim` says where its first target moves and where that person's shoulder is; everybody
     else does the same as far from it as the homes are apart. near: the pads that it may come near.
 
     Raises CellError where the region cannot be moved in.
@@ -63,7 +63,7 @@ class Actor:
         self._limb = LimbMotion(here.motion, seed, clearance)
 
     def at(self, scene_s: float, speed: float) -> Placed:
-        """Where it is at a time of the scene, which runs so fast."""
+        """The pose at a time of the scene, which runs at this speed."""
         pose, rate = self._limb.at(scene_s)
         velocity = speed * np.concatenate([rate[:3], angular_velocity(pose[3:], rate[3:])])
         return Placed(rigid.from_rpy(pose[:3], pose[3:]), pose, velocity)

@@ -48,19 +48,21 @@ TICK_S = 0.02
 STEPS = 4
 """Steps of Bullet in a tick: 200 Hz."""
 GRAVITY = 9.81
+"""Acceleration of gravity [m/s^2]."""
 KEPT = 15_000
 """Ticks that can be asked for again: five minutes."""
 
 STOP_M = 0.010
-"""A robot stops where a person is nearer than this, and farther away where they approach each other."""
+"""Distance [m] to a person at which a robot stops; farther away where they approach each other."""
 REACTION_S = 0.03
-"""By so much time's approach it stops earlier (the protective separation distance of ISO/TS 15066, 5.5.4)."""
+"""Reaction time [s]: a robot stops earlier by the distance that they approach in it (the protective separation distance of ISO/TS
+15066, 5.5.4)."""
 GO_M = 0.015
-"""It goes on where the person is farther away than this. The persons' planned motion keeps to it (`sim.world.clearance`)."""
+"""Distance [m] to the person from which it goes on. The persons' planned motion keeps to it (`sim.world.clearance`)."""
 TOUCH_M = 0.001
-"""Nearer than this a person touches the robot, by the tolerance of Bullet's contacts."""
+"""Distance [m] below which a person touches the robot, by the tolerance of Bullet's contacts."""
 WATCH_M = 0.10
-"""Persons farther away are not looked at."""
+"""Distance [m] beyond which persons are left out."""
 YIELD = 0.1
 """Share of the motors' effort that holds a robot, beside its weight, where a person pushes it."""
 ACCELERATION = 7.5

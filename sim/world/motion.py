@@ -74,7 +74,8 @@ class LimbMotion:
         self._ends = [0.5]
 
     def at(self, time_s: float) -> tuple[Array, Array]:
-        """Pose (6,) and rate (6,) at a time >= 0; plans first where nobody did (up to 0.1 s of computing for each reach)."""
+        """Pose (6,) and rate (6,) at a time >= 0; plans first where that is not done yet (up to 0.1 s of computing for each
+        reach)."""
         self.plan(time_s)
         return self._reaches[bisect.bisect_left(self._ends, time_s)].at(time_s)
 

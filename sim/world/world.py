@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from penumbra.sim.world.dynamics import Robots
 
 FAR = 10.0
-"""What the truth calls the gap [m] where the cell has no pads."""
+"""Gap [m] in the truth of a cell without pads."""
 FAINTEST = 1e-9
-"""Least change of capacitance [fF]: a pad that nobody comes near has a logarithm too."""
+"""Least change of capacitance [fF]: a pad without anything near has a logarithm too."""
 MAX_SPEED = 4.0
 """Fastest scene: more would leave the cameras and the planner behind."""
 
@@ -55,7 +55,7 @@ class WorldState:
 
     @property
     def T_world_target(self) -> Array:
-        """Of the cell's first target, as the next two."""
+        """Pose of the cell's first target; so are the next two."""
         return self._first.T_world_target
 
     @property
@@ -97,7 +97,7 @@ class World:
 
     @property
     def person(self) -> Person:
-        """Whose the cell's first target is."""
+        """The person whose limb the cell's first target is."""
         return next(iter(self.actors.values())).person
 
     def model(self, camera: str) -> str:

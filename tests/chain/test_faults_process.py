@@ -101,7 +101,7 @@ def test_a_process_out_of_memory_ends_and_begins_anew_and_does_not_go_on_half(st
 
 
 @pytest.mark.slow
-def test_a_crash_loop_is_told_by_the_launcher_and_by_doctor_and_takes_nobody_along(struck, capsys):
+def test_a_crash_loop_is_reported_by_the_launcher_and_by_doctor_and_affects_no_other(struck, capsys):
     before = struck.pids()
     launcher = psutil.Process(struck.running.launcher.pid)
 
@@ -170,7 +170,7 @@ def test_a_host_whose_clock_jumps_is_lost_for_a_moment_and_never_wrong(struck, s
 @pytest.mark.slow
 @pytest.mark.parametrize("service", ["search", "fusion"])
 @pytest.mark.parametrize("seconds", [3600.0, -3600.0])
-def test_a_process_whose_clock_is_wrong_is_not_believed_and_says_why(struck, service, seconds):
+def test_a_process_whose_clock_is_wrong_is_not_used_and_says_why(struck, service, seconds):
     process = struck.one(service)
 
     def reasons():

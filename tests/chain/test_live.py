@@ -39,7 +39,7 @@ def test_the_query_without_a_format_answers_in_message_pack(running):
     assert np.linalg.norm(pose.position - running.pose()["position"]) < 0.05
 
 
-def test_any_zenoh_client_hears_fused_poses_at_a_hundred_hertz_or_more(running):
+def test_any_zenoh_client_receives_fused_poses_at_a_hundred_hertz_or_more(running):
     with connect(running.port) as session:
         heard = []
         session.declare_subscriber(topics.FUSED.at(cell="table"), lambda sample: heard.append(time.monotonic()))
@@ -68,7 +68,7 @@ def test_penumbra_pose_prints_the_answer_and_its_json(running):
     assert json.loads(penumbra(running, "pose", "--json").stdout)["target"] == "forearm"
 
 
-def test_penumbra_topics_tells_what_arrives(running):
+def test_penumbra_topics_reports_what_arrives(running):
     result = penumbra(running, "topics", "--hz")
     assert result.returncode == 0
     for key in ("camera/front/frame", "camera/front/mask", "pose/vision", "pose/haptic", "pose/fused"):

@@ -74,7 +74,7 @@ def test_a_rate_is_back_when_it_stays():
     assert observed.recovery_s(steady[::2], 50.0, 1.0, 6.0) is None
 
 
-def test_a_measurement_counts_once_however_often_it_is_told_and_also_where_it_did_not_reach_us():
+def test_a_measurement_counts_once_however_often_it_is_repeated_and_also_where_it_did_not_reach_us():
     numbered = [Seen(0.1 * n, haptic(0.1 * stamp).message, "skin", n) for n, stamp in ((5, 1), (6, 2), (9, 3), (10, 3))]
     assert observed.repeats(numbered) == 1
     assert observed.offered(numbered, "in_range") == 3 + 2

@@ -33,7 +33,7 @@ def test_the_bench_of_the_bus_measures_both_sides_of_every_payload():
         assert 0.01 < sorted(row["throughput_ratio"] for row in of_one_payload)[1] < 2.0
 
 
-def test_a_message_of_the_bench_that_is_lost_is_told_and_does_not_hang(monkeypatch):
+def test_a_message_of_the_bench_that_is_lost_is_reported_and_does_not_hang(monkeypatch):
     monkeypatch.setattr(buses, "PATIENCE_S", 2.0)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, 5.0)

@@ -43,7 +43,7 @@ def test_the_camera_sees_the_target_s_home_near_the_middle_of_its_image():
         ("look_at: [0.05, 0.0, 0.15]", "", "cameras.front", "look_at or rpy"),
     ],
 )
-def test_a_fault_is_told_with_file_line_place_and_reason(tmp_path, old, new, place, reason):
+def test_a_fault_is_reported_with_file_line_place_and_reason(tmp_path, old, new, place, reason):
     with pytest.raises(description.CellError) as error:
         load_changed(tmp_path, old, new)
     text = str(error.value)
@@ -58,7 +58,7 @@ def test_an_unknown_cell_is_answered_with_the_ones_there_are():
         description.load("kitchen")
 
 
-def test_a_file_that_is_not_yaml_is_told_so(tmp_path):
+def test_a_file_that_is_not_yaml_is_refused(tmp_path):
     path = tmp_path / "cell.yaml"
     path.write_text("name: [table")
     with pytest.raises(description.CellError, match="not YAML"):

@@ -69,14 +69,14 @@ def test_a_lost_target_is_looked_for_around_its_home(far):
         T = rigid.perturb(target.home.transform, np.repeat([0.12, 0.4], 3) * rng.uniform(-1.0, 1.0, 6))
         pixels = pixels_of(far.cameras["front"], rigid.apply(T, limb))
         assert (pixels > (first.x0, first.y0)).all() and (pixels < (first.right, first.bottom)).all()
-    lookout.hear(fused(target.home.transform, "lost"))
+    lookout.add(fused(target.home.transform, "lost"))
     assert lookout.look(S) == first
 
 
 def test_a_known_target_is_looked_at_until_its_pose_is_old(far):
     lookout, T = Lookout(far, "front"), rigid.from_rpy((0.05, 0.02, 0.25), (0.1, 0.0, 0.3))
     wide = lookout.window
-    lookout.hear(fused(T))
+    lookout.add(fused(T))
     near = lookout.look(S + 40_000_000)
     assert near == window_around(
         far.cameras["front"], [(T, corners_of(anatomy.target_mesh(far.targets["forearm"], far).vertices))]
@@ -87,7 +87,7 @@ def test_a_known_target_is_looked_at_until_its_pose_is_old(far):
 
 def test_what_is_foreseen_is_what_will_be_looked_at_and_changes_nothing(far):
     lookout, T = Lookout(far, "front"), rigid.from_rpy((0.05, 0.02, 0.25), (0.1, 0.0, 0.3))
-    lookout.hear(fused(T))
+    lookout.add(fused(T))
     now = lookout.look(S)
     wide = lookout.foresee(2 * S)  # by then the pose is too old
     assert wide != now and lookout.window == now and lookout.foresee(S) == now

@@ -111,7 +111,7 @@ def test_upper_arm_and_torso_hang_together_with_the_forearm(world):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 4])
-def test_the_occluder_hides_the_share_that_it_is_told_to(seed):
+def test_the_occluder_hides_the_share_that_is_commanded(seed):
     world = World(CELLS["table"], seed)
     for level, begin in ((0.0, 0.0), (0.3, 4.0), (0.6, 8.0), (0.8, 12.0)):
         world.occlude(level, begin)
@@ -201,7 +201,7 @@ def with_sim(name, **changes):
     return cell.model_copy(update={"sim": cell.sim.model_copy(update=changes)})
 
 
-def test_a_cell_that_the_emulator_cannot_move_in_is_told():
+def test_a_cell_that_the_emulator_cannot_move_in_is_reported():
     table = CELLS["table"]
     assert table.sim is not None
     with pytest.raises(cells.CellError, match="cell table has no `sim`: the emulator needs its motion"):

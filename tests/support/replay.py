@@ -166,10 +166,10 @@ class ReplayNode(ServiceNode):
     def progress(self, what: str, done: int, total: int) -> None:
         """Nobody asks during a replay."""
 
-    def tell(self, name: str, function: Callable[[], Any]) -> None:
+    def add_report(self, name: str, function: Callable[[], Any]) -> None:
         """Nobody asks during a replay."""
 
-    def worry(self, function: Callable[[], Sequence[str]]) -> None:
+    def add_reasons(self, function: Callable[[], Sequence[str]]) -> None:
         """Nobody asks during a replay."""
 
     def warm_when(self, function: Callable[[], bool]) -> None:

@@ -2,7 +2,7 @@
 
 Of the paper's two losses of the rotation, PLoss (eq. 4) compares every point with itself, SLoss (eq. 5) with the nearest one,
 which forgives turns that map the object to itself. A forearm is nearly symmetric in roll, its hand with the thumb is not. So
-points of the forearm are compared with the nearest and points of the hand with themselves: a roll that only the hand tells is
+points of the forearm are compared with the nearest and points of the hand with themselves: a roll that only the hand shows is
 paid for by the hand alone, and turning the limb end for end, which SLoss alone nearly forgives, costs all that it should.
 Distances are not squared (as in Wang et al. 2019, doi:10.1109/CVPR.2019.00346): few arms seen wrongly must not outweigh the rest.
 """

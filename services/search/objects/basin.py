@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.search import evidence
-from penumbra.services.search.contour import DROPPED, NEAR, Model
+from penumbra.services.search.contour import DROPPED, NEAR, Model, Points
 from penumbra.services.search.evidence import COVERED, FREE, TARGET, Evidence, Intrinsics
 from penumbra.services.search.mask_fit import Noise
 from penumbra.shared.geometry import rigid
@@ -29,24 +29,25 @@ from penumbra.shared.native import kernel
 Bool = NDArray[np.bool_]
 
 COARSE_PX, FINE_PX = 45.0, 200.0
-"""Square root of the mask's area [px] that a picture is made smaller for."""
+"""Square root of the mask's area [px] in the small and in the full picture, which are scaled down to it."""
 TURNS = (14.0, 28.0)
 """Angles [deg] by which the starts are turned."""
 AXES = 16
 """Number of axes about which the starts are turned."""
 SURVIVORS = (14, 5)
-"""Hypotheses that go on after the alignment, and to the full picture."""
+"""Number of hypotheses kept after the alignment, and for the full picture."""
 SAME = (0.01, 0.06)
 """Hypotheses nearer than this [m, rad] are one."""
 NOISE = Noise(edge=2.0, correlation=40.0, dilation=0.7)
-"""How a network's mask of any object errs [px of the image]."""
+"""Errors of a network's mask of any object [px of the image]."""
 FARTHEST_PX = 8.0
-"""A pixel further from the mask's boundary than this [px of the image] counts no more: a missing part is one mistake."""
+"""Largest distance from the mask's boundary [px of the image] that a pixel counts with: a missing part is one mistake."""
 PIECE = 0.2
 """Least share of the mask that a piece of it has, to be taken for the whole object."""
 AROUND = 0.5
-"""Diagonals of the mask around it that are looked at."""
+"""Margin around the mask that is searched, in diagonals of the mask."""
 DAMPING = 0.02
+"""Share added to the diagonal of the normal equations (Marquardt)."""
 STILL = (3e-4, 1.5e-3)
 """A step smaller than this [m, rad] is the last."""
 MAX_STEP = np.array([0.08, 0.08, 0.15, 0.3, 0.3, 0.3])
@@ -205,19 +206,20 @@ def _moments(mask: Bool) -> Moments:
 
 @dataclass(frozen=True)
 class Contour:
-    """The contour at a pose: points (n, 8) as in `contour.Matched`, offsets r (n,) to the boundary and their kinds (n,)."""
+    """The contour at a pose: points (n,) as in `contour.Matched`, offsets r (n,) to the boundary and their kinds (n,)."""
 
-    points: Array
+    points: Points
     r: Array
     kind: NDArray[np.uint8]
 
     def jacobian(self, T: Array, k: Intrinsics) -> Array:
         """How the contour moves along its normal (n, 7) [px] by a pose error at T [m, rad] and by the mask's dilation [px]."""
-        X, Y, Z, nx, ny = self.points[:, 0], self.points[:, 1], self.points[:, 2], self.points[:, 5], self.points[:, 6]
+        position, normal = self.points["position"], self.points["normal"]
+        (X, Y, Z), (nx, ny) = position.T, normal.T
         J = np.empty((len(X), 7))
         J[:, 0], J[:, 1] = nx * k.fx / Z, ny * k.fy / Z
         J[:, 2] = -(J[:, 0] * X + J[:, 1] * Y) / Z
-        J[:, 3:6] = np.cross(self.points[:, :3] - T[:3, 3], J[:, :3])  # a rotation vector w moves the point by w x (X - origin)
+        J[:, 3:6] = np.cross(position - T[:3, 3], J[:, :3])  # a rotation vector w moves the point by w x (X - origin)
         J[:, 6] = 1.0
         return J
 
@@ -234,9 +236,9 @@ def robust(r: Array, width: float) -> Array:
 
 
 def information(found: Contour, at: Level, T: Array, width: float, noise: Noise) -> tuple[Array, Array]:
-    """Of the pose error at T: the information (6, 6) and its right side (6,), of points that count less and less beyond `width`
+    """The information (6, 6) about the pose error at T and its right side (6,), of points that count less and less beyond `width`
     [px of the image]. The mask's dilation is marginalised (Schur complement)."""
-    weights = found.points[:, 7] * robust(found.r, width / at.scale) * (found.kind != DROPPED)
+    weights = found.points["length"] * robust(found.r, width / at.scale) * (found.kind != DROPPED)
     weights *= at.scale**3 / (noise.edge**2 * noise.correlation)
     J = found.jacobian(T, at.evidence.intrinsics)
     weighted = J * weights[:, None]
@@ -288,6 +290,8 @@ def pyramid(state: NDArray[np.uint8], k: Intrinsics) -> Pyramid:
 COARSE_WIDTHS = (16.0, 12.0, 10.0, 8.0, 8.0)
 MORE_WIDTHS = (8.0, 6.0, 6.0, 5.0, 5.0)
 FINE_WIDTHS = (5.0, 4.0, 4.0, 3.0, 3.0, 3.0)
+"""Widths [px of the image] of the successive steps, see `descend`: on the small picture for all hypotheses, there for the best,
+and on the full picture."""
 
 
 def search(shape: Shape, masks: Pyramid, prior: Prior, noise: Noise = NOISE) -> list[tuple[Score, Array]]:

@@ -1,4 +1,4 @@
-"""Meshes as they come: read, checked, mended and thinned out, so that contours can be drawn from them."""
+"""Meshes of users: read, checked, repaired and simplified, so that contours can be drawn from them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ Faces = NDArray[np.int32]
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 """Metres in a unit."""
 EXTENT = (0.005, 20.0)
-"""Largest side [m] of a bounding box that is believed."""
+"""Bounds of the largest side [m] of an object: others have a wrong unit."""
 MERGE = 1e-6
 """Vertices nearer than this share of the largest side are one."""
 
-
 DENSE = 5
-"""Times as many triangles as wanted, from which a grid thins them out first."""
+"""Multiple of the wanted number of triangles above which a grid simplifies the mesh first."""
 CELL = 0.008
-"""Its cells, as a share of the largest side: less than a pixel of most pictures."""
+"""Side of the grid's cells, as a share of the largest side: less than a pixel of most pictures."""
 
 
 class ObjectFileError(ValueError):
@@ -59,7 +58,7 @@ def load(path: Path, unit: str) -> Mesh:
     return Mesh(vertices.astype(np.float64) * UNITS[unit], faces.astype(np.int32), np.zeros(len(faces), np.uint8))
 
 
-def mend(mesh: Mesh, most: int) -> Mesh:
+def repaired(mesh: Mesh, most: int) -> Mesh:
     """The same surface with at most about `most` triangles: coinciding vertices are one, triangles without area and twins are
     gone, and neighbours turn the same side outwards. Holes stay. Raises ObjectFileError where nothing is left."""
     vertices, faces = _merged(mesh.vertices, mesh.faces)
@@ -123,7 +122,7 @@ def _oriented(vertices: Array, faces: Faces) -> Faces:
     _spread(owner[i], owner[j], differ, part, flip)
     faces = np.where(flip[:, None] == 1, faces[:, ::-1], faces)
     corners = vertices[faces]
-    # the volume about the part's own middle also tells the outside of a part with holes
+    # the volume about the part's own middle also finds the outside of a part with holes
     count = np.bincount(part)
     middle = np.stack([np.bincount(part, corners.mean(axis=1)[:, k]) / np.maximum(count, 1) for k in range(3)], axis=1)
     corners = corners - middle[part][:, None]

@@ -1,7 +1,7 @@
 """One pose of any rigid mesh on any mask (`find_pose`), and a sequence of them (`Tracker`).
 
 The start counts as a weak measurement beside the mask: a mask that is a few per cent too large says less about the depth than a
-start that is a few centimetres off. The covariance is that of both together. How much the mask is believed is measured on the
+start that is a few centimetres off. The covariance is that of both together. The mask's noise is measured on the
 mask itself, by how far the contour stays away from its boundary.
 """
 
@@ -29,17 +29,17 @@ Bool = NDArray[np.bool_]
 State = Literal["tracking", "occluded", "lost"]
 
 FACES = (800, 4000)
-"""Triangles that a mesh is thinned out to, for small pictures and for all others: finer ones are smaller than a pixel."""
+"""Number of triangles that a mesh is simplified to, for small and for full pictures: finer ones are smaller than a pixel."""
 START = (0.035, 0.4)
 """Standard deviations [m, rad] of a start, along and about each axis: 6 cm and 40 degrees in all."""
 SMALLEST_PX = 60
-"""A smaller mask shows no pose."""
+"""Least number of pixels of a mask that shows a pose."""
 FITS = 0.75
 """Overlap below which the object is not where the pose says. At the right pose, masks with an IoU of 0.83 have 0.8."""
 COVERS = 0.6
 """Share of the silhouette that is covered, from which a pose that fits is called occluded."""
 EDGE_PX = (0.4, 6.0)
-"""Least and largest standard deviation [px] of a mask's boundary that is believed."""
+"""Bounds of the estimated standard deviation [px] of a mask's boundary."""
 CORRELATION, DILATION = 30.0, 0.35
 """Length over which a mask's boundary errs together [px], and how much too large or small the mask is [px], for each pixel that
 the boundary errs: fitted to the masks of `penumbra bench objects`."""
@@ -49,12 +49,12 @@ class RigidObject:
     """A mesh prepared for contours, about its own middle. Raises ObjectFileError for a mesh without a surface."""
 
     def __init__(self, mesh: Mesh):
-        mesh = meshes.mend(mesh, FACES[1])
+        mesh = meshes.repaired(mesh, FACES[1])
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         self.T_object_middle = transform((low + high) / 2.0)
         self.T_middle_object = inverse(self.T_object_middle)
         mesh = Mesh(mesh.vertices - (low + high) / 2.0, mesh.faces, mesh.labels)
-        self.shape = Shape(Model(meshes.mend(mesh, FACES[0])), Model(mesh))
+        self.shape = Shape(Model(meshes.repaired(mesh, FACES[0])), Model(mesh))
         self.diameter = float(np.linalg.norm(high - low))
 
     def published(self, found: ObjectEstimate) -> ObjectEstimate:
@@ -132,7 +132,7 @@ def judged(
         T, covariance = _on_picture(shape, masks, T, covariance, best, noise, picture)
     if prior.cost(T) > ONE_IN_10_000:  # nothing that the start allows explains the mask
         return _lost(T, best.overlap)
-    state = _state(best, contour.points[contour.kind == MEASURED, 7].sum() * at.scale)
+    state = _state(best, contour.points["length"][contour.kind == MEASURED].sum() * at.scale)
     if state == "lost":
         return _lost(T, best.overlap)
     return ObjectEstimate(T, covariance, best.overlap, state)
@@ -182,13 +182,13 @@ def _lost(T: Array, overlap: float = 0.0) -> ObjectEstimate:
 
 
 FRAME_WIDTHS = (8.0, 6.0, 5.0, 5.0, 5.0)
-"""Of the steps from the prediction, see `basin.descend`."""
+"""Widths [px] of the steps from the prediction, see `basin.descend`."""
 DROP = 0.12
-"""Overlap less than usual by this has the surroundings searched too."""
+"""Decrease of the overlap, against its usual value, from which the surroundings are searched too."""
 SMOOTHING = 0.3
-"""Share of a frame's velocity that is believed at once."""
+"""Weight of the newest frame in the smoothed velocity."""
 UNKNOWN = (0.6, 3.0)
-"""Standard deviations of what a constant velocity misses, [m/s] and [rad/s], grown over the time bridged."""
+"""Standard deviations of the change of velocity, [m/s] and [rad/s]; the pose's grow by them with the time bridged."""
 LONGEST_S = 0.3
 """Time without a sight of the object [s] after which it is looked for no further away than before."""
 

@@ -29,16 +29,17 @@ Bool = NDArray[np.bool_]
 
 PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
+"""Keys of a camera file."""
 UNUSED = ("depth_scale",)
 """Keys that camera files of object data sets have besides, and that say nothing about the picture."""
 CROPPED = 0.25
 """How far outside the picture the principal point may lie, as a share of its size: pictures of objects are often cropped."""
 RIGID = 1e-2
-"""A rotation matrix's largest error that is taken for rounding."""
+"""Largest error of a rotation matrix that counts as rounding."""
 FURTHEST = 100.0
-"""A start further away than this [m] is in other units."""
+"""Largest distance [m] of a start: a larger one is in other units."""
 TIMES = 5.0
-"""A start whose silhouette is so many times as large or as small as the mask has a wrong unit, camera or pose."""
+"""Largest ratio of the lengths of silhouette and mask at the start: beyond it unit, camera or pose are wrong."""
 COLOURS = {"tracking": (80, 220, 80), "occluded": (60, 180, 250), "lost": (60, 60, 230)}
 """Blue, green, red of a contour in the video."""
 FIELDS = (
@@ -261,7 +262,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool:
     if image.ndim == 3:
         alpha = image[..., 3:]
         image = image[..., :3].max(axis=2)
-        if alpha.size and image.min() == image.max():  # only the alpha channel tells
+        if alpha.size and image.min() == image.max():  # only the alpha channel has the mask
             image = alpha[..., 0]
     return np.asarray(image > image.max() / 2.0)
 

@@ -17,13 +17,13 @@ from penumbra.services.segmentation.prednet import PredNet
 from penumbra.shared.contract.labels import UNLABELLED, Label
 
 WARM_UP = 3
-"""Frames at the start of a sequence that do not count: the state knows nothing yet."""
+"""Frames at the start of a sequence that do not count: the recurrent state is still empty."""
 HIDDEN = (0.0, 0.33, 0.66, 0.95)
 """Borders of the classes of hidden share in the score."""
 GOOD = 0.8
 """Frames of this IoU and more calibrate the size: in others wholes are wrong, not contours."""
 FEWEST = 50
-"""Pixels of the target that a frame must show to count."""
+"""Least number of pixels of the target in a frame that counts."""
 NEAR_PX = 6.0
 """A boundary farther away than this belongs to something else: it is wrong, but not a contour's error."""
 OWN = (Label.BACKGROUND, Label.TORSO)
@@ -128,8 +128,8 @@ def contour_offsets(found: NDArray[np.bool_], truth: NDArray[np.uint8]) -> NDArr
     rows, columns = np.flatnonzero(target.any(1)), np.flatnonzero(target.any(0))
     if not len(rows):
         return np.empty(0)
-    room = int(NEAR_PX) + 2
-    box = (slice(max(rows[0] - room, 0), rows[-1] + room + 1), slice(max(columns[0] - room, 0), columns[-1] + room + 1))
+    margin = int(NEAR_PX) + 2
+    box = (slice(max(rows[0] - margin, 0), rows[-1] + margin + 1), slice(max(columns[0] - margin, 0), columns[-1] + margin + 1))
     found, target, own = found[box], target[box], own[box]
     if found.all() or not found.any():
         return np.empty(0)

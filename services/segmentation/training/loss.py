@@ -11,8 +11,8 @@ from penumbra.services.segmentation.inference import TARGET_LABELS
 from penumbra.shared.contract.labels import UNLABELLED
 
 ERROR_WEIGHTS = (1.0, 0.1)
-"""Of the first layer's prediction error and of every other's, as in Lotter et al. 2017 (L_all): an upper layer can also lower its
-error by sending nothing, so it must not weigh as much as the picture's."""
+"""Weights of the first layer's prediction error and of every other's, as in Lotter et al. 2017 (L_all): an upper layer can also
+lower its error by sending nothing, so it must not weigh as much as the picture's."""
 
 
 def dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:

@@ -47,11 +47,11 @@ WORN = ("accessories", "bracelet", "ring", "watch")
 """Things that belong to the arm that they are on."""
 BAGS = ("bag", "purse", "wallet")
 SURE = 0.6
-"""Visibility of elbow and wrist from which on an arm is believed."""
+"""Visibility of elbow and wrist from which an arm is used."""
 SIDE = 256
-"""Pixels a side of the pose model's input."""
+"""Width and height [px] of the pose model's input."""
 RADII = {Label.UPPER_ARM: 0.19, Label.FOREARM: 0.16, Label.HAND: 0.2}
-"""Of an arm's parts, as shares of the forearm's length."""
+"""Radii of an arm's parts, as shares of the forearm's length."""
 HAND = 0.75
 """Length of the hand as a share of the forearm's."""
 BAND_PX = 2

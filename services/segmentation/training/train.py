@@ -37,7 +37,7 @@ from penumbra.sim.sets import sequences
 VALIDATION_SEED = 1_000_000
 """Added to the seed for held-out data: nothing there was ever trained on."""
 VARIETY = sequences.Variety(frames=5, size=176, real=0.7)
-"""Of the sequences that are learned from."""
+"""Variety of the training sequences."""
 ENDLESS = 2**31
 """Number of sequences of a set that has no end."""
 
@@ -157,7 +157,7 @@ class Mixed:
     have simulated robots and occluders in front, some of these an arm, too. Calibrated on simulated ones, scored on both."""
 
     jitter = 0.3
-    """Between that of simulated sequences and that of recordings alone."""
+    """Jitter of the colours, between that of simulated sequences and that of recordings alone."""
     side = VARIETY.size
     count = ENDLESS
 
@@ -275,7 +275,7 @@ class Trainer(training.Trainer[PredNet, Data]):
 
     @classmethod
     def begin(cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None) -> Trainer:
-        """A trainer that starts from weights with a card, grown to more channels where these are given; the card it writes tells
+        """A trainer that starts from weights with a card, grown to more channels where these are given; the card it writes says
         of them. Raises ValueError where they are fewer."""
         net, card = prednet.load(path)
         if channels is not None:

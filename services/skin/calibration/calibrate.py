@@ -230,7 +230,7 @@ class _Ear:
                 self._full.set()
 
     def listen(self, seconds: float) -> Array | None:
-        """Samples (s, e) of the next so many seconds, or None where too few come."""
+        """Samples (s, e) of the next `seconds`, or None where too few arrive."""
         with self._lock:
             self._heard, self._wanted_s = [], seconds
             self._full.clear()

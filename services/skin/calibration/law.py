@@ -30,10 +30,11 @@ SNR_DB = 1.0
 FEWEST = 4
 """Gaps, an empty scene among them: three parameters and one to check them by."""
 SAME_GAP = 1e-4
+"""Gaps that differ by at most this [m] are one."""
 CLIPPED = 0.1
 """Share of the samples at an end of the converter above which a gap is left out."""
 SURE = 6.0
-"""Standard errors of a difference that is believed."""
+"""Difference, in standard errors, from which it is significant."""
 MIXED = 0.25
 """Share of the way there that the signal may go back with the gap before its polarity is unclear."""
 

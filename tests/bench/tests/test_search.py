@@ -41,12 +41,13 @@ def test_the_bound_is_that_of_the_contour_which_the_search_would_trace_in_a_fine
     fine = Intrinsics(k.fx * finer, k.fy * finer, (k.cx + 0.5) * finer - 0.5, (k.cy + 0.5) * finer - 0.5)
     V = model.in_camera(T)
     points = model.outline(V, fine, (camera.height * finer, camera.width * finer), 0.5 * finer)
-    near = bound._visible(shot, (points[:, 3:5] + 0.5) / finer - 0.5)
-    normals, X = points[near, 5:7], points[near, :3]
+    near = bound._visible(shot, (points["pixel"] + 0.5) / finer - 0.5)
+    points = points[near]
+    normals, X = points["normal"], points["position"]
     a, b = normals[:, 0] * k.fx / X[:, 2], normals[:, 1] * k.fy / X[:, 2]
     by_position = np.column_stack([a, b, -(a * X[:, 0] + b * X[:, 1]) / X[:, 2]])
     motion = np.hstack([by_position, np.cross(X - T[:3, 3], by_position)])
-    traced = (motion * (points[near, 7] / finer / bound.VARIANCE_PX2)[:, None]).T @ motion
+    traced = (motion * (points["length"] / finer / bound.VARIANCE_PX2)[:, None]).T @ motion
     np.testing.assert_allclose(np.diag(bound.information(shot)), np.diag(traced), rtol=0.1)
 
 

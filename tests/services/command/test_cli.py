@@ -178,7 +178,7 @@ def test_flags_that_take_several_words_take_all_up_to_the_next_flag():
         flags.parse(params, ["--size"])
 
 
-def test_a_service_that_logs_json_tells_its_error_as_json_and_an_unknown_format_is_refused(monkeypatch):
+def test_a_service_that_logs_json_logs_its_error_as_json_and_an_unknown_format_is_refused(monkeypatch):
     out = run("fusion", "--cell", "nowhere", "--log-format", "json")
     line = json.loads(out.stderr)
     assert (out.returncode, line["service"], line["level"]) == (2, "fusion", "error")
@@ -188,7 +188,7 @@ def test_a_service_that_logs_json_tells_its_error_as_json_and_an_unknown_format_
     assert (out.returncode, "--log-format: expected text or json, got 'xml'" in out.stderr) == (2, True)
 
 
-def test_a_bad_cell_file_is_told_with_its_line(tmp_path, capsys):
+def test_a_bad_cell_file_is_reported_with_its_line(tmp_path, capsys):
     path = tmp_path / "cell.yaml"
     path.write_text("name: mine\ncolour: red\ntargets:\n  arm: {mesh: 'body:forearm', labels: [hand], home: {}}\n")
     assert cli.main(["router", "--cell", str(path)]) == 2
@@ -425,12 +425,12 @@ def test_output_that_cannot_be_written_is_one_line_and_no_traceback(argv, endpoi
     assert (result.returncode, result.stderr) == (1, told)
 
 
-def test_a_long_command_whose_output_is_piped_tells_how_far_it_is(capsys):
+def test_a_long_command_whose_output_is_piped_reports_how_far_it_is(capsys):
     assert list(progress.track("abc", "letters")) == ["a", "b", "c"]
     assert capsys.readouterr().err == "letters: 0 of 3\nletters: 3 of 3\n"
 
 
-def test_doctor_finds_nothing_to_mend_on_a_healthy_installation(endpoint, capsys):
+def test_doctor_finds_nothing_to_repair_on_a_healthy_installation(endpoint, capsys):
     assert cli.main(["doctor", "--connect", endpoint]) == 0
     out = capsys.readouterr().out
     assert "has no weights" not in out and "fail" not in out

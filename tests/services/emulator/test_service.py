@@ -85,7 +85,7 @@ def test_a_bad_command_is_refused_with_what_is_possible_and_changes_nothing(worl
     assert ask(world, "state") == before
 
 
-def test_the_list_of_commands_is_told_whole(world):
+def test_the_list_of_commands_is_complete(world):
     with pytest.raises(ValueError) as error:
         ask(world, "help")
     assert all(f"  {name} " in str(error.value) for name in COMMANDS)

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from penumbra.services.fusion.observer import ErrorStateObserver
-from penumbra.services.fusion.settings import Settings
+from penumbra.services.fusion.settings import FusionSettings
 from penumbra.shared import chi_square
 from penumbra.shared.contract import senses
 from penumbra.shared.geometry import rigid
@@ -19,14 +19,14 @@ from penumbra.tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, Error
 
 ERRORS = senses.Errors(0.8, 1.0, 1e-4)
 SENSES = tuple(dataclasses.replace(sense, errors=ERRORS) for sense in senses.SENSES)
-MATCHED = Settings(velocity_spread=(0.4, 0.5), acceleration=(0.3, 0.5), learning=(0.0, 0.0))
+MATCHED = FusionSettings(velocity_spread=(0.4, 0.5), acceleration=(0.3, 0.5), learning=(0.0, 0.0))
 PERIOD = {"vision": 0.05, "haptic": 0.01}
 
 
 # ---- consistency: the truth moves and the senses err as the filter assumes
 
 
-def normalised_error(there: dict[str, tuple[float, float]], settings: Settings, seed: int, seconds: float = 1.0) -> float:
+def normalised_error(there: dict[str, tuple[float, float]], settings: FusionSettings, seed: int, seconds: float = 1.0) -> float:
     """Squared error in units of the covariance (6 degrees of freedom) after a run; there: sense -> from and until when [s]."""
     rng = np.random.default_rng(seed)
     spread = (0.05, 0.15)
@@ -70,7 +70,7 @@ def normalised_error(there: dict[str, tuple[float, float]], settings: Settings, 
         ),
     ],
 )
-def test_errors_are_as_large_as_the_covariance_says(there: dict[str, tuple[float, float]], settings: Settings) -> None:
+def test_errors_are_as_large_as_the_covariance_says(there: dict[str, tuple[float, float]], settings: FusionSettings) -> None:
     runs = 30
     total = sum(normalised_error(there, settings, seed) for seed in range(runs))
     # fixed seeds: the band catches a wrong filter, not bad luck
@@ -156,7 +156,7 @@ def test_fused_is_never_much_worse_than_the_better_sense_although_their_errors_l
 
 def test_a_limb_that_is_faster_than_expected_is_followed() -> None:
     rng = np.random.default_rng(0)
-    learning, stubborn = ErrorStateObserver(HOME, SPREAD), ErrorStateObserver(HOME, SPREAD, Settings(learning=(0.0, 0.0)))
+    learning, stubborn = ErrorStateObserver(HOME, SPREAD), ErrorStateObserver(HOME, SPREAD, FusionSettings(learning=(0.0, 0.0)))
     errors: dict[int, list[float]] = {id(learning): [], id(stubborn): []}
     for k in range(160):
         t = 0.05 * k

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from penumbra.services.fusion import filter
-from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, Refused
+from penumbra.services.fusion import history
+from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, RefusedMeasurement
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver
-from penumbra.services.fusion.settings import Settings
+from penumbra.services.fusion.settings import FusionSettings
 from penumbra.shared.contract.messages import MAX_FUTURE_S
 from penumbra.shared.contract.senses import SENSES
 from penumbra.shared.geometry import rigid, so3
@@ -140,7 +140,7 @@ def test_asking_changes_nothing() -> None:
         np.testing.assert_allclose(asked.estimate(ns(0.52)).T, quiet.estimate(ns(0.52)).T, atol=1e-13)
 
 
-def test_two_cameras_that_expose_together_are_both_heard_in_either_order() -> None:
+def test_two_cameras_that_expose_together_are_both_accepted_in_either_order() -> None:
     first, second = ErrorStateObserver(HOME, SPREAD), ErrorStateObserver(HOME, SPREAD)
     left, right = perturb(HOME, [0.004, 0, 0, 0, 0, 0]), perturb(HOME, [-0.004, 0, 0, 0, 0, 0])
     for k in range(5):
@@ -186,7 +186,7 @@ def test_a_limb_that_jumps_is_found_again_within_three_quarters_of_a_second(make
     assert estimate.state == "tracking"
 
 
-def test_a_sense_that_disagrees_for_long_is_heard_again_beside_one_that_is_believed() -> None:
+def test_a_sense_that_disagrees_for_long_is_used_again_beside_one_that_is_accepted() -> None:
     observer = ErrorStateObserver(HOME, SPREAD)
     wrong = perturb(HOME, [0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
     for k in range(250):
@@ -212,7 +212,7 @@ def test_without_measurements_the_covariance_grows_and_the_state_goes_from_track
 @pytest.mark.parametrize("make", OBSERVERS)
 def test_before_the_first_measurement_the_target_is_lost_at_home(make: type) -> None:
     observer = make(HOME, SPREAD)
-    observer.log.heard("vision", ns(0.0))
+    observer.log.received("vision", ns(0.0))
     estimate = observer.estimate(ns(1.0))
     np.testing.assert_array_equal(estimate.T, HOME)
     np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), np.repeat(SPREAD, 3))
@@ -257,7 +257,7 @@ def test_what_is_no_measurement_is_refused_with_the_reason_counted_and_changes_n
     observer = make(HOME, SPREAD)
     still(observer, HOME, 0.0, 1.0)
     before = observer.estimate(ns(1.1))
-    with pytest.raises(Refused) as caught:
+    with pytest.raises(RefusedMeasurement) as caught:
         observer.measure("vision", ns(1.0 + ahead), T, seen, 0.0, now_ns=ns(1.0))
     assert caught.value.kind == kind and text in str(caught.value)
     assert observer.log.counts["vision"].refused == {kind: 1}
@@ -322,7 +322,7 @@ def test_a_bank_takes_what_is_good_beside_what_is_bad() -> None:
 
 
 def test_a_storm_of_measurements_shortens_the_history_and_nothing_else() -> None:
-    observer = ErrorStateObserver(HOME, SPREAD, Settings(capacity=8))
+    observer = ErrorStateObserver(HOME, SPREAD, FusionSettings(capacity=8))
     for k in range(100):
         observer.measure("haptic", ns(0.001 * k), HOME, VISION)
     assert observer.measure("vision", ns(0.0905), HOME, VISION)
@@ -332,7 +332,7 @@ def test_a_storm_of_measurements_shortens_the_history_and_nothing_else() -> None
     np.testing.assert_allclose(observer.estimate(ns(0.1)).T, HOME, atol=1e-9)
 
 
-def test_no_measurement_is_believed_beyond_the_floor() -> None:
+def test_no_measurement_is_trusted_beyond_the_floor() -> None:
     observer = ErrorStateObserver(HOME, SPREAD)
     observer.measure("vision", ns(0.0), HOME, 1e18 * np.eye(6))
     floor = SENSES[0].errors.floor
@@ -361,7 +361,7 @@ def test_the_compiled_filter_does_what_its_source_says(monkeypatch: pytest.Monke
 
     fast = played()
     for name in ("clear_all", "measure_all", "estimate_all"):
-        monkeypatch.setattr(filter, name, interpreted(getattr(filter, name)))
+        monkeypatch.setattr(history, name, interpreted(getattr(history, name)))
     slow = played()
     # compiled code joins multiplications and additions: the last digits differ
     np.testing.assert_allclose(fast.T, slow.T, atol=1e-11)

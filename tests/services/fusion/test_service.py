@@ -14,7 +14,7 @@ import pytest
 
 from penumbra.services import flags
 from penumbra.services.fusion import service
-from penumbra.services.fusion.estimate import Refused, information
+from penumbra.services.fusion.estimate import RefusedMeasurement, information
 from penumbra.shared.cell import description
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.runtime import bus
@@ -109,7 +109,7 @@ def test_the_service_publishes_and_answers_in_both_formats(observer: str, table:
         assert (stamps > 0).all()
 
 
-def test_the_next_replica_speaks_while_the_owner_is_silent_and_no_longer(table: description.Cell, router: str) -> None:
+def test_the_next_replica_publishes_while_the_owner_is_silent_and_no_longer(table: description.Cell, router: str) -> None:
     options = flags.parse(service.FLAGS, [])
 
     class Frozen(Node):
@@ -257,15 +257,17 @@ def test_a_camera_whose_clock_is_ahead_by_less_than_the_bus_allows_is_fused(
         assert accepted()["refused"] == {}
 
 
-def test_another_publisher_of_a_stream_is_heard_after_the_silence_of_the_first_and_beside_another_stream() -> None:
+def test_another_publisher_of_a_stream_is_accepted_after_the_silence_of_the_first_and_beside_another_stream() -> None:
     publishers = service.Publishers()
     publishers.check("front", "a", 0.0, 0.3)
     publishers.check("side", "b", 0.1, 0.3)
     publishers.check("front", "a", 0.2, 0.3)
-    with pytest.raises(Refused, match="front: expected one publisher, got b beside a: two processes publish the same poses"):
+    with pytest.raises(
+        RefusedMeasurement, match="front: expected one publisher, got b beside a: two processes publish the same poses"
+    ):
         publishers.check("front", "b", 0.4, 0.3)
     publishers.check("front", "b", 0.6, 0.3)
-    with pytest.raises(Refused, match="got a beside b"):
+    with pytest.raises(RefusedMeasurement, match="got a beside b"):
         publishers.check("front", "a", 0.7, 0.3)
 
 
@@ -293,7 +295,7 @@ def test_a_clock_that_is_set_makes_the_pose_lost_until_the_next_measurement_and_
         assert state(measured=True) == "tracking"
 
 
-def test_a_target_that_the_cell_does_not_have_is_told(table: description.Cell) -> None:
+def test_a_target_that_the_cell_does_not_have_is_reported(table: description.Cell) -> None:
     with pytest.raises(description.CellError, match="cell table has no target 'leg': it has forearm"):
         service.start(Node(service.NAME, table), flags.parse(service.FLAGS, ["--target", "leg"]))
 

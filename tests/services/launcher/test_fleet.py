@@ -121,7 +121,7 @@ def test_what_there_can_be_only_one_of_ends_before_its_successor_begins_and_the_
     assert up.pids("worker") != before["worker"]
 
 
-def test_a_successor_that_does_not_start_is_told_and_the_old_one_goes_on(launched, tmp_path, capsys):
+def test_a_successor_that_does_not_start_is_reported_and_the_old_one_goes_on(launched, tmp_path, capsys):
     broken = tmp_path / "broken"
     code = (
         f"import os, runpy, sys; os.path.exists({str(broken)!r}) and sys.exit('no licence'); "
@@ -136,7 +136,7 @@ def test_a_successor_that_does_not_start_is_told_and_the_old_one_goes_on(launche
     assert {name: up.pids(name) for name in ("worker", "helper")} == before
 
 
-def test_a_crash_loop_is_told_and_does_not_hold_up_what_is_restarted(launched, caplog, monkeypatch):
+def test_a_crash_loop_is_reported_and_does_not_hold_up_what_is_restarted(launched, caplog, monkeypatch):
     monkeypatch.setattr(logging.getLogger("penumbra"), "propagate", True)
     crashing = lambda endpoint: Kind(ALWAYS_CRASHES)  # noqa: E731
     up = launched({"crashing": crashing, "worker": small("worker")}, {"crashing": 1, "worker": 1}, {"worker": 1})

@@ -117,7 +117,7 @@ def plain_session(words):
     return int(words[0].rpartition(" ")[2].strip("}"))
 
 
-def test_a_forked_service_that_fails_is_told_with_its_last_words(make, supervise):
+def test_a_forked_service_that_fails_is_reported_with_its_last_output(make, supervise):
     server = make(fails=FAILS)
     process = supervise(server, "fails")
     wait_for(lambda: process.watch() or process.restarts, 10, "the first failure")

@@ -68,7 +68,7 @@ def supervise():
     supervised.stop(started)
 
 
-def test_a_killed_process_is_started_again_and_told_why(supervise):
+def test_a_killed_process_is_started_again_and_the_reason_reported(supervise):
     process = python("sleeper", SLEEPS)
     until = supervise(process)
     first = process.pid
@@ -89,7 +89,7 @@ def test_a_crash_loop_is_reported_slows_down_and_leaves_the_others_alone(supervi
     assert (steady.pid, steady.restarts) == (pid, 0)
 
 
-def test_a_process_that_was_asked_for_nothing_it_has_fails_with_its_last_words_and_stays_down(supervise):
+def test_a_process_that_was_asked_for_nothing_it_has_fails_with_its_last_output_and_stays_down(supervise):
     process = python("wrong", REFUSES)
     until = supervise(process)
     until(lambda: process.state == "failed", 3, "failure")
@@ -310,7 +310,7 @@ def test_a_cell_without_cameras_needs_no_process_that_looks(name, needed):
 # ---- what `up` says by its exit code, and what it refuses
 
 
-def test_a_process_that_failed_is_told_by_the_exit_code(router):
+def test_a_process_that_failed_is_reported_by_the_exit_code(router):
     fleet = Fleet({"wrong": Kind([sys.executable, "-c", REFUSES])}, {"wrong": 1})
     (wrong,) = fleet.processes
     with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:
@@ -319,7 +319,7 @@ def test_a_process_that_failed_is_told_by_the_exit_code(router):
 
 
 @pytest.mark.parametrize(("service", "code"), [("search", 1), ("skin", 0)])
-def test_a_sense_and_a_fusion_without_a_tracked_pose_are_told_by_the_exit_code(router, capsys, service, code):
+def test_a_sense_and_a_fusion_without_a_tracked_pose_are_reported_by_the_exit_code(router, capsys, service, code):
     idle = Kind([sys.executable, "-c", SLEEPS])
     fleet = Fleet({service: idle, "fusion": idle}, {service: 1, "fusion": 1})
     with Node("launcher", CELL, bus.Connection(connect=(router,))) as node:

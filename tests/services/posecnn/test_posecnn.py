@@ -55,7 +55,7 @@ def test_exact_directions_meet_in_the_centre_also_outside_of_the_picture(centre)
     assert vote.share == 1.0
 
 
-def test_the_vote_finds_the_centre_among_noise_and_outliers_and_tells_them_apart():
+def test_the_vote_finds_the_centre_among_noise_and_outliers_and_distinguishes_them():
     centre = np.array([30.0, 27.0])
     pixels, directions, rng = rays(centre, 0.05)
     wrong = rng.random(len(pixels)) < 0.35
@@ -197,7 +197,7 @@ def test_training_lowers_the_loss(data):
         assert after[name] < 0.85 * before[name], name
 
 
-def test_a_batch_tells_the_target_s_place_in_every_patch(data):
+def test_a_batch_contains_the_target_s_place_in_every_patch(data):
     data.ensure(32)
     rng = np.random.default_rng(3)
     chosen = [data[i] for i in range(32) if data[i][1].hidden < 0.3]
@@ -269,7 +269,7 @@ def test_missing_weights_are_an_error_that_says_how_to_make_them(tmp_path, capsy
         estimator.load(tmp_path / "none.npz")
 
 
-def test_held_out_arms_are_found_and_the_covariance_tells_how_far_off_they_are():
+def test_held_out_arms_are_found_and_the_covariance_shows_how_far_off_they_are():
     net, uncertainty = estimator.load()
     shown = [shots.shot(4_200_000, index, distance_m=1.5, hidden=hidden) for index in range(12) for hidden in (0.0, 0.4)]
     found = evaluate.results(net, uncertainty, shown, 1)

@@ -82,7 +82,7 @@ def test_the_covariance_of_the_refined_pose_is_that_of_its_errors(visible, half_
     assert 0.5 < np.median(nees) < 9.0  # chi^2 with six degrees of freedom: 5.3
 
 
-def test_an_occluder_that_the_mask_takes_for_background_is_not_believed(half_hidden):
+def test_an_occluder_that_the_mask_takes_for_background_is_not_accepted(half_hidden):
     errors = []
     for seed, shot in enumerate(half_hidden):
         T = start(shot, seed)
@@ -95,7 +95,7 @@ def test_an_occluder_that_the_mask_takes_for_background_is_not_believed(half_hid
     assert max(errors) < 3.0
 
 
-def test_a_mask_beside_the_limb_is_put_right_or_not_believed(visible):
+def test_a_mask_beside_the_limb_is_corrected_or_not_accepted(visible):
     for seed, shot in enumerate(visible):
         T = start(shot, seed)
         right = mask(shot, T)

@@ -160,13 +160,13 @@ def test_a_damaged_mesh_gives_the_pose_of_the_whole_one(kind):
     assert errors(one, find_pose(RigidObject(mesh_of(one)), mask, K, start).T, T).add < 0.03
 
 
-def test_a_mended_mesh_looks_like_the_one_it_was_made_of():
+def test_a_repaired_mesh_has_the_silhouette_of_the_original():
     for name in ("mug", "scissors", "drill"):
         one = thing(name, 3)
-        mended = meshes.mend(mesh_of(one), 4000)
-        assert len(mended.faces) < 6000
+        repaired = meshes.repaired(mesh_of(one), 4000)
+        assert len(repaired.faces) < 6000
         T = bench.drawn_pose(np.random.default_rng(1))
-        other = Thing(name, trimesh.Trimesh(mended.vertices, mended.faces, process=False), one.symmetries)
+        other = Thing(name, trimesh.Trimesh(repaired.vertices, repaired.faces, process=False), one.symmetries)
         assert bench.iou(drawn(one, T), drawn(other, T)) > 0.98
 
 

@@ -247,7 +247,7 @@ def test_what_has_the_targets_shape_far_from_home_is_not_the_target(search):
     assert search.update(mask, far @ s.T, PRIOR).state == "tracking"  # but what was followed to there is
 
 
-def test_a_small_piece_is_believed_only_where_a_sure_prediction_expects_it(search):
+def test_a_small_piece_is_accepted_only_where_a_sure_prediction_expects_it(search):
     unsure = PRIOR + np.diag([0.1**2] * 3 + [0.5**2] * 3)
     aside = CAMERA.T_world_camera[:3, 0]
     for seed in range(1000, 1005):

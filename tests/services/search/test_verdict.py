@@ -49,7 +49,7 @@ def test_a_poor_overlap_is_enough_only_for_a_sharp_pose_that_is_expected(overlap
     assert judged(overlap=overlap, is_expected=True, has_image=False, is_sharp=False) is Verdict.ELSEWHERE
 
 
-def test_a_small_piece_is_believed_only_where_it_is_expected():
+def test_a_small_piece_is_accepted_only_where_it_is_expected():
     for small in ({"hidden": 0.6}, {"contour_px": 50.0}):
         assert judged(**small) is Verdict.TOO_LITTLE
         assert judged(**small, is_expected=True) is Verdict.RIGHT

@@ -81,7 +81,7 @@ def test_every_parameter_learns_from_mask_and_prediction(cell):
     assert still == []
 
 
-def test_without_delay_the_mask_hears_of_a_picture_at_once_and_with_it_layers_hear_later():
+def test_without_delay_the_mask_depends_on_a_picture_at_once_and_with_it_layers_follow_later():
     for delay, early in ((False, True), (True, False)):
         net = PredNet(Settings(SMALL.channels, SMALL.kernels, delay=delay))
         dark, bright = torch.zeros(1, 3, 32, 32), torch.ones(1, 3, 32, 32)
@@ -204,7 +204,7 @@ def test_the_rate_rises_once_stays_and_falls_at_the_end():
     assert np.all(np.diff(rates[801:]) <= 0.0) and 0.0 < rates[-1] < 0.01
 
 
-def test_a_network_grown_from_another_gives_its_masks_and_learns_to_hear_of_its_new_channels():
+def test_a_network_grown_from_another_gives_its_masks_and_learns_to_use_its_new_channels():
     net = PredNet(SMALL)
     larger = prednet.grown(net, Settings((8, 4, 24), SMALL.kernels, SMALL.decoder_channels))
     first, second = net.initial_state(1, 32, 32), larger.initial_state(1, 32, 32)
@@ -222,7 +222,7 @@ def test_a_network_grown_from_another_gives_its_masks_and_learns_to_hear_of_its_
         prednet.grown(net, Settings((4, 2, 8), SMALL.kernels, SMALL.decoder_channels))
 
 
-def test_training_may_start_from_weights_and_its_card_tells_of_them(tmp_path):
+def test_training_may_start_from_weights_and_its_card_names_them(tmp_path):
     net = PredNet(SMALL)
     prednet.save(tmp_path / "old.npz", net, {"seed": 7, "date": "2026-01-01", "settings": {"minutes": 3.0}})
     trainer = train.Trainer.begin(tmp_path / "old.npz", train.Schedule(), seed=1)
@@ -426,7 +426,7 @@ def test_a_replica_that_waits_has_compiled_for_the_window_of_now():
     poses = [nodes.pose(stamp_ns, x=0.2) for stamp_ns in range(1_000_000_000, 2_000_000_000, 100_000_000)]
     replay.run((topics.FUSED, {"target": "forearm"}, pose) for pose in poses)
     lookout = Lookout(cell, "front")
-    lookout.hear(poses[-1])
+    lookout.add(poses[-1])
     wait_for(lambda: segmenter.is_prepared(lookout.look(poses[-1].stamp_ns)), 60, "the network compiled ahead")
     assert node.is_warm()
 

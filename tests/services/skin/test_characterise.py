@@ -108,7 +108,7 @@ def test_a_recorded_data_set_goes_through_the_same_command(recorded, tmp_path, c
         (["--samples", "2"], "expected 10 to 10000 samples, got '2'"),
     ],
 )
-def test_a_wrong_command_is_told(arguments, text, tmp_path, capsys):
+def test_a_wrong_command_is_reported(arguments, text, tmp_path, capsys):
     code: str | int | None
     try:
         code = cli.main(["skin", "characterise", "--out", str(tmp_path), *arguments])

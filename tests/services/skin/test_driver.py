@@ -147,7 +147,7 @@ def test_a_board_that_the_probes_do_not_bring_back_gets_a_break_and_is_back_with
     assert pad.lines[2].count.breaks == 1 and pad.lines[2].count.longest_s < 0.050
 
 
-def test_a_board_that_says_nothing_any_more_is_told_with_its_port(pad):
+def test_a_board_that_says_nothing_any_more_is_reported_with_its_port(pad):
     pad.ports[1].dead = True
     with pytest.raises(BoardSilent, match="no answer on line 1, nor after a BREAK"):
         pad.rows(1)
@@ -161,7 +161,7 @@ def test_a_board_whose_power_was_off_is_not_read_at_a_frequency_that_it_no_longe
         pad.rows(3)
 
 
-def test_a_device_that_is_no_board_is_told():
+def test_a_device_that_is_no_board_is_reported():
     class Echo(SimulatedPort):
         def write(self, data):
             self._came += data
@@ -283,12 +283,12 @@ def test_a_break_reaches_a_board_on_a_pseudo_terminal():
         ("/dev/null", "/dev/null cannot be opened as a serial port: "),
     ],
 )
-def test_a_port_that_cannot_be_used_is_told_with_what_to_do(device, text):
+def test_a_port_that_cannot_be_used_is_reported_with_what_to_do(device, text):
     with pytest.raises(OSError, match=text):
         SerialPort(device)
 
 
-def test_a_port_in_use_is_told():
+def test_a_port_in_use_is_reported():
     with served(emulated()[:1]) as (names, _):
         first = SerialPort(names[0])
         with pytest.raises(OSError, match="is in use by another process: end it, or give another port"):
@@ -342,7 +342,7 @@ def test_the_service_publishes_voltages_of_its_pad_with_the_times_of_the_measure
     )
 
 
-def test_a_board_that_is_pulled_out_is_told_and_read_again_when_it_is_back(heard, tmp_path):
+def test_a_board_that_is_pulled_out_is_reported_and_read_again_when_it_is_back(heard, tmp_path):
     start, messages = heard
     ports = [tmp_path / f"p0-{k}" for k in range(3)]
     node = start([str(port) for port in ports])

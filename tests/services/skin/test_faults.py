@@ -55,7 +55,7 @@ def watch(volts, faults=None, lost=()):
         ("drift 0.1", "drift", 50 * (LASTS + 4)),
     ],
 )
-def test_every_fault_of_an_electrode_is_told_by_its_name_in_time(fault, kind, batches):
+def test_every_fault_of_an_electrode_is_reported_by_its_name_in_time(fault, kind, batches):
     faults = SkinFaults(SKIN)
     faults.command(f"p0/t {fault}", 0.0)
     told = watch(rest(BATCH * batches, np.random.default_rng(1)), faults)
@@ -63,7 +63,7 @@ def test_every_fault_of_an_electrode_is_told_by_its_name_in_time(fault, kind, ba
     assert told[-1]["t"].text.startswith(kind)
 
 
-def test_a_fault_that_ends_is_told_no_longer():
+def test_a_fault_that_ends_is_no_longer_reported():
     rng, faults = np.random.default_rng(2), SkinFaults(SKIN)
     found, told = Watch(SKIN, 0), []
     for i in range(200):
@@ -253,7 +253,7 @@ def test_a_calibration_of_another_pad_is_suspected_with_its_gain(moments, gain):
     assert "calibrated as another pad" in found.text and found.gain == pytest.approx(gain, rel=0.2)
 
 
-def test_what_nothing_explains_is_told_without_a_reason(moments):
+def test_what_nothing_explains_is_reported_without_a_reason(moments):
     found = suspect(moments, lambda true: true * [1.0, 3.0, 0.3, 0.3, 3.0])
     assert found.text == "does not fit the pose, for no known reason"
 
@@ -285,7 +285,7 @@ def pads_on_the_bus(endpoint, faults, silent=()):
     return node
 
 
-def test_the_doctor_finds_what_is_broken_on_the_bus_and_says_how_to_mend_it(router, capsys):
+def test_the_doctor_finds_what_is_broken_on_the_bus_and_says_how_to_repair_it(router, capsys):
     faults = SkinFaults(SKIN)
     for words in ("p0/r dead", "p3/c saturated", "p5/b hum"):
         faults.command(words, 0.0)
@@ -325,7 +325,7 @@ def test_the_doctor_says_when_there_is_nothing_to_look_at(router, tmp_path, caps
     assert "--seconds: expected 2 to 3600, got 0.5" in capsys.readouterr().err
 
 
-def test_the_doctor_believes_a_pose_that_says_nothing_is_near_more_than_a_pad_that_drifted_as_a_whole():
+def test_the_doctor_trusts_a_pose_that_says_nothing_is_near_more_than_a_pad_that_drifted_as_a_whole():
     """All electrodes of a warm pad rise alike, as if a limb were far away: only the pose tells."""
     examination, rng = Examination(CELL), np.random.default_rng(13)
     assert not examination.notes

@@ -45,17 +45,17 @@ def test_one_pose_costs_no_more_than_a_few_products_of_matrices_a_link(panda):
     assert cost(lambda: panda.link_transforms(q)) < 10 * len(panda.link_transforms(q)) * cost(lambda: T @ T)
 
 
-def test_a_wrong_number_of_joint_angles_is_told(panda):
+def test_a_wrong_number_of_joint_angles_is_reported(panda):
     with pytest.raises(ValueError, match=r"expected 7 values \(panda_joint1, .*\), got shape \(6,\)"):
         panda.link_transforms(np.zeros(6))
 
 
-def test_an_unknown_joint_is_told_with_the_joints_that_there_are():
+def test_an_unknown_joint_is_reported_with_the_joints_that_there_are():
     with pytest.raises(cells.CellError, match=r"no moving joint elbow in .*panda.urdf: it has panda_joint1, panda_joint2"):
         RobotModel(PANDA.model_copy(update={"joints": ("panda_joint1", "elbow")}))
 
 
-def test_a_missing_urdf_is_told():
+def test_a_missing_urdf_is_reported():
     with pytest.raises(cells.CellError, match=r"no file .*panda/none.urdf: give a URDF beside the cell file, or the built-in"):
         RobotModel(PANDA.model_copy(update={"urdf": "panda/none.urdf"}))
 
@@ -173,7 +173,7 @@ print([name for name in ("trimesh", "scipy", "pybullet", "lxml") if name in sys.
     assert float(cpu_s) < 0.15 and loaded == "[]"  # 0.01 s on the machine where it was written
 
 
-def test_a_pad_on_a_link_that_the_robot_has_not_is_told():
+def test_a_pad_on_a_link_that_the_robot_has_not_is_reported():
     cell = cells.load("arm")
     pads = {"p0": cell.pads["p0"].model_copy(update={"link": "panda/panda_thumb"})}
     with pytest.raises(cells.CellError, match=r"pads.p0.link: robot panda has no link 'panda_thumb': it has panda_link0"):

@@ -100,7 +100,7 @@ def secured(folder):
 
 @pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
 @pytest.mark.parametrize("who", WHO)
-def test_only_the_publisher_of_a_topic_is_heard_on_it(secured, who, topic):
+def test_only_the_publisher_of_a_topic_is_received_on_it(secured, who, topic):
     secured.puts()
     session, key = secured.client(who), topic.at(**NAMES)
     put(session, key, b"put")
@@ -120,7 +120,7 @@ def test_a_message_to_all_keys_at_once_is_refused(secured, who):
 
 
 @pytest.mark.parametrize(("who", "whose"), list(itertools.product(WHO, WHO)))
-def test_health_and_liveliness_are_told_only_by_oneself(secured, who, whose):
+def test_health_and_liveliness_are_published_only_by_oneself(secured, who, whose):
     session, instance = secured.client(who), f"of-{who}"
     token = session.liveliness().declare_token(topics.alive("table", whose, instance))
     queryable = session.declare_queryable(topics.health("table", whose, instance), zenoh.handlers.FifoChannel(8))
@@ -188,7 +188,7 @@ def test_everybody_reads_every_topic_and_nobody_anything_else(secured, who):
     assert heard[len(readers) :] == [len(readers), 0]
 
 
-def test_everybody_sees_who_lives(secured):
+def test_everybody_sees_which_services_live(secured):
     token = secured.client("fusion").liveliness().declare_token(topics.alive("table", "fusion", "seen"))
     secured.settle("fusion")
     for who in WHO:
@@ -197,7 +197,7 @@ def test_everybody_sees_who_lives(secured):
     token.undeclare()
 
 
-def test_a_certificate_whose_name_stands_in_no_rule_says_and_hears_nothing(secured):
+def test_a_certificate_whose_name_stands_in_no_rule_sends_and_receives_nothing(secured):
     secured.puts()
     session = secured.client(STRANGER)
     for topic in topics.TOPICS:

@@ -93,7 +93,7 @@ def test_beyond_the_fold_of_a_distortion_nothing_is_seen():
         ({"k1": -8.0}, "k1", "folds over"),
     ],
 )
-def test_what_cannot_be_a_camera_s_is_told(changed, place, words):
+def test_what_cannot_be_a_camera_s_is_reported(changed, place, words):
     found = Lens(**{**SIZE, **changed}).faults()
     assert found[0][0] == place and words in found[0][1]
     assert not Lens(**SIZE).faults() and not BARREL.faults() and not PINCUSHION.faults()

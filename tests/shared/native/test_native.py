@@ -92,7 +92,8 @@ def calls(rng):
     images = np.full((48, 64), np.inf, np.float32), np.zeros((48, 64), np.uint8), np.zeros((48, 64), np.int32)
     yield raster._draw, (V, faces, 60.0, 60.0, 32.0, 24.0, np.ones(len(faces), np.uint8), 0, *images)
     n = 12
-    contour_points = rng.uniform(0.5, 20.0, (n, 8))
+    # fields that Python code too can read as attributes, as kernels do
+    contour_points = rng.uniform(0.5, 20.0, (n, 8)).view(contour.POINT)[:, 0].view(np.recarray)
     kind = rng.integers(0, 3, n).astype(np.uint8)
     sums = np.zeros((7, 7)), np.zeros(7), np.zeros(5)
     weights = rng.uniform(size=n)
@@ -107,13 +108,15 @@ def calls(rng):
 @pytest.mark.parametrize("seed", range(3))
 def test_compiled_code_computes_what_the_python_function_computes(seed):
     for compiled, arguments in calls(np.random.default_rng(seed)):
-        again = [np.copy(each) if isinstance(each, np.ndarray) else each for each in arguments]
+        again = [each.copy() if isinstance(each, np.ndarray) else each for each in arguments]
         result = compiled(*arguments)
         assert compiled._code is not None
         with np.errstate(all="ignore"):
             expected = compiled.function(*again)
         assert result == expected
         for ours, theirs in zip(arguments, again, strict=True):
+            if isinstance(ours, np.recarray):
+                ours, theirs = (each.view((np.float64, 8), np.ndarray) for each in (ours, theirs))
             # sums of a hundred terms, in another order at most
             np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12, err_msg=compiled.name)
 

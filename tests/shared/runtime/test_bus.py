@@ -81,7 +81,7 @@ def test_a_message_arrives_with_the_names_in_its_key(node):
     assert (names["pad"], shape) == ("p3", (5, 5))
 
 
-def test_a_reader_is_told_which_of_two_publishers_sent_a_message(node):
+def test_a_reader_knows_which_of_two_publishers_sent_a_message(node):
     heard: dict[str, list[int]] = {}
     reader, writers = node(), [node(), node()]
     reader.subscribe(topics.VOLTAGES, lambda message, names: heard.setdefault(names["publisher"], []).append(message.stamp_ns))
@@ -139,7 +139,7 @@ def test_bad_messages_are_counted_by_kind_logged_once_and_do_not_stop_the_reader
     assert {record.fields["kind"] for record in log("message refused")} == {"msgpack", "past", "delete"}
 
 
-def test_messages_of_another_version_are_ignored_counted_and_told_once_however_many_keys_they_come_on(node, log):
+def test_messages_of_another_version_are_ignored_counted_and_logged_once_however_many_keys_they_come_on(node, log):
     got = []
     reader, writer = node(), node()
     for topic in (topics.FUSED, topics.HAPTIC):
@@ -333,7 +333,7 @@ def test_a_query_that_nobody_answers_returns_at_once_with_nothing(node):
     assert time.monotonic() - started < 0.2 * timeout_s
 
 
-def test_a_taken_port_is_told_with_what_to_do(endpoint):
+def test_a_taken_port_is_reported_with_what_to_do(endpoint):
     with pytest.raises(bus.BusError, match=r"taken.*--port"):
         Node("router", CELL, bus.Connection("router", listen=(endpoint,))).open()
 
@@ -341,7 +341,7 @@ def test_a_taken_port_is_told_with_what_to_do(endpoint):
 @pytest.mark.parametrize(
     ("text", "reason"), [("{mode: 'nowhere'}", "unknown variant"), ("{nonsense: 1}", "unknown field"), ("{mode:", "expected")]
 )
-def test_a_bad_configuration_file_is_told_with_its_name_and_the_reason(tmp_path, text, reason):
+def test_a_bad_configuration_file_is_reported_with_its_name_and_the_reason(tmp_path, text, reason):
     path = tmp_path / "zenoh.json5"
     path.write_text(text)
     with pytest.raises(bus.BusError, match=reason) as caught:

@@ -52,7 +52,7 @@ def listener(folder: Path | None = None):
         ("tcp/nowhere.invalid:7447", "unknown host 'nowhere.invalid'"),
     ],
 )
-def test_an_impossible_address_and_an_unknown_host_are_told_apart(endpoint, words):
+def test_an_impossible_address_and_an_unknown_host_are_distinguished(endpoint, words):
     assert diagnosis.no_router(bus.Connection(connect=(endpoint,))).startswith(f"no router at {endpoint}: {words}")
 
 
@@ -68,19 +68,19 @@ def test_a_server_that_is_no_router_is_reported():
         assert "does not answer as a Zenoh router" in diagnosis.no_router(bus.Connection(connect=(f"tcp/127.0.0.1:{port}",)))
 
 
-def test_a_plain_connection_to_a_secured_router_is_told_of_secure(folders):
+def test_a_plain_connection_to_a_secured_router_is_advised_to_use_secure(folders):
     with listener(folders[0]) as port:
         said = diagnosis.no_router(bus.Connection(connect=(f"tcp/127.0.0.1:{port}",)))
     assert said.endswith("without TLS: give --secure FOLDER with certificates of `penumbra certs`")
 
 
-def test_a_secured_connection_to_a_plain_router_is_told_to_leave_secure_out(folders):
+def test_a_secured_connection_to_a_plain_router_is_advised_to_leave_secure_out(folders):
     with listener() as port:
         said = diagnosis.no_router(bus.Connection(connect=(f"tls/127.0.0.1:{port}",), secure=folders[0]))
     assert said.endswith("that speaks TLS: leave --secure out, or start it with --secure")
 
 
-def test_a_router_of_another_authority_is_told_apart_from_one_of_ours(folders):
+def test_a_router_of_another_authority_is_distinguished_from_one_of_ours(folders):
     with listener(folders[1]) as port:
         said = diagnosis.no_router(bus.Connection(connect=(f"tls/127.0.0.1:{port}",), secure=folders[0]))
     assert f"with a certificate of the CA in {folders[0]}" in said

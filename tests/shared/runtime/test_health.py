@@ -60,7 +60,7 @@ def seen(node):
     return running.ask(node.session, "table")
 
 
-def test_counters_that_grew_lately_are_told_and_forgotten_after_a_while():
+def test_counters_that_grew_lately_are_reported_and_forgotten_after_a_while():
     lately = health.Lately()
     assert lately.look({("a", "past"): 3}, 0.0) == {("a", "past"): 3}
     assert lately.look({("a", "past"): 5, ("", "ValueError"): 1}, 20.0) == {("a", "past"): 5, ("", "ValueError"): 1}
@@ -81,8 +81,8 @@ def test_a_process_with_nothing_to_say_is_ok_and_one_off_the_bus_is_down():
 def test_every_reason_names_what_is_missing_and_since_when():
     never, old, fresh = (Traffic(0.3) for _ in range(3))
     now_ns = 10**12
-    old.took(now_ns - 3_210_000_000, now_ns)
-    fresh.took(now_ns, now_ns)
+    old.record(now_ns - 3_210_000_000, now_ns)
+    fresh.record(now_ns, now_ns)
     received = {f"penumbra/table/skin/{pad}/voltages": traffic for pad, traffic in zip("abc", (never, old, fresh), strict=True)}
     grown = {("penumbra/table/skin/c/voltages", "past"): 2, ("", "ValueError at x.py:3"): 1}
     assert health.judge("", received, grown, ["fusion: waiting"], now_ns) == (
@@ -103,7 +103,7 @@ def test_missing_inputs_of_one_kind_are_one_reason():
     pads["penumbra/arm/skin/*/voltages"] = Traffic(math.inf)  # counts what is on no pad of the cell
     assert health.judge("", pads, {}, [], now_ns) == ("degraded", ["nothing received on skin/*/voltages (8) yet"])
     for k, traffic in enumerate(list(pads.values())[:8]):
-        traffic.took(now_ns - (k + 1) * 100_000_000, now_ns)
+        traffic.record(now_ns - (k + 1) * 100_000_000, now_ns)
     fused = {"penumbra/arm/target/forearm/pose/fused": Traffic(0.1)}
     expected = ["no skin/*/voltages (7 of 8) for 0.8 s", "nothing received on target/forearm/pose/fused yet"]
     assert health.judge("", pads | fused, {}, [], now_ns)[1] == expected
@@ -137,7 +137,7 @@ def test_an_input_is_waited_for_while_its_publisher_starts_and_missing_when_it_s
         return waiting.why(traffic)
 
     assert why(1.0) == "haptics is not there yet"
-    assert why(progress.NOBODY_S + 1.0) == "", "nobody runs it"
+    assert why(progress.ABSENT_S + 1.0) == "", "nobody runs it"
     answers["haptics"] = [Report("haptics", "a", "starting", progress="compiling 12 of 40")]
     assert why(20.0) == "haptics is compiling 12 of 40"
     answers["haptics"] = None
@@ -173,7 +173,7 @@ def test_a_topic_whose_publisher_has_nothing_to_do_in_a_cell_is_not_missed():
     assert with_pads.report().stale and not without.report().stale
 
 
-def test_a_node_tells_of_stale_inputs_refusals_and_faults_as_they_happen(client):
+def test_a_node_reports_stale_inputs_refusals_and_faults_as_they_happen(client):
     reader, writer = client("reader"), client("writer").open()
     reader.subscribe(topics.FUSED, lambda message, names: 1 / 0)
     reader.open()
@@ -199,7 +199,7 @@ def test_a_node_that_lost_its_router_is_down_and_says_where_it_should_be(router,
     assert report["reasons"] == [f"no router at {router.connection.listen[0]}"]
 
 
-def test_from_outside_every_instance_is_told_and_one_that_hangs_is_down(router, worker, monkeypatch):
+def test_from_outside_every_instance_is_reported_and_one_that_hangs_is_down(router, worker, monkeypatch):
     found = {each.service: each for each in seen(router)}
     assert found["router"].status == "ok"
     assert (found["worker"].status, found["worker"].reasons) == ("starting", (WAITS,))
@@ -212,7 +212,7 @@ def test_from_outside_every_instance_is_told_and_one_that_hangs_is_down(router, 
     assert hung.reasons == ("hangs: no answer within 0.2 s",)
 
 
-def test_doctor_tells_how_the_running_processes_fare(router, worker, capsys):
+def test_doctor_reports_the_status_of_the_running_processes(router, worker, capsys):
     cli.main(["doctor", "--connect", router.connection.listen[0]])
     (line,) = [line for line in capsys.readouterr().out.splitlines() if " worker " in line]
     assert line.startswith("warn worker ")
@@ -224,7 +224,7 @@ def test_doctor_says_how_to_start_a_cell_whose_router_runs_alone(router):
     assert (found.status, found.text, found.mend) == ("warn", "no process of cell arm runs there", "penumbra up --cell arm")
 
 
-def test_topics_hz_tells_how_the_processes_fare_but_not_itself(router, worker, capsys):
+def test_topics_hz_reports_the_status_of_the_processes_but_not_itself(router, worker, capsys):
     assert cli.main(["topics", "--hz", "--seconds", "0.5", "--connect", router.connection.listen[0]]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.strip()]
     services = {row[0]: row[2:] for row in rows[rows.index(["process", "instance", "status", "reasons"]) + 1 :]}
@@ -245,7 +245,7 @@ def test_the_live_view_shows_what_a_running_process_suffers_from(router, worker)
     assert process.row(Report("worker", "a", "ok")).state == "running"
 
 
-def test_the_heartbeat_tells_the_status_and_the_health_check_of_the_containers_reads_it(router, client, monkeypatch, tmp_path):
+def test_the_heartbeat_contains_the_status_and_the_health_check_of_the_containers_reads_it(router, client, monkeypatch, tmp_path):
     path = tmp_path / "heartbeat"
     monkeypatch.setenv("PENUMBRA_HEARTBEAT", str(path))
     node = client("worker").open()

@@ -141,7 +141,7 @@ def test_a_port_that_is_none_is_refused_in_one_line(text):
     assert f"--metrics-port: expected a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, got {text!r}" in err
 
 
-def test_a_port_that_is_taken_is_told_in_one_line(served):
+def test_a_port_that_is_taken_is_reported_in_one_line(served):
     port = served(list)
     process = started("router", "--listen", f"tcp/127.0.0.1:{free_port()}", "--metrics-port", str(port))
     _, err = process.communicate(timeout=20)

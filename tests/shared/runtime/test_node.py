@@ -165,7 +165,7 @@ def test_health_of_all_instances_is_one_wildcard_query(router, process):
     assert found["worker"]["stale"] == [key], "a topic that was never received is stale"
 
 
-def test_health_tells_rate_age_cpu_and_memory_of_a_steady_publisher(router, process):
+def test_health_reports_rate_age_cpu_and_memory_of_a_steady_publisher(router, process):
     reader = Node("reader", CELL, bus.Connection(connect=router.connection.listen))
     reader.subscribe(topics.FUSED, lambda message, names: None)
     with reader:
@@ -331,7 +331,7 @@ raise RuntimeError("the end")
 """
 
 
-def test_as_json_everything_that_a_process_says_is_an_object_a_line_also_its_last_words():
+def test_as_json_everything_that_a_process_says_is_an_object_a_line_also_its_last_output():
     err = subprocess.run([sys.executable, "-c", SAYS_ALL_SORTS], capture_output=True, text=True).stderr
     library, python, thread, end = map(json.loads, err.splitlines())
     assert (library["service"], library["message"]) == ("library", "of a library")
@@ -426,7 +426,7 @@ def test_a_handler_that_always_takes_long_does_not_hang(replica):
     assert patient.health()["hangs"] == "", "it may take as long as it likes"
 
 
-def test_whoever_runs_out_of_memory_in_a_handler_does_not_go_on_as_if_it_were_the_message(router):
+def test_a_process_that_runs_out_of_memory_in_a_handler_does_not_go_on_as_if_it_were_the_message(router):
     node = Node("worker", CELL, bus.Connection(connect=router.connection.listen))
     node.fault("reader", ValueError("a bad picture"))
     with pytest.raises(MemoryError):
@@ -434,7 +434,7 @@ def test_whoever_runs_out_of_memory_in_a_handler_does_not_go_on_as_if_it_were_th
     assert sum(node.health()["faults"].values()) == 1
 
 
-def test_a_log_on_a_full_disk_loses_lines_and_a_closed_one_is_told():
+def test_a_log_on_a_full_disk_loses_lines_and_a_closed_one_is_reported():
     with open("/dev/full", "w") as full:
         stream = logs.Lossy(full)
         for _ in range(10_000):

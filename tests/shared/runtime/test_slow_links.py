@@ -31,7 +31,7 @@ def started(*argv: str) -> Node:
     return node
 
 
-def test_a_router_without_a_slow_link_is_told_nothing():
+def test_a_router_without_a_slow_link_gets_no_rule():
     assert started().connection.slow is None
 
 
@@ -58,7 +58,7 @@ def test_a_slow_link_carries_each_stream_as_often_as_the_table_says_or_the_user(
         (["--slow", LOOPBACK, "--slow-hz", "fused=nan"], "--slow-hz: expected TOPIC=HZ, .*, got fused=nan"),
     ],
 )
-def test_what_cannot_be_is_told(flags, text, capsys):
+def test_what_cannot_be_is_reported(flags, text, capsys):
     assert cli.main(["router", *flags]) == 2
     assert re.search(text, capsys.readouterr().err)
 

@@ -142,7 +142,7 @@ def test_no_bytes_crash_the_decoder(data):
         (b"\x00" + PACKET[1:], "but the first byte says 0: a board takes 2 to 9"),
     ],
 )
-def test_a_packet_of_the_wrong_size_is_told_the_sizes_that_fit(data, text):
+def test_a_packet_of_the_wrong_size_is_refused_with_the_sizes_that_fit(data, text):
     with pytest.raises(PacketError, match=text):
         board.decode(data)
 

@@ -184,7 +184,7 @@ def test_the_networks_derivatives_are_those_of_their_values(response: Response) 
             np.testing.assert_allclose(jacobian[:, 6 + k], (up - down) / (2 * step), rtol=0.01, atol=0.02)
 
 
-def test_a_limb_that_was_not_fitted_is_told_how_to_be(table: cells.Cell) -> None:
+def test_a_limb_that_was_not_fitted_gets_instructions(table: cells.Cell) -> None:
     thick = table.model_copy(update={"body": table.body.model_copy(update={"forearm_circumference": 0.5})})
     with pytest.raises(cells.CellError, match="penumbra skin model --cell"):
         Response(thick, "forearm")

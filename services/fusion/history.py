@@ -1,0 +1,248 @@
+"""The history of the default observer, compiled: measurements that come late and out of order.
+
+The filter goes back to a measurement's stamp, applies it, and replays what came after (`insert`). The result depends on the
+measurements and their stamps alone, never on the order of arrival (within the horizon): the whole state of the filter, what it
+refused included, is a function of the state before and the measurement (`filter.step`).
+
+A history is a ring of measurements in the order of stamp, source and position, each with the state after it. Its first entry is
+the newest one that is older than the horizon: nothing is inserted before it. `ring` (2,) holds the slot of the first entry and
+the number of entries.
+
+`clear_all`, `adopt`, `measure_all` and `estimate_all` are called from outside, for as many targets as there are.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, GATED, LATE, LOST, NOTHING, fault, state_of
+from penumbra.services.fusion.filter import Model, State, forget, move, reduce, spread, step
+from penumbra.services.fusion.records import (
+    ESTIMATE,
+    MEASUREMENT,
+    MODEL,
+    MOTION,
+    NEVER,
+    POSE,
+    SENSE_ESTIMATE,
+    SENSE_MODEL,
+    SENSE_STATE,
+    STATE,
+)
+from penumbra.shared.geometry import so3
+from penumbra.shared.native import inner, kernel
+
+
+class Entries(NamedTuple):
+    """The history of one target: as `records.History`, without the first dimension."""
+
+    measurements: Any
+    states: Any
+    senses: Any
+    P: Any
+    ring: Any
+
+
+@inner
+def clear(history):  # type: ignore[no-untyped-def]
+    """Makes a history of one entry without any information, older than every measurement."""
+    history.ring[0], history.ring[1] = 0, 1
+    first = history.measurements[0]
+    first.stamp_ns, first.source = NEVER, -1
+    forget(State(history.states[0], history.senses[0], history.P[0]))
+
+
+@inner
+def insert(model, history, m, PHt):  # type: ignore[no-untyped-def]
+    """Takes a measurement: ACCEPTED or GATED, LATE (older than the history: not applied) or DUPLICATE (not applied). Where
+    the ring is full, its oldest entry is dropped, though it is within the horizon."""
+    measurements, ring = history.measurements, history.ring
+    size, horizon_ns = len(measurements), np.int64(model.one.horizon * 1e9)
+    at = ring[1]  # where it belongs: seldom far from the end
+    while at > 0 and _is_after(measurements[(ring[0] + at - 1) % size], m):
+        at -= 1
+    newest_ns = measurements[(ring[0] + ring[1] - 1) % size].stamp_ns
+    if at == 0 or m.stamp_ns < newest_ns - horizon_ns:
+        return LATE
+    if not _is_after(m, measurements[(ring[0] + at - 1) % size]):
+        return DUPLICATE
+    if ring[1] == size:
+        if at == 1:
+            return LATE
+        _drop_first(ring, size)
+        at -= 1
+    for j in range(ring[1], at, -1):
+        measurements[(ring[0] + j) % size] = measurements[(ring[0] + j - 1) % size]
+    measurements[(ring[0] + at) % size] = m
+    ring[1] += 1
+    for j in range(at, ring[1]):
+        slot = (ring[0] + j) % size
+        _copy_state(history, (ring[0] + j - 1) % size, slot)
+        step(model, State(history.states[slot], history.senses[slot], history.P[slot]), measurements[slot], PHt)
+    passed = history.states[(ring[0] + at) % size].passed
+    newest_ns = max(newest_ns, m.stamp_ns)
+    while ring[1] > 1 and measurements[(ring[0] + 1) % size].stamp_ns < newest_ns - horizon_ns:
+        _drop_first(ring, size)
+    return ACCEPTED if passed else GATED
+
+
+@inner
+def _copy_state(history, source, slot):  # type: ignore[no-untyped-def]
+    history.states[slot] = history.states[source]
+    for s in range(history.senses.shape[1]):
+        history.senses[slot, s] = history.senses[source, s]
+    so3.copy(history.P[source], history.P[slot])
+
+
+@inner
+def find(history, stamp_ns):  # type: ignore[no-untyped-def]
+    """The slot of the state after the newest measurement not after `stamp_ns`; of the oldest one with information, if all are
+    later."""
+    states, ring = history.states, history.ring
+    size, at = len(states), ring[1] - 1
+    while at > 0 and states[(ring[0] + at) % size].stamp_ns > stamp_ns:
+        at -= 1
+    if at == 0 and ring[1] > 1 and states[ring[0]].stamp_ns == NEVER:
+        at = 1
+    return (ring[0] + at) % size
+
+
+@inner
+def _is_after(a, b):  # type: ignore[no-untyped-def]
+    """Whether a measurement comes after another: by stamp, source, and position, as of two cameras that expose together."""
+    if a.stamp_ns != b.stamp_ns:
+        return a.stamp_ns > b.stamp_ns
+    if a.source != b.source:
+        return a.source > b.source
+    for i in range(3):
+        if a.p[i] != b.p[i]:
+            return a.p[i] > b.p[i]
+    return False
+
+
+@inner
+def _drop_first(ring, size):  # type: ignore[no-untyped-def]
+    ring[0] = (ring[0] + 1) % size
+    ring[1] -= 1
+
+
+@kernel(
+    "out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], out i8[t, 2]",
+    MEASUREMENT=MEASUREMENT,
+    STATE=STATE,
+    SENSE_STATE=SENSE_STATE,
+)
+def clear_all(measurements, states, senses, P, rings):  # type: ignore[no-untyped-def]
+    """Clears the histories of all targets."""
+    for i in range(len(rings)):
+        clear(Entries(measurements[i], states[i], senses[i], P[i], rings[i]))
+
+
+@kernel(
+    "MODEL[t], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], out i8[t, 2], "
+    "i8, i8, f8[4, 4], f8[6], f8[6, 6], SENSE_ESTIMATE[n]",
+    MODEL=MODEL,
+    MEASUREMENT=MEASUREMENT,
+    STATE=STATE,
+    SENSE_STATE=SENSE_STATE,
+    SENSE_ESTIMATE=SENSE_ESTIMATE,
+)
+def adopt(models, measurements, states, senses, P, rings, target, stamp_ns, T, velocity, covariance, known):  # type: ignore[no-untyped-def]
+    """Makes a history of one entry: a pose T (4, 4) at a stamp, with velocity (6,), the pose's covariance (6, 6), and what is
+    known of the senses. The velocity may be off by as much as one that is unknown."""
+    history = Entries(measurements[target], states[target], senses[target], P[target], rings[target])
+    clear(history)
+    state = State(history.states[0], history.senses[0], history.P[0])
+    now, first = state.now, history.measurements[0]
+    first.stamp_ns = now.stamp_ns = stamp_ns
+    for i in range(3):
+        now.p[i] = T[i, 3]
+    so3.copy(T, now.R)
+    so3.orthonormalise(now.R)
+    spread(models[target], state, covariance)
+    for i in range(POSE):
+        now.velocity[i] = velocity[i]
+    for s in range(len(known)):
+        sense = state.senses[s]
+        sense.accepted_ns, sense.gain = known[s].accepted_ns, known[s].weight
+        now.accepted_ns = max(now.accepted_ns, known[s].accepted_ns)
+
+
+@kernel(
+    "MODEL[t], SENSE_MODEL[n], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], "
+    "out i8[t, 2], i8[m], i8[m], i8[m], f8[m, 4, 4], f8[m, 6, 6], i8, out i8[m], out MEASUREMENT[1], out f8[size, 6]",
+    MODEL=MODEL,
+    SENSE_MODEL=SENSE_MODEL,
+    MEASUREMENT=MEASUREMENT,
+    STATE=STATE,
+    SENSE_STATE=SENSE_STATE,
+)
+def measure_all(
+    models, sense_models, measurements, states, senses, P, rings,
+    targets, sources, stamps_ns, T, information, latest_ns, fates, taken, PHt,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """`Bank.measure`, one after the other. taken, PHt : memory for the measurement under way, and for `step`."""
+    m = taken[0]
+    for r in range(len(targets)):
+        i = targets[r]
+        fates[r] = fault(stamps_ns[r], T[r], information[r], latest_ns)
+        if fates[r] == 0:
+            model = Model(models[i], sense_models)
+            reduce(model, sources[r], stamps_ns[r], T[r], information[r], m)
+            history = Entries(measurements[i], states[i], senses[i], P[i], rings[i])
+            fates[r] = insert(model, history, m, PHt) if m.rank else NOTHING
+
+
+@kernel(
+    "MODEL[t], MEASUREMENT[t, c], STATE[t, c], SENSE_STATE[t, c, n], f8[t, c, size, size], i8[t, 2], i8, "
+    "out ESTIMATE[t], out SENSE_ESTIMATE[t, n]",
+    MODEL=MODEL,
+    MEASUREMENT=MEASUREMENT,
+    STATE=STATE,
+    SENSE_STATE=SENSE_STATE,
+    ESTIMATE=ESTIMATE,
+    SENSE_ESTIMATE=SENSE_ESTIMATE,
+)
+def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, shares):  # type: ignore[no-untyped-def]
+    """`Bank.estimate`, one after the other."""
+    p, R, velocity, covariance = np.empty(3), np.empty((3, 3)), np.empty(POSE), np.empty((MOTION, MOTION))
+    for n in range(len(out)):
+        history = Entries(measurements[n], states[n], senses[n], P[n], rings[n])
+        one, slot, found = models[n], find(history, stamp_ns), out[n]
+        now, of_senses = states[n, slot], senses[n, slot]
+        if now.stamp_ns == NEVER:
+            for i in range(3):
+                p[i] = one.home[i, 3]
+            so3.copy(one.home, R)
+            for i in range(POSE):
+                velocity[i] = 0.0
+                for j in range(POSE):
+                    covariance[i, j] = one.home_covariance[i, j]
+            found.state = LOST
+        else:
+            for i in range(3):
+                p[i] = now.p[i]
+            so3.copy(now.R, R)
+            so3.copy(P[n, slot], covariance)
+            for i in range(POSE):
+                velocity[i] = now.velocity[i]
+            dt = max(0.0, (stamp_ns - now.stamp_ns) * 1e-9)
+            move(one, dt, p, R, velocity, covariance, now.agility)
+            found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)
+        for i in range(3):
+            for j in range(3):
+                found.pose[i, j] = R[i, j]
+            found.pose[i, 3], found.pose[3, i] = p[i], 0.0
+        found.pose[3, 3] = 1.0
+        so3.copy(covariance, found.covariance)
+        total = 0.0
+        for i in range(POSE):
+            found.velocity[i] = velocity[i]
+        for s in range(len(of_senses)):
+            total += of_senses[s].gain
+        for s in range(len(of_senses)):
+            share = shares[n, s]
+            share.accepted_ns = of_senses[s].accepted_ns
+            share.weight = of_senses[s].gain / total if total > 0.0 else 0.0
