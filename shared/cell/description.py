@@ -277,7 +277,7 @@ class PadType(_Model):
 class SensingBoard(_Model):
     """A sensing board of a pad."""
 
-    port: str | None = Field(default=None, description="its serial port; without it, `penumbra skin --port` names it")
+    port: str | None = Field(default=None, description="its serial port; without it, `penumbra skin --device` names it")
     channels: Annotated[dict[Name, tuple[Annotated[Whole, Field(ge=0, le=5)], ...]], Field(min_length=1)] = Field(
         description="which of its six channels, 0 to 5, measure which electrode"
     )
