@@ -29,7 +29,7 @@ test-network:
 docs:
     python docs/messages.py
     python -m penumbra.shared.cell.reference docs/own-cell.md
-    mkdocs build --strict --quiet
+    NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
 
 # build and run the images; needs a Docker engine
 containers:

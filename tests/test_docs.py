@@ -54,6 +54,11 @@ def test_every_page_is_in_the_menu_of_the_site():
     assert not {page for page in pages if f"- {page}\n" not in menu}
 
 
+def test_every_name_of_the_client_is_on_its_page_of_the_api():
+    shown = re.findall(r"^::: penumbra\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    assert sorted(shown) == sorted(penumbra.__all__)
+
+
 def test_the_page_of_messages_is_that_of_the_tables():
     written = runpy.run_path(str(ROOT / "docs" / "messages.py"))
     assert (ROOT / "docs" / "messages.md").read_text() == written["page"](), "run `just docs`"

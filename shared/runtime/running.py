@@ -14,7 +14,14 @@ ANSWER_S = 1.0
 
 @dataclass(frozen=True)
 class Instance:
-    """One running instance: its status (ok, starting, degraded or down, as `shared.runtime.health` has them) and the reasons."""
+    """One running process of a cell.
+
+    Attributes:
+        service: Its name, such as `fusion`.
+        instance: Tells replicas of a service apart.
+        status: `ok`, `starting`, `degraded` or `down`.
+        reasons: Why, where it is not `ok`.
+    """
 
     service: str
     instance: str
