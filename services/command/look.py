@@ -18,14 +18,15 @@ import zenoh
 from click.shell_completion import CompletionItem
 
 from penumbra.services import flags
-from penumbra.services.launcher import runs
-from penumbra.shared.cell import description as cells
+from penumbra.shared.cell import names
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.report import TopicReport
 from penumbra.shared.runtime import bus, running
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from penumbra.shared.cell.description import Cell
 
 PATIENCE_S = 1.0
 """How long a command waits for the router before it says that there is none."""
@@ -58,8 +59,8 @@ def pose(options: flags.Options) -> int:
     """0, or 3 where the pose is lost."""
     if options.watch and options.wait is not None:
         flags.refuse("expected --watch or --wait, got both")
-    cell = cells.load(options.cell)
-    target = cell.one("targets", options.target)
+    cell = names.read(options.cell)
+    target = cell.target(options.target)
     patience_s = PATIENCE_S if options.wait is None else options.wait
     deadline = time.monotonic() + (options.wait or 0.0)
     with open_session(bus.connection(options), patience_s) as session:
@@ -114,7 +115,7 @@ def _describe(pose: dict[str, Any]) -> str:
 
 
 def _row(values: list[float], scale: float, spec: str, unit: str, spread: float | None = None) -> str:
-    text = " ".join(format(value * scale, spec) for value in values)
+    text = " ".join(format(value * scale, f"z{spec}") for value in values)
     return f"{text} {unit}" + ("" if spread is None else f"  +- {spread * scale:.2g} {unit}")
 
 
@@ -136,7 +137,9 @@ def list_topics(options: flags.Options) -> None:
 
 def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.TOPICS) -> None:
     """Prints the topics that are known, or what arrives of them."""
-    cell = cells.load(options.cell)
+    from penumbra.shared.cell import description
+
+    cell = description.load(options.cell)
     if options.hz:
         received, instances = listen(cell, bus.connection(options), options.seconds, known)
         if options.json:
@@ -160,11 +163,11 @@ def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.T
     _console().print(table)
 
 
-def keys(topic: topics.Topic, cell: cells.Cell) -> list[str]:
+def keys(topic: topics.Topic, cell: Cell) -> list[str]:
     """The keys of a topic in a cell; none where the cell has no such part."""
-    names = [name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell"]
-    parts = itertools.product(*(getattr(cell, f"{name}s") for name in names))
-    return [topic.at(cell=cell.name, **dict(zip(names, part, strict=True))) for part in parts]
+    fields = [name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell"]
+    parts = itertools.product(*(getattr(cell, f"{name}s") for name in fields))
+    return [topic.at(cell=cell.name, **dict(zip(fields, part, strict=True))) for part in parts]
 
 
 def _described(key: str, topic: topics.Topic) -> dict[str, Any]:
@@ -212,7 +215,7 @@ def _console() -> Console:
 
 
 def listen(
-    cell: cells.Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic]
+    cell: Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic]
 ) -> tuple[dict[str, TopicReport], list[running.Instance]]:
     """The counters of every key of the topics that are known after listening for a while, and how the cell's processes fare."""
     from penumbra.shared.runtime.node import Node
@@ -238,6 +241,8 @@ def listen(
 )
 def list_cells(options: flags.Options) -> None:
     """Prints a row per router."""
+    from penumbra.services.launcher import runs
+
     asked = bus.connection(options)
     found = dict.fromkeys(asked.connect or (asked.default,), asked)
     found |= {at: replace(asked, connect=(at,), secure=Path(run.secure) if run.secure else None)
@@ -279,7 +284,7 @@ def list_cells(options: flags.Options) -> None:
 )
 def sim(options: flags.Options) -> None:
     """Passes the command on: what is possible is decided by the emulator."""
-    cell = cells.load(options.cell)
+    cell = names.read(options.cell)
     request = {"command": options.action} | ({"value": " ".join(options.value)} if options.value else {})
     with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:
         answers = bus.ask(session, topics.control(cell.name), payload=json.dumps(request).encode())

@@ -17,15 +17,18 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from penumbra.shared.body import urdf
-from penumbra.shared.cell import document
+from penumbra.shared.cell import document, names
 from penumbra.shared.cell.document import Document
+from penumbra.shared.cell.explain import explain
 from penumbra.shared.cell.faults import CellError as CellError  # every reader of a cell file catches it from here
-from penumbra.shared.cell.faults import Fault, Faulty, explain, meant, refuse
+from penumbra.shared.cell.faults import Fault, Faulty, meant, refuse
+from penumbra.shared.cell.names import BUILT_IN as BUILT_IN
+from penumbra.shared.cell.names import NAME, is_file
+from penumbra.shared.cell.names import source as source
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.lens import COEFFICIENTS, Lens
 
-BUILT_IN = Path(__file__).parent / "built_in"
 FAULTS = 20
 """Maximum number of faults in the text of an error."""
 SAME = 1e-6
@@ -52,7 +55,7 @@ Length = Annotated[Number, Field(gt=0, le=1)]
 """A length on a pad [m]; what is larger is in millimetres."""
 Measure = Annotated[Number, Field(ge=0.02, le=3)]
 """A measure of a person [m]."""
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Name = Annotated[str, Field(pattern=NAME)]
 
 
 class _Model(BaseModel):
@@ -529,12 +532,7 @@ class Cell(_Model):
 
     def one(self, kind: Literal["cameras", "robots", "pads", "targets"], name: str | None) -> str:
         """The name of a camera, robot, pad or target, checked; None means the first one. Raises CellError."""
-        known = getattr(self, kind)
-        if name is None and known:
-            return str(next(iter(known)))
-        if name not in known:
-            raise CellError(f"cell {self.name} has no {kind[:-1]} {name!r}: it has {', '.join(known) or 'none'}")
-        return str(name)
+        return names.one(self.name, kind[:-1], getattr(self, kind), name)
 
 
 def _bound_faults(sim: Sim, limits: Sequence[tuple[str, float, float]]) -> list[tuple[str, str]]:
@@ -555,17 +553,6 @@ def _bound_faults(sim: Sim, limits: Sequence[tuple[str, float, float]]) -> list[
                 what = f"expected a bound of {joint} within its limits in the URDF, {lower:g} to {upper:g}, got {value:g}"
                 faults.append((f"sim.joints_{side}.{k}", what))
     return faults
-
-
-def source(cell: str | Path) -> Path:
-    """The YAML file of a built-in name (`table`, `arm`) or path. Raises CellError where there is none."""
-    path = BUILT_IN / f"{cell}.yaml"
-    if not is_file(path):
-        path = Path(cell)
-    if not is_file(path):
-        built_in = ", ".join(sorted(p.stem for p in BUILT_IN.glob("*.yaml")))
-        raise CellError(f"no cell {str(cell)!r}: give one of {built_in}, or the path of a YAML file")
-    return path
 
 
 @dataclass(frozen=True)
@@ -612,11 +599,3 @@ def urdf_path(robot: Robot, folder: Path) -> Path:
         if is_file(path):
             return path
     raise CellError(f"no file {folder / robot.urdf}: give a URDF beside the cell file, or the built-in panda/panda.urdf")
-
-
-def is_file(path: Path) -> bool:
-    """Whether a file is there; none is where the name cannot be one."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
