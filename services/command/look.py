@@ -232,8 +232,9 @@ def listen(
 
 @flags.command(
     "ls",
-    "Lists routers and the cells on them: those of this machine's `penumbra up`, the one that --connect or $PENUMBRA_CONNECT "
-    "names (by default that of this machine), and those on the network whose Zenoh configuration enables scouting.",
+    "Lists routers and the cells on them: the router that --connect or $PENUMBRA_CONNECT names (default: that of this machine), "
+    "those of this machine's `penumbra up`, and on other hosts those that run with `penumbra router --announce`. A router also "
+    "lists the cells on the routers that it is linked to.",
     flags.Option("--seconds", type=flags.above_zero, default=0.5, help="how long to wait for answers from the network"),
     flags.JSON,
     *flags.BUS,
@@ -244,26 +245,47 @@ def list_cells(options: flags.Options) -> None:
     from penumbra.services.launcher import runs
 
     asked = bus.connection(options)
-    found = dict.fromkeys(asked.connect or (asked.default,), asked)
-    found |= {at: replace(asked, connect=(at,), secure=Path(run.secure) if run.secure else None)
-              for run in runs.running() for at in run.connect}  # fmt: skip
-    scout = zenoh.scout(what="router", config=zenoh.Config())
-    time.sleep(options.seconds)
-    while (each := scout.try_recv()) is not None:
-        found |= {str(at): replace(asked, connect=(str(at),)) for at in each.locators if str(at) not in found}
-    scout.stop()
-    rows = []
-    for at, connection in found.items():
-        try:
-            with open_session(replace(connection, connect=(at,)), 0.0) as session:
-                rows.append({"router": at, "cells": running.cells_there(session), "why": ""})
-        except bus.BusError as error:
-            rows.append({"router": at, "cells": [], "why": str(error)})
+    guess = None if asked.connect else replace(asked, connect=(asked.default,))
+    places = [guess] if guess else [replace(asked, connect=(at,)) for at in asked.connect]
+    places += [replace(asked, connect=run.connect, secure=Path(run.secure) if run.secure else None) for run in runs.running()]
+    places += [replace(asked, connect=found) for found in _announced(options.seconds)]
+    known: set[str] = set()
+    rows = [row for place in places for row in _rows(place, PATIENCE_S if place is not guess else 0.0, known)]
+    if guess and any(not row["why"] for row in rows):  # that there is none at the default is no news then
+        rows = [row for row in rows if not (row["why"] and row["router"] == asked.default)]
     if options.json:
         print(json.dumps(rows))
         return
     for row in rows:
         print(row["why"] or f"{row['router']}: {', '.join(row['cells']) or 'no cell'}")
+
+
+def _announced(seconds: float) -> list[tuple[str, ...]]:
+    """The endpoints of each router that answers on the network within a time."""
+    scout = zenoh.scout(what="router", config=zenoh.Config())
+    time.sleep(seconds)
+    found = {}
+    while (each := scout.try_recv()) is not None:
+        found[str(each.zid)] = tuple(map(str, each.locators))
+    scout.stop()
+    return list(found.values())
+
+
+def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dict[str, Any]]:
+    """The router at the first of several endpoints that opens, and its cells; nothing where the router is known already, which it
+    then is. Where none opens, why the first one does not."""
+    reasons = []
+    for at in place.connect:
+        try:
+            with open_session(replace(place, connect=(at,)), patience_s) as session:
+                routers = {str(each) for each in session.info.routers_zid()}
+                if routers & known:
+                    return []
+                known |= routers
+                return [{"router": at, "cells": running.cells_there(session), "why": ""}]
+        except bus.BusError as error:
+            reasons.append(str(error))
+    return [{"router": place.connect[0], "cells": [], "why": reasons[0]}] if reasons else []
 
 
 @flags.command(

@@ -356,6 +356,10 @@ class Node:
         """Has a router send little over some of its links; before it is open."""
         self._link.connection = replace(self.connection, slow=slow)
 
+    def announce(self) -> None:
+        """Has a router answer those that look for one on the network; before it is open."""
+        self._link.connection = replace(self.connection, is_announced=True)
+
     def report(self) -> Report:
         """What this instance is and how it fares."""
         self._streams.drain()
