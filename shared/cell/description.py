@@ -26,11 +26,14 @@ from penumbra.shared.cell.names import BUILT_IN as BUILT_IN
 from penumbra.shared.cell.names import NAME, is_file
 from penumbra.shared.cell.names import source as source
 from penumbra.shared.contract.labels import Label
+from penumbra.shared.contract.messages import Frame
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.lens import COEFFICIENTS, Lens
 
 FAULTS = 20
 """Maximum number of faults in the text of an error."""
+MOST_PIXELS = Frame.MAX_BYTES // 3 - 1000
+"""Of a picture in three colours, with room for the rest of its message."""
 SAME = 1e-6
 """Points nearer to each other than this [m] are one."""
 
@@ -112,6 +115,9 @@ class Camera(_Model):
     @model_validator(mode="after")
     def _possible(self) -> Camera:
         faults = self.lens.faults()
+        if (count := self.width * self.height) > MOST_PIXELS:
+            what = f"expected at most {MOST_PIXELS} pixels, which is what a message may carry, got {count}"
+            faults.append(("width", f"{what}; publish smaller pictures, and scale fx, fy, cx and cy as well"))
         if (self.look_at is None) == (self.rpy is None):
             got = "neither" if self.rpy is None else "both"
             faults.append(("rpy" if self.rpy else "", f"expected either look_at or rpy, got {got}; give one of them"))
@@ -391,7 +397,7 @@ class Motion(_Model):
     high: Vector3 = Field(description="upper bounds of x, y, z [m]")
     rpy_low: Angles3 = Field(description="lower bounds of roll, pitch, yaw [rad]")
     rpy_high: Angles3 = Field(description="upper bounds of roll, pitch, yaw [rad]")
-    speed: Annotated[Number, Field(gt=0, le=10)] = Field(default=0.25, description="mean speed of a reach [m/s]")
+    speed: Annotated[Number, Field(ge=0.01, le=10)] = Field(default=0.25, description="mean speed of a reach [m/s]")
 
     @model_validator(mode="after")
     def _ordered(self) -> Motion:

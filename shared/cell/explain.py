@@ -60,7 +60,7 @@ def _reason(model: type[BaseModel], location: list[str], error: Any) -> str:
         case "string_type":
             return f"expected a text, got {got}; put it in quotes"
         case "string_pattern_mismatch":
-            return f"expected a name of letters, digits, _ and -, got {got}; rename it"
+            return f"expected a name of at most 64 letters, digits, _ and -, got {got}; rename it"
         case "literal_error":
             known = [str(value) for value in _values(_annotation(model, location))]
             return f"expected one of {', '.join(known)}, got {got}{meant(str(error.get('input')), known)}"

@@ -12,8 +12,8 @@ from penumbra.shared.cell import document
 from penumbra.shared.cell.faults import CellError
 
 BUILT_IN = Path(__file__).parent / "built_in"
-NAME = r"^[A-Za-z0-9_-]+$"
-"""What a name in a cell file may be: it becomes a part of keys."""
+NAME = r"^[A-Za-z0-9_-]{1,64}$"
+"""What a name in a cell file may be: it becomes a part of keys and of files' names."""
 
 
 @dataclass(frozen=True)
