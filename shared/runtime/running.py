@@ -59,5 +59,5 @@ def whats_there(session: zenoh.Session, cell: str, service: str) -> str:
         return f"its processes are {', '.join(running)}: start `penumbra {service}`"
     others = cells_there(session)
     if others:
-        return f"no process of it is on this router, where cells run: {', '.join(others)}; give --cell {others[0]}"
+        return f"no process of it is on this router, where cells run: {', '.join(others)}; give --cell {others[0]}, or its file"
     return "no process of any cell is on this router: start `penumbra up`"
