@@ -217,7 +217,7 @@ def _line(text: str, style: str = "") -> Text:
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[Text]], width: int) -> Table:
     """Names and numbers keep their width; the last column takes what is left of `width`, and is cut."""
-    table = Table(box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # one column between two, as is counted below
     left = width
     for k, name in enumerate(columns):
         needed = max([len(name), *(len(row[k]) for row in rows)])
