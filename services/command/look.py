@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import shutil
 import string
 import sys
 import threading
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 PATIENCE_S = 1.0
 """How long a command waits for the router before it says that there is none."""
 WATCH_S = 0.1
+WIDE = 72
+"""Columns that a pose in words takes."""
 LOST = 3
 """Exit code of a lost pose."""
 ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "state")
@@ -90,14 +93,19 @@ def _ask_pose(session: zenoh.Session, cell: str, target: str) -> dict[str, Any]:
 
 
 def _print_pose(found: dict[str, Any], options: flags.Options) -> None:
-    text = json.dumps(found) if options.json else _describe(found)
-    if options.watch and not options.json and sys.stdout.isatty():
-        text = "\x1b[H\x1b[J" + text
-    print(text, flush=True)
+    if options.json:
+        print(json.dumps(found), flush=True)
+    elif sys.stdout.isatty():
+        text = describe(found, shutil.get_terminal_size().columns)
+        # each line is written over the one before, and what is left of that erased: erased first, it would flicker
+        print("\x1b[H" + text.replace("\n", "\x1b[K\n") + "\x1b[K\n\x1b[J" if options.watch else text, flush=True)
+    else:
+        print(describe(found), flush=True)
 
 
-def _describe(pose: dict[str, Any]) -> str:
-    """The answer to the pose query in words and everyday units."""
+def describe(pose: dict[str, Any], columns: int = WIDE) -> str:
+    """The answer to the pose query in words and everyday units. columns: of the terminal; below WIDE, names have lines of their
+    own."""
     spread = [math.sqrt(max(0.0, pose["covariance"][i][i])) for i in range(6)]
     age_ms = (time.time_ns() - pose["stamp_ns"]) * 1e-6
     senses = [
@@ -111,7 +119,9 @@ def _describe(pose: dict[str, Any]) -> str:
         "velocity": _row(pose["velocity"][:3], 100, "8.1f", "cm/s"),
         "senses": ", ".join(senses) or "none received",
     }
-    return "\n".join(f"{name:15} {text}" for name, text in rows.items())
+    if columns >= WIDE:
+        return "\n".join(f"{name:15} {text}" for name, text in rows.items())
+    return "\n".join(f"{name}\n  " + text.strip().replace(", ", "\n  ") for name, text in rows.items())
 
 
 def _row(values: list[float], scale: float, spec: str, unit: str, spread: float | None = None) -> str:

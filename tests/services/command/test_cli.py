@@ -15,7 +15,7 @@ import click
 import pytest
 
 from penumbra.services import flags, progress
-from penumbra.services.command import cli, doctor
+from penumbra.services.command import cli, doctor, look
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import processes, topics
 from penumbra.shared.runtime import bus
@@ -254,6 +254,14 @@ def test_pose_prints_the_pose_in_words(endpoint, capsys):
     assert "tracking, in frame world" in out
     assert "0.00     0.00    20.00 cm  +- 1 cm" in out
     assert "haptic 30 % (10 ms old), vision 70 % (50 ms old)" in out
+
+
+@pytest.mark.parametrize("columns", [40, 71, 80])
+def test_a_pose_in_words_fits_the_terminal(columns):
+    text = look.describe(json.loads(pose_json()), columns)
+    assert max(map(len, text.splitlines())) <= columns
+    for word in ("forearm", "tracking", "20.00 cm", "roll pitch yaw", "velocity", "haptic 30 %", "vision 70 %"):
+        assert word in text
 
 
 def test_pose_as_json_is_exactly_what_fusion_answers(endpoint, capsys):
