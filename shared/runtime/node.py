@@ -193,7 +193,11 @@ class Node:
             while not self.is_warm() and time.monotonic() - began < (WARM_UP_S if self.replicas.others else NEWS_S):
                 if self.stopping.wait(0.02):
                     return
-            self.replicas.join(session)
+            try:
+                self.replicas.join(session)
+            except zenoh.ZError:  # the session was closed just now
+                if not self.stopping.is_set():
+                    raise
 
         if not self.is_warm():
             self._link.spawn(warm_up, "warm up")
