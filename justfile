@@ -29,7 +29,7 @@ test-network:
 docs:
     python docs/messages.py
     python -m penumbra.shared.cell.reference docs/own-cell.md
-    mkdocs build --strict --quiet
+    NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
 
 # the tables of docs/results, from the benchmarks' JSON in docs/results/data
 results:
@@ -47,6 +47,7 @@ kernels:
 kubernetes:
     python docker/kubernetes/generate.py
 
-# the tested set of versions
-lock:
-    uv pip compile --quiet --universal --python-version 3.11 --extra all --extra test --extra docs pyproject.toml -o requirements.lock
+# requirements.lock, the tested set of versions; `just lock --upgrade` takes the newest ones
+lock *arguments:
+    uv pip compile --quiet --universal --python-version 3.11 --all-extras --no-emit-index-url --no-emit-find-links \
+        --custom-compile-command "just lock" {{arguments}} pyproject.toml -o requirements.lock

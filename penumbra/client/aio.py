@@ -37,14 +37,14 @@ class AsyncPoses(Subscription):
                     changed = asyncio.Event()
                     sample = self._slot.take(partial(_call, loop, changed.set))
                     if sample is not None:
-                        if (pose := self.pose_of(sample)) is not None:
+                        if (pose := self._pose_of(sample)) is not None:
                             return pose
                     elif self._slot.is_closed:
                         raise StopAsyncIteration
                     else:
                         await changed.wait()
         except TimeoutError:
-            raise self.silence() from None
+            raise self._silence() from None
 
     async def __aenter__(self) -> Self:
         return self
@@ -54,7 +54,8 @@ class AsyncPoses(Subscription):
 
 
 class AsyncCell(CellBase):
-    """A running cell, of `penumbra.aconnect`, for one event loop. Publishing does not block and is as in `Cell`."""
+    """A running cell, as `penumbra.aconnect` gives it, for one event loop. What is not listed is as in `Cell`: names, and
+    sensors, whose publishing does not block."""
 
     def poses(self, target: str | None = None, *, timeout: float | None = None) -> AsyncPoses:
         """As `Cell.poses`, for `async for`."""
@@ -63,15 +64,15 @@ class AsyncCell(CellBase):
 
     async def pose(self, *, at: int | None = None, target: str | None = None, timeout: float = 1.0) -> Pose:
         """As `Cell.pose`."""
-        return await asyncio.to_thread(self.ask_pose, at, target, timeout)
+        return await asyncio.to_thread(self._ask_pose, at, target, timeout)
 
     async def health(self) -> tuple[running.Instance, ...]:
         """As `Cell.health`."""
-        return await asyncio.to_thread(self.ask_health)
+        return await asyncio.to_thread(self._ask_health)
 
     async def close(self) -> None:
         """As `Cell.close`."""
-        await asyncio.to_thread(self.leave)
+        await asyncio.to_thread(self._leave)
 
 
 @asynccontextmanager

@@ -28,7 +28,8 @@ Sensor = TypeVar("Sensor", Camera, Robot, Pad)
 
 
 class CellBase:
-    """What `Cell` and `AsyncCell` share. session: to read with. connection: how it was opened. outline: what is in the cell.
+    """What `Cell` and `AsyncCell` have in common. session: to read with. connection: how it was opened. outline: what is in the
+    cell.
 
     Sensors publish in a second session, which the first message opens: on a secured bus it shows the certificate of a driver, and
     its shared memory has room for the cameras' images. A program that only reads needs neither.
@@ -90,15 +91,27 @@ class CellBase:
         return tuple(self._pads)
 
     def camera(self, name: str) -> Camera:
-        """A camera, to publish its images. Raises LookupError for a name that the cell does not have."""
+        """A camera, to publish its images.
+
+        Raises:
+            LookupError: The cell has no camera of this name.
+        """
         return self._one("camera", self._cameras, name)
 
     def robot(self, name: str) -> Robot:
-        """A robot, to publish its joint angles. Raises LookupError for a name that the cell does not have."""
+        """A robot, to publish its joint angles.
+
+        Raises:
+            LookupError: The cell has no robot of this name.
+        """
         return self._one("robot", self._robots, name)
 
     def pad(self, name: str) -> Pad:
-        """A pad, to publish its voltages. Raises LookupError for a name that the cell does not have."""
+        """A pad, to publish its voltages.
+
+        Raises:
+            LookupError: The cell has no pad of this name.
+        """
         return self._one("pad", self._pads, name)
 
     def __repr__(self) -> str:
@@ -140,7 +153,7 @@ class CellBase:
             return f"the router at {self._connection.where} does not answer; poses go on when it is back"
         return f"nobody publishes it in cell {self.name}: is `penumbra fusion` running?"
 
-    def ask_pose(self, at: int | None, target: str | None, timeout: float) -> Pose:
+    def _ask_pose(self, at: int | None, target: str | None, timeout: float) -> Pose:
         name = self._target(target)
         parameters = "" if at is None else f"stamp_ns={at}"
         answers = bus.ask(self._session, topics.current_pose(self.name, name), parameters, timeout_s=timeout)
@@ -148,10 +161,10 @@ class CellBase:
             raise TimeoutError(f"no pose of {name} within {timeout:g} s: {self._why_silent()}")
         return Pose.of(decode(FusedPose, answers[0]))
 
-    def ask_health(self) -> tuple[running.Instance, ...]:
+    def _ask_health(self) -> tuple[running.Instance, ...]:
         return tuple(running.ask(self._session, self.name))
 
-    def leave(self) -> None:
+    def _leave(self) -> None:
         self._closing.set()
         self._session.close()
         with self._opening:
@@ -163,33 +176,43 @@ class Cell(CellBase):
     """A running cell, as `penumbra.connect` returns it. Threads may share it, but not one sensor or one iterator over poses."""
 
     def poses(self, target: str | None = None, *, timeout: float | None = None) -> Poses:
-        """Iterates over the poses of a target (default: the cell's first). Each is the newest at the moment it is taken: fusion
-        publishes 200 a second, and a slow reader skips some. There are poses also while the target is lost; see their `state`.
+        """Iterates over the poses of a target. Each is the newest at the moment it is taken: fusion publishes 200 a second, and a
+        slow reader skips some. There are poses also while the target is lost; see their `state`. When the router or fusion ends
+        and starts again, the poses resume.
 
-        timeout: how long to wait for a pose [s]; then TimeoutError says why there is none. None waits without end. When the
-        router or fusion ends and starts again, the poses resume. Raises LookupError for a target that the cell does not have.
+        Args:
+            target: Its name. Default: the cell's first.
+            timeout: How long to wait for each pose [s]; then the iterator raises TimeoutError, which says why there is none. None
+                waits without end.
+
+        Raises:
+            LookupError: The cell has no target of this name.
         """
         name = self._target(target)
         return Poses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
 
     def pose(self, *, at: int | None = None, target: str | None = None, timeout: float = 1.0) -> Pose:
-        """The pose of a target (default: the cell's first), asked of fusion.
+        """Asks fusion for the pose of a target. The answer uses all measurements that fusion has received so far.
 
-        at: a moment of about the last second [ns since the epoch], such as the stamp of an image; None: now. The answer uses all
-        measurements that fusion has received so far. timeout: how long to wait for it [s].
+        Args:
+            at: A moment of about the last second [ns since the epoch], such as the stamp of an image. None: now.
+            target: Its name. Default: the cell's first.
+            timeout: How long to wait for the answer [s].
 
-        Raises TimeoutError where nobody answers, LookupError for a target that the cell does not have, and ValueError for a
-        moment outside of fusion's history.
+        Raises:
+            TimeoutError: Nobody answered; the text says why.
+            LookupError: The cell has no target of this name.
+            ValueError: The moment is outside of fusion's history.
         """
-        return self.ask_pose(at, target, timeout)
+        return self._ask_pose(at, target, timeout)
 
     def health(self) -> tuple[running.Instance, ...]:
         """The state of each process of the cell: `service`, `instance`, `status` (ok, starting, degraded or down), `reasons`."""
-        return self.ask_health()
+        return self._ask_health()
 
     def close(self) -> None:
         """Leaves the bus; loops over poses end."""
-        self.leave()
+        self._leave()
 
     def __enter__(self) -> Self:
         return self

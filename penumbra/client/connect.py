@@ -34,13 +34,17 @@ def connect(
 ) -> Cell:
     """Connects to a running cell; use it in `with`.
 
-    cell: name of the cell, or its YAML file. Default: $PENUMBRA_CELL, else the only cell that runs at the router.
-    endpoint: of the router, as tcp/192.168.0.7:7447; several are separated by spaces. Default: $PENUMBRA_CONNECT, else this
-    machine.
-    secure: folder of certificates of `penumbra certs`; needs `ca`, `viewer` and, to publish, `driver`. Default: $PENUMBRA_SECURE.
-    timeout: how long to wait for the router and the cell [s]. A program that starts with the machine may use `math.inf`.
+    Args:
+        cell: Name of the cell, or its YAML file. Default: `$PENUMBRA_CELL`, else the only cell that runs at the router.
+        endpoint: Of the router, as `tcp/192.168.0.7:7447`; several are separated by spaces. Default: `$PENUMBRA_CONNECT`, else
+            this machine.
+        secure: Folder of certificates of `penumbra certs`; needs `ca`, `viewer` and, to publish, `driver`. Default:
+            `$PENUMBRA_SECURE`, else without certificates.
+        timeout: How long to wait for the router and the cell [s], by default 3 s. A program that starts with the machine
+            may use `math.inf`.
 
-    Raises BusError whose text says what is missing: the router, the cell, or a choice between several cells.
+    Raises:
+        BusError: The router, fusion or the cell is missing, or several cells run there. The text says which, and what to do.
     """
     return Cell(*Search.of(cell, endpoint, secure, timeout).run())
 

@@ -14,21 +14,24 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 State = Literal["tracking", "coasting", "lost"]
-"""tracking: a sense measures the target. coasting: none does now, and the covariance grows. lost: nothing is known any more."""
+"""`tracking`: a sense measures the target. `coasting`: none does now, and the covariance grows. `lost`: nothing is known any
+more."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
     """Pose and motion of a target at one moment. All arrays are float64 and read-only.
 
-    target, frame: names of the target, and of the fixed frame that everything is given in.
-    stamp_ns: the moment, in nanoseconds since the epoch.
-    state: tracking, coasting or lost (`State`). The numbers of a lost pose are where the target is expected at first.
-    T (4, 4): T_frame_target, maps coordinates of the target to the frame [m].
-    orientation (4,): the same rotation as a unit quaternion (x, y, z, w).
-    velocity (6,): linear [m/s] and angular [rad/s], along the axes of the frame.
-    covariance (6, 6): in the order x, y, z [m], rotation about x, y, z of the frame [rad], as in ROS.
-    sources: by sense (`vision`, `haptic`), the age of its last measurement `age_s` [s] and its share `weight` of the information.
+    Attributes:
+        target: Name of the target.
+        frame: Name of the fixed frame that everything is given in.
+        stamp_ns: The moment, in nanoseconds since the epoch.
+        state: `tracking`, `coasting` or `lost`. The numbers of a lost pose are where the target is expected at first.
+        T: (4, 4), T_frame_target: maps coordinates of the target to the frame [m].
+        orientation: (4,), the same rotation as a unit quaternion x, y, z, w.
+        velocity: (6,), linear [m/s] and angular [rad/s], along the axes of the frame.
+        covariance: (6, 6), in the order x, y, z [m], rotation about x, y, z of the frame [rad], as in ROS.
+        sources: For each sense (`vision`, `haptic`) the age of its last measurement and its share of the information.
     """
 
     target: str

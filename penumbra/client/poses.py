@@ -94,7 +94,7 @@ class Subscription:
         self._end()
         self._slot.close()
 
-    def pose_of(self, sample: zenoh.Sample) -> Pose | None:
+    def _pose_of(self, sample: zenoh.Sample) -> Pose | None:
         """The pose in a sample; None for a message that was refused, and for one that is not newer than the last: while fusion's
         replicas take over from each other, both publish."""
         try:
@@ -110,7 +110,7 @@ class Subscription:
         self._last_ns = message.stamp_ns
         return Pose.of(message)
 
-    def silence(self) -> TimeoutError:
+    def _silence(self) -> TimeoutError:
         """The error that says why no pose came within the timeout."""
         why, self._refusal = self._refusal or self._why_silent(), ""
         return TimeoutError(f"no pose for {self._timeout:g} s: {why}")
@@ -132,10 +132,10 @@ class Poses(Subscription):
             try:
                 sample = self._slot.wait(deadline)
             except TimeoutError:
-                raise self.silence() from None
+                raise self._silence() from None
             if sample is None:
                 raise StopIteration
-            if (pose := self.pose_of(sample)) is not None:
+            if (pose := self._pose_of(sample)) is not None:
                 return pose
 
     def __enter__(self) -> Self:

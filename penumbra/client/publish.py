@@ -73,8 +73,13 @@ class Stream:
 class Camera:
     """A camera of the cell, as its file describes it.
 
-    width, height: of its images [px]. rate_hz: images a second that the cell expects. K (3, 3): intrinsic matrix [px].
-    T_world_camera (4, 4): where the optical frame is (x right, y down, z forward).
+    Attributes:
+        name: Its name in the cell.
+        width: Columns of an image [px].
+        height: Rows of an image [px].
+        rate_hz: Images per second that the cell expects.
+        K: (3, 3), intrinsic matrix [px].
+        T_world_camera: (4, 4), where the optical frame is (x right, y down, z forward).
     """
 
     name: str
@@ -86,10 +91,16 @@ class Camera:
     _stream: Stream = field(repr=False)
 
     def publish(self, image: NDArray[np.uint8], stamp_ns: int | None = None) -> None:
-        """Sends an image: uint8 (height, width, 3), channels in the order red, green, blue. OpenCV has them the other way round:
-        `cv2.cvtColor(image, cv2.COLOR_BGR2RGB)`. stamp_ns: the middle of the exposure; now where it is None.
+        """Sends an image.
 
-        Raises ValueError that says what was expected and what to do.
+        Args:
+            image: uint8 (height, width, 3), channels in the order red, green, blue. OpenCV has them the other way round:
+                `cv2.cvtColor(image, cv2.COLOR_BGR2RGB)`.
+            stamp_ns: The middle of the exposure [ns since the epoch]. None: now.
+
+        Raises:
+            ValueError: The image or the stamp is not as expected, or images come too often. The text says what to do.
+            BusError: The cell is closed, or no router is there at the first message.
         """
         expected = (self.height, self.width, 3)
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != expected:
@@ -102,16 +113,27 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot of the cell. joints: names of its moving joints, in the order of their angles."""
+    """A robot of the cell.
+
+    Attributes:
+        name: Its name in the cell.
+        joints: Names of its moving joints, in the order of their angles.
+    """
 
     name: str
     joints: tuple[str, ...]
     _stream: Stream = field(repr=False)
 
     def publish(self, q: ArrayLike, stamp_ns: int | None = None) -> None:
-        """Sends joint angles [rad] in the order of `joints`. stamp_ns: when they were measured; now where it is None.
+        """Sends joint angles.
 
-        Raises ValueError that says what was expected and what to do.
+        Args:
+            q: Angles [rad] in the order of `joints`.
+            stamp_ns: When they were measured [ns since the epoch]. None: now.
+
+        Raises:
+            ValueError: Angles or stamp are not as expected, or messages come too often. The text says what to do.
+            BusError: The cell is closed, or no router is there at the first message.
         """
         angles = _floats(f"robot {self.name}", q)
         if angles.shape != (len(self.joints),):
@@ -125,8 +147,13 @@ class Robot:
 
 @dataclass(frozen=True, eq=False)
 class Pad:
-    """A pad of the skin. electrodes: their names, in the order of the columns of voltages. limit_V: the largest amplitude that
-    its converter can give."""
+    """A pad of the skin.
+
+    Attributes:
+        name: Its name in the cell.
+        electrodes: Their names, in the order of the columns of voltages.
+        limit_V: The largest amplitude that its converter can give [V].
+    """
 
     name: str
     electrodes: tuple[str, ...]
@@ -134,11 +161,16 @@ class Pad:
     _stream: Stream = field(repr=False)
 
     def publish(self, volts: ArrayLike, stamps_ns: ArrayLike | None = None) -> None:
-        """Sends electrode amplitudes [V]: one row (electrodes,), or a batch (samples, electrodes) with the oldest row first.
+        """Sends amplitudes of the electrodes. Readers accept 250 messages per second of a pad: send faster samples in batches.
 
-        stamps_ns: a stamp for each row, evenly spaced. Where it is None, the last row is of now, and rows are a millisecond
-        apart. A single row has the period since the row before it. Readers take at most 250 messages a second of a pad: send
-        faster samples in batches. Raises ValueError that says what was expected and what to do.
+        Args:
+            volts: Amplitudes [V]: one row (electrodes,), or a batch (samples, electrodes) with the oldest row first.
+            stamps_ns: A stamp [ns since the epoch] for each row, evenly spaced. None: the last row is of now, and rows are a
+                millisecond apart. A single row has the period since the row before it.
+
+        Raises:
+            ValueError: Amplitudes or stamps are not as expected, or messages come too often. The text says what to do.
+            BusError: The cell is closed, or no router is there at the first message.
         """
         what = f"pad {self.name}"
         rows = np.atleast_2d(_floats(what, volts))

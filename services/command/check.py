@@ -27,6 +27,7 @@ from penumbra.shared.skin import response
 from penumbra.shared.skin.layout import Near
 
 SERVICES = Path(__file__).parents[1]
+EMULATOR = SERVICES / "emulator"
 SEGMENTATION, HAPTICS = SERVICES / "segmentation" / "weights", SERVICES / "haptics" / "weights"
 LINK_FACES = 50_000
 """Number of triangles of a robot's collision meshes above which every picture of the emulator takes longer than its period."""
@@ -60,7 +61,7 @@ Nearby = dict[str, Near]
 def main(options: flags.Options) -> int:
     """Prints every fault and warning: 0 without faults, 1 with."""
     path = cells.source(options.cell)
-    _, found = examine(path)
+    _, found = examine(path, is_whole=True)
     wrong, warnings = ([fault for fault in found if fault.is_warning is kind] for kind in (False, True))
     if options.json:
         both = {"faults": wrong, "warnings": warnings}
@@ -86,9 +87,9 @@ def refuse(cell: str | Path) -> cells.Cell:
     return found
 
 
-def examine(path: Path) -> tuple[cells.Cell | None, list[Fault]]:
+def examine(path: Path, is_whole: bool = False) -> tuple[cells.Cell | None, list[Fault]]:
     """The cell of a file, None where it has faults, and its faults and warnings: those of the file itself alone where it has
-    any."""
+    any. is_whole: also what a start leaves to the emulator, which would do it again."""
     try:
         reading = cells.read(path)
     except cells.CellError as error:
@@ -101,6 +102,8 @@ def examine(path: Path) -> tuple[cells.Cell | None, list[Fault]]:
         near = {target: Near.of(cell, target) for target in cell.targets}
         for look in (_models, _networks, _cameras, _pads, _homes):
             found += look(cell, document, near)
+    if is_whole and all(fault.is_warning for fault in found):
+        found += _motion(cell, document)
     is_good = all(fault.is_warning for fault in found)
     return cell if is_good else None, sorted(found, key=lambda fault: (fault.is_warning, fault.line))
 
@@ -267,6 +270,22 @@ def _pads(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]
         elif not facing[name]:
             what = "expected a pad whose z axis points towards the target, got one that points away from it"
             yield document.fault(f"pads.{name}.rpy", f"{what}; turn it", is_warning=True)
+
+
+def _motion(cell: cells.Cell, document: Document) -> Iterator[Fault]:
+    """Regions in which the emulator finds no pose to begin with."""
+    if cell.sim is None or not EMULATOR.is_dir():
+        return
+    from penumbra.sim.world.actor import Actor
+    from penumbra.sim.world.motion import joint_motions
+
+    robots, scripts = robot_models(cell), joint_motions(cell, cell.sim, 0)
+    for name in cell.targets:
+        try:
+            Actor(cell, cell.sim, name, 0, robots, scripts)
+        except cells.CellError as error:
+            is_first = name == next(iter(cell.targets))
+            yield document.fault("sim.motion" if is_first else f"targets.{name}.home", str(error).removeprefix("sim.motion: "))
 
 
 def _drawn_skin(cell: cells.Cell, name: str, count: int, rng: np.random.Generator) -> Array:

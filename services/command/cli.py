@@ -284,7 +284,7 @@ def _complain(command: str, line: str) -> None:
 
 def _is_ours(error: Exception) -> bool:
     """Whether the text of an error already says what was expected, what was received and what to do."""
-    from penumbra.shared.cell.description import CellError
+    from penumbra.shared.cell.faults import CellError
     from penumbra.shared.runtime.bus import BusError, Refused
 
     return isinstance(error, BusError | Refused | CellError | FileNotFoundError)

@@ -165,7 +165,8 @@ def _cell(cell: str) -> Iterator[Finding]:
     for fault in faults:
         yield Finding("warn" if fault.is_warning else "fail", str(fault))
     if found is not None:
-        parts = f"{len(found.cameras)} cameras, {len(found.robots)} robots, {len(found.pads)} pads, {len(found.targets)} targets"
+        counts = {kind: len(getattr(found, kind)) for kind in ("cameras", "robots", "pads", "targets")}
+        parts = ", ".join(f"{count} {kind if count != 1 else kind[:-1]}" for kind, count in counts.items())
         yield Finding("ok", f"cell {found.name}: {parts}")
 
 

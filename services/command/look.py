@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import shutil
 import string
 import sys
 import threading
@@ -18,8 +19,7 @@ import zenoh
 from click.shell_completion import CompletionItem
 
 from penumbra.services import flags
-from penumbra.services.command import runs
-from penumbra.shared.cell import description as cells
+from penumbra.shared.cell import names
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.report import TopicReport
 from penumbra.shared.runtime import bus, running
@@ -27,9 +27,13 @@ from penumbra.shared.runtime import bus, running
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from penumbra.shared.cell.description import Cell
+
 PATIENCE_S = 1.0
 """How long a command waits for the router before it says that there is none."""
 WATCH_S = 0.1
+WIDE = 72
+"""Columns that a pose in words takes."""
 LOST = 3
 """Exit code of a lost pose."""
 ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "state")
@@ -58,8 +62,8 @@ def pose(options: flags.Options) -> int:
     """0, or 3 where the pose is lost."""
     if options.watch and options.wait is not None:
         flags.refuse("expected --watch or --wait, got both")
-    cell = cells.load(options.cell)
-    target = cell.one("targets", options.target)
+    cell = names.read(options.cell)
+    target = cell.target(options.target)
     patience_s = PATIENCE_S if options.wait is None else options.wait
     deadline = time.monotonic() + (options.wait or 0.0)
     with open_session(bus.connection(options), patience_s) as session:
@@ -89,14 +93,19 @@ def _ask_pose(session: zenoh.Session, cell: str, target: str) -> dict[str, Any]:
 
 
 def _print_pose(found: dict[str, Any], options: flags.Options) -> None:
-    text = json.dumps(found) if options.json else _describe(found)
-    if options.watch and not options.json and sys.stdout.isatty():
-        text = "\x1b[H\x1b[J" + text
-    print(text, flush=True)
+    if options.json:
+        print(json.dumps(found), flush=True)
+    elif sys.stdout.isatty():
+        text = describe(found, shutil.get_terminal_size().columns)
+        # each line is written over the one before, and what is left of that erased: erased first, it would flicker
+        print("\x1b[H" + text.replace("\n", "\x1b[K\n") + "\x1b[K\n\x1b[J" if options.watch else text, flush=True)
+    else:
+        print(describe(found), flush=True)
 
 
-def _describe(pose: dict[str, Any]) -> str:
-    """The answer to the pose query in words and everyday units."""
+def describe(pose: dict[str, Any], columns: int = WIDE) -> str:
+    """The answer to the pose query in words and everyday units. columns: of the terminal; below WIDE, names have lines of their
+    own."""
     spread = [math.sqrt(max(0.0, pose["covariance"][i][i])) for i in range(6)]
     age_ms = (time.time_ns() - pose["stamp_ns"]) * 1e-6
     senses = [
@@ -110,11 +119,13 @@ def _describe(pose: dict[str, Any]) -> str:
         "velocity": _row(pose["velocity"][:3], 100, "8.1f", "cm/s"),
         "senses": ", ".join(senses) or "none received",
     }
-    return "\n".join(f"{name:15} {text}" for name, text in rows.items())
+    if columns >= WIDE:
+        return "\n".join(f"{name:15} {text}" for name, text in rows.items())
+    return "\n".join(f"{name}\n  " + text.strip().replace(", ", "\n  ") for name, text in rows.items())
 
 
 def _row(values: list[float], scale: float, spec: str, unit: str, spread: float | None = None) -> str:
-    text = " ".join(format(value * scale, spec) for value in values)
+    text = " ".join(format(value * scale, f"z{spec}") for value in values)
     return f"{text} {unit}" + ("" if spread is None else f"  +- {spread * scale:.2g} {unit}")
 
 
@@ -136,7 +147,9 @@ def list_topics(options: flags.Options) -> None:
 
 def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.TOPICS) -> None:
     """Prints the topics that are known, or what arrives of them."""
-    cell = cells.load(options.cell)
+    from penumbra.shared.cell import description
+
+    cell = description.load(options.cell)
     if options.hz:
         received, instances = listen(cell, bus.connection(options), options.seconds, known)
         if options.json:
@@ -160,11 +173,11 @@ def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.T
     _console().print(table)
 
 
-def keys(topic: topics.Topic, cell: cells.Cell) -> list[str]:
+def keys(topic: topics.Topic, cell: Cell) -> list[str]:
     """The keys of a topic in a cell; none where the cell has no such part."""
-    names = [name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell"]
-    parts = itertools.product(*(getattr(cell, f"{name}s") for name in names))
-    return [topic.at(cell=cell.name, **dict(zip(names, part, strict=True))) for part in parts]
+    fields = [name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell"]
+    parts = itertools.product(*(getattr(cell, f"{name}s") for name in fields))
+    return [topic.at(cell=cell.name, **dict(zip(fields, part, strict=True))) for part in parts]
 
 
 def _described(key: str, topic: topics.Topic) -> dict[str, Any]:
@@ -212,7 +225,7 @@ def _console() -> Console:
 
 
 def listen(
-    cell: cells.Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic]
+    cell: Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic]
 ) -> tuple[dict[str, TopicReport], list[running.Instance]]:
     """The counters of every key of the topics that are known after listening for a while, and how the cell's processes fare."""
     from penumbra.shared.runtime.node import Node
@@ -229,8 +242,9 @@ def listen(
 
 @flags.command(
     "ls",
-    "Lists routers and the cells on them: those of this machine's `penumbra up`, the one that --connect or $PENUMBRA_CONNECT "
-    "names (by default that of this machine), and those on the network whose Zenoh configuration enables scouting.",
+    "Lists routers and the cells on them: the router that --connect or $PENUMBRA_CONNECT names (default: that of this machine), "
+    "those of this machine's `penumbra up`, and on other hosts those that run with `penumbra router --announce`. A router also "
+    "lists the cells on the routers that it is linked to.",
     flags.Option("--seconds", type=flags.above_zero, default=0.5, help="how long to wait for answers from the network"),
     flags.JSON,
     *flags.BUS,
@@ -238,27 +252,50 @@ def listen(
 )
 def list_cells(options: flags.Options) -> None:
     """Prints a row per router."""
+    from penumbra.services.command import runs
+
     asked = bus.connection(options)
-    found = dict.fromkeys(asked.connect or (asked.default,), asked)
-    found |= {at: replace(asked, connect=(at,), secure=Path(run.secure) if run.secure else None)
-              for run in runs.running() for at in run.connect}  # fmt: skip
-    scout = zenoh.scout(what="router", config=zenoh.Config())
-    time.sleep(options.seconds)
-    while (each := scout.try_recv()) is not None:
-        found |= {str(at): replace(asked, connect=(str(at),)) for at in each.locators if str(at) not in found}
-    scout.stop()
-    rows = []
-    for at, connection in found.items():
-        try:
-            with open_session(replace(connection, connect=(at,)), 0.0) as session:
-                rows.append({"router": at, "cells": running.cells_there(session), "why": ""})
-        except bus.BusError as error:
-            rows.append({"router": at, "cells": [], "why": str(error)})
+    guess = None if asked.connect else replace(asked, connect=(asked.default,))
+    places = [guess] if guess else [replace(asked, connect=(at,)) for at in asked.connect]
+    places += [replace(asked, connect=run.connect, secure=Path(run.secure) if run.secure else None) for run in runs.running()]
+    places += [replace(asked, connect=found) for found in _announced(options.seconds)]
+    known: set[str] = set()
+    rows = [row for place in places for row in _rows(place, PATIENCE_S if place is not guess else 0.0, known)]
+    if guess and any(not row["why"] for row in rows):  # that there is none at the default is no news then
+        rows = [row for row in rows if not (row["why"] and row["router"] == asked.default)]
     if options.json:
         print(json.dumps(rows))
         return
     for row in rows:
         print(row["why"] or f"{row['router']}: {', '.join(row['cells']) or 'no cell'}")
+
+
+def _announced(seconds: float) -> list[tuple[str, ...]]:
+    """The endpoints of each router that answers on the network within a time."""
+    scout = zenoh.scout(what="router", config=zenoh.Config())
+    time.sleep(seconds)
+    found = {}
+    while (each := scout.try_recv()) is not None:
+        found[str(each.zid)] = tuple(map(str, each.locators))
+    scout.stop()
+    return list(found.values())
+
+
+def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dict[str, Any]]:
+    """The router at the first of several endpoints that opens, and its cells; nothing where the router is known already, which it
+    then is. Where none opens, why the first one does not."""
+    reasons = []
+    for at in place.connect:
+        try:
+            with open_session(replace(place, connect=(at,)), patience_s) as session:
+                routers = {str(each) for each in session.info.routers_zid()}
+                if routers & known:
+                    return []
+                known |= routers
+                return [{"router": at, "cells": running.cells_there(session), "why": ""}]
+        except bus.BusError as error:
+            reasons.append(str(error))
+    return [{"router": place.connect[0], "cells": [], "why": reasons[0]}] if reasons else []
 
 
 @flags.command(
@@ -279,7 +316,7 @@ def list_cells(options: flags.Options) -> None:
 )
 def sim(options: flags.Options) -> None:
     """Passes the command on: what is possible is decided by the emulator."""
-    cell = cells.load(options.cell)
+    cell = names.read(options.cell)
     request = {"command": options.action} | ({"value": " ".join(options.value)} if options.value else {})
     with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:
         answers = bus.ask(session, topics.control(cell.name), payload=json.dumps(request).encode())

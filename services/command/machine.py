@@ -8,11 +8,11 @@ import os
 import signal
 import sys
 import time
-from collections import deque
-from collections.abc import Iterator
+from bisect import bisect_right
+from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import psutil
 from click.shell_completion import CompletionItem
@@ -24,6 +24,7 @@ from penumbra.services.command.runs import Run
 from penumbra.shared.contract import report, topics
 from penumbra.shared.contract.processes import LAUNCHER
 from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.logs import time_of
 
 MEASURED_S = 0.2
 """Over which CPU is measured."""
@@ -152,34 +153,32 @@ def _chosen(cell: str | None) -> list[Run]:
 
 @flags.command(
     "logs",
-    "Prints what the processes of a cell have logged, of one that was started with `penumbra up --detach`.",
+    "Prints what the processes of a cell have logged, in the order of time, of one that was started with `penumbra up --detach`.",
     flags.Argument("service", nargs=-1, shell_complete=flags.complete_service, help="only of these; of all where none is named"),
     flags.Option("-f", "--follow", is_flag=True, help="go on with what is logged from now on, until Ctrl-C"),
-    flags.Option("-n", "--lines", type=flags.natural, default=100, help="the newest lines of each process"),
+    flags.Option("-n", "--lines", type=flags.natural, default=100, help="how many of the newest lines"),
     flags.Option("--cell", shell_complete=complete_cell, show_default="the only one with logs", help="the cell's name"),
     example="penumbra logs\npenumbra logs -f fusion",
 )
 def logs(options: flags.Options) -> None:
     """Prints the newest lines, and follows."""
     where = _folder(options.cell)
-    files = {path.stem: path for path in sorted(where.glob("*.log"))}
-    if unknown := [name for name in options.service if name not in files]:
-        raise bus.BusError(f"{where}: expected the log of one of {', '.join(files)}, got {unknown[0]!r}")
-    chosen = {name: files[name] for name in options.service or files}
-    width = max(map(len, chosen))
-
-    def show(name: str, line: str) -> None:
-        print(f"{name:{width}} | {line.rstrip()}" if len(chosen) > 1 else line.rstrip(), flush=options.follow)
-
-    tails = [Tail(path) for path in chosen.values()]
-    for name, tail in zip(chosen, tails, strict=True):
-        for line in deque(tail.read(), options.lines):
-            show(name, line)
+    names = sorted(path.stem for path in where.glob("*.log"))
+    if unknown := [name for name in options.service if name not in names]:
+        raise bus.BusError(f"{where}: expected the log of one of {', '.join(names)}, got {unknown[0]!r}")
+    merged = Merged(where, options.service)
+    lines = merged.read()
+    _show(lines[max(0, len(lines) - options.lines) :], merged.width)
     while options.follow:
-        for name, tail in zip(chosen, tails, strict=True):
-            for line in tail.read():
-                show(name, line)
         time.sleep(LOOK_S)
+        _show(merged.settled(), merged.width)
+
+
+def _show(lines: list[Line], width: int) -> None:
+    """width: of the services' names, which are left out where it is 0."""
+    for line in lines:
+        print(f"{line.service:{width}} | {line.text}" if width else line.text)
+    sys.stdout.flush()
 
 
 def _folder(cell: str | None) -> Path:
@@ -196,6 +195,51 @@ def _folder(cell: str | None) -> Path:
     if cell not in names:
         raise bus.BusError(f"--cell: expected a cell with logs, one of {', '.join(names)}, got {cell!r}")
     return base / cell
+
+
+class Line(NamedTuple):
+    """A line of a service's log. time: as it stands there; of the line before where it has none."""
+
+    time: str
+    service: str
+    text: str
+
+
+class Merged:
+    """The lines of a cell's logs in the order of their times. only: the services; none stands for all, also those that begin to
+    log later."""
+
+    def __init__(self, where: Path, only: Collection[str]):
+        self._where, self._only = where, only
+        self._tails: dict[str, Tail] = {}
+        self._times: dict[str, str] = {}
+        self._waiting: list[Line] = []
+
+    @property
+    def width(self) -> int:
+        """Of the services' names; 0 where there is but one."""
+        return max(map(len, self._tails)) if len(self._tails) > 1 else 0
+
+    def read(self) -> list[Line]:
+        """The lines since the last look."""
+        for path in self._where.glob("*.log"):
+            if path.stem not in self._tails and (not self._only or path.stem in self._only):
+                self._tails[path.stem] = Tail(path)
+        lines = [self._line(name, text) for name, tail in self._tails.items() for text in tail.read()]
+        return sorted(lines, key=lambda line: line.time)
+
+    def settled(self) -> list[Line]:
+        """The lines that are not newer than those of the look before: what a service logs may be in its file a little later than
+        what another one logs after it."""
+        last = self._waiting[-1].time if self._waiting else ""
+        lines = sorted(self._waiting + self.read(), key=lambda line: line.time)
+        count = bisect_right(lines, last, key=lambda line: line.time)
+        self._waiting = lines[count:]
+        return lines[:count]
+
+    def _line(self, service: str, text: str) -> Line:
+        at = self._times[service] = time_of(text) or self._times.get(service, "")
+        return Line(at, service, text.rstrip())
 
 
 class Tail:

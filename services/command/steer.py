@@ -10,7 +10,7 @@ from typing import Any
 
 from penumbra.services import flags
 from penumbra.services.command.look import open_session
-from penumbra.shared.cell import description as cells
+from penumbra.shared.cell import names
 from penumbra.shared.contract import access, topics
 from penumbra.shared.runtime import bus
 
@@ -64,7 +64,7 @@ def scale(options: flags.Options) -> int:
 
 def _change(options: flags.Options, command: dict[str, Any]) -> int:
     """Asks every launcher of the cell for a change, and tells how it gets on until all are done; 1 if one of them failed."""
-    cell = cells.load(options.cell)
+    cell = names.read(options.cell)
     key, name = topics.launcher(cell.name), secrets.token_hex(8)
     with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:
         states = _ask(session, key, command | {"id": name})

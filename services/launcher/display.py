@@ -217,7 +217,7 @@ def _line(text: str, style: str = "") -> Text:
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[Text]], width: int) -> Table:
     """Names and numbers keep their width; the last column takes what is left of `width`, and is cut."""
-    table = Table(box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # one column between two, as is counted below
     left = width
     for k, name in enumerate(columns):
         needed = max([len(name), *(len(row[k]) for row in rows)])
@@ -234,8 +234,8 @@ def pose_line(accuracy: Accuracy | None) -> str:
     if accuracy is None:
         return "pose: none yet"
     pose = accuracy.pose
-    position = " ".join(f"{100 * value:.1f}" for value in pose.position)
-    rpy = " ".join(f"{math.degrees(value):.0f}" for value in rigid.rpy(pose.orientation))
+    position = " ".join(f"{100 * value:z.1f}" for value in pose.position)
+    rpy = " ".join(f"{math.degrees(value):z.0f}" for value in rigid.rpy(pose.orientation))
     senses = ", ".join(f"{name} {100 * source.weight:.0f} %" for name, source in sorted(pose.sources.items())) or "no sense"
     line = f"pose of {pose.target}: {pose.state}, at {position} cm, rpy {rpy} deg, from {senses}"
     if math.isfinite(accuracy.position):

@@ -67,8 +67,8 @@ class Change:
 
 class Fleet:
     """kinds: every service that may run; counts: how many of each, none where it is not named; forkserver: where a service that
-    died comes from, while there is one; write: takes a service and a
-    line of its standard error, by default the launcher\'s takes the line."""
+    died comes from, while there is one; write: takes a service and a line of its standard error, which by default goes to the
+    launcher's own."""
 
     def __init__(
         self,

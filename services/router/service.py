@@ -19,6 +19,13 @@ MODE = "router"
 LINKS = "Several hosts"
 FLAGS = (
     flags.Option(
+        "--announce",
+        is_flag=True,
+        section=LINKS,
+        help="answer Zenoh's scouting, so that `penumbra ls` finds this router from other hosts; other Zenoh programs that scout "
+        "find it as well",
+    ),
+    flags.Option(
         "--slow",
         multiple=True,
         metavar="INTERFACE",
@@ -36,9 +43,9 @@ FLAGS = (
     ),
 )
 EXAMPLE = """\
-penumbra router                                     # of one host
-penumbra router --listen tcp/0.0.0.0:7447           # one of several hosts, and on each of the others:
-penumbra router --connect tcp/THAT-HOST:7447        # processes connect to the router of their host"""
+penumbra router                                         # of one host
+penumbra router --listen tcp/0.0.0.0:7447 --announce    # one of several hosts, and on each of the others:
+penumbra router --connect tcp/THAT-HOST:7447            # processes connect to the router of their host"""
 
 
 def start(node: Node, options: flags.Options) -> None:
@@ -49,6 +56,8 @@ def start(node: Node, options: flags.Options) -> None:
         raise bus.BusError(f"--slow: expected a network interface of this host ({', '.join(known)}), got {unknown[0]}")
     if options.slow_hz and not options.slow:
         raise bus.BusError(f"--slow-hz: expected --slow INTERFACE beside it, got {options.slow_hz[0]} alone")
+    if options.announce:
+        node.announce()
     if options.slow:
         keys = {key: rates_hz[topic.name] for topic in topics.TOPICS for key in node.keys(topic, {})}
         node.thin_out(SlowLinks(tuple(options.slow), keys))

@@ -212,8 +212,8 @@ def examine(cell: cells.Cell, connection: bus.Connection, seconds: float, progre
         misfits = _misfits(node.query(topics.health(cell.name, "haptics")))
     if not any(pad.looks for pad in examination.pads.values()):
         raise bus.BusError(
-            f"cell {cell.name}: expected voltages within {seconds:g} s, got none; start `penumbra up`, or `penumbra skin --port "
-            "DEVICE` for a real board"
+            f"cell {cell.name}: expected voltages within {seconds:g} s, got none; start `penumbra up`, or `penumbra skin "
+            "--device DEVICE` for a real board"
         )
     return examination.judge(misfits)
 

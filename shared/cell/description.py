@@ -17,17 +17,23 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from penumbra.shared.body import urdf
-from penumbra.shared.cell import document
+from penumbra.shared.cell import document, names
 from penumbra.shared.cell.document import Document
+from penumbra.shared.cell.explain import explain
 from penumbra.shared.cell.faults import CellError as CellError  # every reader of a cell file catches it from here
-from penumbra.shared.cell.faults import Fault, Faulty, explain, meant, refuse
+from penumbra.shared.cell.faults import Fault, Faulty, meant, refuse
+from penumbra.shared.cell.names import BUILT_IN as BUILT_IN
+from penumbra.shared.cell.names import NAME, is_file
+from penumbra.shared.cell.names import source as source
 from penumbra.shared.contract.labels import Label
+from penumbra.shared.contract.messages import Frame
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.lens import COEFFICIENTS, Lens
 
-BUILT_IN = Path(__file__).parent / "built_in"
 FAULTS = 20
 """Maximum number of faults in the text of an error."""
+MOST_PIXELS = Frame.MAX_BYTES // 3 - 1000
+"""Of a picture in three colours, with room for the rest of its message."""
 SAME = 1e-6
 """Points nearer to each other than this [m] are one."""
 
@@ -52,7 +58,7 @@ Length = Annotated[Number, Field(gt=0, le=1)]
 """A length on a pad [m]; what is larger is in millimetres."""
 Measure = Annotated[Number, Field(ge=0.02, le=3)]
 """A measure of a person [m]."""
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Name = Annotated[str, Field(pattern=NAME)]
 
 
 class _Model(BaseModel):
@@ -109,6 +115,9 @@ class Camera(_Model):
     @model_validator(mode="after")
     def _possible(self) -> Camera:
         faults = self.lens.faults()
+        if (count := self.width * self.height) > MOST_PIXELS:
+            what = f"expected at most {MOST_PIXELS} pixels, which is what a message may carry, got {count}"
+            faults.append(("width", f"{what}; publish smaller pictures, and scale fx, fy, cx and cy as well"))
         if (self.look_at is None) == (self.rpy is None):
             got = "neither" if self.rpy is None else "both"
             faults.append(("rpy" if self.rpy else "", f"expected either look_at or rpy, got {got}; give one of them"))
@@ -277,7 +286,7 @@ class PadType(_Model):
 class SensingBoard(_Model):
     """A sensing board of a pad."""
 
-    port: str | None = Field(default=None, description="its serial port; without it, `penumbra skin --port` names it")
+    port: str | None = Field(default=None, description="its serial port; without it, `penumbra skin --device` names it")
     channels: Annotated[dict[Name, tuple[Annotated[Whole, Field(ge=0, le=5)], ...]], Field(min_length=1)] = Field(
         description="which of its six channels, 0 to 5, measure which electrode"
     )
@@ -388,7 +397,7 @@ class Motion(_Model):
     high: Vector3 = Field(description="upper bounds of x, y, z [m]")
     rpy_low: Angles3 = Field(description="lower bounds of roll, pitch, yaw [rad]")
     rpy_high: Angles3 = Field(description="upper bounds of roll, pitch, yaw [rad]")
-    speed: Annotated[Number, Field(gt=0, le=10)] = Field(default=0.25, description="mean speed of a reach [m/s]")
+    speed: Annotated[Number, Field(ge=0.01, le=10)] = Field(default=0.25, description="mean speed of a reach [m/s]")
 
     @model_validator(mode="after")
     def _ordered(self) -> Motion:
@@ -530,12 +539,7 @@ class Cell(_Model):
 
     def one(self, kind: Literal["cameras", "robots", "pads", "targets"], name: str | None) -> str:
         """The name of a camera, robot, pad or target, checked; None means the first one. Raises CellError."""
-        known = getattr(self, kind)
-        if name is None and known:
-            return str(next(iter(known)))
-        if name not in known:
-            raise CellError(f"cell {self.name} has no {kind[:-1]} {name!r}: it has {', '.join(known) or 'none'}")
-        return str(name)
+        return names.one(self.name, kind[:-1], getattr(self, kind), name)
 
 
 def _bound_faults(sim: Sim, limits: Sequence[tuple[str, float, float]]) -> list[tuple[str, str]]:
@@ -556,17 +560,6 @@ def _bound_faults(sim: Sim, limits: Sequence[tuple[str, float, float]]) -> list[
                 what = f"expected a bound of {joint} within its limits in the URDF, {lower:g} to {upper:g}, got {value:g}"
                 faults.append((f"sim.joints_{side}.{k}", what))
     return faults
-
-
-def source(cell: str | Path) -> Path:
-    """The YAML file of a built-in name (`table`, `arm`) or path. Raises CellError where there is none."""
-    path = BUILT_IN / f"{cell}.yaml"
-    if not is_file(path):
-        path = Path(cell)
-    if not is_file(path):
-        built_in = ", ".join(sorted(p.stem for p in BUILT_IN.glob("*.yaml")))
-        raise CellError(f"no cell {str(cell)!r}: give one of {built_in}, or the path of a YAML file")
-    return path
 
 
 @dataclass(frozen=True)
@@ -613,11 +606,3 @@ def urdf_path(robot: Robot, folder: Path) -> Path:
         if is_file(path):
             return path
     raise CellError(f"no file {folder / robot.urdf}: give a URDF beside the cell file, or the built-in panda/panda.urdf")
-
-
-def is_file(path: Path) -> bool:
-    """Whether a file is there; none is where the name cannot be one."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False

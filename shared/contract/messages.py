@@ -226,7 +226,12 @@ class HapticPose(Message, frozen=True, kw_only=True):
 
 
 class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One sense as the observer sees it: age of its last accepted measurement [s] and its share of the information in use."""
+    """One sense as the observer sees it.
+
+    Attributes:
+        age_s: Age of its last accepted measurement [s].
+        weight: Its share of the information in use, from 0 to 1.
+    """
 
     age_s: Quantity
     weight: Quantity

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable
 import zenoh
 
 from penumbra.shared.contract.topics import TOPICS, Topic
-from penumbra.shared.runtime import diagnosis, memory
+from penumbra.shared.runtime import memory
 from penumbra.shared.runtime.connection import (
     DEFAULT_ENDPOINT,
     POOL_BYTES,
@@ -87,6 +87,8 @@ def open_session(
             if "Unable to connect" not in str(error):
                 raise BusError(f"the Zenoh session does not open: {short(error)}") from None
         if stopping.is_set() or time.monotonic() > deadline:
+            from penumbra.shared.runtime import diagnosis  # with Python's TLS, which nothing else here needs
+
             raise BusError(diagnosis.no_router(connection))
         if not told:
             waiting()

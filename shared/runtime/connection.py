@@ -36,9 +36,10 @@ class Connection:
     """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
     tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise; `secure`: a
     folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part; `service`: who
-    this is, and so whose certificate it shows; `slow`: a router's links that carry little; `pool_bytes`: of shared memory, by
-    which what is large goes to processes of the same host. Readers keep the pool of a publisher that is gone for as long as they
-    live, so it is no larger than it must be."""
+    this is, and so whose certificate it shows; `slow`: a router's links that carry little; `is_announced`: whether a router
+    answers those that look for one on the network; `pool_bytes`: of shared memory, by which what is large goes to processes of
+    the same host. Readers keep the pool of a publisher that is gone for as long as they live, so it is no larger than it must
+    be."""
 
     mode: str | None = None
     connect: tuple[str, ...] = ()
@@ -47,6 +48,7 @@ class Connection:
     secure: Path | None = None
     service: str = access.VIEWER
     slow: SlowLinks | None = None
+    is_announced: bool = False
     pool_bytes: int = POOL_BYTES
 
     @property
@@ -122,6 +124,9 @@ def configuration(connection: Connection) -> zenoh.Config:
         "transport/shared_memory/transport_optimization/message_size_threshold": SHARED_BYTES,
     }
     settings |= {key: value for key, value in defaults.items() if not is_set(key)}
+    if connection.is_announced:
+        nobody: dict[str, list[str]] = {"router": [], "peer": [], "client": []}
+        settings |= {"scouting/multicast/enabled": True, "scouting/multicast/autoconnect": nobody}  # it links to nobody by itself
     if connection.config is None:
         settings["transport/link/tx/lease"] = 1000  # ms after which a frozen process is no longer alive
     for endpoint in (*connection.connect, *connection.listen):

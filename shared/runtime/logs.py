@@ -10,6 +10,7 @@ import errno
 import json
 import logging
 import os
+import re
 import sys
 import threading
 from collections.abc import Iterator, MutableMapping
@@ -17,6 +18,7 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import Any, TextIO
 
+_TIME = re.compile(r'(?:\{"time": ")?(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z)')
 LEVELS = ("debug", "info", "warning", "error")
 FORMATS = ("text", "json")
 
@@ -94,6 +96,12 @@ def sentence(line: str) -> str:
         return str(json.loads(line)["message"])
     except (ValueError, TypeError, KeyError):
         return line
+
+
+def time_of(line: str) -> str | None:
+    """The time of a line of a log as it stands there, which sorts as text; None for a line that goes on, as in a trace."""
+    found = _TIME.match(line)
+    return found[1] if found else None
 
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -193,7 +193,11 @@ class Node:
             while not self.is_warm() and time.monotonic() - began < (WARM_UP_S if self.replicas.others else NEWS_S):
                 if self.stopping.wait(0.02):
                     return
-            self.replicas.join(session)
+            try:
+                self.replicas.join(session)
+            except zenoh.ZError:  # the session was closed just now
+                if not self.stopping.is_set():
+                    raise
 
         if not self.is_warm():
             self._link.spawn(warm_up, "warm up")
@@ -355,6 +359,10 @@ class Node:
     def thin_out(self, slow: SlowLinks) -> None:
         """Has a router send little over some of its links; before it is open."""
         self._link.connection = replace(self.connection, slow=slow)
+
+    def announce(self) -> None:
+        """Has a router answer those that look for one on the network; before it is open."""
+        self._link.connection = replace(self.connection, is_announced=True)
 
     def report(self) -> Report:
         """The health report of this instance."""

@@ -15,7 +15,14 @@ ANSWER_S = 1.0
 
 @dataclass(frozen=True)
 class Instance:
-    """One running instance: its status (ok, starting, degraded or down, as `shared.runtime.health` has them) and the reasons."""
+    """One running process of a cell.
+
+    Attributes:
+        service: Its name, such as `fusion`.
+        instance: Tells replicas of a service apart.
+        status: `ok`, `starting`, `degraded` or `down`.
+        reasons: Why, where it is not `ok`.
+    """
 
     service: str
     instance: str
@@ -53,5 +60,5 @@ def whats_there(session: zenoh.Session, cell: str, service: str) -> str:
         return f"its processes are {', '.join(running)}: start `penumbra {service}`"
     others = cells_there(session)
     if others:
-        return f"no process of it is on this router, where cells run: {', '.join(others)}; give --cell {others[0]}"
+        return f"no process of it is on this router, where cells run: {', '.join(others)}; give --cell {others[0]}, or its file"
     return "no process of any cell is on this router: start `penumbra up`"

@@ -63,12 +63,12 @@ class LimbMotion:
         self._rng = np.random.default_rng([seed, 1])
         self._lock = threading.Lock()
         stay = np.arange(0.0, OUTLOOK_S, 2 * STEP_S)
-        drawn = ((p := self._draw(), clearance(stay, np.tile(p, (len(stay), 1)))) for _ in range(10 * self.TRIES))
-        start = next((pose for pose, free in drawn if free >= 0.0), None)
+        start = next((pose for pose in (self._draw() for _ in range(10 * self.TRIES)) if self._may_stay(pose, stay)), None)
         if start is None:
+            low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (region.low, region.high))
             raise cells.CellError(
-                f"sim.motion: no pose of the region {region.low} to {region.high} keeps clear of the robot and the table: "
-                "move the region"
+                "sim.motion: expected a region with a pose that keeps the person clear of robot, pads and table, got none from "
+                f"[{low}] to [{high}] m; move or widen the region"
             )
         self._reaches = [Reach(0.0, 0.5, 0.5, start, start)]
         self._ends = [0.5]
@@ -88,6 +88,10 @@ class LimbMotion:
                 reach = self._next(self._reaches[-1])
                 self._reaches.append(reach)
                 self._ends.append(reach.end_s)
+
+    def _may_stay(self, pose: Array, times: Array) -> bool:
+        """Whether a pose is allowed at all times. Most that are not are not at the first, which takes a part of the computing."""
+        return all(self._clearance(at, np.tile(pose, (len(at), 1))) >= 0.0 for at in (times[:1], times))
 
     def _draw(self) -> Array:
         return self._rng.uniform(self._low, self._high)

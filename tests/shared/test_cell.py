@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from penumbra.shared.cell import description
+from penumbra.shared.cell import description, names
 
 TABLE = (description.BUILT_IN / "table.yaml").read_text()
 
@@ -53,9 +53,33 @@ def test_a_fault_is_reported_with_file_line_place_and_reason(tmp_path, old, new,
     assert line - 12 <= told <= line
 
 
-def test_an_unknown_cell_is_answered_with_the_ones_there_are():
+@pytest.mark.parametrize("read", [description.load, names.read])
+def test_an_unknown_cell_is_answered_with_the_ones_there_are(read):
     with pytest.raises(description.CellError, match="give one of arm, table"):
-        description.load("kitchen")
+        read("kitchen")
+
+
+def test_the_names_alone_are_those_of_the_whole_cell(tmp_path):
+    for cell in ("table", "arm"):
+        whole, found = description.load(cell), names.read(cell)
+        assert (found.name, found.targets) == (whole.name, tuple(whole.targets))
+        assert found.target(None) == whole.one("targets", None)
+        for each in (found.target, lambda name, whole=whole: whole.one("targets", name)):
+            with pytest.raises(description.CellError, match=f"cell {cell} has no target 'hand': it has forearm"):
+                each("hand")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("name: table", "name: my table"), ("name: table", ""), ("targets:", "target:"), ("forearm:", "7:")]
+)
+def test_names_that_a_file_does_not_have_are_reported_as_by_the_whole_cell(tmp_path, old, new):
+    path = tmp_path / "cell.yaml"
+    path.write_text(TABLE.replace(old, new, 1))
+    with pytest.raises(description.CellError) as whole:
+        description.load(path)
+    with pytest.raises(description.CellError) as error:
+        names.read(path)
+    assert str(error.value) == str(whole.value)
 
 
 def test_a_file_that_is_not_yaml_is_refused(tmp_path):

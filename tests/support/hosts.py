@@ -73,6 +73,12 @@ class Host:
         """Runs a command on the host to its end."""
         subprocess.run([*self._enter(), *command], check=True, capture_output=True, text=True)
 
+    def penumbra(self, *words: str) -> str:
+        """What `penumbra WORDS...` prints on the host."""
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        command = [*self._enter(), *penumbra_command(*words)]
+        return subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
+
     def start(self, service: str, *arguments: str) -> subprocess.Popen:
         """Starts `penumbra SERVICE`, which connects to the host's own router unless it is told otherwise."""
         environment = os.environ | {"PYTHONPATH": str(ROOT), "PENUMBRA_PARENT": str(os.getpid())}

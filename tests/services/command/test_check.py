@@ -79,6 +79,27 @@ BROKEN = {
     "a pad moved on its robot": ("arm", "-1.756]", "-1.7]", "  p2:", "field model of the pads p2 for target forearm, got none"),
     "no such link": ("arm", "panda/panda_hand", "panda/thumb", "  p0:", "robot panda has no link 'thumb'"),
     "backed by the world": ("arm", "link: panda/panda_hand, ", "", "  p0:", "leave backed out"),
+    "no room over the table": (
+        "table", BUILT_IN["table"][BUILT_IN["table"].index("    low:") : BUILT_IN["table"].index("    rpy_low:")],
+        "    low: [-0.08, -0.06, -0.3]\n    high: [0.08, 0.06, 0.0]\n",
+        "  motion:", "keeps the person clear of robot, pads and table, got none",
+    ),
+    "a region in the robot": (
+        "arm", "low: [-0.06, -0.32, 0.50]\n    high: [0.14, -0.06, 0.74]", "low: [0.49, 0.09, 0.1]\n    high: [0.51, 0.11, 0.3]",
+        "  motion:", "move or widen the region",
+    ),
+    "a second person in the floor": (
+        "table", "\nsim:\n",
+        "\n  other:\n    mesh: body:forearm\n    labels: [hand]\n    home: {position: [0.0, 2.0, -0.5]}\nsim:\n",
+        "    home: {position: [0.0, 2.0", "keeps the person clear",
+    ),
+    "a slow person": ("table", "speed: 0.25", "speed: 1.0e-9", "    speed:", "expected a number of at least 0.01"),
+    "a long name": ("table", "  forearm:\n", f"  {300 * 'f'}:\n", "fff", "at most 64 letters"),
+    "a picture too large": (
+        "table", "width: 640\n    height: 480\n    fx: 554.26\n    fy: 554.26\n    cx: 319.5\n    cy: 239.5",
+        "width: 6400\n    height: 4800\n    fx: 5542\n    fy: 5542\n    cx: 3199\n    cy: 2399",
+        "width:", "which is what a message may carry, got 30720000",
+    ),
     "a load of nobody": ("arm", "  table: [", "  payloads: {ur5: {mass: 1, link: tip}}\n  table: [", "payloads", "one of panda"),
 }  # fmt: skip
 """Broken cell files. Each is a built-in one with one change."""

@@ -15,7 +15,7 @@ import click
 import pytest
 
 from penumbra.services import flags, progress
-from penumbra.services.command import cli, doctor
+from penumbra.services.command import cli, doctor, look
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import processes, topics
 from penumbra.shared.runtime import bus
@@ -256,15 +256,24 @@ def test_pose_prints_the_pose_in_words(endpoint, capsys):
     assert "haptic 30 % (10 ms old), vision 70 % (50 ms old)" in out
 
 
+@pytest.mark.parametrize("columns", [40, 71, 80])
+def test_a_pose_in_words_fits_the_terminal(columns):
+    text = look.describe(json.loads(pose_json()), columns)
+    assert max(map(len, text.splitlines())) <= columns
+    for word in ("forearm", "tracking", "20.00 cm", "roll pitch yaw", "velocity", "haptic 30 %", "vision 70 %"):
+        assert word in text
+
+
 def test_pose_as_json_is_exactly_what_fusion_answers(endpoint, capsys):
     assert cli.main(["pose", "--json", "--connect", endpoint]) == 0
     assert json.loads(capsys.readouterr().out).keys() == json.loads(pose_json()).keys()
 
 
-def test_pose_loads_nothing_heavy(endpoint):
+def test_pose_loads_nothing_that_takes_longer_than_its_answer(endpoint):
     program = (
         "import sys; from penumbra.services.command import cli; cli.main(['pose', '--json', '--connect', sys.argv[1]]); "
-        "print([name for name in ('torch', 'numba', 'cv2', 'pybullet', 'trimesh') if name in sys.modules])"
+        "print([name for name in ('torch', 'numba', 'cv2', 'pybullet', 'trimesh', 'scipy', 'rich', 'pydantic', 'psutil', 'ssl') "
+        "if name in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", program, endpoint], capture_output=True, text=True, timeout=30)
     assert result.stdout.splitlines()[-1] == "[]", result

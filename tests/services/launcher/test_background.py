@@ -78,6 +78,52 @@ def test_records_of_launchers_that_are_gone_are_removed(state):
         assert not path.exists()
 
 
+def test_logs_of_several_services_are_in_the_order_of_time_also_while_they_are_followed(state):
+    logs = runs.Logs(state / "here")
+
+    def say(service: str, second: int, *more: str) -> None:
+        for line in (f"2026-11-23T00:00:{second:02}.000Z info    {service}: {second}", *more):
+            logs.write(service, f"{line}\n")
+
+    def numbers(lines: list[machine.Line]) -> list[str]:
+        return [line.text.rpartition(" ")[2] for line in lines]
+
+    say("fusion", 1)
+    say("fusion", 4, "Traceback", "ValueError: bad")
+    say("search", 2)
+    logs.write("search", '{"time": "2026-11-23T00:00:05.000Z", "level": "info", "message": "as JSON: 5"}\n')
+    merged = machine.Merged(state / "here", ())
+    assert [(line.service, line.text.split()[-1]) for line in merged.read()] == [
+        ("fusion", "1"),
+        ("search", "2"),
+        ("fusion", "4"),
+        ("fusion", "Traceback"),
+        ("fusion", "bad"),
+        ("search", '5"}'),
+    ]
+    say("search", 8)
+    assert merged.settled() == []
+    say("fusion", 7)  # in the file after what was logged later
+    say("haptics", 9)
+    assert numbers(merged.settled()) == ["7", "8"]
+    assert numbers(merged.settled()) == ["9"]
+    assert merged.width == len("haptics")
+    assert machine.Merged(state / "here", ("fusion",)).read()[-1].text.endswith("7")
+    assert machine.Merged(state / "here", ("fusion",)).width == 0
+
+
+def test_the_newest_lines_of_all_services_are_printed_with_their_names(state, capfd):
+    logs = runs.Logs(runs.logs_of("table"))
+    for second, service in enumerate(("fusion", "search", "fusion", "search")):
+        logs.write(service, f"2026-11-23T00:00:{second:02}.000Z info    {service}: said {second}\n")
+    assert cli.main(["logs", "-n", "3"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert [line.partition(" | ")[0] for line in lines] == ["search", "fusion", "search"]
+    assert [line[-1] for line in lines] == ["1", "2", "3"]
+    assert cli.main(["logs", "fusion", "-n", "1"]) == 0
+    assert capfd.readouterr().out == "2026-11-23T00:00:02.000Z info    fusion: said 2\n"
+
+
 def test_a_log_is_rolled_and_followed_across_its_roll(state, monkeypatch):
     monkeypatch.setattr(runs, "LOG_BYTES", 200)
     logs = runs.Logs(state / "here")

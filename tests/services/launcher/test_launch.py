@@ -13,6 +13,7 @@ import numpy as np
 import psutil
 import pytest
 from rich.console import Console
+from rich.text import Text
 
 from penumbra.services import flags as command_line
 from penumbra.services.launcher import display, launch, supervised
@@ -180,6 +181,27 @@ def test_the_launcher_shows_a_service_running_and_its_topics(capsys):
     assert "pose of forearm: tracking, at 0.0 0.0 20.0 cm" in drawn.get()
     assert steady.state == "stopped"
     assert "restarts: none" in capsys.readouterr().out
+
+
+def test_only_the_last_column_of_a_table_is_cut_to_the_width():
+    cells = [
+        "segmentation",
+        "degraded",
+        "27666",
+        "100",
+        "1198",
+        "0",
+        "no camera/front/mask for 1.6 s; refused on camera/front/frame",
+    ]
+    for width in (80, 71, 60):
+        console = Console(width=width)
+        with console.capture() as drawn:
+            console.print(
+                display._table(["process", "state", "pid", "CPU %", "MB", "restarts", ""], [list(map(Text, cells))], width)
+            )
+        (row,) = drawn.get().splitlines()[1:]
+        assert row.split()[:6] == cells[:6]
+        assert row.rstrip().endswith("…") and len(row) <= width
 
 
 def is_shown(launcher, process):

@@ -456,3 +456,24 @@ def test_a_process_whose_thread_fails_ends_and_says_why():
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
     assert ended.returncode == 1
     assert "ZeroDivisionError" in ended.stderr
+
+
+def test_a_node_that_ends_while_it_warms_up_says_nothing(router, monkeypatch):
+    failed: list[Any] = []
+    monkeypatch.setattr(threading, "excepthook", failed.append)
+    node = Node("worker", CELL, bus.Connection(connect=router.connection.listen))
+    closed = threading.Event()
+
+    def ends_in_its_thread() -> bool:
+        if threading.current_thread() is threading.main_thread() or node.session is None:
+            return False
+        node.stopping.set()
+        node.session.close()
+        closed.set()
+        return True
+
+    node.warm_when(ends_in_its_thread)
+    with node:
+        assert closed.wait(20)
+        wait_for(lambda: not any(thread.name == "warm up" for thread in threading.enumerate()), 20, "the end of the thread")
+    assert not failed
