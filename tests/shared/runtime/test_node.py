@@ -24,7 +24,7 @@ from penumbra.shared.contract import topics
 from penumbra.shared.runtime import bus, logs
 from penumbra.shared.runtime.hang import Turn
 from penumbra.shared.runtime.node import Node
-from penumbra.shared.runtime.replicas import Clock, Replicas, Share
+from penumbra.shared.runtime.replicas import Clock, Pace, Replicas, Share
 from penumbra.tests.support import injected
 from penumbra.tests.support.live import free_port, penumbra_command, stays, wait_for
 from penumbra.tests.support.nodes import node_command, pose
@@ -376,6 +376,20 @@ def test_a_replica_that_is_slow_but_alive_leaves_its_streams_to_the_others(repli
         wait_for(lambda: all(map(other.owns, STREAMS)), 20, "all streams to be the other one's")
         assert stays(lambda: all(map(other.owns, STREAMS)), 1.0), "they stay there while it is slow"
     wait_for(lambda: not all(map(other.owns, STREAMS)), 20, "the streams to come back")
+
+
+def test_where_no_replica_is_fit_one_keeps_all_streams_until_the_others_are_fit(replica, monkeypatch):
+    nodes = [replica() for _ in range(3)]
+    before = wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    with monkeypatch.context() as overloaded:
+        overloaded.setattr(Pace, "judge", lambda *_: "stalled")
+        kept = wait_for(lambda: (found := owners(nodes)) and len(set(map(id, found))) == 1 and found, 10, "a single owner")
+        assert living(nodes[0]) == {kept[0].instance}
+        kept[0].close()
+        left = [node for node in nodes if node is not kept[0]]
+        wait_for(lambda: len(living(left[0])) == 1 and owners(left), 10, "one of the others to serve")
+    wait_for(lambda: (found := owners(left)) and all(new is old for old, new in zip(before, found, strict=True) if old in left),
+             10, "the streams to be shared again")  # fmt: skip
 
 
 def test_a_process_whose_watch_itself_hangs_says_so(replica, monkeypatch):
