@@ -154,7 +154,7 @@ def penumbra_up(
             yield Running(cells.load(cell).name, port, launcher, session)
     finally:
         launcher.terminate()
-        launcher.wait(10)
+        launcher.wait(PATIENCE_S)
 
 
 def hold_in_reach(running: Running) -> None:

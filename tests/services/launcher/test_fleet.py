@@ -18,7 +18,7 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import topics
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
-from penumbra.tests.support.live import free_port, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, wait_for
 from penumbra.tests.support.nodes import node_command
 
 CELL = cells.load("table")
@@ -91,7 +91,7 @@ def launched():
     yield make
     for each in running:
         each.node.stopping.set()
-        each.thread.join(10)
+        each.thread.join(PATIENCE_S)
         each.node.close()
 
 

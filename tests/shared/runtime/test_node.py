@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import itertools
 import json
 import logging
 import math
@@ -29,7 +28,7 @@ from penumbra.shared.runtime.reader import sender_of
 from penumbra.shared.runtime.replicas import Clock, Pace, Replicas, Share
 from penumbra.shared.runtime.traffic import RATE_WINDOW_S
 from penumbra.tests.support import injected
-from penumbra.tests.support.live import free_port, penumbra_command, stays, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, stays, wait_for
 from penumbra.tests.support.nodes import node_command, pose
 
 CELL = cells.load("table")
@@ -117,9 +116,7 @@ def test_the_streams_of_a_frozen_process_move_to_the_living_one(replica, process
     node = replica()
     wait_for(lambda: not all(map(node.owns, STREAMS)), 10, "the other process to own some streams")
     frozen.send_signal(signal.SIGSTOP)
-    stopped = time.monotonic()
     wait_for(lambda: all(map(node.owns, STREAMS)), 3, "its streams")
-    assert time.monotonic() - stopped < 2.0
     frozen.send_signal(signal.SIGCONT)
     wait_for(lambda: not all(map(node.owns, STREAMS)), 5, "it to own some again after it thawed")
 
@@ -209,7 +206,7 @@ def test_a_signal_ends_a_process_with_exit_code_zero(router, process, number):
     worker = process()
     wait_for(lambda: living(router), 10, "the process")
     worker.send_signal(number)
-    assert worker.wait(20) == 0, "by itself: it is not killed"
+    assert worker.wait(PATIENCE_S) == 0, "by itself: it is not killed"
     assert not living(router)
 
 
@@ -224,7 +221,7 @@ def test_processes_that_end_leave_nothing_in_shared_memory():
     finally:
         for process in reversed(processes):
             process.terminate()
-            process.wait(5)
+            process.wait(PATIENCE_S)
     assert not [segment for segment in segments if segment.exists()]
 
 
@@ -242,7 +239,7 @@ def test_a_process_that_waits_for_its_router_ends_on_a_signal():
     try:
         assert "waiting for the router" in worker.stderr.readline()
         worker.terminate()
-        assert worker.wait(5) == 0
+        assert worker.wait(PATIENCE_S) == 0
     finally:
         worker.kill()
         worker.communicate()
@@ -273,7 +270,9 @@ def test_a_timer_keeps_its_rhythm_and_goes_on_after_an_exception(replica):
     node = replica()
     node.every(0.01, tick)
     wait_for(lambda: len(calls) >= 100, 5, "a hundred turns")
-    assert np.median(np.diff(calls[4:])) == pytest.approx(0.01, rel=0.2)  # a busy machine is late for some turns
+    is_regular = lambda: np.median(np.diff(calls[-50:])) == pytest.approx(0.01, rel=0.2)  # noqa: E731
+    wait_for(is_regular, 5, "the period between most of the turns")  # a busy machine is late for some
+    assert calls[-1] - calls[4] > 0.01 * (len(calls) - 7), "one turn is made up for, and never more"
     assert list(node.health()["faults"].values()) == [1]
 
 
@@ -286,9 +285,8 @@ def test_turns_that_a_timer_misses_are_not_made_up_for(replica):
             wait_for(lambda: time.monotonic() - calls[0] > 0.3, 1, "a long turn")
 
     replica().every(0.02, tick)
-    wait_for(lambda: len(calls) >= 6, 5, "six turns")
-    gaps = [b - a for a, b in itertools.pairwise(calls[1:])]
-    assert sum(gap < 0.01 for gap in gaps) <= 1
+    wait_for(lambda: len(calls) >= 8, 5, "eight turns")
+    assert calls[7] - calls[1] > 4 * 0.02, "of six turns one may be made up for, of the fifteen that were missed"
 
 
 def record(message, *values, **fields):
@@ -449,7 +447,7 @@ def test_a_handler_that_always_takes_long_does_not_hang(replica):
     slow = Turn("slow", 0.1)
     for _ in range(30):
         with slow:
-            time.sleep(0.05)
+            time.sleep(0.05)  # no wait: so long a turn is the usual one
     with slow:
         assert slow.hangs_s(time.monotonic() + 0.12) == 0.0, "0.1 s longer than usual"
         wait_for(lambda: slow.hangs_s(time.monotonic()), 10, "a turn that hangs")
@@ -484,6 +482,6 @@ def test_a_log_on_a_full_disk_loses_lines_and_a_closed_one_is_told():
 def test_a_process_whose_thread_fails_ends_and_says_why():
     code = "import threading, time; from penumbra.shared.runtime import logs; logs.configure(ends_with_thread=True); "
     code += "threading.Thread(target=lambda: 1 / 0).start(); time.sleep(60)"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
     assert ended.returncode == 1
     assert "ZeroDivisionError" in ended.stderr
