@@ -2,6 +2,7 @@
 
 import importlib.util
 import logging
+import signal
 import threading
 from collections.abc import Iterator
 
@@ -12,6 +13,13 @@ from penumbra.tests.support.live import Running, free_port, hold_in_reach, penum
 
 collect_ignore = [] if importlib.util.find_spec("pybullet") else ["test_pybullet.py", "test_dynamics.py"]
 """What only pybullet can answer; it has wheels up to CPython 3.11."""
+
+
+def pytest_configure() -> None:
+    """What the tests start inherits which signals are ignored, as they are in a run in the background, and tests send them."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler if number is signal.SIGINT else signal.SIG_DFL)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -44,19 +44,21 @@ class Fitness:
         before: Callable[[], None],
     ) -> None:
         """Looks every LOOK_S until `stopping` is set. While a handler hangs, this process stands still or its clock is off, it
-        has no part where others live: its streams are theirs until it is fit again. received: the counters of what is read.
-        rejoin: called when the replica is fit again. before: called before each look."""
-        self._looked_s, has_withdrawn = time.monotonic(), False
+        has no part where others live: its streams are theirs until it is fit again. Where all are unfit, as on an overloaded
+        machine, one keeps its part: the last to withdraw looks once more before it does. received: the counters of what is read.
+        rejoin: called when the replica is fit again, or alone. before: called before each look."""
+        self._looked_s, has_withdrawn, unfit_looks = time.monotonic(), False, 0
         while not stopping.wait(LOOK_S):
             before()
             unfit = self._look(time.monotonic(), received)
+            unfit_looks = unfit_looks + 1 if unfit else 0
             try:
-                if unfit and self._replicas.has_joined and self._replicas.others:
+                if unfit_looks > self._replicas.is_last_to_withdraw and self._replicas.has_joined and self._replicas.others:
                     self._log.warning("unfit: the other replicas take over", why=unfit)
                     has_withdrawn = True
                     self._replicas.withdraw()
-                elif has_withdrawn and not unfit:
-                    self._log.info("fit again")
+                elif has_withdrawn and not (unfit and self._replicas.others):
+                    self._log.info("no other replica is left" if unfit else "fit again")
                     has_withdrawn = False
                     rejoin()
             except zenoh.ZError:  # the session was closed

@@ -75,6 +75,11 @@ class Replicas:
         """Whether the others know of this replica."""
         return self._token is not None
 
+    @property
+    def is_last_to_withdraw(self) -> bool:
+        """Whether this one withdraws last, of those that live, where none of them is fit."""
+        return self._instance == min(self._living, default="")
+
     def __len__(self) -> int:
         return len(self._living)
 

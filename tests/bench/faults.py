@@ -38,8 +38,6 @@ BEFORE_S = 3.0
 OLD_S = 15.0
 """How old what is struck has to be: what dies early is in a crash loop, and waits before it is started again."""
 STEADY = 0.3
-TAIL_S = 0.5
-"""How much later than fusion we may hear of a measurement."""
 AFTER_S, LONGEST_S = 4.0, 30.0
 """How long the chain is watched when a fault is over: at least, and at most while the old rate is not back."""
 READY_S = 180.0
@@ -141,7 +139,7 @@ def _crash_loop(chain: Chain, process: psutil.Process) -> Iterator[None]:
         yield
 
 
-def _on(inject: Callable[[psutil.Process], AbstractContextManager[None]]) -> Callable[..., AbstractContextManager[None]]:
+def _on(inject: Callable[[psutil.Process], AbstractContextManager[Any]]) -> Callable[..., AbstractContextManager[Any]]:
     return lambda chain, process: inject(process)
 
 
@@ -234,16 +232,14 @@ def measure(chain: Chain, name: str, service: str) -> Row:
     wait_for(lambda: chain.is_settled(service), READY_S, "a chain that tracks the arm", 0.3)
     old_hz = wait_for(lambda: steady_hz(chain.outside), READY_S, "steady rates of all topics", 0.0)
     process = None if service == ALL else chain.owner(service)
-    chain.outside.forget()
-    taken = observed.taken(chain.running)
+    taken = observed.opened(chain.running, chain.outside)
     fault_s = time.monotonic()
     with fault.strike(chain, process):
         time.sleep(fault.lasts_s)
     over_s = time.monotonic()
     while True:
         time.sleep(AFTER_S)
-        taken_after = observed.taken(chain.running)
-        time.sleep(TAIL_S)
+        taken_after = observed.closed(chain.running, chain.outside)
         reused = observed.reused(chain.outside, taken, taken_after)
         now_s = time.monotonic()
         found = observed.numbers(chain.outside, service, old_hz, fault_s, now_s, reused)

@@ -1,4 +1,4 @@
-"""A recorded minute through all services: a changed output is a mistake, or a new reference in the same commit
+"""A recorded quarter of a minute through all services: a changed output is a mistake, or a new reference in the same commit
 (`python -m penumbra.tests.support.replay`)."""
 
 import json
@@ -21,19 +21,19 @@ SEED = 11
 
 
 def play() -> list[Heard]:
-    """Half a minute with masks in single precision: processors round bfloat16 differently, and some have none."""
+    """A quarter of a minute with masks in single precision: processors round bfloat16 differently, and some have none."""
     table = description.load("table")
     with pytest.MonkeyPatch.context() as context:
         context.setenv("ONEDNN_MAX_CPU_ISA", "AVX2")
-        return Replay(table).run(record(table, SEED, 30.0))
+        return Replay(table).run(record(table, SEED, 15.0))
 
 
 def masks() -> list[list[int]]:
-    """Pixels of every class in the masks of ten seconds, one mask a second. Whole frames in single precision: what a mask shows
+    """Pixels of every class in the masks of five seconds, one mask a second. Whole frames in single precision: what a mask shows
     changes the window of the next one, so that in the chain the rounding of one processor becomes pixels of another."""
     table = description.load("table")
     window, segmenter = whole_frame(table.cameras["front"]), load_segmenter(precision="f32")
-    frames: list[Any] = [message for topic, _, message in record(table, SEED, 10.0) if topic is FRAME]
+    frames: list[Any] = [message for topic, _, message in record(table, SEED, 5.0) if topic is FRAME]
     found = [np.bincount(segmenter(frame.image, window, frame.stamp_ns).ravel(), minlength=len(Label)) for frame in frames]
     return [counts.tolist() for counts in found[::20]]
 

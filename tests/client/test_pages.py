@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
-from penumbra.tests.support.live import wait_for
+from penumbra.tests.support.live import PATIENCE_S, wait_for
 from penumbra.tests.support.small import small
 
 ROOT = Path(__file__).parents[2]
@@ -26,6 +26,10 @@ def run(code: str, router: str) -> subprocess.Popen:
     code = code.replace("tcp/127.0.0.1:7447", router)
     environment = {**os.environ, "PENUMBRA_CONNECT": router}
     return subprocess.Popen([sys.executable, "-u", "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def said(code: str, router: str) -> str:
+    return run(code, router).communicate(timeout=PATIENCE_S)[0]
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
@@ -44,11 +48,11 @@ def test_the_first_program_on_a_page_prints_poses(router, page):
 def test_the_program_without_the_client_prints_the_pose_or_why_there_is_none(router):
     (code,) = (code for code in blocks("docs/python.md", "python") if "import zenoh" in code)
     with small("table", router) as chain:
-        assert run(code, router).communicate(timeout=60)[0].startswith("nobody answers")
+        assert said(code, router).startswith("nobody answers")
         with chain.fusion():
-            asked = lambda: (out := run(code, router).communicate(timeout=60)[0]).startswith("{'target': 'forearm'") and out  # noqa: E731
+            asked = lambda: (out := said(code, router)).startswith("{'target': 'forearm'") and out  # noqa: E731
             assert "'state': 'lost'" in wait_for(asked, 30, "the pose")
-            assert run(code.replace("format=json", "format=xml"), router).communicate(timeout=60)[0].startswith("refused: ")
+            assert said(code.replace("format=json", "format=xml"), router).startswith("refused: ")
 
 
 def test_the_cell_file_of_an_own_camera_loads_and_its_camera_sees_the_arms_home(tmp_path):

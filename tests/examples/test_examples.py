@@ -19,7 +19,7 @@ import pytest
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
 from penumbra.sim.world.world import Sensors, World
-from penumbra.tests.support.live import penumbra_up, wait_for
+from penumbra.tests.support.live import PATIENCE_S, penumbra_up, wait_for
 from penumbra.tests.support.small import small
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -51,7 +51,7 @@ def example(name: str, endpoint: str, *arguments: str) -> Iterator[Example]:
         yield running
         assert process.poll() is None, running.errors.read()
         process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0, running.errors.read()
+        assert process.wait(PATIENCE_S) == 0, running.errors.read()
     finally:
         process.kill()
         process.wait()

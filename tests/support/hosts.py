@@ -19,7 +19,7 @@ import zenoh
 
 from penumbra.shared.cell import description as cells
 from penumbra.shared.runtime import bus
-from penumbra.tests.support.live import penumbra_command, wait_for
+from penumbra.tests.support.live import PATIENCE_S, penumbra_command, wait_for
 
 ROOT = Path(__file__).parents[3]
 NAMESPACES = ("--net", "--mount", "--uts")
@@ -56,13 +56,13 @@ class Host:
             process.terminate()
         for process in self.processes.values():
             try:
-                process.wait(5)
+                process.wait(PATIENCE_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
         assert self._holder.stdin is not None
         self._holder.stdin.close()
-        self._holder.wait(5)
+        self._holder.wait(PATIENCE_S)
 
     @property
     def pid(self) -> int:

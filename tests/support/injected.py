@@ -55,20 +55,24 @@ def frozen(process: psutil.Process) -> Iterator[None]:
 
 
 @contextmanager
-def slowed(process: psutil.Process, stopped_s: float = 0.4, running_s: float = 0.1) -> Iterator[None]:
-    """It runs for a fifth of the time, in bursts that the lease of its connection does not notice."""
+def slowed(process: psutil.Process, stopped_s: float = 0.4, running_s: float = 0.1) -> Iterator[list[tuple[float, float]]]:
+    """It runs for a fifth of the time, in bursts that the lease of its connection does not notice. From when to when it was
+    stopped, by the steady clock, is in the list."""
     done = threading.Event()
+    stops: list[tuple[float, float]] = []
 
     def alternate() -> None:
         with suppress(psutil.NoSuchProcess):
             while not done.is_set():
                 process.send_signal(signal.SIGSTOP)
+                stopped_at_s = time.monotonic()
                 done.wait(stopped_s)
+                stops.append((stopped_at_s, time.monotonic()))
                 process.send_signal(signal.SIGCONT)
                 done.wait(running_s)
 
     with _signalled(process, signal.SIGCONT), meanwhile(alternate, done):
-        yield
+        yield stops
 
 
 @contextmanager

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-import random
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -58,26 +55,20 @@ def penumbra_command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "penumbra", *arguments]
 
 
-PORTS = range(20_000, 30_000)
-"""Ports for tests: below those that the kernel gives away (from 32,768 on), so that no connection takes one meanwhile."""
-_held: list[int] = []
-"""Descriptors of locked files, one per port, kept until this process ends."""
+_held: list[socket.socket] = []
+"""Sockets that hold a port, one each, until this process ends."""
 
 
 def free_port() -> int:
-    """A TCP port on loopback that nobody listens on, and that no other test gets before this process has ended."""
-    for port in random.sample(PORTS, len(PORTS)):
-        lock = os.open(f"{tempfile.gettempdir()}/penumbra-test-port-{port}", os.O_CREAT | os.O_RDWR, 0o666)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with socket.socket() as probe:
-                probe.bind(("127.0.0.1", port))
-        except OSError:  # another test's, or somebody listens
-            os.close(lock)
-            continue
-        _held.append(lock)
-        return port
-    raise AssertionError(f"no free port in {PORTS}")
+    """A TCP port that nobody listens on, and that nobody but who is told it gets before this process has ended.
+
+    The socket that the kernel gave it to stays bound and does not listen: the kernel gives the port to nobody else, neither to
+    listen on nor to call from, and lets one that asks for it by its number listen there (SO_REUSEADDR, as all servers set it)."""
+    holder = socket.socket()
+    holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    holder.bind(("", 0))
+    _held.append(holder)
+    return int(holder.getsockname()[1])
 
 
 def connect(port: int = 7447) -> zenoh.Session:
@@ -163,7 +154,7 @@ def penumbra_up(
             yield Running(cells.load(cell).name, port, launcher, session)
     finally:
         launcher.terminate()
-        launcher.wait(10)
+        launcher.wait(PATIENCE_S)
 
 
 def hold_in_reach(running: Running) -> None:

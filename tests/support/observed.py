@@ -15,8 +15,9 @@ import zenoh
 
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.geometry import rigid
+from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.reader import sender_of
-from penumbra.tests.support.live import Running
+from penumbra.tests.support.live import Running, wait_for
 
 READ = (topics.FUSED, topics.VISION, topics.HAPTIC, topics.TRUTH, topics.MASK, topics.FRAME, topics.VOLTAGES)
 DECODED = {topics.FUSED.name, topics.VISION.name, topics.HAPTIC.name, topics.TRUTH.name}
@@ -37,6 +38,8 @@ SHARE, WINDOW_S = 0.75, 0.5
 """A rate is back when so much of it is seen in two windows of this length, one after the other: below is no hiccup."""
 FAR_S = 0.5
 """A pose stamped further from the truth of its time of arrival is not of that time."""
+SETTLE_S = 20.0
+"""Within this a message that was sent has come wherever it goes."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,11 @@ class Outside:
             message = messages.decode(topic.message, payload) if topic.name in DECODED else None
             out.append(Seen(at_s, message, publisher.hex(), number))
         return out
+
+    def newest_ns(self, topic: topics.Topic) -> int:
+        """The stamp of the message of a topic that came last, 0 where none did."""
+        rows = self._rows[topic.name]
+        return int(messages.decode(topic.message, rows[-1][1]).stamp_ns) if rows else 0
 
     def forget(self) -> None:
         """Drops what came until now, but for the last message of each topic, from which the next are counted on."""
@@ -209,8 +217,12 @@ def health(running: Running, service: str = "*") -> list[dict[str, Any]]:
     return [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
 
 
-def taken(running: Running) -> dict[tuple[str, str], int]:
-    """How many measurements each instance of fusion has accepted of each sense."""
+Taken = dict[tuple[str, str], int]
+"""How many measurements each instance of fusion has accepted of each sense."""
+
+
+def taken(running: Running) -> Taken:
+    """What fusion has accepted until now."""
     return {
         (report["instance"], sense): target[sense]["accepted"]
         for report in health(running, "fusion")
@@ -219,9 +231,44 @@ def taken(running: Running) -> dict[tuple[str, str], int]:
     }
 
 
-def reused(outside: Outside, before: dict[tuple[str, str], int], after: dict[tuple[str, str], int]) -> int:
-    """How many measurements an instance of fusion has accepted more than there were: by its own counters, between two times,
-    before the first of which we listened already."""
+def believed_ns(running: Running) -> list[dict[str, int]]:
+    """By each instance of fusion that answers, the stamp of the newest measurement that it has of each sense."""
+    selector = topics.current_pose(running.cell, "*") + "?format=json"
+    poses = [json.loads(answer) for answer in bus.ask(running.session, selector)]
+    return [
+        {sense: pose["stamp_ns"] - round(1e9 * source["age_s"]) for sense, source in pose["sources"].items()} for pose in poses
+    ]
+
+
+def opened(running: Running, outside: Outside) -> Taken:
+    """What fusion has accepted, with all that came before forgotten by `outside`: none of that is still on its way to fusion, or
+    it would be accepted afterwards, and counted as one that nobody has offered."""
+
+    def settled() -> Taken | None:
+        outside.forget()
+        newest_ns = {topic.name: outside.newest_ns(topic) for topic, _ in SENSES}
+        found = believed_ns(running)
+        is_through = all(pose.get(sense, 0) >= stamp_ns for pose in found for sense, stamp_ns in newest_ns.items())
+        return taken(running) if found and is_through else None
+
+    return wait_for(settled, SETTLE_S, "fusion to have all that was sent")
+
+
+def closed(running: Running, outside: Outside) -> Taken:
+    """What fusion has accepted, all of which `outside` has seen: what it sees later than fusion would be missing there."""
+    found = taken(running)
+    believed = believed_ns(running)
+
+    def has_seen() -> bool:
+        return all(outside.newest_ns(topic) >= pose.get(topic.name, 0) for pose in believed for topic, _ in SENSES)
+
+    wait_for(has_seen, SETTLE_S, "all that fusion has taken")
+    return found
+
+
+def reused(outside: Outside, before: Taken, after: Taken) -> int:
+    """How many measurements an instance of fusion has accepted more than there were: by its own counters, between `opened` and
+    `closed`."""
     there_were = {topic.name: offered(outside.seen(topic), usable) for topic, usable in SENSES}
     return sum(max(0, n - before.get((instance, sense), 0) - there_were[sense]) for (instance, sense), n in after.items())
 

@@ -20,7 +20,7 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import processes, topics
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
-from penumbra.tests.support.live import free_port, penumbra_command, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 from penumbra.tests.support.nodes import pose_json, start
 
 CELL = cells.load("table")
@@ -275,7 +275,7 @@ def test_pose_loads_nothing_that_takes_longer_than_its_answer(endpoint):
         "print([name for name in ('torch', 'numba', 'cv2', 'pybullet', 'trimesh', 'scipy', 'rich', 'pydantic', 'psutil', 'ssl') "
         "if name in sys.modules])"
     )
-    result = subprocess.run([sys.executable, "-c", program, endpoint], capture_output=True, text=True, timeout=30)
+    result = subprocess.run([sys.executable, "-c", program, endpoint], capture_output=True, text=True, timeout=PATIENCE_S)
     assert result.stdout.splitlines()[-1] == "[]", result
 
 
@@ -289,7 +289,7 @@ def test_watch_prints_pose_after_pose_until_ctrl_c(endpoint):
         stamps = [json.loads(watch.stdout.readline())["stamp_ns"] for _ in range(4)]
         assert stamps == sorted(set(stamps))
         watch.send_signal(2)
-        assert watch.wait(5) in (0, 130)
+        assert watch.wait(PATIENCE_S) in (0, 130)
     finally:
         watch.kill()
         watch.communicate()
@@ -421,7 +421,7 @@ def test_a_command_ends_quietly_when_its_reader_does(endpoint):
     watch.stdout.readline()
     watch.stdout.close()
     assert watch.stderr.read() == ""
-    assert watch.wait(10) == 0
+    assert watch.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.parametrize("argv", [["topics"], ["--help"], ["pose", "--json"]])

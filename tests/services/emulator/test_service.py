@@ -22,7 +22,7 @@ from penumbra.shared.contract import topics
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 from penumbra.sim.world.world import World
-from penumbra.tests.support.live import free_port, penumbra_command, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 
 ROOT = Path(__file__).parents[3]
 
@@ -168,7 +168,7 @@ def emulator(ports):
             yield node, heard
     finally:
         process.terminate()
-        code = process.wait(5)
+        code = process.wait(PATIENCE_S)
         router.close()
     assert code == 0 and not list(ports.iterdir())
 

@@ -24,7 +24,7 @@ from penumbra.shared.contract import topics
 from penumbra.shared.contract.processes import PROCESSES
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
-from penumbra.tests.support.live import free_port, penumbra_command, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 from penumbra.tests.support.nodes import node_command
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are adopted on Linux only")
@@ -247,7 +247,7 @@ def test_a_fork_server_whose_launcher_is_gone_ends_without_a_word():
     theirs.close()
     wait_for(lambda: select.select([ours], [], [], 0)[0], 30, "the fork server")
     ours.close()
-    assert server.communicate(timeout=10)[1] == ""
+    assert server.communicate(timeout=PATIENCE_S)[1] == ""
 
 
 def children(pid, word):

@@ -188,6 +188,7 @@ def test_training_that_was_interrupted_ends_with_the_same_weights(data, tmp_path
         assert torch.equal(a, b)
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(data):
     trainer = train.Trainer(SMALL, train.Schedule(batch=8, peak_rate=4e-3), seed=1)
     parts = [trainer.train_step(data, 0.1) for _ in range(50)]

@@ -20,7 +20,7 @@ from penumbra.shared.runtime.node import Node
 from penumbra.shared.skin import board
 from penumbra.sim.skin.board import FAULTS, Board, Tank
 from penumbra.tests.support.boards import SimulatedPort
-from penumbra.tests.support.live import free_port, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, wait_for
 
 CELL = cells.load("table")
 ELECTRODES = ["c", "r", "l", "t", "b"]
@@ -237,7 +237,7 @@ def served(devices):
 
     def unplug():
         stopping.set()
-        thread.join(10)
+        thread.join(PATIENCE_S)
 
     try:
         yield list(terminals.devices.values()), unplug

@@ -21,7 +21,7 @@ from penumbra.shared.contract import access, messages, topics
 from penumbra.shared.contract.processes import PROCESSES
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
-from penumbra.tests.support.live import free_port, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, wait_for
 from penumbra.tests.support.nodes import pose
 
 CELL = cells.load("table")
@@ -279,7 +279,7 @@ def test_processes_and_commands_take_the_switch(folder, capsys):
     finally:
         for process in reversed(processes):
             process.terminate()
-            process.wait(10)
+            process.wait(PATIENCE_S)
 
 
 # ---- who gets in

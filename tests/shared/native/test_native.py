@@ -15,10 +15,14 @@ import pytest
 
 from penumbra.services.haptics import paper_nearest
 from penumbra.services.search import contour
+from penumbra.shared.cell import description
 from penumbra.shared.geometry import raster, surface
 from penumbra.shared.native import KERNELS, Kernel, build, inner, kernel, machine
 from penumbra.shared.native.compiler import LIBC
 from penumbra.shared.native.signature import Signature
+from penumbra.sim.world.world import record
+from penumbra.tests.support import emulated
+from penumbra.tests.support.replay import Replay
 
 ROOT = Path(__file__).parents[3]
 
@@ -119,6 +123,35 @@ def test_compiled_code_computes_what_the_python_function_computes(seed):
                 ours, theirs = (each.view((np.float64, 8), np.ndarray) for each in (ours, theirs))
             # sums of a hundred terms, in another order at most
             np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12, err_msg=compiled.name)
+
+
+REORDERED = {"penumbra.shared.skin.response.values": 1e-5, "penumbra.services.haptics.solve._descend": 1e-2}
+"""Relative tolerances of what sums in single precision in another order, and of the steps that begin from there."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(emulated.missing()), reason=f"not installed here: {emulated.missing()} (Debian's qemu-user and gcc)")
+def test_on_an_emulated_aarch64_kernels_give_what_they_give_here(tmp_path):
+    table = description.load("table")
+    with emulated.recorded(most=3) as recorded:
+        Replay(table).run(record(table, 11, 1.0))
+        for compiled, arguments in calls(np.random.default_rng(0)):
+            compiled(*arguments)
+    assert len({call.kernel.name for call in recorded}) >= 15, "kernels of every service, and of the emulated sensors"
+    for call, arrays, result in emulated.run(recorded, tmp_path):
+        kinds, name = call.kernel.signature.parameters, call.kernel.name
+        expected = [value for value, kind in zip(call.after, kinds, strict=True) if kind.is_array]
+        for ours, theirs in zip([*arrays, *fields(result)], [*expected, *fields(call.result)], strict=True):
+            for one, other in zip(fields(ours), fields(theirs), strict=True):
+                np.testing.assert_allclose(one, other, rtol=REORDERED.get(name, 1e-9), atol=1e-12, err_msg=name)
+
+
+def fields(array):
+    """The fields of an array of records, and of those in it; an array of numbers, and a number, alone; nothing for None."""
+    if array is None:
+        return []
+    names = getattr(array, "dtype", np.dtype(float)).names
+    return [each for name in names for each in fields(array[name])] if names else [array]
 
 
 def imported(path, text):

@@ -97,31 +97,31 @@ def test_a_reader_knows_which_of_two_publishers_sent_a_message(node):
 
 
 def test_a_slow_reader_of_one_topic_does_not_hold_up_another(node):
-    slow, ages = [], []
+    masks, poses, sent, let_go = [], [], [], threading.Event()
     reader, writer = node(), node()
 
     def take_long(message, names):
-        time.sleep(0.05)
-        slow.append(time.time_ns() - message.stamp_ns)
+        masks.append(message.stamp_ns)
+        let_go.wait()
 
     reader.subscribe(topics.MASK, take_long)
-    reader.subscribe(topics.FUSED, lambda message, names: ages.append(time.time_ns() - message.stamp_ns))
+    reader.subscribe(topics.FUSED, lambda message, names: poses.append(message))
     reader.open(), writer.open()
-    until(lambda: ages and slow, lambda: send(writer), "both topics")
-    del ages[:], slow[:]
-    writer.every(0.01, lambda: send(writer))  # 100 Hz: five times what the slow reader can take
-    wait_for(lambda: len(ages) >= 150, 10, "150 poses")
-    assert np.median(ages) * 1e-9 < 0.01
-    assert max(slow) * 1e-9 < 0.2, "the slow reader gets the newest, not the backlog"
+    until(lambda: masks, lambda: send(writer), "the first mask")
+    del poses[:]
+    until(lambda: len(poses) >= 50, lambda: sent.append(send(writer)), "50 poses while a mask is worked on")
+    assert len(masks) == 1
+    let_go.set()
+    wait_for(lambda: masks[-1] == sent[-1], 5, "the newest mask")
+    assert len(masks) < 0.5 * len(sent), "the slow reader gets the newest, not the backlog"
 
 
 def send(writer):
-    writer.publish(
-        topics.MASK,
-        messages.Mask(stamp_ns=time.time_ns(), labels=np.zeros((4, 4), np.uint8), x0=0, y0=0, scale=1),
-        camera="front",
-    )
+    """Sends a mask and a pose; the stamp of the mask."""
+    mask = messages.Mask(stamp_ns=time.time_ns(), labels=np.zeros((4, 4), np.uint8), x0=0, y0=0, scale=1)
+    writer.publish(topics.MASK, mask, camera="front")
     writer.publish(topics.FUSED, pose(), target="forearm")
+    return mask.stamp_ns
 
 
 def test_bad_messages_are_counted_by_kind_logged_once_and_do_not_stop_the_reader(node, log):
@@ -191,7 +191,7 @@ def test_what_a_reader_missed_is_counted_from_the_publishers_numbers(node):
 
     def hold(message, names):
         got.append(message)
-        go.wait(5)
+        go.wait()
 
     reader.subscribe(topics.MASK, hold)
     reader.open(), writer.open()
@@ -373,7 +373,7 @@ def router_process(endpoint):
     return subprocess.Popen(penumbra_command("router", "--listen", endpoint), stderr=subprocess.DEVNULL)
 
 
-def test_nodes_wait_for_the_router_and_go_on_after_it_was_away_for_five_seconds(log):
+def test_nodes_wait_for_the_router_and_go_on_after_it_was_away(log):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     got = []
     reader, writer = (Node(name, CELL, bus.Connection(connect=(endpoint,))) for name in ("reader", "writer"))
@@ -390,9 +390,7 @@ def test_nodes_wait_for_the_router_and_go_on_after_it_was_away_for_five_seconds(
         wait_for(lambda: got, 10, "a message through the router")
         router.kill()
         router.wait()
-        killed = time.monotonic()
         wait_for(lambda: len(log("waiting")) == 4, 5, "both to say that the router is gone")
-        wait_for(lambda: time.monotonic() - killed > 5.0, 6, "five seconds without a router")
         before, back_ns = len(got), time.time_ns()
         router = router_process(endpoint)
         wait_for(lambda: len(got) > before, 3, "messages after the router came back")

@@ -204,10 +204,17 @@ def test_from_outside_every_instance_is_reported_and_one_that_hangs_is_down(rout
     assert found["router"].status == "ok"
     assert (found["worker"].status, found["worker"].reasons) == ("starting", (WAITS,))
     monkeypatch.setattr(running, "ANSWER_S", 0.2)
-    worker.send_signal(signal.SIGSTOP)  # its token is there until its lease ends
-    wait_for(lambda: psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED, 5, "it to stop")
-    hung = next(each for each in seen(router) if each.service == "worker")
-    worker.send_signal(signal.SIGCONT)
+
+    def seen_while_it_stands_still():
+        """None where its lease has ended before it was asked, as on a busy machine: its token is gone then."""
+        wait_for(lambda: any(each.service == "worker" and each.status == "starting" for each in seen(router)), 5, "the worker")
+        worker.send_signal(signal.SIGSTOP)
+        wait_for(lambda: psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED, 5, "it to stop", 0.001)
+        found = [each for each in seen(router) if each.service == "worker"]
+        worker.send_signal(signal.SIGCONT)
+        return found
+
+    (hung,) = wait_for(seen_while_it_stands_still, 20, "the worker among those that are there")
     assert hung.status == "down"
     assert hung.reasons == ("hangs: no answer within 0.2 s",)
 

@@ -12,7 +12,7 @@ from penumbra.shared.contract import topics
 from penumbra.shared.contract.report import Report
 from penumbra.shared.runtime import bus, metrics
 from penumbra.shared.runtime.node import Node
-from penumbra.tests.support.live import free_port, penumbra_command, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 from penumbra.tests.support.nodes import pose
 
 CELL = cells.load("table")
@@ -109,7 +109,7 @@ def test_a_service_serves_its_own_page_until_it_ends_and_ends_in_time():
     try:
         wait_for(lambda: value(page(port), "penumbra_status", service="router", status="ok") == 1, 20, "the page", 0.2)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(5) == 0
+        assert process.wait(PATIENCE_S) == 0
         assert page(port) is None
     finally:
         process.kill()
@@ -130,13 +130,13 @@ def test_the_launchers_page_covers_the_processes_that_answer_it():
         wait_for(lambda: value(page(port), "penumbra_uptime_seconds", service="helper") is None, 10, "its end", 0.2)
     finally:
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=20)
+        process.communicate(timeout=PATIENCE_S)
 
 
 @pytest.mark.parametrize("text", ["0", "70000", "here", "0.0.0.0:", "-1"])
 def test_a_port_that_is_none_is_refused_in_one_line(text):
     process = started("router", f"--metrics-port={text}")
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert f"--metrics-port: expected a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, got {text!r}" in err
 
@@ -144,6 +144,6 @@ def test_a_port_that_is_none_is_refused_in_one_line(text):
 def test_a_port_that_is_taken_is_reported_in_one_line(served):
     port = served(list)
     process = started("router", "--listen", f"tcp/127.0.0.1:{free_port()}", "--metrics-port", str(port))
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, len(err.splitlines())) == (2, 1)
     assert f"--metrics-port 127.0.0.1:{port} cannot be opened (Address already in use): give another one" in err

@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import itertools
 import json
 import logging
 import math
@@ -18,15 +17,18 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import zenoh
 
 from penumbra.shared.cell import description as cells
-from penumbra.shared.contract import topics
+from penumbra.shared.contract import messages, topics
 from penumbra.shared.runtime import bus, logs
 from penumbra.shared.runtime.hang import Turn
 from penumbra.shared.runtime.node import Node
-from penumbra.shared.runtime.replicas import Clock, Replicas, Share
+from penumbra.shared.runtime.reader import sender_of
+from penumbra.shared.runtime.replicas import Clock, Pace, Replicas, Share
+from penumbra.shared.runtime.traffic import RATE_WINDOW_S
 from penumbra.tests.support import injected
-from penumbra.tests.support.live import free_port, penumbra_command, stays, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, stays, wait_for
 from penumbra.tests.support.nodes import node_command, pose
 
 CELL = cells.load("table")
@@ -114,9 +116,7 @@ def test_the_streams_of_a_frozen_process_move_to_the_living_one(replica, process
     node = replica()
     wait_for(lambda: not all(map(node.owns, STREAMS)), 10, "the other process to own some streams")
     frozen.send_signal(signal.SIGSTOP)
-    stopped = time.monotonic()
     wait_for(lambda: all(map(node.owns, STREAMS)), 3, "its streams")
-    assert time.monotonic() - stopped < 2.0
     frozen.send_signal(signal.SIGCONT)
     wait_for(lambda: not all(map(node.owns, STREAMS)), 5, "it to own some again after it thawed")
 
@@ -166,25 +166,39 @@ def test_health_of_all_instances_is_one_wildcard_query(router, process):
 
 
 def test_health_reports_rate_age_cpu_and_memory_of_a_steady_publisher(router, process):
+    key = topics.FUSED.at(cell="table", target="forearm")
+    sent = router.session.declare_subscriber(key, zenoh.handlers.FifoChannel(100_000))
     reader = Node("reader", CELL, bus.Connection(connect=router.connection.listen))
-    reader.subscribe(topics.FUSED, lambda message, names: None)
+    taken: list[tuple[float, int]] = []
+    reader.subscribe(topics.FUSED, lambda message, names: taken.append((time.monotonic(), message.stamp_ns)))
+    row = lambda: reader.health()["topics"][key]  # noqa: E731
     with reader:
         worker = process()
-        key = topics.FUSED.at(cell="table", target="forearm")
-        first = wait_for(lambda: (r := reader.health()["topics"][key])["count"] >= 50 and r, 20, "50 poses")
-        began = time.monotonic()
-        row = wait_for(lambda: (r := reader.health()["topics"][key])["count"] >= first["count"] + 200 and r, 20, "200 more poses")
-        arrived_hz = (row["count"] - first["count"]) / (time.monotonic() - began)
-        assert row["rate_hz"] == pytest.approx(arrived_hz, rel=0.3)
-        assert 0.0 <= row["delay_s"] < topics.FUSED.oldest_s
-        assert row["dropped"] < 0.1 * row["count"], "a reader that does nothing keeps up, but for moments on a busy machine"
-        assert not row["stale"]
+        wait_for(lambda: len(taken) > 250, 20, "250 poses")
+
+        def rate_is_reported():
+            reported_hz, now_s = row()["rate_hz"], time.monotonic()
+            return reported_hz == pytest.approx(sum(at_s > now_s - RATE_WINDOW_S for at_s, _ in taken) / RATE_WINDOW_S, rel=0.3)
+
+        wait_for(rate_is_reported, 20, "the rate at which poses arrive")
+        wait_for(lambda: not row()["stale"], 5, "a fresh pose")
+        assert 0.0 <= row()["delay_s"] < topics.FUSED.oldest_s
         (report,) = health(router)
         assert report["pid"] == worker.pid
         assert 0 < report["cpu"] < 1
         assert 20 < report["memory_mb"] < 500
         worker.kill()
-        wait_for(lambda: reader.health()["topics"][key]["stale"], 2, "the topic to be stale after its publisher died")
+        wait_for(lambda: row()["stale"], 2, "the topic to be stale after its publisher died")
+
+        numbers: dict[int, Any] = {}
+        while (sample := sent.try_recv()) is not None:
+            numbers[messages.decode(messages.FusedPose, sample.payload.to_bytes()).stamp_ns] = sender_of(sample)[1]
+
+        def is_all_counted():  # a reader that a busy machine holds up for longer than its ring lasts, 40 ms, drops some
+            (_, first), (_, last), now = taken[0], taken[-1], row()
+            return now["count"] == len(taken) and now["count"] + now["dropped"] == numbers[last] - numbers[first] + 1
+
+        wait_for(is_all_counted, 5, "every pose to be taken or counted as dropped")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -192,7 +206,7 @@ def test_a_signal_ends_a_process_with_exit_code_zero(router, process, number):
     worker = process()
     wait_for(lambda: living(router), 10, "the process")
     worker.send_signal(number)
-    assert worker.wait(20) == 0, "by itself: it is not killed"
+    assert worker.wait(PATIENCE_S) == 0, "by itself: it is not killed"
     assert not living(router)
 
 
@@ -207,7 +221,7 @@ def test_processes_that_end_leave_nothing_in_shared_memory():
     finally:
         for process in reversed(processes):
             process.terminate()
-            process.wait(5)
+            process.wait(PATIENCE_S)
     assert not [segment for segment in segments if segment.exists()]
 
 
@@ -225,7 +239,7 @@ def test_a_process_that_waits_for_its_router_ends_on_a_signal():
     try:
         assert "waiting for the router" in worker.stderr.readline()
         worker.terminate()
-        assert worker.wait(5) == 0
+        assert worker.wait(PATIENCE_S) == 0
     finally:
         worker.kill()
         worker.communicate()
@@ -256,7 +270,9 @@ def test_a_timer_keeps_its_rhythm_and_goes_on_after_an_exception(replica):
     node = replica()
     node.every(0.01, tick)
     wait_for(lambda: len(calls) >= 100, 5, "a hundred turns")
-    assert np.median(np.diff(calls[4:])) == pytest.approx(0.01, rel=0.2)  # a busy machine is late for some turns
+    is_regular = lambda: np.median(np.diff(calls[-50:])) == pytest.approx(0.01, rel=0.2)  # noqa: E731
+    wait_for(is_regular, 5, "the period between most of the turns")  # a busy machine is late for some
+    assert calls[-1] - calls[4] > 0.01 * (len(calls) - 7), "one turn is made up for, and never more"
     assert list(node.health()["faults"].values()) == [1]
 
 
@@ -269,9 +285,8 @@ def test_turns_that_a_timer_misses_are_not_made_up_for(replica):
             wait_for(lambda: time.monotonic() - calls[0] > 0.3, 1, "a long turn")
 
     replica().every(0.02, tick)
-    wait_for(lambda: len(calls) >= 6, 5, "six turns")
-    gaps = [b - a for a, b in itertools.pairwise(calls[1:])]
-    assert sum(gap < 0.01 for gap in gaps) <= 1
+    wait_for(lambda: len(calls) >= 8, 5, "eight turns")
+    assert calls[7] - calls[1] > 4 * 0.02, "of six turns one may be made up for, of the fifteen that were missed"
 
 
 def record(message, *values, **fields):
@@ -378,6 +393,20 @@ def test_a_replica_that_is_slow_but_alive_leaves_its_streams_to_the_others(repli
     wait_for(lambda: not all(map(other.owns, STREAMS)), 20, "the streams to come back")
 
 
+def test_where_no_replica_is_fit_one_keeps_all_streams_until_the_others_are_fit(replica, monkeypatch):
+    nodes = [replica() for _ in range(3)]
+    before = wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    with monkeypatch.context() as overloaded:
+        overloaded.setattr(Pace, "judge", lambda *_: "stalled")
+        kept = wait_for(lambda: (found := owners(nodes)) and len(set(map(id, found))) == 1 and found, 10, "a single owner")
+        assert living(nodes[0]) == {kept[0].instance}
+        kept[0].close()
+        left = [node for node in nodes if node is not kept[0]]
+        wait_for(lambda: len(living(left[0])) == 1 and owners(left), 10, "one of the others to serve")
+    wait_for(lambda: (found := owners(left)) and all(new is old for old, new in zip(before, found, strict=True) if old in left),
+             10, "the streams to be shared again")  # fmt: skip
+
+
 def test_a_process_whose_watch_itself_hangs_says_so(replica, monkeypatch):
     node, let_go = replica(), threading.Event()
     assert node.health()["hangs"] == ""
@@ -418,7 +447,7 @@ def test_a_handler_that_always_takes_long_does_not_hang(replica):
     slow = Turn("slow", 0.1)
     for _ in range(30):
         with slow:
-            time.sleep(0.05)
+            time.sleep(0.05)  # no wait: so long a turn is the usual one
     with slow:
         assert slow.hangs_s(time.monotonic() + 0.12) == 0.0, "0.1 s longer than usual"
         wait_for(lambda: slow.hangs_s(time.monotonic()), 10, "a turn that hangs")
@@ -453,7 +482,7 @@ def test_a_log_on_a_full_disk_loses_lines_and_a_closed_one_is_reported():
 def test_a_process_whose_thread_fails_ends_and_says_why():
     code = "import threading, time; from penumbra.shared.runtime import logs; logs.configure(ends_with_thread=True); "
     code += "threading.Thread(target=lambda: 1 / 0).start(); time.sleep(60)"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
     assert ended.returncode == 1
     assert "ZeroDivisionError" in ended.stderr
 
