@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from types import TracebackType
 
@@ -14,7 +15,8 @@ SHARE = 0.05
 
 
 class Turn:
-    """The calls of one handler, one at a time: `with turn: handler(...)`.
+    """The calls of one handler, one at a time: `with turn: handler(...)`. A call waits for the one under way, which is that of
+    another thread where a subscription was closed and opened again meanwhile.
 
     what: the handler in words. patience_s: how much longer than usual a call may take; infinite for one that never returns.
     """
@@ -22,16 +24,19 @@ class Turn:
     def __init__(self, what: str, patience_s: float = HANG_S):
         self.what = what
         self._patience_s = patience_s
+        self._is_free = threading.Lock()
         self._began_s: float | None = None
         self._usual_s = FIRST_S
 
     def __enter__(self) -> None:
+        self._is_free.acquire()
         self._began_s = time.monotonic()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._began_s is not None:
             self._usual_s += SHARE * (time.monotonic() - self._began_s - self._usual_s)
         self._began_s = None
+        self._is_free.release()
 
     def hangs_s(self, now_s: float) -> float:
         """Duration [s] of the call under way, where that is too long; else 0. `now_s`: of time.monotonic."""

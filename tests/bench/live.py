@@ -24,12 +24,14 @@ from penumbra.tests.bench.lib.accuracy import SENSES, percentiles
 from penumbra.tests.bench.lib.results import Part, Result, marked
 from penumbra.tests.support.live import penumbra_up, wait_for
 
-RATES = (("frames_per_s", "frames used per second", 15.0), ("fused_hz", "fused poses per second", 100.0))
+RATES = (("frames_per_s", "frames used per second", 19.0), ("fused_hz", "fused poses per second", 100.0))
 AGES = (
-    ("age_ms", "exposure to fused pose, p50 / p95 ms", 100.0),
+    ("age_ms", "exposure to fused pose, p50 / p95 ms", 80.0),
     ("haptic_age_ms", "skin sample to haptic pose, p50 / p95 ms", 10.0),
 )
-"""Keys of the result, what they are called, and their goals."""
+"""Keys of the result, what they are called, and their goals; the cameras of the built-in cells give 20 frames a second."""
+CPU_GOAL = 0.8
+"""Goal [cores] of all processes but the emulator."""
 
 
 class Recording:
@@ -91,6 +93,8 @@ def tables(result: Result) -> list[Part]:
         table.add_row(name, "-" if p95 is None else marked(f"{p50:.1f} / {p95:.1f}", p95 <= goal), f"p95 <= {goal:g}")
     for name, share in result["cpu"].items():
         table.add_row(f"CPU of {name}", f"{share:.2f} cores", "")
+    own = sum(share for name, share in result["cpu"].items() if name != "emulator")
+    table.add_row("CPU of all but the emulator", marked(f"{own:.2f} cores", own <= CPU_GOAL), f"<= {CPU_GOAL:g} cores")
     return [table, accuracy.table(result)]
 
 

@@ -145,7 +145,7 @@ def tables(found: Result) -> list[Part]:
     flags.Option("--seed", type=int, default=1, help="draws the scenes"),
     flags.Option("--frames", type=flags.positive, default=1650, help="frames of the rows"),
     flags.Option("--films", type=flags.natural, default=6, help="films of 10 s with full occlusions"),
-    flags.Option("--weights", type=Path, default=inference.WEIGHTS, help="the network"),
+    flags.Option("--weights", type=Path, default=inference.WEIGHTS, show_default="the committed ones", help="the network"),
     example="penumbra bench segmentation --json segmentation.json",
 )
 def main(options: flags.Options, report: results.Report) -> None:

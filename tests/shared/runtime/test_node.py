@@ -382,6 +382,33 @@ def test_a_replica_with_a_hanging_handler_leaves_its_streams_to_the_others_until
     assert hanging.health()["hangs"] == ""
 
 
+def test_a_stream_that_comes_back_waits_for_the_call_that_is_under_way(replica):
+    """The handler belongs to one thread at a time, also where its subscription was closed and opened again."""
+    node, other = nodes = [replica(), replica()]
+    wait_for(lambda: owners(nodes), 5, "one owner for every stream")
+    stream = next(stream for stream in STREAMS if node.owns(stream))
+    at_once, let_go = [], threading.Event()
+    under_way = threading.Semaphore(0)
+
+    def handler(message, names):
+        under_way.release()
+        at_once.append(under_way._value)
+        let_go.wait(PATIENCE_S)
+        under_way.acquire()
+
+    node.subscribe(topics.FUSED, handler, [stream])
+    other.every(0.01, lambda: other.publish(topics.FUSED, pose(), target="forearm"))
+    wait_for(lambda: at_once, 10, "a call")
+    row = lambda: node.health()["topics"][topics.FUSED.at(cell="table", target="forearm")]  # noqa: E731
+    node.replicas.withdraw()
+    wait_for(lambda: not node.owns(stream), 10, "the stream to go")
+    node.replicas.join(node.session)
+    wait_for(lambda: row()["count"] >= 2, 10, "a message for the second reader")
+    let_go.set()
+    wait_for(lambda: len(at_once) > 20, 10, "more calls")
+    assert max(at_once) == 1
+
+
 def test_a_replica_that_is_slow_but_alive_leaves_its_streams_to_the_others(replica, process):
     slow = psutil.Process(process().pid)
     other = replica()
