@@ -17,7 +17,7 @@ types:
 test *arguments:
     pytest {{arguments}}
 
-# what takes tens of seconds per test: other instruction sets, faults, trainings, benchmarks
+# what takes long: other instruction sets, faults, trainings, benchmarks
 test-slow *arguments:
     pytest -m slow {{arguments}}
 

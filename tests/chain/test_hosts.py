@@ -124,6 +124,7 @@ def test_the_pose_is_tracked_across_hosts_by_both_senses(watched):
         assert np.linalg.norm(pose.position - truth.position) < 0.05
 
 
+@pytest.mark.slow
 @linked
 @pytest.mark.parametrize(("end", "lost", "left"), [("compute", VISION, HAPTIC), ("robot", None, None)])
 def test_a_link_that_was_down_leaves_nothing_stale_behind(watched, end, lost, left):
@@ -161,6 +162,7 @@ def test_a_link_that_was_down_leaves_nothing_stale_behind(watched, end, lost, le
                 newest_ns = taken_ns
 
 
+@pytest.mark.slow
 @slow
 def test_poses_cross_a_slow_link_in_time_and_frames_not_at_all(watched):
     """A viewer beside the robot asks for frames, each of which would take the link for 14 s."""

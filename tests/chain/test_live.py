@@ -101,6 +101,7 @@ def test_a_service_that_dies_is_started_again_and_the_pose_comes_back(running, s
     wait_for(lambda: running.is_tracking(killed_ns), 30, f"the pose after {service} died")
 
 
+@pytest.mark.slow
 def test_a_rolling_restart_of_all_that_estimates_never_loses_the_pose(running):
     """All but the emulator, which stands for the sensors and holds the arm still for the other tests."""
     services = ("segmentation", "search", "haptics", "fusion")

@@ -21,6 +21,7 @@ CAMERA_HZ = 1
 START_S = 240.0
 
 
+@pytest.mark.slow
 def test_the_bench_of_the_bus_measures_both_sides_of_every_payload(monkeypatch):
     monkeypatch.setattr(scale, "FLOOD_S", 0.1)
     monkeypatch.setattr(scale, "MESSAGES", 20)

@@ -22,6 +22,7 @@ def test_recovery_is_counted_from_half_free_again_to_the_overlap_of_before():
     assert twice == [4, 4]
 
 
+@pytest.mark.slow
 def test_the_benchmark_writes_the_agreed_numbers(tmp_path, capsys):
     assert segmentation.main(["--seed", "3", "--frames", "20", "--films", "0", "--json", str(tmp_path / "out.json")]) == 0
     found = json.loads((tmp_path / "out.json").read_text())
@@ -33,6 +34,7 @@ def test_the_benchmark_writes_the_agreed_numbers(tmp_path, capsys):
     assert "0.93" in capsys.readouterr().out  # the goal beside it
 
 
+@pytest.mark.slow
 def test_the_ablation_trains_each_variant_as_long_and_scores_it(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "SCHEDULE", replace(ablation.SCHEDULE, patches=((0.0, 32, 1),), seen=((0, 1.0),)))
     monkeypatch.setattr(ablation, "SEQUENCES", 3)

@@ -69,6 +69,7 @@ def test_a_turn_about_the_origin_moves_the_centre_and_a_twist_about_the_axis_is_
     assert (found["axis_deg"], found["roll_deg"]) == (pytest.approx(10.0), pytest.approx(0.0, abs=1e-6))
 
 
+@pytest.mark.slow
 def test_the_centre_of_mass_of_a_box_is_its_middle_and_that_of_the_forearm_lies_in_it(drawn):
     from penumbra.shared.contract.labels import Label
     from penumbra.sim.picture.occluder import box
@@ -80,6 +81,7 @@ def test_the_centre_of_mass_of_a_box_is_its_middle_and_that_of_the_forearm_lies_
     assert -0.05 < x < 0.1 and abs(y) < 0.01 and abs(z) < 0.01
 
 
+@pytest.mark.slow
 def test_every_trial_keeps_its_gap_distance_and_hidden_share_without_being_rendered(drawn):
     for one in drawn:
         setting, world = one.setting, one.world
@@ -95,6 +97,7 @@ def test_every_trial_keeps_its_gap_distance_and_hidden_share_without_being_rende
         assert np.mean((hidden >= low) & (hidden <= high)) >= trial.IN_BAND, setting
 
 
+@pytest.mark.slow
 def test_the_pictures_are_a_region_of_one_sensor_that_holds_the_limb(drawn):
     for one in drawn:
         camera, binning = one.camera, trial.BINNING[one.setting.distance]
@@ -107,6 +110,7 @@ def test_the_pictures_are_a_region_of_one_sensor_that_holds_the_limb(drawn):
         np.testing.assert_allclose(camera.look_at, middle)
 
 
+@pytest.mark.slow
 def test_trials_differ_by_seed_and_index_and_are_the_same_again(drawn):
     first = drawn[0]
     again, other = trial.draw(first.setting, SEEDS[0], 0), trial.draw(first.setting, SEEDS[0], 2)
@@ -118,6 +122,7 @@ def test_trials_differ_by_seed_and_index_and_are_the_same_again(drawn):
     assert trial.draw(first.setting, SEEDS[0], 1).cell.name == "arm"
 
 
+@pytest.mark.slow
 def test_a_coarse_picture_tells_the_hidden_share_of_the_full_one(drawn):
     one = next(each for each in drawn if each.setting.occlusion == "medium")
     camera, time_s = next(iter(one.cell.cameras)), 1.5

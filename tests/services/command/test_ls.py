@@ -14,6 +14,7 @@ def listed(text: str) -> dict[str, Any]:
     return {row["router"]: row["cells"] or row["why"] for row in json.loads(text)}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(hosts.why_not()), reason=hosts.why_not())
 def test_another_host_finds_a_router_that_announces_itself_and_no_other(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))

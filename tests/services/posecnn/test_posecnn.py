@@ -347,6 +347,7 @@ def test_up_starts_one_way_to_see(vision, there):
     assert started == there | {"router", "emulator", "haptics", "fusion"}
 
 
+@pytest.mark.slow
 def test_the_command_s_train_writes_weights_that_the_service_reads(tmp_path, monkeypatch):
     few = functools.partial(train.RenderedPictures, most=16, chunk=16)
     monkeypatch.setattr(train, "RenderedPictures", lambda folder, seed, most: few(folder, seed))

@@ -56,6 +56,7 @@ def errors(is_distorted: bool, is_undistorted: bool) -> np.ndarray:
     return np.array(out[5:])  # the recurrent network has seen nothing at first
 
 
+@pytest.mark.slow
 def test_a_distorted_camera_gives_the_poses_of_one_that_is_not():
     plain, distorted = np.median(errors(False, False)), np.median(errors(True, True))
     assert distorted < 1.3 * plain + 0.001

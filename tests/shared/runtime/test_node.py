@@ -434,6 +434,7 @@ def test_where_no_replica_is_fit_one_keeps_all_streams_until_the_others_are_fit(
              10, "the streams to be shared again")  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_process_whose_watch_itself_hangs_says_so(replica, monkeypatch):
     node, let_go = replica(), threading.Event()
     assert node.health()["hangs"] == ""
