@@ -37,6 +37,7 @@ def test_the_bench_of_the_bus_measures_both_sides_of_every_payload(monkeypatch):
         assert 0.01 < sorted(row["throughput_ratio"] for row in of_one_payload)[1] < 2.0
 
 
+@pytest.mark.slow
 def test_a_message_of_the_bench_that_is_lost_is_reported_and_does_not_hang(monkeypatch):
     monkeypatch.setattr(buses, "PATIENCE_S", 2.0)
     endpoint = f"tcp/127.0.0.1:{free_port()}"

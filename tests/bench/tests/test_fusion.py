@@ -89,6 +89,7 @@ def test_messages_come_in_order_of_arrival_pictures_40_to_60_ms_and_the_skins_3_
     assert any(a.stamp > b.stamp for a, b in itertools.pairwise(messages))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["visible", "part hidden", "hidden, in range"])
 def test_the_senses_err_as_their_information_says(name: str) -> None:
     ratios: dict[str, list[float]] = {"vision": [], "haptic": []}

@@ -8,6 +8,7 @@ from penumbra.shared.contract.processes import PROCESSES
 from penumbra.tests.bench import start
 
 
+@pytest.mark.slow
 def test_a_start_tells_when_each_process_showed_itself_and_when_the_pose_was_tracked(tmp_path):
     found = start.start(start.ROOT, "table", 1, tmp_path)
     names = {process.name for process in PROCESSES if process.replicas and process.vision in (None, "procnet")}

@@ -278,6 +278,7 @@ class Held:
         return ""
 
 
+@pytest.mark.slow
 def test_the_guided_procedure_asks_for_every_gap_and_fits_what_the_bus_brings(router, tmp_path, monkeypatch, capsys):
     held = Held(router)
     monkeypatch.setattr("builtins.input", held.answer)
