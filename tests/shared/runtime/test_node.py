@@ -387,14 +387,13 @@ def test_a_stream_that_comes_back_waits_for_the_call_that_is_under_way(replica):
     node, other = nodes = [replica(), replica()]
     wait_for(lambda: owners(nodes), 5, "one owner for every stream")
     stream = next(stream for stream in STREAMS if node.owns(stream))
-    at_once, let_go = [], threading.Event()
-    under_way = threading.Semaphore(0)
+    under_way, at_once, let_go = set(), [], threading.Event()
 
     def handler(message, names):
-        under_way.release()
-        at_once.append(under_way._value)
+        under_way.add(threading.get_ident())
+        at_once.append(len(under_way))
         let_go.wait(PATIENCE_S)
-        under_way.acquire()
+        under_way.discard(threading.get_ident())
 
     node.subscribe(topics.FUSED, handler, [stream])
     other.every(0.01, lambda: other.publish(topics.FUSED, pose(), target="forearm"))
