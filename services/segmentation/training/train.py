@@ -191,7 +191,7 @@ def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.
     target = np.argwhere(np.isin(film[frames // 2, ..., 3], inference.TARGET_LABELS))
     if len(target) and rng.random() < 0.8:
         middle = target[rng.integers(len(target))] + rng.integers(-size // 6, size // 6 + 1, 2)
-    zoom = np.exp(rng.uniform(np.log(0.5), np.log(3.0)))
+    zoom = np.exp(rng.uniform(np.log(0.5), np.log(2.5)))
     angle = rng.normal(0.0, 20.0) if rng.random() < 0.7 else rng.uniform(-180.0, 180.0)
     speed = rng.random() ** 1.5
     shift, turn, grow = speed * rng.uniform(-8.0, 8.0, 2), speed * rng.uniform(-2.0, 2.0), 1.0 + speed * rng.uniform(-0.02, 0.02)
