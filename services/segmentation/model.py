@@ -19,11 +19,16 @@ CELLS = ("hgru", "convlstm", "conv")
 """What may update a layer's representation; `prednet.py` describes them."""
 
 
+def kernels_of(layers: int) -> tuple[int, ...]:
+    """The width of the cell's kernel in each of so many layers: 3 where they have half the picture's resolution, 5 above."""
+    return tuple(3 if i < 2 else 5 for i in range(layers))
+
+
 @dataclass(frozen=True)
 class Settings:
     """Size of the network. channels, kernels: of the cell of each layer. The authors have 64-128-256-512 and kernels of 5;
-    kernels of 5 in the two coarse layers alone cost a tenth of the time of 5 everywhere and reach as far. `delay`: axonal
-    delays. `cell`: one of CELLS, all of nearly the same number of parameters."""
+    kernels of 5 in the coarse layers alone (`kernels_of`) cost a tenth of the time of 5 everywhere and reach as far. `delay`:
+    axonal delays. `cell`: one of CELLS, all of nearly the same number of parameters."""
 
     channels: tuple[int, ...] = (16, 16, 32, 64)
     kernels: tuple[int, ...] = (3, 3, 5, 5)

@@ -16,6 +16,7 @@ References: Lotter, Kreiman, Cox 2017 (arXiv:1605.08104); Linsley, Kim, Veerabad
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -169,16 +170,22 @@ def stored(net: PredNet) -> Model:
 
 
 def grown(net: PredNet, settings: Settings) -> PredNet:
-    """A network with more channels that gives the masks of `net`: its own channels come first and receive nothing from the
-    new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641). Raises ValueError where it would not
+    """A network with more channels or layers that gives the masks of `net`: its own channels come first and receive nothing from
+    the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641). Raises ValueError where it would not
     be larger."""
-    old = net.settings
-    same = replace(settings, channels=old.channels) == old
-    if not same or any(new < before for new, before in zip(settings.channels, old.channels, strict=True)):
+    old, layers = net.settings, len(net.settings.channels)
+    same = replace(settings, channels=old.channels, kernels=settings.kernels[:layers]) == old
+    if not same or any(new < before for new, before in itertools.zip_longest(settings.channels, old.channels, fillvalue=0)):
         raise ValueError(f"expected at least the channels {old.channels} and otherwise the network of {old}, got {settings}")
     larger = PredNet(settings)
+    own = dict(net.named_parameters())
     with torch.no_grad():
-        for (name, value), before in zip(larger.named_parameters(), net.parameters(), strict=True):
+        for name, value in larger.named_parameters():
+            before = own.get(name)
+            if before is None:
+                if name.startswith((f"descend.{layers - 1}.", "decode.")):  # what the old layers and the mask get of new layers
+                    value.zero_()
+                continue
             rows = torch.arange(before.shape[0])
             if before.ndim == 1:
                 value[rows] = before

@@ -15,8 +15,8 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.perception.prediction import predict
 
-STEP = 8
-"""Windows lie and measure in multiples of this many of their own pixels: the stride of the network's coarsest layer."""
+STEP = 16
+"""Windows lie and measure in multiples of this many of their own pixels: the stride of the coarsest of five layers."""
 SIZE_STEP = 32
 """Sizes are rounded up to this, so that the size seldom changes while the target turns."""
 MAX_PIXELS = 224 * 224

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from penumbra.services import flags
 from penumbra.services.segmentation import inference, prednet
+from penumbra.services.segmentation.model import kernels_of
 from penumbra.services.segmentation.prednet import PredNet, Settings
 from penumbra.services.segmentation.training import loss, recordings
 from penumbra.services.segmentation.training.evaluate import Labelled, calibrate, held_out
@@ -275,12 +276,12 @@ class Trainer(training.Trainer[PredNet, Data]):
 
     @classmethod
     def begin(cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None) -> Trainer:
-        """A trainer that starts from weights with a card, grown to more channels where these are given; the card it writes says
-        of them. Raises ValueError where they are fewer."""
+        """A trainer that starts from weights with a card, grown to more channels or layers where channels are given; the card it
+        writes says of them. Raises ValueError where they are fewer."""
         net, card = prednet.load(path)
         if channels is not None:
             torch.manual_seed(seed)
-            net = prednet.grown(net, replace(net.settings, channels=channels))
+            net = prednet.grown(net, replace(net.settings, channels=channels, kernels=kernels_of(len(channels))))
         trainer = cls(net.settings, schedule, seed)
         trainer.net.load_state_dict(net.state_dict())
         trainer.average.load_state_dict(net.state_dict())
@@ -390,8 +391,8 @@ def main(options: flags.Options) -> int:
         trainer = Trainer.begin(options.start, schedule, options.seed, tuple(options.size) if options.size else None)
     else:
         channels = tuple(options.size or Settings.channels)
-        kernels = (*(3 for _ in channels[:-2]), 5, 5)
-        trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.recurrence), schedule, options.seed)
+        settings = Settings(channels, kernels_of(len(channels)), delay=options.delay, cell=options.recurrence)
+        trainer = Trainer(settings, schedule, options.seed)
     simulated = Simulated(trainer.seed, options.held_out)
     data: Data = simulated
     try:
