@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from penumbra.services.segmentation import inference
+from penumbra.services.segmentation import files, inference
 from penumbra.services.segmentation.prednet import Settings
 from penumbra.services.segmentation.training import recordings
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED
@@ -92,7 +92,7 @@ def test_photographs_are_scored_without_their_unlabelled_pixels(photograph, tmp_
     (row,) = found["photographs"].pop("rows")
     assert set(row) == {"name", "iou"} and row["name"] == "arm" and 0.0 < row["iou"] < 1.0
     assert found["photographs"] == {"pictures": 1, "iou_mean": row["iou"], "iou_median": row["iou"]}
-    assert cv2.imread(str(tmp_path / "seen" / "arm.png")).shape == (300, 400, 3)
+    assert files.read(tmp_path / "seen" / "arm.png").shape == (300, 400, 3)
     assert "0.75" in capsys.readouterr().out  # the goal beside it
 
     path = photograph / "masks" / "arm.png"
