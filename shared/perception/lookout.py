@@ -152,7 +152,13 @@ def window_around(
         pixels = points[:, :2] / points[:, 2:] * focal + centre
         margin = MARGIN_M * focal / points[:, 2].mean()
         low, high = np.minimum(low, pixels.min(axis=0) - margin), np.maximum(high, pixels.max(axis=0) + margin)
-    size = np.array([camera.width, camera.height])
+    return window_of(camera, low, high, previous, most)
+
+
+def window_of(picture: Sized, low: Array, high: Array, previous: Window | None = None, most: int = MAX_PIXELS) -> Window | None:
+    """The window of at most `most` pixels that holds the rectangle from low (2,) to high (2,), x and y [px], as far as it lies in
+    the picture; the previous one is kept as `window_around` says. None where nothing of it lies in the picture."""
+    size = np.array([picture.width, picture.height])
     low, high = np.maximum(low, 0.0), np.minimum(high, size - 1.0)
     if np.any(high - low < 2.0):
         return None
