@@ -138,7 +138,7 @@ def _robots(robots: NDArray[np.bool_], kind: Kind, rng: np.random.Generator) -> 
     place = np.array([[1.0, 0.0, rng.normal(0.0, CALIBRATION_PX)], [0.0, 1.0, rng.normal(0.0, CALIBRATION_PX)]])
     if kind == "wrong":
         height, width = robots.shape[1:]
-        place = cv2.getRotationMatrix2D((width / 2.0, height / 2.0), rng.uniform(-180.0, 180.0), 1.0)
+        place = np.asarray(cv2.getRotationMatrix2D((width / 2.0, height / 2.0), rng.uniform(-180.0, 180.0), 1.0), float)
         place[:, 2] += _direction(2, rng) * rng.uniform(10.0, 60.0)
     return 2.0 * _warped(robots, place, cv2.INTER_NEAREST) - 1.0
 
@@ -169,7 +169,7 @@ def _moved(shown: NDArray[np.bool_], kind: Kind, rng: np.random.Generator) -> ND
         shift = shift + _direction(2, rng) * rng.uniform(0.3, 1.0) * extent
         turn += rng.uniform(30.0, 180.0)
     scale = float(np.exp(rng.normal(0.0, 0.08)))
-    place = cv2.getRotationMatrix2D((float(columns.mean()), float(rows.mean())), turn, scale)
+    place = np.asarray(cv2.getRotationMatrix2D((float(columns.mean()), float(rows.mean())), turn, scale), float)
     place[:, 2] += shift
     film = _warped(shown, place, cv2.INTER_LINEAR)
     wider = int(rng.integers(0, 3))  # labels are coarse, and a limb's mesh is not this person's

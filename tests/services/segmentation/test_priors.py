@@ -102,7 +102,7 @@ def test_a_training_draws_right_wrong_and_missing_priors_and_bytes_keep_them(sim
 
 
 def test_right_priors_lie_on_the_target_and_wrong_ones_do_not(simulated):
-    on: dict[str, list[float]] = {"right": [], "wrong": []}
+    on: dict[drawn.Kind, list[float]] = {"right": [], "wrong": []}
     for index, sequence in enumerate(simulated):
         shown = np.isin(sequence.labels, TARGET_LABELS)
         if shown.sum() < 500 or sequence.hidden.max() > 0.5:
