@@ -31,11 +31,16 @@ class Priors:
     once."""
 
     def __init__(self, cell: Cell, camera: str, targets: Iterable[str]):
-        self._camera = cell.cameras[camera]
+        self._camera, self._targets = cell.cameras[camera], cell.targets
         self._T_camera_world = rigid.inverse(self._camera.T_world_camera)
         self._axes = np.kron(np.eye(2), self._T_camera_world[:3, :3])  # covariances: world axes to camera axes
         self._robots = RobotDepth(cell, self._T_camera_world)
         self._meshes = {name: anatomy.target_mesh(cell.targets[name], cell) for name in targets}
+
+    def prepare(self, window: Window) -> None:
+        """Compiles what a call needs, so that the first frame does not wait for it."""
+        homes = {name: (self._targets[name].home.transform, np.eye(6)) for name in self._meshes}
+        self(window, homes, {name: np.zeros(len(robot.joints)) for name, robot in self._robots.robots.items()})
 
     def __call__(
         self, window: Window, poses: Mapping[str, tuple[Array, Array]], joints: Mapping[str, Array]

@@ -1,18 +1,27 @@
 """Priors: what is known of a window beside its picture, drawn for the network and for its training."""
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
+import torch
 
-from penumbra.services.segmentation import model, priors
+from penumbra.services.segmentation import inference, model, prednet, priors
+from penumbra.services.segmentation.prednet import PredNet, Settings
+from penumbra.services.segmentation.training import evaluate
 from penumbra.services.segmentation.training import priors as drawn
 from penumbra.shared.body import anatomy
 from penumbra.shared.cell import description as cells
+from penumbra.shared.contract import topics
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
+from penumbra.shared.contract.messages import Frame, Joints, Mask
 from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.shared.perception.lookout import Window
+from penumbra.shared.perception.prediction import extrapolate
 from penumbra.sim.sets import sequences, shots
+from penumbra.tests.support import nodes
+from penumbra.tests.support.replay import Replay
 
 ROBOT, TARGET = (model.PRIORS.index(name) for name in ("robot", "target"))
 SURE = 1e-10 * np.eye(6)
@@ -133,3 +142,64 @@ def test_of_labels_alone_a_prior_shows_both_arms_or_one():
             shown.add((known[..., 10:25, TARGET].max() > 0.5, known[..., 70:85, TARGET].max() > 0.5))
     assert {(True, True), (True, False), (False, True)} <= shown
     assert not drawn.of_labels(np.zeros_like(labels), np.random.default_rng(0), "right").any()
+
+
+@pytest.fixture
+def weights(tmp_path):
+    """A network whose masks priors change."""
+    torch.manual_seed(0)
+    net = PredNet(Settings((4, 4, 8), (3, 3, 3), 4, priors=2))
+    for value in (net.prior_input, net.prior_drive):
+        assert value is not None
+        value.weight.data *= 10.0
+    card = {"seed": 0, "date": "2026-01-01", "calibration": {"target_logit_offset": 0.0}}
+    prednet.save(tmp_path / "net.npz", net, card)
+    return tmp_path / "net.npz"
+
+
+def test_the_service_gives_a_network_what_is_known_at_the_frame_and_waits_for_nothing(weights):
+    cell, image = cells.load("arm"), np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    period_ns, start_ns = 50_000_000, 10**18
+    turning = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.0])
+    angles = lambda t: turning + 0.1 * t  # noqa: E731
+    home = next(iter(cell.targets.values())).home.transform
+
+    def masks(has_joints: bool, has_pose: bool) -> list[Mask]:
+        recording: list = []
+        for t in range(5):  # of which the last one's mask is still on its way at the end
+            stamp_ns = start_ns + t * period_ns
+            pose = msgspec.structs.replace(nodes.pose(stamp_ns), position=home[:3, 3], covariance=1e-4 * np.eye(6))
+            recording += [(topics.FUSED, {"target": "forearm"}, pose)] * has_pose
+            recording += [(topics.JOINTS, {"robot": "panda"}, Joints(stamp_ns=stamp_ns, position=angles(t)))] * has_joints
+            recording.append((topics.FRAME, {"camera": "side"}, Frame(stamp_ns=stamp_ns + 20_000_000, image=image)))
+        replay = Replay(cell, ("segmentation",), {"segmentation": ["--weights", str(weights)]})
+        return [heard.message for heard in replay.run(recording) if heard.topic is topics.MASK]
+
+    prior = priors.Priors(cell, "side", ["forearm"])
+    for has_joints, has_pose in ((True, True), (True, False), (False, True), (False, False)):
+        found = masks(has_joints, has_pose)
+        ours, ignorant = inference.load_segmenter(weights), inference.load_segmenter(weights)
+        assert len(found) == 4, "a mask of every frame"
+        for t, mask in enumerate(found):
+            window = Window(mask.x0, mask.y0, mask.labels.shape[1], mask.labels.shape[0], mask.scale)
+            T = rigid.transform(home[:3, 3], (0.0, 0.0, 0.0, 1.0))
+            poses = {"forearm": extrapolate(T, np.zeros(6), 1e-4 * np.eye(6), 0.02)} if has_pose else {}
+            # carried on with the last velocity: the joints of the frame's stamp come later
+            joints = {"panda": angles(t + 0.4 if t else 0.0)} if has_joints else {}
+            wanted = ours(image, window, mask.stamp_ns, prior(window, poses, joints))
+            assert (mask.labels != wanted).mean() < 1e-3, (has_joints, has_pose, t)
+            without = ignorant(image, window, mask.stamp_ns)
+            assert ((mask.labels != without).mean() > 0.01) == (has_joints or has_pose)
+
+
+def test_a_network_without_priors_needs_no_joints(shot):
+    replay = Replay(cells.load("arm"), ("segmentation",))
+    assert {topic for topic, _, _ in replay._listeners} == {topics.FRAME, topics.FUSED}
+
+
+def test_the_card_says_what_priors_give_and_what_wrong_ones_cost(weights, simulated):
+    net, _ = prednet.load(weights)
+    score = evaluate.held_out(net, 0.0, simulated[:6])
+    assert score["with_priors"]["iou_by_class"] != score["iou_by_class"] != score["with_wrong_priors"]["iou_by_class"]
+    plain = PredNet(Settings((4, 4, 8), (3, 3, 3), 4))
+    assert not {"with_priors", "with_wrong_priors"} & evaluate.held_out(plain, 0.0, simulated[:6]).keys()
