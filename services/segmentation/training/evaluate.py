@@ -100,7 +100,7 @@ def calibrate(net: PredNet, data: Iterable[Labelled]) -> tuple[float, dict[str, 
 
 def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str, Any]:
     """The card's score: `summary` by hidden share, and the IoU of every class. Of a network that has priors these are without
-    any, and beside them stand the scores with right and with wrong ones."""
+    any; beside them stand the scores with right and with wrong ones, of simulated sequences, whose truth they are not made of."""
     kinds: dict[str, priors.Kind] = {"without": "missing"}
     if net.settings.priors:
         kinds |= {"with_priors": "right", "with_wrong_priors": "wrong"}
@@ -109,6 +109,8 @@ def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str,
     bias[list(TARGET_LABELS)] = offset
     for index, sequence in enumerate(data):
         for name, kind in kinds.items():
+            if kind != "missing" and not isinstance(sequence, sequences.Sequence):
+                continue
             given = None if kind == "missing" else priors_of(sequence, index, kind)
             found = np.stack([classes((logits + bias).numpy()) for logits in run(net, sequence.images, given)])
             scores[name].add(found[WARM_UP:], sequence.labels[WARM_UP:], sequence.hidden[WARM_UP:])
