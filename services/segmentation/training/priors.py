@@ -31,8 +31,9 @@ ROBOT_SHARES: dict[Kind, float] = {"right": 0.57, "wrong": 0.08, "missing": 0.35
 """How often a sequence has which kind of prior."""
 SWITCHED = 0.25
 """Share of the sequences with a prior in which it is there before, or from, some frame only."""
-STATED_M, STATED_RAD, STATED_PX = (0.002, 0.06), (0.02, 0.5), (0.7, 25.0)
-"""Bounds of the stated standard deviations, drawn evenly in their logarithm."""
+STATED_M, STATED_RAD, STATED_PX = (0.002, 0.06), (0.02, 0.5), (2.0, 25.0)
+"""Bounds of the stated standard deviations, drawn evenly in their logarithm. The last is for priors that are made of labels: a
+sharper one would give away the outline, where the mesh of a limb has fingers of its own."""
 UNDERSTATED = 0.5
 """Standard deviation of the logarithm of an error beside its stated deviation: now and then it is thrice what is stated."""
 LATEST = 2
@@ -172,7 +173,7 @@ def _moved(shown: NDArray[np.bool_], kind: Kind, rng: np.random.Generator) -> ND
     place = np.asarray(cv2.getRotationMatrix2D((float(columns.mean()), float(rows.mean())), turn, scale), float)
     place[:, 2] += shift
     film = _warped(shown, place, cv2.INTER_LINEAR)
-    wider = int(rng.integers(0, 3))  # labels are coarse, and a limb's mesh is not this person's
+    wider = int(rng.integers(0, 5))  # a limb's mesh is not this person's, and labels have gaps between its parts
     film = film[np.maximum(np.arange(len(film)) - rng.integers(0, LATEST + 1), 0)]
     soft = [cv2.dilate(frame, np.ones((2 * wider + 1, 2 * wider + 1), np.uint8)) for frame in film]
     return np.stack([2.0 * priors.blurred(np.asarray(frame, np.float32), (stated, stated)) - 1.0 for frame in soft])
