@@ -119,12 +119,21 @@ class Lookout:
         self._window = self.foresee(stamp_ns)
         return self._window
 
+    def predicted(self, stamp_ns: int) -> dict[str, tuple[Array, Array]]:
+        """T_world_target and covariance (6, 6) at a stamp, by target, of those that it can see and that are not lost."""
+        found = {}
+        for name in self._boxes:
+            T, covariance = predict(self._poses.get(name), stamp_ns)
+            if T is not None and covariance is not None:
+                found[name] = T, covariance
+        return found
+
     def foresee(self, stamp_ns: int) -> Window:
         """The window that `look` would give next, for a frame of this stamp."""
-        known = {name: predict(self._poses.get(name), stamp_ns)[0] for name in self._boxes}
-        sure = [(T, self._boxes[name]) for name, T in known.items() if T is not None]
-        found = window_around(self._camera, sure, self._window) if len(sure) == len(known) else None
-        return found or self._wide([name for name, T in known.items() if T is None], sure)
+        known = self.predicted(stamp_ns)
+        sure = [(T, self._boxes[name]) for name, (T, _) in known.items()]
+        found = window_around(self._camera, sure, self._window) if len(sure) == len(self._boxes) else None
+        return found or self._wide([name for name in self._boxes if name not in known], sure)
 
     def _wide(self, lost: Iterable[str] = (), sure: Iterable[tuple[Array, Array]] = ()) -> Window:
         homes = [self._homes[name] for name in lost or self._homes]
