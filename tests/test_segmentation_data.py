@@ -90,7 +90,7 @@ def folder(tmp_path):
 
 
 def test_photographs_are_turned_moved_and_seen_nearer_with_their_labels_and_unlabelled_outside(folder):
-    recorded = recordings.Recordings(folder, 1)
+    recorded = recordings.Recordings([folder], 1)
     films = [train.moved(recorded[0], 3, 64, np.random.default_rng(seed)) for seed in range(8)]
     assert all(film.shape == (3, 64, 64, 4) for film in films)
     values = set(np.unique([film[..., 3] for film in films]))
@@ -117,7 +117,7 @@ def test_recordings_and_simulated_sequences_are_mixed_by_their_share_and_both_ar
         return sequences.Sequence(sequence.images, np.full_like(sequence.labels, Label.TORSO), sequence.hidden)
 
     simulated = train.Simulated(1, 2, learned, lambda seed, index: sequences.render(seed, index, tiny), most=1)
-    data = train.Mixed(recordings.Recordings(folder, 1), simulated, 0.5, 1)
+    data = train.Mixed(recordings.Recordings([folder], 1), simulated, 0.5, 1)
     simulated.count = train.ENDLESS
     share = np.mean([(data[index][..., 3] == Label.TORSO).all() for index in range(30)])
     assert 0.2 < share < 0.8  # 30 draws of a half

@@ -1,4 +1,5 @@
-"""A user's own frames and masks to train on. The folder has one of these forms:
+"""A user's own frames and masks to train on, in one folder or in several, each of which is learned from as often as the others,
+however much is in it. A folder has one of these forms:
 
   images/ and masks/   images/[SEQUENCE/]NAME.png and masks/[SEQUENCE/]NAME.png
   pairs                [SEQUENCE/]NAME.png and [SEQUENCE/]NAME_mask.png
@@ -114,7 +115,7 @@ class Recorded:
 
 
 class Recordings:
-    """All sequences of a folder, checked: to learn from (indexed), for the calibration and for the score (a tenth each).
+    """All sequences of folders, checked: to learn from (indexed), for the calibration and for the score (a tenth of each folder).
 
     Raises DataError or FileNotFoundError where there is nothing to learn from or something does not fit.
     """
@@ -122,31 +123,46 @@ class Recordings:
     jitter = 0.4
     """The authors' amount for photographs."""
 
-    def __init__(self, folder: Path, seed: int):
-        pieces = []
-        for sequence in find(folder):
-            size = check(sequence)
-            cuts = range(0, len(sequence), PIECE)
-            pieces += [Recorded(sequence[i : i + PIECE], size) for i in cuts]
-        if len(pieces) < 3:
-            raise DataError(
-                f"{folder}: expected at least 3 sequences, or pieces of {PIECE} frames of them (to learn from, to calibrate and "
-                f"to score with), got {len(pieces)}"
-            )
-        order = np.random.default_rng([seed, 4]).permutation(len(pieces))
-        tenth = max(len(pieces) // 10, 1)
-        self.calibration = [pieces[i] for i in order[:tenth]]
-        self.held_out = [pieces[i] for i in order[tenth : 2 * tenth]]
-        self._train = [pieces[i] for i in order[2 * tenth :]]
-        self.count = len(self._train)
-        self.side = min(piece.side for piece in pieces)
-        self.sources = ({"folder": folder.name, "sequences": tenth}, {"folder": folder.name, "sequences": len(self.held_out)})
+    def __init__(self, folders: Sequence[Path], seed: int):
+        self.calibration: list[Recorded] = []
+        self.held_out: list[Recorded] = []
+        self._train: list[list[Recorded]] = []
+        for folder in folders:
+            pieces = _pieces(folder)
+            order = np.random.default_rng([seed, 4]).permutation(len(pieces))
+            tenth = max(len(pieces) // 10, 1)
+            self.calibration += [pieces[i] for i in order[:tenth]]
+            self.held_out += [pieces[i] for i in order[tenth : 2 * tenth]]
+            self._train.append([pieces[i] for i in order[2 * tenth :]])
+        self.count = len(folders) * max(len(pieces) for pieces in self._train)
+        self.side = min(piece.side for piece in itertools.chain(self.calibration, self.held_out, *self._train))
+        names = ", ".join(folder.name for folder in folders)
+        self.sources = (
+            {"folder": names, "sequences": len(self.calibration)},
+            {"folder": names, "sequences": len(self.held_out)},
+        )
 
     def __getitem__(self, index: int) -> Recorded:
-        return self._train[index]
+        """Of indices drawn at random from [0, count), as many fall to each folder."""
+        turn, folder = divmod(index, len(self._train))
+        return self._train[folder][turn % len(self._train[folder])]
 
     def close(self) -> None:
         """Nothing is open."""
+
+
+def _pieces(folder: Path) -> list[Recorded]:
+    pieces = []
+    for sequence in find(folder):
+        size = check(sequence)
+        cuts = range(0, len(sequence), PIECE)
+        pieces += [Recorded(sequence[i : i + PIECE], size) for i in cuts]
+    if len(pieces) < 3:
+        raise DataError(
+            f"{folder}: expected at least 3 sequences, or pieces of {PIECE} frames of them (to learn from, to calibrate and "
+            f"to score with), got {len(pieces)}"
+        )
+    return pieces
 
 
 def find(folder: Path) -> list[list[Frame]]:

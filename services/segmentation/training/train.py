@@ -396,7 +396,11 @@ def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
         help="start from these weights (without a value: the committed ones), grown to --size, instead of random ones",
     ),
     flags.Option(
-        "--data", type=Path, metavar="FOLDER", help="your own frames and masks, in the forms above, instead of simulated ones"
+        "--data",
+        type=Path,
+        takes="many",
+        metavar="FOLDER ...",
+        help="your own frames and masks, in the forms above, instead of simulated ones",
     ),
     flags.Option(
         "--simulated",

@@ -179,7 +179,7 @@ def no_coco(folder, scene):
 def test_a_folder_that_does_not_fit_is_refused_with_what_was_expected(tmp_path, scene, spoil, says, capsys):
     spoil(tmp_path, scene)
     with pytest.raises(recordings.DataError, match=says):
-        recordings.Recordings(tmp_path, 0)
+        recordings.Recordings([tmp_path], 0)
     assert train.main(["--data", str(tmp_path), "--steps", "1"]) == 2
     assert "penumbra segmentation train: " in capsys.readouterr().err
 
@@ -201,11 +201,21 @@ def test_training_on_one_s_own_frames_keeps_some_apart_and_says_so_in_the_card(t
 def test_what_is_held_out_is_not_learned_from(tmp_path, scene):
     for name in "abcdefghijklmnopqrstu":
         write_pairs(tmp_path, scene, name, 1)
-    data = recordings.Recordings(tmp_path, 3)
+    data = recordings.Recordings([tmp_path], 3)
     parts = [[data[i] for i in range(data.count)], data.calibration, data.held_out]
     names = [{piece._frames[0].picture for piece in part} for part in parts]
     assert [len(part) for part in names] == [17, 2, 2]
     assert len(set.union(*names)) == 21
+
+
+def test_a_small_folder_is_learned_from_as_often_as_a_large_one(tmp_path, scene):
+    for folder, count in (("large", 12), ("small", 4)):
+        for k in range(count):
+            write_pairs(tmp_path / folder, scene, f"{k}", 1)
+    data = recordings.Recordings([tmp_path / "large", tmp_path / "small"], 3)
+    drawn = [data[i]._frames[0].picture.parent.parent.name for i in range(data.count)]
+    assert drawn.count("large") == drawn.count("small") == 10
+    assert len(data.calibration) == len(data.held_out) == 2
 
 
 def test_pictures_get_a_mask_of_their_size_and_an_overlay(tmp_path, scene, weights):
