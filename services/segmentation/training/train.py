@@ -35,6 +35,7 @@ from penumbra.services.segmentation.training.evaluate import Labelled, calibrate
 from penumbra.shared import training
 from penumbra.shared.contract.labels import UNLABELLED, Label
 from penumbra.shared.native import processor
+from penumbra.shared.perception.lookout import WIDEST_ARM_PX
 from penumbra.sim.picture import looks
 from penumbra.sim.sets import sequences
 
@@ -42,6 +43,10 @@ VALIDATION_SEED = 1_000_000
 """Added to the seed for held-out data: nothing there was ever trained on."""
 VARIETY = sequences.Variety(frames=5, size=176, real=0.7)
 """Variety of the training sequences."""
+ARM_PX = (12.0, float(WIDEST_ARM_PX))
+"""Width [px] that arms of recordings get."""
+ARM_SHARE = 0.08
+"""Width of an arm that a recording without any might show, as a share of its longer side."""
 ENDLESS = 2**31
 """Number of sequences of a set that has no end."""
 
@@ -191,15 +196,22 @@ class Mixed:
 
 
 def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """So many frames of a recording as a camera of `size` pixels a side that is turned, nearer or farther, and moves shows them:
-    (frames, size, size, 4); what lies outside of the picture is UNLABELLED."""
+    """So many frames of a recording as a camera of `size` pixels a side that is turned and moves shows them, from where its arms
+    are as wide as windows show them: (frames, size, size, 4); what lies outside of the picture is UNLABELLED."""
     start = int(rng.integers(0, len(recorded) - frames + 1))
     film = recorded[start : start + frames]
+    arms = np.isin(film[frames // 2, ..., 3], inference.TARGET_LABELS)
+    arm_px = (
+        2.0 * cv2.distanceTransform(arms.astype(np.uint8), cv2.DIST_L2, 5).max() if arms.any() else ARM_SHARE * max(arms.shape)
+    )
+    zoom = np.exp(rng.uniform(*np.log(ARM_PX))) / arm_px
+    if (shrink := int(1.0 / zoom)) > 1:  # no detail finer than a pixel is left to be sampled
+        film = np.stack([_smaller(frame, shrink) for frame in film])
+        arms, zoom = arms[::shrink, ::shrink], zoom * shrink
     middle = rng.integers(0, film.shape[1:3])
-    target = np.argwhere(np.isin(film[frames // 2, ..., 3], inference.TARGET_LABELS))
+    target = np.argwhere(arms)
     if len(target) and rng.random() < 0.8:
         middle = target[rng.integers(len(target))] + rng.integers(-size // 6, size // 6 + 1, 2)
-    zoom = np.exp(rng.uniform(np.log(0.5), np.log(2.5)))
     angle = rng.normal(0.0, 20.0) if rng.random() < 0.7 else rng.uniform(-180.0, 180.0)
     speed = rng.random() ** 1.5
     shift, turn, grow = speed * rng.uniform(-8.0, 8.0, 2), speed * rng.uniform(-2.0, 2.0), 1.0 + speed * rng.uniform(-0.02, 0.02)
@@ -208,11 +220,18 @@ def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.
         since = t - frames // 2
         place = cv2.getRotationMatrix2D((float(middle[1]), float(middle[0])), angle + since * turn, zoom * grow**since)
         place[:, 2] += size / 2.0 - middle[::-1] + since * shift
-        smaller = cv2.INTER_AREA if zoom < 1.0 else cv2.INTER_LINEAR
         picture, labels = np.ascontiguousarray(frame[..., :3]), np.ascontiguousarray(frame[..., 3])
-        out[t, ..., :3] = cv2.warpAffine(picture, place, (size, size), flags=smaller, borderMode=cv2.BORDER_REFLECT)
+        out[t, ..., :3] = cv2.warpAffine(picture, place, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         out[t, ..., 3] = cv2.warpAffine(labels, place, (size, size), flags=cv2.INTER_NEAREST, borderValue=float(UNLABELLED))
     return out
+
+
+def _smaller(frame: NDArray[np.uint8], by: int) -> NDArray[np.uint8]:
+    height, width = (n // by for n in frame.shape[:2])
+    picture = cv2.resize(
+        np.ascontiguousarray(frame[: height * by, : width * by, :3]), (width, height), interpolation=cv2.INTER_AREA
+    )
+    return np.dstack([picture, frame[by // 2 :: by, by // 2 :: by, 3][:height, :width]])
 
 
 def pasted(film: NDArray[np.uint8], over: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
