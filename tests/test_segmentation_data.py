@@ -1,18 +1,21 @@
 """What the segmentation learns from beside the simulation's usual looks: posed hands, real cameras, photographs."""
 
+import csv
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from penumbra.services.segmentation.inference import TARGET_LABELS
-from penumbra.services.segmentation.training import photographs, recordings, train
+from penumbra.services.segmentation.training import pasted, photographs, recordings, street, train
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import UNLABELLED, Label
 from penumbra.sim.picture import limb, looks
 from penumbra.sim.sets import sequences
 
-NAMES = ["null", "bag", "coat", "jeans", "skin", "gloves", *(name for name in photographs.SLEEVED if name != "coat")]
-NAMES += ["purse", "wallet", *photographs.WORN, "hair", "hat", "scarf"]
+NAMES = ["null", "bag", "coat", "jeans", "skin", "gloves", *(name for name in street.SLEEVED if name != "coat")]
+NAMES += ["purse", "wallet", *street.WORN, "hair", "hat", "scarf"]
 
 
 def test_a_posed_hand_is_as_large_as_the_stiff_one_and_its_forearm_is_the_same():
@@ -43,7 +46,7 @@ def test_a_cheap_camera_changes_a_film_s_colours_and_not_its_size():
     assert looks.filmed(film, np.random.default_rng(0)).shape == film.shape and np.median(changed) > 2.0
 
 
-def person() -> tuple[np.ndarray, photographs.Pose]:
+def person() -> tuple[np.ndarray, street.Pose]:
     """A person with a coat's body, two bare arms that hang down beside it, and a bag at the right hand, 200 x 120 pixels."""
     parts = np.full((200, 120), NAMES.index("null"), np.uint8)
     parts[40:130, 40:80] = NAMES.index("coat")
@@ -57,12 +60,12 @@ def person() -> tuple[np.ndarray, photographs.Pose]:
     places |= {23: (70, 130), 25: (70, 165), 27: (70, 199), 24: (50, 130), 26: (50, 165), 28: (50, 199)}
     for index, place in places.items():
         points[index] = place
-    return parts, photographs.Pose(points, np.ones(33), 1.0)
+    return parts, street.Pose(points, np.ones(33), 1.0)
 
 
 def test_skin_is_forearm_or_hand_by_the_landmarks_and_what_nobody_knows_is_unlabelled():
     parts, pose = person()
-    labels = photographs.masks(parts, NAMES, pose)
+    labels = street.masks(parts, NAMES, pose)
     for column in (25, 95):
         assert labels[60, column] == Label.UPPER_ARM
         assert labels[105, column] == Label.FOREARM
@@ -70,8 +73,8 @@ def test_skin_is_forearm_or_hand_by_the_landmarks_and_what_nobody_knows_is_unlab
     assert labels[25, 60] == Label.TORSO and labels[60, 60] == Label.TORSO and labels[180, 60] == Label.TORSO
     assert labels[10, 10] == Label.BACKGROUND and labels[142, 17] == Label.OCCLUDER
     assert labels[105, 20] == UNLABELLED, "the contour is coarse"
-    unsure = photographs.Pose(pose.points, np.where(np.arange(33) == 13, 0.1, 1.0), 1.0)
-    labels = photographs.masks(parts, NAMES, unsure)
+    unsure = street.Pose(pose.points, np.where(np.arange(33) == 13, 0.1, 1.0), 1.0)
+    labels = street.masks(parts, NAMES, unsure)
     assert labels[105, 95] == UNLABELLED and labels[105, 25] == Label.FOREARM
 
 
@@ -123,3 +126,112 @@ def test_recordings_and_simulated_sequences_are_mixed_by_their_share_and_both_ar
     assert 0.2 < share < 0.8  # 30 draws of a half
     assert len(list(data.held_out)) == 3
     assert {"seed", "folder", "sequences", "simulated"} <= data.sources[1].keys()
+
+
+MADE_UP = photographs.HANDS, "somebody/pictures", "nobody/cloned"
+
+
+@pytest.fixture
+def sources(tmp_path):
+    """Tables and made-up clones: two labelled pictures, a large one and one on white, one without people, and one hand."""
+    rng = np.random.default_rng(0)
+    (tmp_path / "tables" / "masks").mkdir(parents=True)
+    digits, pictures = tmp_path / "Sign-Language-Digits-Dataset" / "Dataset" / "5", tmp_path / "pictures"
+    digits.mkdir(parents=True)
+    pictures.mkdir()
+    lines = [f"{name},{'0' * 40},MIT,Somebody" for name in MADE_UP]
+    (tmp_path / "tables" / "repositories.csv").write_text("\n".join(["repository,commit,licence,copyright", *lines]))
+    lines = [
+        "close,large,somebody/pictures,large.png,,960,480,",
+        "close,white,somebody/pictures,white.png,,120,90,white",
+        "close,elsewhere,nobody/cloned,1.png,,120,90,",
+        "scene,desk,somebody/pictures,desk.png,,120,90,",
+    ]
+    header = "kind,name,repository,path,frame,width,height,backdrop"
+    (tmp_path / "tables" / "pictures.csv").write_text("\n".join([header, *lines]))
+    cv2.imwrite(str(pictures / "large.png"), np.full((1000, 2000, 3), 90, np.uint8))
+    cv2.imwrite(str(pictures / "desk.png"), rng.integers(100, 140, (90, 120, 3), dtype=np.uint8))
+    white, mask = np.full((90, 120, 3), 255, np.uint8), np.zeros((90, 120), np.uint8)
+    white[50:, 40:60], mask[50:, 40:60] = (90, 120, 200), Label.HAND
+    white[20:50, 30:90] = 20  # what it holds
+    cv2.imwrite(str(pictures / "white.png"), white)
+    cv2.imwrite(str(tmp_path / "tables" / "masks" / "white.png"), mask)
+    cv2.imwrite(str(tmp_path / "tables" / "masks" / "large.png"), np.full((480, 960), Label.FOREARM, np.uint8))
+    cv2.imwrite(str(digits / "1.JPG"), arm())
+    return tmp_path
+
+
+def arm() -> np.ndarray:
+    """A hand with a narrower wrist before a grey wall, 100 x 100 BGR."""
+    image = np.full((100, 100, 3), 180, np.uint8)
+    cv2.ellipse(image, (50, 45), (22, 28), 0, 0, 360, (90, 120, 200), -1)
+    image[60:, 40:60] = (90, 120, 200)
+    return cv2.blur(image, (3, 3))
+
+
+def test_a_hand_is_cut_out_by_its_colour_and_parted_at_the_wrist():
+    cutout = pasted.hand(arm())
+    assert cutout is not None and cutout.solid.shape == (pasted.SIDE, pasted.SIDE)
+    truth = cv2.resize((arm()[..., 0] < 135).astype(np.uint8), (pasted.SIDE, pasted.SIDE))
+    assert (cutout.solid & truth).sum() / (cutout.solid | truth).sum() > 0.95
+    assert cutout.labels[90, 100] == Label.HAND and cutout.labels[190, 100] == Label.FOREARM
+    assert cutout.labels[90, 10] == Label.BACKGROUND
+    assert pasted.hand(np.full((100, 100, 3), 180, np.uint8)) is None
+    assert pasted.hand(np.ascontiguousarray(arm()[::-1])) is None, "an arm from above"
+
+
+def test_what_is_pasted_into_a_scene_has_its_classes_where_it_is_seen():
+    cutout = pasted.hand(arm())
+    assert cutout is not None
+    sides = set()
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        scene, labels = np.full((240, 320, 3), (60, 60, 60), np.uint8), np.zeros((240, 320), np.uint8)
+        pasted.paste(scene, labels, cutout, pasted.from_side(cutout, 240, 320, rng), rng)
+        target = np.isin(labels, TARGET_LABELS)
+        skin = scene[..., 2].astype(int) - scene[..., 0] > 40
+        assert (skin & target).sum() > 0.95 * target.sum() > 0 and not (skin & (labels == Label.BACKGROUND)).any()
+        ends = {"above": labels[0], "below": labels[-1], "left": labels[:, 0], "right": labels[:, -1]}
+        sides |= {side for side, edge in ends.items() if np.isin(edge, TARGET_LABELS).any()}
+    assert sides == {"above", "below", "left", "right"}
+
+
+def test_clones_become_folders_to_train_on_and_what_is_missing_is_named(sources, monkeypatch, capsys):
+    monkeypatch.setattr(photographs, "SCENE", (90, 120))
+    call = [str(sources), "--tables", str(sources / "tables"), "--out", str(sources / "out")]
+    assert photographs.main(call) == 0
+    said = capsys.readouterr()
+    assert f"git clone https://github.com/nobody/cloned && git -C cloned checkout {'0' * 40}" in said.err
+    assert "somebody/pictures" not in said.err and not (sources / "out" / "street").exists()
+    close, scenes = (sources / "out" / kind for kind in ("close", "scenes"))
+    assert {path.stem for path in (close / "images").iterdir()} == {"large", "white"}
+    assert cv2.imread(str(close / "images" / "large.jpg")).shape == (480, 960, 3)
+    assert (cv2.imread(str(close / "masks" / "large.png"), cv2.IMREAD_UNCHANGED) == Label.FOREARM).all()
+    names = {"desk", "hands-000", *(f"white-{index}" for index in range(photographs.REPEATS))}
+    assert {path.stem for path in (scenes / "masks").iterdir()} == names
+    assert not cv2.imread(str(scenes / "masks" / "desk.png"), cv2.IMREAD_UNCHANGED).any()
+    image, mask = (cv2.imread(str(scenes / place), cv2.IMREAD_UNCHANGED) for place in ("images/white-0.jpg", "masks/white-0.png"))
+    assert (mask == Label.HAND).sum() > 600 and image.min(2).max() < 180, "no white is left"
+    assert recordings.Recordings([scenes], 1).count > 0
+    before = {path.name: path.read_bytes() for path in scenes.rglob("*.*")}
+    assert photographs.main(call) == 0 and before == {path.name: path.read_bytes() for path in scenes.rglob("*.*")}
+
+
+def test_a_clone_of_another_commit_is_refused(sources, capsys):
+    cv2.imwrite(str(sources / "pictures" / "white.png"), np.zeros((91, 120, 3), np.uint8))
+    call = [str(sources), "--tables", str(sources / "tables"), "--out", str(sources / "out")]
+    assert photographs.main(call) == 2
+    assert "expected 120 x 90, got 120 x 91; check out the commit" in capsys.readouterr().err
+    assert photographs.main([str(sources / "none"), *call[1:]]) == 2
+
+
+def test_the_project_has_a_mask_of_the_right_size_for_each_photograph_that_it_names():
+    tables = Path(__file__).parents[1] / "training" / "photographs"
+    rows = {kind: list(csv.DictReader((tables / f"{kind}.csv").open())) for kind in ("repositories", "pictures")}
+    repositories = {row["repository"] for row in rows["repositories"]}
+    assert {row["repository"] for row in rows["pictures"]} | {photographs.STREET, photographs.HANDS} == repositories
+    close = {row["name"]: row for row in rows["pictures"] if row["kind"] == "close"}
+    assert {path.stem for path in (tables / "masks").iterdir()} == set(close)
+    for name, row in close.items():
+        mask = recordings.read_mask(tables / "masks" / f"{name}.png")
+        assert mask.shape == (int(row["height"]), int(row["width"])) and np.isin(mask, TARGET_LABELS).any(), name

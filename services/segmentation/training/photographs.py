@@ -1,222 +1,254 @@
-"""`penumbra segmentation photographs`: street photographs with labelled people, as frames and masks to train on.
+"""`penumbra segmentation photographs`: photographs as frames and masks to train on, from clones of public repositories.
 
-The photographs and the class of every pixel (skin, kinds of clothes, bags) are those of Clothing Co-Parsing (Yang, Luo, Lin 2014,
-doi:10.1109/CVPR.2014.407; github.com/bearpaw/clothing-co-parsing, Apache-2.0; the rights of the photographers are not cleared, so
-neither pictures nor masks are kept here). Landmarks of a pose model say where the arms are (BlazePose, arXiv:2006.10204;
-`pose_landmark_full.tflite` of the Python package mediapipe 0.10.21, Apache-2.0, run in OpenVINO). Skin and sleeves near a
-forearm are forearm, beyond the wrist hand; what cannot be decided is UNLABELLED, as is a band along the target's coarse contours.
+The photographs are not kept in the project. Its folder training/photographs has what makes them ready again: repositories with
+their commits and licences (repositories.csv), the pictures that are used (pictures.csv), and masks that were drawn for it. Three
+folders are written, of what the clones have:
+
+  street   people in the street, from Clothing Co-Parsing and a pose model
+  close    hands and forearms at work, with the project's masks
+  scenes   pictures without people, and cut-out hands in front of these
+
+A larger picture is shrunk, by the mean of areas, until its longer side has 960 pixels; that is the size of the masks.
 """
 
 from __future__ import annotations
 
-import shutil
+import csv
+import itertools
+import math
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-import scipy.io
 from numpy.typing import NDArray
 from rich.progress import track
 
 from penumbra.services import flags
-from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
+from penumbra.services.segmentation.training import pasted, street
+from penumbra.services.segmentation.training.recordings import DataError, read_mask
+from penumbra.shared.contract.labels import Label
 
-SLEEVED = (
-    "blazer",
-    "blouse",
-    "bodysuit",
-    "cape",
-    "cardigan",
-    "coat",
-    "dress",
-    "hoodie",
-    "jacket",
-    "jumper",
-    "romper",
-    "shirt",
-    "suit",
-    "sweater",
-    "sweatshirt",
-    "t-shirt",
-    "top",
-)
-"""Clothes that may cover an arm."""
-WORN = ("accessories", "bracelet", "ring", "watch")
-"""Things that belong to the arm that they are on."""
-BAGS = ("bag", "purse", "wallet")
-SURE = 0.6
-"""Visibility of elbow and wrist from which an arm is used."""
-SIDE = 256
-"""Width and height [px] of the pose model's input."""
-RADII = {Label.UPPER_ARM: 0.19, Label.FOREARM: 0.16, Label.HAND: 0.2}
-"""Radii of an arm's parts, as shares of the forearm's length."""
-HAND = 0.75
-"""Length of the hand as a share of the forearm's."""
-BAND_PX = 2
-"""Half the width of the band along the target's contours that is not learned from."""
+STREET = "bearpaw/clothing-co-parsing"
+HANDS = "ardamavi/Sign-Language-Digits-Dataset"
+LONGEST = 960
+"""Pixels of a picture's longer side at most."""
+QUALITY = 95
+"""Of the JPEG files, in percent."""
+SEED = 8
+"""Of the pasted hands."""
+SCENE = 480, 640
+"""Height and width [px] of a scene with pasted hands."""
+COMPOSED = 200
+"""Scenes with hands that are cut out by colour."""
+HANDS_IN_A_SCENE = 2, 4
+"""Bounds of their number."""
+REPEATS = 6
+"""Scenes made of each picture on white."""
 
 
 @dataclass(frozen=True)
-class Pose:
-    """Landmarks of a person in a picture: points (33, 2) x, y [px], visible (33,) in [0, 1], as BlazePose numbers them; found:
-    how sure it is that there is a person."""
+class Repository:
+    """A line of repositories.csv: repository "owner/name"; licence and copyright are for readers."""
 
-    points: NDArray[np.float64]
-    visible: NDArray[np.float64]
-    found: float
+    repository: str
+    commit: str
+    licence: str
+    copyright: str
+
+    @property
+    def folder(self) -> str:
+        """Where `git clone` puts it."""
+        return self.repository.split("/")[1]
+
+    @property
+    def clone(self) -> str:
+        """The command that gets what the table means."""
+        return f"git clone https://github.com/{self.repository} && git -C {self.folder} checkout {self.commit}"
 
 
-class PoseModel:
-    """BlazePose's landmark network in OpenVINO."""
+@dataclass(frozen=True)
+class Picture:
+    """A line of pictures.csv: kind "close" or "scene"; name of what is written and of the mask; frame of a GIF, else empty; width
+    and height [px] as labelled; backdrop "white" where what is shown can be cut out."""
+
+    kind: str
+    name: str
+    repository: str
+    path: str
+    frame: str
+    width: str
+    height: str
+    backdrop: str
+
+    def read(self, clone: Path) -> NDArray[np.uint8]:
+        """The picture (height, width, 3) BGR. Raises DataError where the clone has not that one."""
+        path = clone / self.path
+        image = cv2.imread(str(path)) if not self.frame else _frame(path, int(self.frame))
+        if image is None:
+            raise DataError(f"{path}: expected a picture, found none; check out the commit in repositories.csv")
+        if max(image.shape) > LONGEST:
+            scale = LONGEST / max(image.shape)
+            image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        if image.shape[:2] != (int(self.height), int(self.width)):
+            got = f"{image.shape[1]} x {image.shape[0]}"
+            raise DataError(f"{path}: expected {self.width} x {self.height}, got {got}; check out the commit in repositories.csv")
+        return image.astype(np.uint8)
+
+
+def _frame(path: Path, index: int) -> NDArray[np.uint8] | None:
+    film = cv2.VideoCapture(str(path))
+    for _ in range(index):
+        film.grab()
+    return film.read()[1]
+
+
+class Folder:
+    """Where images/ and masks/ are written to, and what was."""
 
     def __init__(self, path: Path):
-        import openvino
+        self._images, self._masks = path / "images", path / "masks"
+        self.written = 0
 
-        self._compiled = openvino.Core().compile_model(path, "CPU", {"INFERENCE_NUM_THREADS": 1})
+    def write(self, name: str, image: NDArray[np.uint8], labels: NDArray[np.uint8]) -> None:
+        """An image (h, w, 3) BGR and its classes (h, w)."""
+        for folder in (self._images, self._masks):
+            folder.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(self._images / f"{name}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        cv2.imwrite(str(self._masks / f"{name}.png"), labels)
+        self.written += 1
 
-    def __call__(self, image: NDArray[np.uint8], person: NDArray[np.bool_]) -> Pose:
-        """The pose of the person whose pixels (h, w) are known in an image (h, w, 3) RGB: first looked at in the square around
-        these, then in the one that the model's own two auxiliary points describe."""
-        rows, columns = np.flatnonzero(person.any(1)), np.flatnonzero(person.any(0))
-        height, width = np.ptp(rows) + 1, np.ptp(columns) + 1
-        centre, side, angle = np.array([columns.mean(), rows.mean()]), 1.2 * float(max(height, width)), 0.0
-        for _ in range(2):
-            points, visible, found = self._look(image, centre, side, angle)
-            hips, circle = points[33], points[34]  # the middle of the hips, and a point on the circle around the whole body
-            up = circle - hips
-            centre, side, angle = hips, 2.5 * float(np.linalg.norm(up)), float(np.arctan2(up[0], -up[1]))
-        return Pose(points[:33], visible[:33], found)
-
-    def _look(self, image: NDArray[np.uint8], centre: NDArray[np.float64], side: float, angle: float):
-        turned: NDArray[np.float64] = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        corners = side * np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5]]) @ turned.T + centre
-        place = np.array([[0, 0], [SIDE, 0], [0, SIDE]], np.float32)
-        crop = cv2.warpAffine(image, cv2.getAffineTransform(corners.astype(np.float32), place), (SIDE, SIDE))
-        outputs = {tuple(port.shape): value for port, value in self._compiled(crop[None].astype(np.float32) / 255.0).items()}
-        marks = outputs[1, 195].reshape(39, 5).astype(float)  # x, y, z, logits of visibility and presence
-        back = cv2.getAffineTransform(place, corners.astype(np.float32))
-        return marks[:, :2] @ back[:, :2].T + back[:, 2], 1.0 / (1.0 + np.exp(-marks[:, 3])), float(outputs[1, 1].item())
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """An image (h, w, 3) BGR that was written."""
+        return cv2.imread(str(self._images / f"{name}.jpg")).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class Arm:
-    """Ends (2, 2) [px] of the parts of an arm, the forearm's length [px], and whether elbow and wrist are surely there."""
+class Sources:
+    """The tables of a folder, and the clones in another one. Raises OSError or TypeError where a table cannot be read."""
 
-    parts: dict[Label, NDArray[np.float64]]
-    length: float
-    is_sure: bool
+    def __init__(self, tables: Path, clones: Path):
+        with (tables / "repositories.csv").open(newline="") as file:
+            found = [Repository(**row) for row in csv.DictReader(file)]
+        with (tables / "pictures.csv").open(newline="") as file:
+            pictures = [Picture(**row) for row in csv.DictReader(file)]
+        self.missing = [repository for repository in found if not (clones / repository.folder).is_dir()]
+        self._there = {
+            repository.repository: clones / repository.folder for repository in found if repository not in self.missing
+        }
+        self._masks = tables / "masks"
+        self._pictures = [picture for picture in pictures if picture.repository in self._there]
 
-    @classmethod
-    def of(cls, pose: Pose, first: int) -> Arm:
-        """The left arm (landmarks from 11) or the right one (from 12): shoulder, elbow, wrist, little and index finger."""
-        shoulder, elbow, wrist, little, index = pose.points[[first, first + 2, first + 4, first + 6, first + 8]]
-        length = max(float(np.linalg.norm(wrist - elbow)), 0.7 * float(np.linalg.norm(elbow - shoulder)), 1.0)
-        ahead = (little + index) / 2.0 - wrist
-        tip = wrist + ahead / max(float(np.linalg.norm(ahead)), 1e-6) * HAND * length
-        ends = {Label.UPPER_ARM: (shoulder, elbow), Label.FOREARM: (elbow, wrist), Label.HAND: (wrist, tip)}
-        is_sure = bool(pose.visible[[first + 2, first + 4]].min() > SURE)
-        return cls({label: np.array(two) for label, two in ends.items()}, length, is_sure)
+    def clone(self, repository: str) -> Path | None:
+        """Where a repository's clone is, if it is."""
+        return self._there.get(repository)
 
+    def pictures(self, kind: str) -> list[Picture]:
+        """The pictures of a kind that the clones should have."""
+        return [picture for picture in self._pictures if picture.kind == kind]
 
-def masks(parts: NDArray[np.uint8], names: list[str], pose: Pose) -> NDArray[np.uint8]:
-    """Classes (h, w) from the dataset's (h, w), whose names are given, and the person's landmarks."""
+    def read(self, picture: Picture) -> NDArray[np.uint8]:
+        """A picture (h, w, 3) BGR. Raises DataError where the clone has not that one."""
+        return picture.read(self._there[picture.repository])
 
-    def named(*wanted: str) -> NDArray[np.bool_]:
-        return np.isin(parts, [names.index(name) for name in wanted])
-
-    height, width = parts.shape
-    skin, sleeved, nothing = named("skin"), named(*SLEEVED), named("null")
-    arms = [Arm.of(pose, first) for first in (11, 12)]
-    length = max(arm.length for arm in arms)
-    # how far [forearm lengths] each pixel lies outside each part of the nearer arm
-    outside = {
-        label: np.min([_distance(arm.parts[label], height, width) / arm.length for arm in arms], axis=0) - radius
-        for label, radius in RADII.items()
-    }
-    kinds = list(outside)
-    every = np.stack([outside[label] for label in kinds])
-    nearest = np.array(kinds, np.uint8)[every.argmin(0)]
-    near = every.min(0)
-    target_near = np.minimum(outside[Label.FOREARM], outside[Label.HAND])
-    points = pose.points
-    shoulders = points[11:13].mean(0)
-    other = [(points[0], points[0], 0.45), (points[0], shoulders, 0.3)]  # head and neck
-    other += [(points[a], points[b], 0.25) for a, b in ((23, 25), (25, 27), (24, 26), (26, 28))]  # legs
-    rest = np.min([_distance(np.array([a, b]), height, width) / length - radius for a, b, radius in other], axis=0)
-
-    labels = np.full(parts.shape, Label.TORSO, np.uint8)  # the rest of the person, too
-    labels[nothing] = Label.BACKGROUND
-    labels[nothing & (outside[Label.HAND] < -0.05)] = UNLABELLED  # things held have no class there
-    on_arm = near < rest
-    labels[skin & on_arm] = nearest[skin & on_arm]
-    labels[skin & ((np.abs(near - rest) < 0.1) | (on_arm & (near > 0.3)))] = UNLABELLED
-    core = target_near < -0.08
-    bare = (core & skin).sum() > (core & sleeved).sum()
-    if bare:  # clothes under the arm, or its short sleeve
-        labels[sleeved & (outside[Label.FOREARM] < -0.05)] = UNLABELLED
-        labels[sleeved & (outside[Label.UPPER_ARM] < 0.0)] = Label.UPPER_ARM
-    else:
-        limb = sleeved & (near < -0.03)
-        labels[limb] = np.where(nearest == Label.HAND, np.uint8(UNLABELLED), nearest)[limb]  # cuff, or a coat behind a hand
-        labels[sleeved & (np.abs(near - 0.05) <= 0.08)] = UNLABELLED
-    labels[named("gloves")] = Label.HAND
-    worn = named(*WORN)
-    labels[worn] = np.where(near < 0.1, nearest, UNLABELLED)[worn]
-    bags = named(*BAGS)
-    labels[bags] = np.where(target_near < 0.4, np.uint8(Label.OCCLUDER), np.uint8(UNLABELLED))[bags]
-    lower = ~(skin | sleeved | nothing | worn | bags | named("gloves", "hair", "hat", "scarf"))
-    labels[lower & (outside[Label.HAND] < -0.05)] = UNLABELLED  # a hand in a pocket
-    for arm in arms:
-        if not arm.is_sure:
-            about = np.min([_distance(ends, height, width) for ends in arm.parts.values()], axis=0)
-            labels[(about < 0.5 * arm.length) & ~nothing] = UNLABELLED
-    target = np.isin(labels, TARGET_LABELS).astype(np.uint8)
-    square = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)
-    labels[cv2.dilate(target, square) != cv2.erode(target, square)] = UNLABELLED
-    return labels
+    def mask(self, picture: Picture) -> NDArray[np.uint8]:
+        """Classes (h, w) of a close picture. Raises DataError where there are none."""
+        return read_mask(self._masks / f"{picture.name}.png")
 
 
-def _distance(ends: NDArray[np.float64], height: int, width: int) -> NDArray[np.float32]:
-    """Distance [px] of every pixel (h, w) from the line between two ends (2, 2)."""
-    along = ends[1] - ends[0]
-    y, x = np.mgrid[:height, :width].astype(np.float32) - ends[0, ::-1, None, None].astype(np.float32)
-    t = np.clip((x * along[0] + y * along[1]) / max(float(along @ along), 1e-6), 0.0, 1.0)
-    return np.hypot(x - t * along[0], y - t * along[1]).astype(np.float32)
+def write_close(sources: Sources, out: Path) -> int:
+    """Writes the photographs that the project has masks of: how many."""
+    folder = Folder(out)
+    for picture in track(sources.pictures("close"), "close"):
+        folder.write(picture.name, sources.read(picture), sources.mask(picture))
+    return folder.written
+
+
+def write_scenes(sources: Sources, out: Path) -> int:
+    """Writes photographs without people, and others with hands pasted in front of these: how many."""
+    folder, rng = Folder(out), np.random.default_rng(SEED)
+    for picture in track(sources.pictures("scene"), "scenes"):
+        image = sources.read(picture)
+        folder.write(picture.name, image, np.full(image.shape[:2], Label.BACKGROUND, np.uint8))
+    if not folder.written:
+        return 0
+    hands = _hands(sources.clone(HANDS), rng)
+    for index in track(range(COMPOSED), "hands"):
+        cutouts = list(itertools.islice(hands, int(rng.integers(*HANDS_IN_A_SCENE, endpoint=True))))
+        if not cutouts:
+            break
+        scene, labels = _empty(sources, folder, SCENE, rng)
+        for cutout in cutouts:
+            pasted.paste(scene, labels, cutout, pasted.from_side(cutout, *SCENE, rng), rng)
+        folder.write(f"hands-{index:03d}", pasted.noisy(scene, rng), labels)
+    for picture in track([picture for picture in sources.pictures("close") if picture.backdrop == "white"], "hands with things"):
+        cutout = pasted.on_white(sources.read(picture), sources.mask(picture))
+        size = round(SCENE[1] * int(picture.height) / int(picture.width)), SCENE[1]
+        for index in range(REPEATS):
+            scene, labels = _empty(sources, folder, size, rng)
+            pasted.paste(scene, labels, cutout, pasted.filling(cutout, *size, rng), rng)
+            folder.write(f"{picture.name}-{index}", pasted.noisy(scene, rng), labels)
+    return folder.written
+
+
+def _hands(clone: Path | None, rng: np.random.Generator) -> Iterator[pasted.Cutout]:
+    """The hands of a clone of HANDS, where there is one, in a drawn order, without those that cannot be cut out."""
+    paths = sorted(clone.glob("Dataset/*/*.JPG")) if clone else []
+    for index in rng.permutation(len(paths)):
+        image = cv2.imread(str(paths[index]))
+        cutout = None if image is None else pasted.hand(image.astype(np.uint8))
+        if cutout:
+            yield cutout
+
+
+def _empty(
+    sources: Sources, folder: Folder, size: tuple[int, int], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A part (h, w, 3) BGR of a drawn scene, mirrored or not, and its classes (h, w)."""
+    scenes = sources.pictures("scene")
+    image = folder.read(scenes[rng.integers(len(scenes))].name)
+    scale = max(np.divide(size, image.shape[:2])) * rng.uniform(1.0, 1.4)
+    shape = [max(math.ceil(scale * n), least) for n, least in zip(image.shape[:2], size, strict=True)]
+    image = cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR).astype(np.uint8)
+    top, left = (int(rng.integers(n - least + 1)) for n, least in zip(shape, size, strict=True))
+    part = image[top : top + size[0], left : left + size[1]]
+    return np.ascontiguousarray(part[:, :: rng.choice([-1, 1])]), np.full(size, Label.BACKGROUND, np.uint8)
 
 
 @flags.command(
     "segmentation photographs",
-    "Makes frames and masks for `penumbra segmentation train --data` from labelled street photographs.\n\n" + (__doc__ or ""),
-    flags.Argument("source", type=Path, help="a copy of github.com/bearpaw/clothing-co-parsing"),
-    flags.Option("--pose", type=Path, required=True, metavar="FILE", help="pose_landmark_full.tflite"),
-    flags.Option("--out", type=Path, default=Path("photographs"), help="folder to write images/ and masks/ to"),
-    example="penumbra segmentation photographs clothing-co-parsing --pose pose_landmark_full.tflite",
+    "Makes frames and masks for `penumbra segmentation train --data` from clones of public repositories.\n\n" + (__doc__ or ""),
+    flags.Argument(
+        "clones", type=Path, help="folder with the clones; those that are not there are named, with the commands to get them"
+    ),
+    flags.Option("--pose", type=Path, metavar="FILE", help="pose_landmark_full.tflite, for the people in the street"),
+    flags.Option("--tables", type=Path, default=Path("training/photographs"), help="the project's folder with tables and masks"),
+    flags.Option("--out", type=Path, default=Path("photographs"), help="folder to write street/, close/ and scenes/ to"),
+    example="penumbra segmentation photographs clones --pose pose_landmark_full.tflite",
 )
 def main(options: flags.Options) -> int:
-    """Writes images/ and masks/ of the photographs in which a person's pose is found."""
-    annotated = sorted((options.source / "annotations" / "pixel-level").glob("*.mat"))
-    if not annotated or not options.pose.is_file():
-        wanted = options.pose if annotated else options.source / "annotations" / "pixel-level"
-        print(f"penumbra segmentation photographs: expected {wanted}, found nothing there; see --help", file=sys.stderr)
+    """Writes the folders that can be made of the clones that are there."""
+    try:
+        sources = Sources(options.tables, options.clones)
+        if sources.missing:
+            lines = "\n".join(f"  {repository.clone}" for repository in sources.missing)
+            _tell(f"{options.clones}: expected these clones as well; what needs them is left out:\n{lines}")
+        folders = {}
+        people = sources.clone(STREET)
+        if people and options.pose:
+            folders["street"] = street.write(people, options.pose, options.out / "street")
+        elif people:
+            _tell("street: expected --pose FILE, got none; it is left out")
+        folders["close"] = write_close(sources, options.out / "close")
+        folders["scenes"] = write_scenes(sources, options.out / "scenes")
+    except (OSError, TypeError, ValueError) as error:
+        _tell(str(error))
         return 2
-    names = [str(name[0]) for name in scipy.io.loadmat(options.source / "label_list.mat")["label_list"][0]]
-    find = PoseModel(options.pose)
-    for folder in ("images", "masks"):
-        (options.out / folder).mkdir(parents=True, exist_ok=True)
-    written = 0
-    for path in track(annotated, "photographs"):
-        parts = scipy.io.loadmat(path)["groundtruth"].astype(np.uint8)
-        photograph = options.source / "photos" / f"{path.stem}.jpg"
-        image = cv2.imread(str(photograph), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None or image.shape[:2] != parts.shape or not parts.any():
-            continue
-        pose = find(np.ascontiguousarray(image[..., ::-1]), parts > 0)
-        if pose.found < 0.8 or not any(Arm.of(pose, first).is_sure for first in (11, 12)):
-            continue
-        shutil.copyfile(photograph, options.out / "images" / photograph.name)
-        cv2.imwrite(str(options.out / "masks" / f"{path.stem}.png"), masks(parts, names, pose))
-        written += 1
-    print(f"{written} of {len(annotated)} photographs: {options.out}")
-    return 0
+    for name, written in folders.items():
+        print(f"{options.out / name}: {written} photographs")
+    return 0 if any(folders.values()) else 2
+
+
+def _tell(text: str) -> None:
+    print(f"penumbra segmentation photographs: {text}", file=sys.stderr)
