@@ -166,13 +166,19 @@ def arm() -> np.ndarray:
     image = np.full((100, 100, 3), 180, np.uint8)
     cv2.ellipse(image, (50, 45), (22, 28), 0, 0, 360, (90, 120, 200), -1)
     image[60:, 40:60] = (90, 120, 200)
-    return cv2.blur(image, (3, 3))
+    return cv2.blur(image, (3, 3)).astype(np.uint8)
+
+
+def seen(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image
 
 
 def test_a_hand_is_cut_out_by_its_colour_and_parted_at_the_wrist():
     cutout = pasted.hand(arm())
     assert cutout is not None and cutout.solid.shape == (pasted.SIDE, pasted.SIDE)
-    truth = cv2.resize((arm()[..., 0] < 135).astype(np.uint8), (pasted.SIDE, pasted.SIDE))
+    truth = cv2.resize((arm()[..., 0] < 135).astype(np.uint8), (pasted.SIDE, pasted.SIDE)).astype(np.uint8)
     assert (cutout.solid & truth).sum() / (cutout.solid | truth).sum() > 0.95
     assert cutout.labels[90, 100] == Label.HAND and cutout.labels[190, 100] == Label.FOREARM
     assert cutout.labels[90, 10] == Label.BACKGROUND
@@ -205,12 +211,12 @@ def test_clones_become_folders_to_train_on_and_what_is_missing_is_named(sources,
     assert "somebody/pictures" not in said.err and not (sources / "out" / "street").exists()
     close, scenes = (sources / "out" / kind for kind in ("close", "scenes"))
     assert {path.stem for path in (close / "images").iterdir()} == {"large", "white"}
-    assert cv2.imread(str(close / "images" / "large.jpg")).shape == (480, 960, 3)
-    assert (cv2.imread(str(close / "masks" / "large.png"), cv2.IMREAD_UNCHANGED) == Label.FOREARM).all()
+    assert seen(close / "images" / "large.jpg").shape == (480, 960, 3)
+    assert (recordings.read_mask(close / "masks" / "large.png") == Label.FOREARM).all()
     names = {"desk", "hands-000", *(f"white-{index}" for index in range(photographs.REPEATS))}
     assert {path.stem for path in (scenes / "masks").iterdir()} == names
-    assert not cv2.imread(str(scenes / "masks" / "desk.png"), cv2.IMREAD_UNCHANGED).any()
-    image, mask = (cv2.imread(str(scenes / place), cv2.IMREAD_UNCHANGED) for place in ("images/white-0.jpg", "masks/white-0.png"))
+    assert not recordings.read_mask(scenes / "masks" / "desk.png").any()
+    image, mask = seen(scenes / "images" / "white-0.jpg"), recordings.read_mask(scenes / "masks" / "white-0.png")
     assert (mask == Label.HAND).sum() > 600 and image.min(2).max() < 180, "no white is left"
     assert recordings.Recordings([scenes], 1).count > 0
     before = {path.name: path.read_bytes() for path in scenes.rglob("*.*")}

@@ -12,10 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.shared.contract.labels import UNLABELLED, Label
+from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 
 SIDE = 200
 """Pixels a side at which a hand is cut out."""
+CLEAR = 1.15
+"""Colour difference from the wall from which a pixel is likely the hand's, as a multiple of Otsu's threshold."""
+ARM_PX = 12
+"""Least width of an arm where it leaves the picture."""
 AREA = 0.09, 0.55
 """Bounds of a cut-out hand's share of its picture: less is a part of one, more has the wall in it."""
 DISTINCT = 0.45
@@ -54,17 +58,18 @@ def hand(image: NDArray[np.uint8]) -> Cutout | None:
     difference = np.linalg.norm(colours - wall, axis=2)
     scaled = (255.0 * difference / max(float(difference.max()), 1e-6)).astype(np.uint8)
     threshold, _ = cv2.threshold(scaled, 0, 255, cv2.THRESH_OTSU)
-    other = cv2.morphologyEx((scaled > 1.15 * threshold).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    other = cv2.morphologyEx((scaled > CLEAR * threshold).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     guess = np.where(other > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     guess[cv2.erode(other, np.ones((9, 9), np.uint8)) > 0] = cv2.GC_FGD
     guess[cv2.dilate(other, np.ones((21, 21), np.uint8)) == 0] = cv2.GC_BGD
     if not (guess == cv2.GC_FGD).any() or not (guess == cv2.GC_BGD).any():
         return None
-    cv2.grabCut(image, guess, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
-    solid = largest(cv2.medianBlur(np.isin(guess, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8), 5))
+    cv2.setRNGSeed(0)  # GrabCut draws from a generator of the whole process, and the same picture is to be cut the same way
+    cv2.grabCut(image, guess, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
+    solid = largest(cv2.medianBlur(np.isin(guess, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8), 5).astype(np.uint8))
     inside = difference[cv2.erode(solid, np.ones((5, 5), np.uint8)) > 0]
     leaves_elsewhere = solid[:3].any() or solid[: SIDE // 2, :3].any() or solid[: SIDE // 2, -3:].any()
-    if not AREA[0] < solid.mean() < AREA[1] or leaves_elsewhere or solid[-3:].sum() < 40 or not inside.size:
+    if not AREA[0] < solid.mean() < AREA[1] or leaves_elsewhere or solid[-1].sum() < ARM_PX or not inside.size:
         return None
     if np.quantile(inside, 0.08) < DISTINCT * np.median(inside):
         return None
@@ -95,7 +100,8 @@ def parted(solid: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def on_white(image: NDArray[np.uint8], labels: NDArray[np.uint8]) -> Cutout:
     """All that is not white in a picture (h, w, 3) BGR whose classes (h, w) are known."""
     things = cv2.morphologyEx((image.min(2) < WHITE).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
-    return Cutout(image, things | np.isin(labels, (Label.FOREARM, Label.HAND)), labels)
+    solid = ((things > 0) | np.isin(labels, TARGET_LABELS)).astype(np.uint8)
+    return Cutout(image, solid, labels)
 
 
 def from_side(cutout: Cutout, height: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -141,9 +147,10 @@ def paste(
     solid, classes = (cv2.warpAffine(part, place, size, flags=cv2.INTER_NEAREST) for part in (cutout.solid, cutout.labels))
     three = np.ones((3, 3), np.uint8)
     cover = cv2.GaussianBlur(cv2.erode(solid, three).astype(np.float32), (0, 0), 0.8)[..., None]
-    shift = np.float32([[1, 0, rng.uniform(-12, 12)], [0, 1, rng.uniform(-12, 12)]])
-    shadow = cv2.GaussianBlur(cv2.warpAffine(solid.astype(np.float32), shift, size), (0, 0), 8.0)[..., None]
-    shadow *= np.float32(rng.uniform(0.1, 0.45))
+    shift = np.array([[1.0, 0.0, rng.uniform(-12.0, 12.0)], [0.0, 1.0, rng.uniform(-12.0, 12.0)]])
+    shadow = (
+        rng.uniform(0.1, 0.45) * cv2.GaussianBlur(cv2.warpAffine(solid.astype(np.float32), shift, size), (0, 0), 8.0)[..., None]
+    )
     light = (rng.uniform(0.75, 1.2) * np.exp(rng.normal(0.0, 0.035, 3))).astype(np.float32)
     front = np.minimum(image * light, 255.0)
     scene[:] = (scene * (1.0 - shadow) * (1.0 - cover) + front * cover).astype(np.uint8)

@@ -102,7 +102,8 @@ def _frame(path: Path, index: int) -> NDArray[np.uint8] | None:
     film = cv2.VideoCapture(str(path))
     for _ in range(index):
         film.grab()
-    return film.read()[1]
+    found, image = film.read()
+    return image.astype(np.uint8) if found else None
 
 
 class Folder:
@@ -122,7 +123,9 @@ class Folder:
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """An image (h, w, 3) BGR that was written."""
-        return cv2.imread(str(self._images / f"{name}.jpg")).astype(np.uint8)
+        image = cv2.imread(str(self._images / f"{name}.jpg"))
+        assert image is not None
+        return image.astype(np.uint8)
 
 
 class Sources:
