@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from penumbra.services.segmentation.inference import TARGET_LABELS
-from penumbra.services.segmentation.training import landmarks, photographs, recordings, train
+from penumbra.services.segmentation.training import photographs, recordings, train
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import UNLABELLED, Label
+from penumbra.shared.perception import landmarks
 from penumbra.sim.picture import limb, looks
 from penumbra.sim.sets import sequences
 

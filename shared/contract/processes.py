@@ -133,7 +133,7 @@ PROCESSES = (
             Tool(
                 "models",
                 "fetch the landmark models that label films and photographs",
-                "penumbra.services.segmentation.training.landmarks:main",
+                "penumbra.services.segmentation.training.models:main",
                 extra="segmentation",
             ),
             Tool(

@@ -26,10 +26,11 @@ from scipy.ndimage import gaussian_filter
 from penumbra.services import flags
 from penumbra.services.segmentation import files
 from penumbra.services.segmentation.inference import cut
-from penumbra.services.segmentation.training import landmarks
-from penumbra.services.segmentation.training.landmarks import Hand, Landmarks, Points, Pose, Region
+from penumbra.services.segmentation.training.models import FOLDER
 from penumbra.services.segmentation.training.recordings import PIECE
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
+from penumbra.shared.perception import landmarks
+from penumbra.shared.perception.landmarks import Hand, Landmarks, Points, Pose, Region
 from penumbra.shared.perception.lookout import MARGIN_M, Window, window_of
 
 RATE_HZ = 15.0
@@ -492,7 +493,7 @@ class Folder:
     flags.Option(
         "--every", type=flags.positive, metavar="N", show_default=f"{RATE_HZ:.0f} a second", help="label every Nth frame"
     ),
-    landmarks.FOLDER,
+    FOLDER,
     example="penumbra segmentation label arm.mp4 --out labels",
 )
 def main(options: flags.Options) -> int:

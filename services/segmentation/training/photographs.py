@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from penumbra.services import flags
-from penumbra.services.segmentation.training import landmarks
-from penumbra.services.segmentation.training.landmarks import Pose
+from penumbra.services.segmentation.training import models
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
+from penumbra.shared.perception.landmarks import Landmarks, ModelsError, Pose
 
 SLEEVED = (
     "blazer",
@@ -148,7 +148,7 @@ def _distance(ends: NDArray[np.float64], height: int, width: int) -> NDArray[np.
     "segmentation photographs",
     "Makes frames and masks for `penumbra segmentation train --data` from labelled street photographs.\n\n" + (__doc__ or ""),
     flags.Argument("source", type=Path, help="a copy of github.com/bearpaw/clothing-co-parsing"),
-    landmarks.FOLDER,
+    models.FOLDER,
     flags.Option("--out", type=Path, default=Path("photographs"), help="folder to write images/ and masks/ to"),
     example="penumbra segmentation photographs clothing-co-parsing",
 )
@@ -160,8 +160,8 @@ def main(options: flags.Options) -> int:
         print(f"penumbra segmentation photographs: expected {wanted}, found nothing there; see --help", file=sys.stderr)
         return 2
     try:
-        find = landmarks.Landmarks(options.models)
-    except landmarks.ModelsError as error:
+        find = Landmarks(options.models)
+    except ModelsError as error:
         print(f"penumbra segmentation photographs: {error}", file=sys.stderr)
         return 2
     names = [str(name[0]) for name in scipy.io.loadmat(options.source / "label_list.mat")["label_list"][0]]

@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 
 from penumbra.services.segmentation import files
-from penumbra.services.segmentation.training import label, landmarks, recordings
+from penumbra.services.segmentation.training import label, models, recordings
 from penumbra.services.segmentation.training.label import Colours, Limb
-from penumbra.services.segmentation.training.landmarks import Hand, Pose, Region
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 from penumbra.shared.geometry import rigid
+from penumbra.shared.perception import landmarks
+from penumbra.shared.perception.landmarks import Hand, Pose, Region
 from penumbra.sim.sets import shots
 
 
 @pytest.fixture(scope="module")
-def models():
+def finder():
     try:
         return landmarks.Landmarks(landmarks.kept())
     except landmarks.ModelsError as error:
@@ -84,12 +85,12 @@ def test_models_that_are_missing_or_others_are_told(tmp_path, capsys):
     with zipfile.ZipFile(tmp_path / "wheel.whl", "w") as wheel:
         wheel.writestr("mediapipe/LICENSE.txt", "")
     with pytest.raises(landmarks.ModelsError, match=r"without palm_detection_full\.tflite"):
-        landmarks.unpack(tmp_path / "wheel.whl", tmp_path / "models")
+        models.unpack(tmp_path / "wheel.whl", tmp_path / "models")
 
 
 @pytest.mark.network
 def test_the_models_are_fetched(tmp_path):
-    assert landmarks.main(["--out", str(tmp_path)]) == 0
+    assert models.main(["--out", str(tmp_path)]) == 0
     assert {path.stem for path in tmp_path.iterdir()} == {*landmarks.FILES, "LICENSE"}
 
 
@@ -190,7 +191,7 @@ def test_pictures_are_written_at_the_scale_at_which_the_service_would_look():
     np.testing.assert_allclose(limb.scaled(4.0).scaled(0.25).points, limb.points)
 
 
-def test_films_without_hands_are_told(models, tmp_path, capsys):
+def test_films_without_hands_are_told(finder, tmp_path, capsys):
     film = tmp_path / "wall.png"
     cv2.imwrite(str(film), np.full((240, 320, 3), 128, np.uint8))
     assert label.main([str(film), "--out", str(tmp_path / "labels")]) == 2
