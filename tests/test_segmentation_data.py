@@ -35,7 +35,7 @@ def test_sequences_as_real_cameras_show_them_have_arms_of_all_sizes():
         sequence = sequences.render(4, index, real)
         shares.append(np.isin(sequence.labels, TARGET_LABELS).mean())
         assert sequence.images.shape == (1, 96, 96, 3) and sequence.labels.max() <= max(Label)
-    assert np.quantile(shares, 0.9) > 0.25 and np.median([share for share in shares if share > 0.0]) < 0.25
+    assert np.quantile(shares, 0.9) > 0.14 and np.median([share for share in shares if share > 0.0]) < 0.14
 
 
 def test_a_cheap_camera_changes_a_film_s_colours_and_not_its_size():
@@ -100,13 +100,14 @@ def test_photographs_are_turned_moved_and_seen_nearer_with_their_labels_and_unla
 
 
 def test_what_is_pasted_lies_in_front_with_its_labels():
-    below = np.zeros((2, 32, 32, 4), np.uint8)
-    over = np.full((2, 32, 32, 4), 200, np.uint8)
+    below = np.zeros((2, 32, 32, 6), np.uint8)
+    over = np.full((2, 32, 32, 6), 200, np.uint8)
     over[..., 3] = Label.BACKGROUND
     over[:, :, :8, 3], over[:, :, 8:16, 3] = Label.ROBOT, Label.OCCLUDER
     out = train.pasted(below, over, np.random.default_rng(0))
     assert (out[:, :, :8, 3] == Label.ROBOT).all() and (out[:, :, 8:16, 3] == Label.OCCLUDER).all()
-    assert (out[:, :, :13, :3] == 200).all() and not out[:, :, 20:].any() and not below.any()
+    assert (out[:, :, :13, :3] == 200).all() and not out[:, :, 20:, :4].any() and not below.any()
+    assert (out[..., 4] == 200).all(), "what is known of the robot"
 
 
 def test_recordings_and_simulated_sequences_are_mixed_by_their_share_and_both_are_scored(folder):

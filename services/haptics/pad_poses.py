@@ -8,7 +8,7 @@ import numpy as np
 from penumbra.shared.body.robot import RobotModel
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry.rigid import Array
-from penumbra.shared.perception.joint_history import JointHistory
+from penumbra.shared.perception.joint_history import RobotJoints
 from penumbra.shared.skin.layout import Skin, link_names
 
 STALE_NS = 100_000_000
@@ -25,24 +25,20 @@ class PadPoses:
     def __init__(self, cell: cells.Cell, skin: Skin, models: dict[str, RobotModel]):
         self.skin, self.models = skin, models
         self._carriers = {link.partition("/")[0] for link in skin.links} & set(models)
-        self._history = {name: JointHistory(STALE_NS, is_carried_on=True) for name in models}
+        counts = {name: len(model.joints) for name, model in models.items()}
+        self._joints = RobotJoints(counts, STALE_NS, is_carried_on=True)
 
     def add(self, robot: str, stamp_ns: int, joints: Array) -> None:
         """Take joint angles (j,) [rad]. Raises ValueError for an unknown robot or another number of joints than it has."""
-        if robot not in self.models:
-            raise ValueError(f"expected a robot of {', '.join(self.models) or 'none'}, got {robot!r}: compare the cell files")
-        wanted = len(self.models[robot].joints)
-        if joints.shape != (wanted,):
-            raise ValueError(f"robot {robot}: expected {wanted} joint angles, got shape {joints.shape}")
-        self._history[robot].add(stamp_ns, joints)
+        self._joints.add(robot, stamp_ns, joints)
 
     def at(self, stamp_ns: int) -> tuple[Array, Array] | None:
         """T_world_pads (p, 4, 4) and all joint angles (j,) at stamp_ns; None where a robot that carries pads sent none near that
         time."""
         links: dict[str, dict[str, Array]] = {}
-        joints = []
+        joints, known = [], self._joints.at(stamp_ns)
         for name, model in self.models.items():
-            q = self._history[name].at(stamp_ns)
+            q = known.get(name)
             if q is not None:
                 links[name] = model.link_transforms(q)
             elif name in self._carriers:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from penumbra.shared.cell.description import Camera
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.native import kernel
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 FREE, TARGET, COVERED = 0, 1, 2
 """State of a pixel. COVERED: something stands in front, or nothing is known there. The limb's other parts cover too: the
@@ -37,24 +38,6 @@ UNEXPLAINED_PX, PREDICTED_PX = 5, 10
 """Within the first distance [px] of a mask its boundary may be the target's own; within the second the prediction may be off."""
 FORESHORTENED = 0.4
 """A limb whose image is shorter than this share of its length has no side beyond its end in the picture."""
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole in pixels of a mask, whose first pixel's centre is (0, 0)."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    @staticmethod
-    def of_window(camera: Camera, x0: int, y0: int, scale: int) -> Intrinsics:
-        """The intrinsics of a window of a camera's image whose pixels cover `scale` x `scale` image pixels."""
-        centre = (scale - 1) / 2.0
-        return Intrinsics(
-            camera.fx / scale, camera.fy / scale, (camera.cx - x0 - centre) / scale, (camera.cy - y0 - centre) / scale
-        )
 
 
 @dataclass(frozen=True)

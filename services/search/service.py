@@ -7,7 +7,7 @@ from penumbra.services.search.tracker import METHODS, Search
 from penumbra.shared.contract.messages import Frame, Joints, Mask
 from penumbra.shared.contract.topics import FRAME, FUSED, JOINTS, MASK, VISION
 from penumbra.shared.geometry.lens import Undistortion
-from penumbra.shared.perception.joint_history import JointHistory
+from penumbra.shared.perception.joint_history import RobotJoints
 from penumbra.shared.perception.lookout import Lookout
 from penumbra.shared.perception.prediction import predict
 from penumbra.shared.runtime.node import ServiceNode
@@ -31,7 +31,7 @@ EXAMPLE = "penumbra search --cell table --method paper"
 def start(node: ServiceNode, options: flags.Options) -> None:
     """Subscribes; every mask is searched for every target that its camera can see and this replica owns.
 
-    Threads: `history[robot]` belongs to the reader of that robot's joints, `frames[camera]` to the reader of that camera's
+    Threads: the joints of a robot are written by their reader, `frames[camera]` to the reader of that camera's
     frames. The reader of its masks takes what is there at that moment; the searches of a camera are that reader's alone.
     """
     cell = node.cell
@@ -46,7 +46,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
         node.progress("preparing searches", k, len(searches))
         search.prepare()
     node.progress("preparing searches", len(searches), len(searches))
-    history = {robot: JointHistory(JOINTS_NEAR_NS) for robot in cell.robots}
+    joints = RobotJoints({name: len(robot.joints) for name, robot in cell.robots.items()}, JOINTS_NEAR_NS)
     fused = {target: node.latest(FUSED, target=target) for target in targets}
     frames: dict[str, tuple[Frame, ...]] = dict.fromkeys(cameras, ())
     undistort = {camera: Undistortion(cell.cameras[camera].lens) for camera in cameras}
@@ -56,22 +56,19 @@ def start(node: ServiceNode, options: flags.Options) -> None:
         frames[names["camera"]] = (*known, message)[-FRAMES_KEPT:]  # a new one each time: `on_mask` may be in the old one
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
-        robot, expected = names["robot"], len(cell.robots[names["robot"]].joints)
-        if len(message.position) != expected:
-            raise ValueError(f"joints of {robot}: expected {expected} values, got {len(message.position)}")
-        history[robot].add(message.stamp_ns, message.position)
+        joints.add(names["robot"], message.stamp_ns, message.position)
 
     def on_mask(message: Mask, names: dict[str, str]) -> None:
         image = next((frame.image for frame in frames[names["camera"]] if frame.stamp_ns == message.stamp_ns), None)
         if image is not None:
             (h, w), scale = message.labels.shape, message.scale
             image = undistort[names["camera"]](image, (message.x0, message.y0, message.x0 + w * scale, message.y0 + h * scale))
-        joints = {robot: q for robot, h in history.items() if (q := h.at(message.stamp_ns)) is not None}
+        known = joints.at(message.stamp_ns)
         for (camera, target), search in searches.items():
             if camera != names["camera"] or not node.owns(f"{camera}/{target}"):
                 continue
             T_prior, covariance = predict(fused[target].get(target=target), message.stamp_ns)
-            estimate = search.update(message, T_prior, covariance, joints, image)
+            estimate = search.update(message, T_prior, covariance, known, image)
             pose = estimate.message(message.stamp_ns, target, camera, cell.frame)
             node.publish(VISION, pose, target=target)
 

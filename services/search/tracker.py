@@ -12,7 +12,6 @@ from penumbra.services.search import contour, detect, evidence, paper_search
 from penumbra.services.search.evidence import TARGET, Evidence, Intrinsics
 from penumbra.services.search.image_fit import fit_image
 from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
-from penumbra.services.search.robot_depth import RobotDepth
 from penumbra.services.search.settings import SearchSettings
 from penumbra.services.search.verdict import Findings, explains_mask, least_overlap, verdict
 from penumbra.shared.body import anatomy
@@ -20,6 +19,7 @@ from penumbra.shared.cell.description import Cell
 from penumbra.shared.contract.messages import Mask
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.robot_depth import RobotDepth
 from penumbra.shared.perception.vision import State, VisionEstimate
 
 METHODS = ("default", "paper")

@@ -23,16 +23,19 @@ CHANNELS_FIRST, CHANNELS_LAST = np.array([0, 3, 1, 2]), np.array([0, 2, 3, 1])
 def step(model: Model, height: int, width: int, precision: str) -> Any:
     """OpenVINO's model of a time step for images of one size. precision: OpenVINO's name of the state's type, f32 or bf16.
 
-    Inputs: the image (1, h, w, channels) float32 in [0, 1], then the tensors of the state (1, h / stride, w / stride, channels).
+    Inputs: the image (1, h, w, channels) float32 in [0, 1], the tensors of the state (1, h / stride, w / stride, channels), and,
+    where the network has any, priors (1, h, w, priors) float32 in [-1, 1].
     Outputs: the class logits (1, classes, h, w) float32, then the new state. Raises ValueError where the size does not fit.
     """
     inputs, sizes = model.inputs, model.settings.state_sizes(height, width)
     state_type = getattr(openvino.Type, precision)
     image = op.parameter([1, height, width, inputs[0] // FOLD**2], np.float32, "image")
     state = [op.parameter([1, *size, channels], state_type) for size, channels in zip(sizes, model.state_channels, strict=True)]
-    logits, new = _Step(model).forward(_channels_first(image), [_channels_first(tensor) for tensor in state])
+    known = [op.parameter([1, height, width, model.settings.priors], np.float32, "priors")] if model.settings.priors else []
+    first = [_channels_first(tensor) for tensor in (image, *known)]
+    logits, new = _Step(model).forward(first[0], [_channels_first(tensor) for tensor in state], *first[1:])
     outputs = [op.convert(logits, "f32"), *(op.convert(op.transpose(r, CHANNELS_LAST), state_type) for r in new)]
-    return openvino.Model(outputs, [image, *state], "prednet")
+    return openvino.Model(outputs, [image, *state, *known], "prednet")
 
 
 def _channels_first(parameter: Any) -> Any:
@@ -45,21 +48,26 @@ class _Step:
     def __init__(self, model: Model):
         self._settings, self._weights = model.settings, model.weights
 
-    def forward(self, image: Any, state: list[Any]) -> tuple[Any, list[Any]]:
-        """(class logits, new state) of an image and the old state."""
+    def forward(self, image: Any, state: list[Any], priors: Any = None) -> tuple[Any, list[Any]]:
+        """(class logits, new state) of an image, the old state and, where the network has any, priors."""
         n = len(self._settings.channels)
         old, delayed = state[:n], state[n:]  # with delays: E_l of the step before
         errors: list[Any] = []
         arriving = op.space_to_depth(image, "depth_first", FOLD)
+        known = None if priors is None else op.space_to_depth(priors, "depth_first", FOLD)
         for i in range(n):
             difference = op.subtract(arriving, self._convolution(f"predict.{i}", old[i]))
             errors.append(op.relu(op.concat([difference, op.negative(difference)], 1)))
             if i + 1 < n:
                 up = self._convolution(f"ascend.{i}", delayed[i] if delayed else errors[i])
+                if i == 0 and known is not None:
+                    up = op.add(up, self._convolution("prior_input", known))
                 arriving = op.relu(_pooled(up) if i > 0 else up)
         new: list[Any] = []
         for i in reversed(range(n)):
             drive = self._convolution(f"drive.{i}", errors[i])
+            if i == 1 and known is not None:
+                drive = op.add(drive, self._convolution("prior_drive", known))
             if i + 1 < n:
                 down = self._convolution(f"descend.{i}", old[i + 1] if delayed else new[0])
                 drive = op.add(drive, _enlarged(down, 2, "nearest") if i > 0 else down)

@@ -32,18 +32,28 @@ class Segmenter:
     def __init__(self, network: Model, offset: float = 0.0, precision: Precision | None = None):
         self._compiled = Compiled(network, precision or ("bf16" if processor.has_bfloat16() else "f32"))
         self._strides, self._offset = network.settings.strides, np.float32(offset)
+        self._has_priors = network.settings.priors > 0
         self._state: State | None = None
         self._window: Window | None = None
         self._stamp_ns = 0
 
-    def __call__(self, image: NDArray[np.uint8], window: Window, stamp_ns: int) -> NDArray[np.uint8]:
+    @property
+    def has_priors(self) -> bool:
+        """Whether the network makes use of what is known beside the picture."""
+        return self._has_priors
+
+    def __call__(
+        self, image: NDArray[np.uint8], window: Window, stamp_ns: int, priors: NDArray[np.float32] | None = None
+    ) -> NDArray[np.uint8]:
         """Class indices (window.height, window.width) uint8 of a window of an RGB image (h, w, 3) uint8, exposed at `stamp_ns`.
+        priors (window.height, window.width, 2): what is known of the window beside the picture (`model.PRIORS`), None where
+        nothing is.
 
         The state is forgotten where the scale changes, time stands, goes back or jumps by more than MAX_GAP_S.
         Raises ValueError where the window does not lie in the image.
         """
         picture = cut(image, window)
-        logits, self._state = self._compiled(picture, self._remembered(window, stamp_ns))
+        logits, self._state = self._compiled(picture, self._remembered(window, stamp_ns), priors)
         self._window, self._stamp_ns = window, stamp_ns
         for label in TARGET_LABELS:
             logits[label] += self._offset

@@ -17,25 +17,38 @@ FOLD = 2
 """Width and height [px] of what one position of the first layer sees."""
 CELLS = ("hgru", "convlstm", "conv")
 """What may update a layer's representation; `prednet.py` describes them."""
+PRIORS = ("robot", "target")
+"""What may be known before a picture is looked at, a channel each: where the robots are, and where the targets should be. Values
+are 2 p - 1 of a pixel's probability p to lie in the silhouette, whatever covers it: 1 inside, -1 outside, 0 where nothing is
+known."""
+
+
+def kernels_of(layers: int) -> tuple[int, ...]:
+    """The width of the cell's kernel in each of so many layers: 3 where they have half the picture's resolution, 5 above."""
+    return tuple(3 if i < 2 else 5 for i in range(layers))
 
 
 @dataclass(frozen=True)
 class Settings:
     """Size of the network. channels, kernels: of the cell of each layer. The authors have 64-128-256-512 and kernels of 5;
-    kernels of 5 in the two coarse layers alone cost a tenth of the time of 5 everywhere and reach as far. `delay`: axonal
-    delays. `cell`: one of CELLS, all of nearly the same number of parameters."""
+    kernels of 5 in the coarse layers alone (`kernels_of`) cost a tenth of the time of 5 everywhere and reach as far. `delay`:
+    axonal delays. `cell`: one of CELLS, all of nearly the same number of parameters. `priors`: channels of what is known beside
+    the picture, those of PRIORS or none."""
 
     channels: tuple[int, ...] = (16, 16, 32, 64)
     kernels: tuple[int, ...] = (3, 3, 5, 5)
     decoder_channels: int = 16
     delay: bool = False
     cell: str = "hgru"
+    priors: int = 0
 
     def __post_init__(self) -> None:
         if self.cell not in CELLS:
             raise ValueError(f"cell: expected one of {', '.join(CELLS)}, got {self.cell!r}")
         if self.cell == "convlstm" and any(n % 2 for n in self.channels):
             raise ValueError(f"expected even channels, which a ConvLSTM halves, got {self.channels}")
+        if self.priors not in (0, len(PRIORS)):
+            raise ValueError(f"priors: expected 0 or {len(PRIORS)} channels ({', '.join(PRIORS)}), got {self.priors}")
         if len(self.channels) != len(self.kernels) or len(self.channels) < 2:
             raise ValueError(f"expected one kernel per layer and at least 2 layers, got {self.channels} and {self.kernels}")
 

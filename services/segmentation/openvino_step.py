@@ -63,15 +63,22 @@ class Compiled:
         sizes, channels = self._model.settings.state_sizes(height, width), self._model.state_channels
         return tuple(np.zeros((1, *size, c), self._dtype) for size, c in zip(sizes, channels, strict=True))
 
-    def __call__(self, image: NDArray[np.float32], state: State) -> tuple[NDArray[np.float32], State]:
-        """(class logits (classes, h, w), new state) of an image (h, w, channels) in [0, 1] and the old state. The logits are
-        OpenVINO's memory: the next call writes over them."""
+    def __call__(
+        self, image: NDArray[np.float32], state: State, priors: NDArray[np.float32] | None = None
+    ) -> tuple[NDArray[np.float32], State]:
+        """(class logits (classes, h, w), new state) of an image (h, w, channels) in [0, 1], the old state and the priors
+        (h, w, priors) in [-1, 1] of a network that has any, None where nothing is known. The logits are OpenVINO's memory: the
+        next call writes over them."""
         request = self._request(*image.shape[:2])
         new = tuple(np.empty_like(tensor) for tensor in state)
         request.set_input_tensor(0, self._ov.Tensor(image[None]))
         for i, (before, after) in enumerate(zip(state, new, strict=True), 1):
             request.set_input_tensor(i, self._tensor(before))
             request.set_output_tensor(i, self._tensor(after))
+        if count := self._model.settings.priors:
+            if priors is None:
+                priors = np.zeros((*image.shape[:2], count), np.float32)
+            request.set_input_tensor(1 + len(state), self._ov.Tensor(priors[None]))
         request.infer()
         logits: NDArray[np.float32] = request.get_output_tensor(0).data[0]
         return logits, new

@@ -7,6 +7,10 @@ One time step (section "PredNet Model"):
 2. Top-down. From the last layer to the first, R_l is updated by a cell (hGRU; others for comparison) driven by E_l and R_{l+1}.
 3. The mask is decoded from all R_l but the first: brought to one resolution, summed, convolved.
 
+Priors, where the network has any (`model.PRIORS`), enter beside the picture and are not predicted: convolved they are added to
+what the second layer receives from below, from which all layers above learn of them, and to the drive of its cell. Where nothing
+is known they are zero and add nothing.
+
 The picture enters folded: 2 x 2 pixels become 12 channels (space to depth). The first layer therefore works at half resolution
 where the authors' works at full; the pooling that would follow it is this folding, which, unlike it, throws nothing away.
 Together this halves the time of a step. The second layer keeps half resolution, each one above halves it.
@@ -16,6 +20,7 @@ References: Lotter, Kreiman, Cox 2017 (arXiv:1605.08104); Linsley, Kim, Veerabad
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -100,7 +105,8 @@ CELLS: dict[str, type[nn.Module]] = {"hgru": HGRU, "convlstm": ConvLSTM, "conv":
 
 
 class PredNet(nn.Module):
-    """The network of the module's description. Images are (batch, 3, h, w) in [0, 1], h and w multiples of `multiple`."""
+    """The network of the module's description. Images are (batch, 3, h, w) in [0, 1], h and w multiples of `multiple`; priors
+    (batch, priors, h, w) in [-1, 1], None where nothing is known."""
 
     def __init__(self, settings: Settings | None = None):
         super().__init__()
@@ -114,6 +120,10 @@ class PredNet(nn.Module):
         self.cells = nn.ModuleList(CELLS[settings.cell](c[i], settings.kernels[i]) for i in range(n))
         self.decode = nn.ModuleList(nn.Conv2d(c[i], settings.decoder_channels, 1) for i in range(1, n))
         self.head = nn.Conv2d(settings.decoder_channels, len(Label) * FOLD * FOLD, 3, padding=1)
+        known = settings.priors * FOLD * FOLD
+        self.prior_input, self.prior_drive = (
+            nn.Conv2d(known, c[1], 3, padding=1, bias=False) if known else None for _ in range(2)
+        )
         for module in self.modules():  # channels innermost: what convolutions on a CPU are fastest with
             if isinstance(module, nn.Conv2d):
                 module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)
@@ -129,7 +139,7 @@ class PredNet(nn.Module):
             for c, size in zip(channels, self.settings.state_sizes(height, width), strict=True)
         )
 
-    def forward(self, image: Tensor, state: State) -> tuple[Tensor, list[Tensor], State]:
+    def forward(self, image: Tensor, state: State, priors: Tensor | None = None) -> tuple[Tensor, list[Tensor], State]:
         """One time step: (class logits (batch, classes, h, w), mean absolute prediction error of each layer, new state).
 
         With axonal delays a layer receives its neighbours' activity of the step before: layer l learns of a picture l steps late.
@@ -140,16 +150,21 @@ class PredNet(nn.Module):
         errors: list[Tensor] = []
         missed: list[Tensor] = []
         arriving = F.pixel_unshuffle(image, FOLD)
+        known = None if priors is None else F.pixel_unshuffle(priors, FOLD)
         for i in range(n):
             difference = arriving - self.predict[i](old[i])
             errors.append(F.relu(torch.cat([difference, -difference], 1)))
             missed.append(difference.abs().mean())
             if i + 1 < n:
                 up = self.ascend[i](delayed[i] if delayed else errors[i])
+                if i == 0 and known is not None and self.prior_input is not None:
+                    up = up + self.prior_input(known)
                 arriving = F.relu(F.max_pool2d(up, 2) if i > 0 else up)  # the folding is the first layer's pooling
         new: list[Tensor] = []
         for i in reversed(range(n)):
             drive = self.drive[i](errors[i])
+            if i == 1 and known is not None and self.prior_drive is not None:
+                drive = drive + self.prior_drive(known)
             if i + 1 < n:
                 down = self.descend[i](old[i + 1] if delayed else new[0])
                 drive = drive + (F.interpolate(down, scale_factor=2, mode="nearest") if i > 0 else down)
@@ -169,16 +184,25 @@ def stored(net: PredNet) -> Model:
 
 
 def grown(net: PredNet, settings: Settings) -> PredNet:
-    """A network with more channels that gives the masks of `net`: its own channels come first and receive nothing from the
-    new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641). Raises ValueError where it would not
-    be larger."""
-    old = net.settings
-    same = replace(settings, channels=old.channels) == old
-    if not same or any(new < before for new, before in zip(settings.channels, old.channels, strict=True)):
-        raise ValueError(f"expected at least the channels {old.channels} and otherwise the network of {old}, got {settings}")
-    larger = PredNet(settings)
+    """A network with more channels, layers or priors that gives the masks of `net`: its own channels come first and receive
+    nothing from the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641), and priors add nothing yet.
+    Raises ValueError where it would not be larger."""
+    old, layers = net.settings, len(net.settings.channels)
+    same = replace(settings, channels=old.channels, kernels=settings.kernels[:layers], priors=old.priors) == old
+    fewer = any(new < before for new, before in itertools.zip_longest(settings.channels, old.channels, fillvalue=0))
+    if not same or fewer or settings.priors < old.priors:
+        raise ValueError(
+            f"expected at least the channels {old.channels} and {old.priors} priors and otherwise those of {old}, got {settings}"
+        )
+    larger, own = PredNet(settings), dict(net.named_parameters())
+    ignored = (f"descend.{layers - 1}.", "decode.", "prior_")  # what the old layers and the mask get of what is new
     with torch.no_grad():
-        for (name, value), before in zip(larger.named_parameters(), net.parameters(), strict=True):
+        for name, value in larger.named_parameters():
+            before = own.get(name)
+            if before is None:
+                if name.startswith(ignored):
+                    value.zero_()
+                continue
             rows = torch.arange(before.shape[0])
             if before.ndim == 1:
                 value[rows] = before

@@ -1,4 +1,4 @@
-"""Wiring: camera frames and fused poses in, masks out."""
+"""Wiring: camera frames, joints and fused poses in, masks out."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from pathlib import Path
 
 from penumbra.services import flags
 from penumbra.services.segmentation.inference import WEIGHTS, Segmenter, load_segmenter
+from penumbra.services.segmentation.priors import Priors
 from penumbra.shared.cell.description import Camera
 from penumbra.shared.contract.labels import Label
-from penumbra.shared.contract.messages import Frame, Mask
-from penumbra.shared.contract.topics import FRAME, FUSED, MASK
+from penumbra.shared.contract.messages import Frame, Joints, Mask
+from penumbra.shared.contract.topics import FRAME, FUSED, JOINTS, MASK
 from penumbra.shared.geometry.lens import Undistortion
+from penumbra.shared.perception.joint_history import RobotJoints
 from penumbra.shared.perception.lookout import Lookout
 from penumbra.shared.runtime.node import ServiceNode
 
@@ -21,6 +23,9 @@ FOLLOW_S = 0.2
 """Period [s] of the prediction of the next windows, also of those that are another replica's."""
 AHEAD_S = 0.4
 """Time [s] ahead of that prediction: in it the network is compiled for a window's size."""
+JOINTS_NEAR_NS = 100_000_000
+"""Largest distance [ns] of a frame from the joint angles with which robots are drawn into it: a frame does not wait for those of
+its stamp, and before they come the last velocity goes on. Chosen: the age after which joints are stale."""
 
 
 FLAGS = (
@@ -39,8 +44,11 @@ EXAMPLE = "penumbra segmentation --cell table --camera front"
 def start(node: ServiceNode, options: flags.Options) -> None:
     """Segment the frames of the cell's cameras that this replica owns.
 
+    A network with priors is also given where robots and targets should be; one without reads no joints.
+
     Threads: the reader of a camera's frames and the timer `follow` share its lookout, under a lock, and its segmenter, of which
-    the timer only prepares windows, and only while another replica owns the camera.
+    the timer only prepares windows, and only while another replica owns the camera. The joints of a robot are written by their
+    reader.
     """
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
@@ -50,6 +58,11 @@ def start(node: ServiceNode, options: flags.Options) -> None:
     segmenters = {name: load_segmenter(options.weights) for name in cameras}
     for name, segmenter in segmenters.items():
         segmenter.prepare(lookouts[name].window)  # while the process joins the others
+
+    joints = RobotJoints({name: len(robot.joints) for name, robot in cell.robots.items()}, JOINTS_NEAR_NS, is_carried_on=True)
+    priors = {name: Priors(cell, name, lookouts[name].targets) for name in cameras if segmenters[name].has_priors}
+    for name, prior in priors.items():
+        prior.prepare(lookouts[name].window)
 
     fused = {target: node.latest(FUSED, target=target) for lookout in lookouts.values() for target in lookout.targets}
 
@@ -91,8 +104,10 @@ def start(node: ServiceNode, options: flags.Options) -> None:
                 raise ValueError(f"camera {name}: expected frames of {camera.width} x {camera.height} (the cell file), got {got}")
             with looking[name]:
                 window = informed(name).look(frame.stamp_ns)
+                poses = lookouts[name].predicted(frame.stamp_ns)
+            known = priors[name](window, poses, joints.at(frame.stamp_ns)) if name in priors else None
             image = undistort(frame.image, (window.x0, window.y0, window.right, window.bottom))
-            labels = segmenter(image, window, frame.stamp_ns)
+            labels = segmenter(image, window, frame.stamp_ns, known)
             if undistort.unseen is not None:  # nothing is known there, as behind an occluder
                 unseen = undistort.unseen[window.y0 : window.bottom : window.scale, window.x0 : window.right : window.scale]
                 labels[unseen] = Label.OCCLUDER
@@ -101,6 +116,12 @@ def start(node: ServiceNode, options: flags.Options) -> None:
 
         node.subscribe(FRAME, on_frame, streams=[f"camera/{name}"], camera=name)
 
+    def on_joints(message: Joints, names: dict[str, str]) -> None:
+        joints.add(names["robot"], message.stamp_ns, message.position)
+
+    if priors:
+        for robot in cell.robots:
+            node.subscribe(JOINTS, on_joints, [f"camera/{name}" for name in cameras], robot=robot)
     for name in cameras:
         watch(name, cell.cameras[name], segmenters[name])
     node.every(FOLLOW_S, follow)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Mapping
 
 from penumbra.shared.geometry.rigid import Array
 
@@ -46,3 +47,25 @@ class JointHistory:
             return around[0][1]
         (t0, q0), (t1, q1) = samples[after - 1], samples[after]
         return q0 + (q1 - q0) * ((stamp_ns - t0) / (t1 - t0))
+
+
+class RobotJoints:
+    """The joint angles of all robots of a cell at a moment: a `JointHistory` each, with these settings. counts: their numbers of
+    joints, by robot."""
+
+    def __init__(self, counts: Mapping[str, int], tolerance_ns: int, is_carried_on: bool = False):
+        self._counts = counts
+        self._history = {name: JointHistory(tolerance_ns, is_carried_on) for name in counts}
+
+    def add(self, robot: str, stamp_ns: int, joints: Array) -> None:
+        """Keeps joint angles (n,) [rad] of a stamp. Raises ValueError for an unknown robot or another number of joints than it
+        has."""
+        if robot not in self._counts:
+            raise ValueError(f"expected a robot of {', '.join(self._counts) or 'none'}, got {robot!r}: compare the cell files")
+        if joints.shape != (self._counts[robot],):
+            raise ValueError(f"robot {robot}: expected {self._counts[robot]} joint angles, got shape {joints.shape}")
+        self._history[robot].add(stamp_ns, joints)
+
+    def at(self, stamp_ns: int) -> dict[str, Array]:
+        """Joint angles (n,) [rad] at a stamp of the robots of which they are known then."""
+        return {robot: q for robot, history in self._history.items() if (q := history.at(stamp_ns)) is not None}

@@ -18,7 +18,7 @@ from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.body.robot import RobotModel, robot_models
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import Label
-from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.sim.picture import appearance, limb, looks
 from penumbra.sim.picture.appearance import Appearance
@@ -31,7 +31,7 @@ PERIOD_S = 0.05
 """Time [s] between frames: that of a camera at 20 Hz."""
 ASTRAY = 0.12
 """Share of sequences whose window lies anywhere in the frame."""
-ARM_PX = (8.0, 120.0)
+ARM_PX = (8.0, 56.0)
 """Bounds of the forearm's width in the picture [px] where sequences are drawn as real cameras may show them."""
 ARM_M = 0.085
 """Width of a forearm [m] that the focal length is chosen by."""
@@ -65,12 +65,14 @@ class Poses:
 @dataclass(frozen=True)
 class Sequence:
     """images (frames, h, w, 3) uint8 RGB, labels (frames, h, w) uint8, hidden (frames,): share of the target's pixels in the
-    window that something covers; poses: None where only the labels are known."""
+    window that something covers; poses: None where only the labels are known; robots (frames, h, w): the silhouettes of the
+    robots, whatever covers them, None where these are not known."""
 
     images: NDArray[np.uint8]
     labels: NDArray[np.uint8]
     hidden: NDArray[np.float64]
     poses: Poses | None = None
+    robots: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,10 @@ def render(seed: int, index: int, variety: Variety = Variety()) -> Sequence:
     look = looks.look(rng, around) if is_real else appearance.look(rng, around)
     x0, y0 = _window(camera, things[0], variety, rng, anywhere=is_real)
     renderer = Renderer(camera, (x0, y0, variety.size, variety.size))
+    k = np.array([camera.fx, camera.fy, camera.cx - x0, camera.cy - y0])
+    T_camera_world = rigid.inverse(camera.T_world_camera)
+    machines = [thing for thing in things if Label.ROBOT in thing.shape.mesh.labels]
+    robots = np.zeros((variety.frames, variety.size, variety.size), np.bool_)
     images, labels, hidden = [], [], []
     for t in range(variety.frames):
         bodies = [Body(thing.shape, thing.T[t], thing.appearance) for thing in things]
@@ -98,14 +104,15 @@ def render(seed: int, index: int, variety: Variety = Variety()) -> Sequence:
         images.append(picture.image)
         labels.append(picture.labels)
         hidden.append(renderer.hidden_fraction(picture, bodies, 0))
+        for machine in machines:
+            mesh = machine.shape.mesh
+            raster.draw_silhouette(rigid.apply(T_camera_world @ machine.T[t], mesh.vertices), mesh.faces, *k, robots[t])
     film = np.stack(images)
     if is_real:
         film = looks.filmed(film, rng)
-    T_camera_target = np.stack([rigid.inverse(camera.T_world_camera) @ T for T in things[0].T])
-    poses = Poses(
-        T_camera_target, np.array([camera.fx, camera.fy, camera.cx - x0, camera.cy - y0]), things[0].shape.mesh.vertices
-    )
-    return Sequence(film, np.stack(labels), np.array(hidden), poses)
+    T_camera_target = np.stack([T_camera_world @ T for T in things[0].T])
+    poses = Poses(T_camera_target, k, things[0].shape.mesh.vertices)
+    return Sequence(film, np.stack(labels), np.array(hidden), poses, robots)
 
 
 def _window(camera: cells.Camera, target: Thing, variety: Variety, rng: np.random.Generator, anywhere: bool) -> tuple[int, int]:

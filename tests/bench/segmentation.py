@@ -2,10 +2,11 @@
 
 Rows: sequences of 14 frames in the training's domain, seen through a window of the default size that stands still while things
 come between and leave. Recovery: films of 10 s in which a board hides all of the target for 0.2 to 2 s every few seconds, seen
-through the window that the service would choose around the true pose. Both by the segmenter that the service runs.
+through the window that the service would choose around the true pose. Both by the segmenter that the service runs, and without
+priors; the rows of a network that has priors are measured with right and with wrong ones as well.
 
 With --photographs instead: still pictures with masks drawn by hand, each shown a few times through the window that the service
-would choose around the arm, its margin in relation to the arm's width in the picture.
+would choose around the arm, its margin in relation to the arm's width in the picture, without priors.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from rich.table import Table
 
 from penumbra.services import flags
 from penumbra.services.segmentation import files, inference
-from penumbra.services.segmentation.training import evaluate, recordings
+from penumbra.services.segmentation.training import evaluate, priors, recordings
 from penumbra.services.segmentation.training.evaluate import WARM_UP, FrameScore
 from penumbra.shared.perception.lookout import Window, corners_of, whole_frame, window_around
 from penumbra.sim.sets import sequences, shots
@@ -49,13 +50,18 @@ GOALS: dict[str, Any] = {
 }
 
 
-def rows(segmenter: inference.Segmenter, data: Iterable[evaluate.Labelled]) -> list[FrameScore]:
-    """Scores of the frames of sequences after their first ones."""
+PRIORS: dict[str, priors.Kind] = {"with_priors": "right", "with_wrong_priors": "wrong"}
+"""What a network that has priors is given beside nothing, by the name in the JSON file."""
+
+
+def rows(segmenter: inference.Segmenter, data: Iterable[evaluate.Labelled], kind: priors.Kind = "missing") -> list[FrameScore]:
+    """Scores of the frames of sequences after their first ones, with priors of a kind."""
     scores: list[FrameScore] = []
     for index, sequence in enumerate(data, 1):
         height, width = sequence.labels.shape[1:]
         window, start_ns = Window(0, 0, width, height), index * 10**10  # a gap after which the state is forgotten
-        masks = [segmenter(image, window, start_ns + t * PERIOD_NS) for t, image in enumerate(sequence.images)]
+        known = evaluate.priors_of(sequence, index, kind)
+        masks = [segmenter(image, window, start_ns + t * PERIOD_NS, known[t]) for t, image in enumerate(sequence.images)]
         scores += evaluate.frame_scores(np.stack(masks)[WARM_UP:], sequence.labels[WARM_UP:], sequence.hidden[WARM_UP:])
     return scores
 
@@ -97,21 +103,40 @@ def recoveries(hidden: list[float], iou: list[float]) -> list[int | None]:
 
 def result(seed: int, scores: list[FrameScore], recovered: list[int | None], ms: dict[str, float]) -> Result:
     """What the JSON file holds. recovery_frames: nine of ten full occlusions need no more; ms_per_frame: of the processor."""
+    known = [n for n in recovered if n is not None]
+    return {
+        "seed": seed,
+        "rows": by_occlusion(scores),
+        "recovery_frames": round(float(np.percentile(known, 90)), 1) if known else None,
+        "recoveries": recovered,
+        "ms_per_frame": ms["cpu_ms"],
+        "wall_ms_per_frame": ms["wall_ms"],
+    }
+
+
+def by_occlusion(scores: list[FrameScore]) -> list[dict[str, Any]]:
+    """A row of the JSON file for every class of hidden share."""
     table = []
     for (low, high), part in evaluate.by_hidden(scores).items():
         row = evaluate.summary(part) if part else {}
         names = {"iou": "iou_mean", "iou_median": "iou_median", "area_bias": "area_bias_median"}
         names |= {"contour_mean_px": "contour_mean_px", "contour_rms_px": "contour_rms_px"}
         table.append({"occlusion": [low, high], "frames": len(part), **{name: row.get(key) for name, key in names.items()}})
-    known = [n for n in recovered if n is not None]
-    return {
-        "seed": seed,
-        "rows": table,
-        "recovery_frames": round(float(np.percentile(known, 90)), 1) if known else None,
-        "recoveries": recovered,
-        "ms_per_frame": ms["cpu_ms"],
-        "wall_ms_per_frame": ms["wall_ms"],
-    }
+    return table
+
+
+def priors_table(found: Result) -> list[Part]:
+    """What priors give, and what wrong ones cost; nothing of a network without."""
+    if not found.keys() >= PRIORS.keys():
+        return []
+    table = Table(
+        "hidden", "without priors", "with priors", "with wrong priors", title="IoU mean, by what is known beside the picture"
+    )
+    for several in zip(found["rows"], *(found[name] for name in PRIORS), strict=True):
+        low, high = several[0]["occlusion"]
+        cells = ("-" if row["iou"] is None else f"{row['iou']:.3f}" for row in several)
+        table.add_row(f"{low:.0%} to {high:.0%}", *cells)
+    return [table]
 
 
 def tables(found: Result) -> list[Part]:
@@ -129,7 +154,7 @@ def tables(found: Result) -> list[Part]:
         table.add_row(f"{low:.0%} to {high:.0%}", str(row["frames"]), iou, f">= {goal}", *cells)
     goals = (f"within {GOALS['area_bias']:.0%}", f"within {GOALS['contour_mean_px']}", f"<= {GOALS['contour_rms_px']}")
     table.add_row("goal", "", "", "", *goals)
-    parts: list[Part] = [table]
+    parts: list[Part] = [table, *priors_table(found)]
     if known := [n for n in found["recoveries"] if n is not None]:
         most = marked(f"{found['recovery_frames']}", found["recovery_frames"] <= GOALS["recovery"])
         parts.append(
@@ -170,12 +195,17 @@ def main(options: flags.Options, report: results.Report) -> int | None:
         return None
     ms = inference.speed(segmenter, VARIETY.size, VARIETY.size, 200)
     count = -(-options.frames // (VARIETY.frames - WARM_UP))
-    held_out = (sequences.render(SEED_BASE + options.seed, index, VARIETY) for index in range(count))
-    scores = rows(segmenter, track(held_out, "sequences", total=count, transient=True))
+
+    def scored(kind: priors.Kind) -> list[FrameScore]:
+        held_out = (sequences.render(SEED_BASE + options.seed, index, VARIETY) for index in range(count))
+        return rows(segmenter, track(held_out, f"sequences, priors {kind}", total=count, transient=True), kind)
+
+    scores = scored("missing")
+    known = {name: by_occlusion(scored(kind)) for name, kind in PRIORS.items() if segmenter.has_priors}
     recovered: list[int | None] = []
     for index in track(range(options.films), "films", transient=True):
         recovered += recoveries(*film_scores(segmenter, list(shots.passing(SEED_BASE + options.seed, index))))
-    report.save(result(options.seed, scores, recovered, ms))
+    report.save(result(options.seed, scores, recovered, ms) | known)
     return None
 
 

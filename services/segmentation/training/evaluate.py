@@ -14,7 +14,9 @@ from scipy.ndimage import distance_transform_edt
 
 from penumbra.services.segmentation.inference import TARGET_LABELS, classes
 from penumbra.services.segmentation.prednet import PredNet
+from penumbra.services.segmentation.training import priors
 from penumbra.shared.contract.labels import UNLABELLED, Label
+from penumbra.sim.sets import sequences
 
 WARM_UP = 3
 """Frames at the start of a sequence that do not count: the recurrent state is still empty."""
@@ -53,27 +55,40 @@ class FrameScore:
     offsets: NDArray[np.float64]
 
 
-def run(net: PredNet, images: NDArray[np.uint8]) -> Iterator[torch.Tensor]:
-    """Logits (classes, h, w) float32 of each frame of a sequence (frames, h, w, 3) uint8, from an empty state."""
+def priors_of(sequence: Labelled, seed: int, kind: priors.Kind | None = None) -> NDArray[np.float32]:
+    """Priors (frames, h, w, 2) of a sequence, drawn from a seed as for the training, or all of one kind: of a simulated one from
+    what is known of it, of others from their labels."""
+    rng = np.random.default_rng(seed)
+    if isinstance(sequence, sequences.Sequence):
+        return priors.of_sequence(sequence, rng, kind)
+    return priors.of_labels(sequence.labels, rng, kind)
+
+
+def run(net: PredNet, images: NDArray[np.uint8], known: NDArray[np.float32] | None = None) -> Iterator[torch.Tensor]:
+    """Logits (classes, h, w) float32 of each frame of a sequence (frames, h, w, 3) uint8, from an empty state; known: its priors
+    (frames, h, w, 2), None where nothing is known."""
     state = net.initial_state(1, *images.shape[1:3])
     dtype = net.head.weight.dtype
-    for image in images:
+    for t, image in enumerate(images):
         with torch.inference_mode():
             picture = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(dtype) / 255.0
-            logits, _, state = net(picture, state)
+            prior = None if known is None else torch.from_numpy(known[t]).permute(2, 0, 1)[None].to(dtype)
+            logits, _, state = net(picture, state, prior)
         yield logits[0].float()
 
 
 def calibrate(net: PredNet, data: Iterable[Labelled]) -> tuple[float, dict[str, Any]]:
-    """The offset of the target classes' logits that makes the median ratio of masked to true area 1, and the bias without it."""
+    """The offset of the target classes' logits that makes the median ratio of masked to true area 1, and the bias without it. A
+    network that has priors gets them as in the training."""
     offsets = np.linspace(-3.0, 3.0, 241)
     target, other = list(TARGET_LABELS), [i for i in Label if i not in TARGET_LABELS]
     ratios = []
-    for sequence in data:
-        for logits, labels in itertools.islice(zip(run(net, sequence.images), sequence.labels, strict=True), WARM_UP, None):
-            known = labels != UNLABELLED
-            m = (logits[target].amax(0) - logits[other].amax(0)).numpy()[known]
-            t = np.isin(labels[known], TARGET_LABELS)
+    for index, sequence in enumerate(data):
+        found = run(net, sequence.images, priors_of(sequence, index) if net.settings.priors else None)
+        for logits, labels in itertools.islice(zip(found, sequence.labels, strict=True), WARM_UP, None):
+            labelled = labels != UNLABELLED
+            m = (logits[target].amax(0) - logits[other].amax(0)).numpy()[labelled]
+            t = np.isin(labels[labelled], TARGET_LABELS)
             if t.any() and ((m > 0) & t).sum() >= GOOD * ((m > 0) | t).sum():
                 ratios.append((m.size - np.searchsorted(np.sort(m.ravel()), -offsets, side="right")) / t.sum())
     if not ratios:
@@ -84,27 +99,51 @@ def calibrate(net: PredNet, data: Iterable[Labelled]) -> tuple[float, dict[str, 
 
 
 def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str, Any]:
-    """The card's score: `summary` by hidden share, and the IoU of every class."""
+    """The card's score: `summary` by hidden share, and the IoU of every class. Of a network that has priors these are without
+    any; beside them stand the scores with right and with wrong ones, of simulated sequences, whose truth they are not made of."""
+    kinds: dict[str, priors.Kind] = {"without": "missing"}
+    if net.settings.priors:
+        kinds |= {"with_priors": "right", "with_wrong_priors": "wrong"}
+    scores = {name: _Score() for name in kinds}
     bias = torch.zeros(len(Label), 1, 1)
     bias[list(TARGET_LABELS)] = offset
-    scores: list[FrameScore] = []
-    both, either = np.zeros(len(Label)), np.zeros(len(Label))
-    for sequence in data:
-        found = np.stack([classes((logits + bias).numpy()) for logits in run(net, sequence.images)])[WARM_UP:]
-        labels = sequence.labels[WARM_UP:]
+    for index, sequence in enumerate(data):
+        for name, kind in kinds.items():
+            if kind != "missing" and not isinstance(sequence, sequences.Sequence):
+                continue
+            given = None if kind == "missing" else priors_of(sequence, index, kind)
+            found = np.stack([classes((logits + bias).numpy()) for logits in run(net, sequence.images, given)])
+            scores[name].add(found[WARM_UP:], sequence.labels[WARM_UP:], sequence.hidden[WARM_UP:])
+    first = scores.pop("without").result()
+    return first | {name: score.result() for name, score in scores.items()}
+
+
+class _Score:
+    """Scores of frames as they are added."""
+
+    def __init__(self) -> None:
+        self._frames: list[FrameScore] = []
+        self._both, self._either = np.zeros(len(Label)), np.zeros(len(Label))
+
+    def add(self, found: NDArray[np.uint8], labels: NDArray[np.uint8], hidden: NDArray[np.float64]) -> None:
+        """Adds classes found and true (frames, h, w)."""
         found[labels == UNLABELLED] = UNLABELLED  # which is no class
         for label in Label:
-            both[label] += np.sum((found == label) & (labels == label))
-            either[label] += np.sum((found == label) | (labels == label))
-        scores += frame_scores(found, labels, sequence.hidden[WARM_UP:])
-    score: dict[str, Any] = {}
-    for (low, high), part in by_hidden(scores).items():
-        if part:
-            score[f"hidden {low:.0%} to {high:.0%}"] = summary(part)
-    if unknown := [s for s in scores if np.isnan(s.hidden)]:
-        score["hidden share unknown"] = summary(unknown)
-    score["iou_by_class"] = {i.name.lower(): round(float(both[i] / either[i]), 3) for i in Label if either[i]}
-    return score
+            self._both[label] += np.sum((found == label) & (labels == label))
+            self._either[label] += np.sum((found == label) | (labels == label))
+        self._frames += frame_scores(found, labels, hidden)
+
+    def result(self) -> dict[str, Any]:
+        """What the card says."""
+        score: dict[str, Any] = {}
+        for (low, high), part in by_hidden(self._frames).items():
+            if part:
+                score[f"hidden {low:.0%} to {high:.0%}"] = summary(part)
+        if unknown := [s for s in self._frames if np.isnan(s.hidden)]:
+            score["hidden share unknown"] = summary(unknown)
+        either = self._either
+        score["iou_by_class"] = {i.name.lower(): round(float(self._both[i] / either[i]), 3) for i in Label if either[i]}
+        return score
 
 
 def frame_scores(found: NDArray[np.uint8], labels: NDArray[np.uint8], hidden: NDArray[np.float64]) -> Iterator[FrameScore]:

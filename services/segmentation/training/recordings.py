@@ -33,7 +33,7 @@ PIECE = 40
 """Frames of a longer sequence that are held out, or learned from, together; less where there are few, so that a tenth is one."""
 SHORTEST = 8
 """Frames of a sequence; a shorter one is played forth and back."""
-UNIT = 8
+UNIT = 16
 """Pictures are cut to multiples of this many pixels a side: what the network can take."""
 SMALLEST = 32
 """Pixels a side that a picture has at least."""

@@ -5,6 +5,9 @@ colours from a generator seeded by (seed, n), and all schedules are functions of
 interrupted and resumed ends with the same weights as one that was not. For days in the background, over several machines:
 
   OMP_NUM_THREADS=1 nice -n 19 penumbra segmentation train --size 16 32 64 128 --steps 150000 --resume --compact FILE
+
+With --priors the network also receives what is known of the robot and of the target. One without, from --start or --resume, gets
+inputs for them, and gives the same masks until it has learned to use them.
 """
 
 from __future__ import annotations
@@ -25,8 +28,9 @@ from numpy.typing import NDArray
 
 from penumbra.services import flags
 from penumbra.services.segmentation import inference, prednet
-from penumbra.services.segmentation.prednet import PredNet, Settings
-from penumbra.services.segmentation.training import loss, recordings
+from penumbra.services.segmentation.model import PRIORS, kernels_of
+from penumbra.services.segmentation.prednet import PredNet, Settings, State
+from penumbra.services.segmentation.training import loss, priors, recordings
 from penumbra.services.segmentation.training.evaluate import Labelled, calibrate, held_out
 from penumbra.shared import training
 from penumbra.shared.contract.labels import UNLABELLED, Label
@@ -76,7 +80,8 @@ class Schedule:
 
 
 class Data(Protocol):
-    """Sequences to learn from, red, green, blue and class (frames, h, w, 4), and others for the calibration and the score.
+    """Sequences to learn from, and others for the calibration and the score. The first are red, green, blue and class
+    (frames, h, w, 4), and, where more is known than what the labels say, priors beside them (frames, h, w, 6), packed.
     jitter: how much their colours are changed; side: the largest patch [px] that fits in all; sources: what a card says of the
     calibration's and the score's."""
 
@@ -126,12 +131,13 @@ class Simulated:
         self._kept = functools.lru_cache(maxsize=most or 0)(self._rendered)
 
     def __getitem__(self, index: int) -> NDArray[np.uint8]:
-        """Red, green, blue and class (frames, h, w, 4) of a sequence."""
+        """Red, green, blue, class and priors (frames, h, w, 6) of a sequence."""
         return self._kept(index)
 
     def _rendered(self, index: int) -> NDArray[np.uint8]:
         sequence = self._learned(self._seed, index)
-        return np.concatenate([sequence.images, sequence.labels[..., None]], axis=-1)
+        known = priors.of_sequence(sequence, np.random.default_rng([self._seed, 6, index]))
+        return np.concatenate([sequence.images, sequence.labels[..., None], priors.packed(known)], axis=-1)
 
     @property
     def sources(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -169,11 +175,13 @@ class Mixed:
         self.sources = simulated.sources[0], {**of_simulated, **of_recorded, "simulated": share}
 
     def __getitem__(self, index: int) -> NDArray[np.uint8]:
-        """Red, green, blue and class (frames, h, w, 4) of a sequence."""
+        """Red, green, blue, class and priors (frames, h, w, 6) of a sequence."""
         rng = np.random.default_rng([self._seed, 5, index])
         if rng.random() < self._share:
             return self._simulated[index]
         film = moved(self._recorded[int(rng.integers(self._recorded.count))], VARIETY.frames, VARIETY.size, rng)
+        known = priors.packed(priors.of_labels(film[..., 3], np.random.default_rng([self._seed, 6, index])))
+        film = np.concatenate([film, known], axis=-1)
         if rng.random() < 0.5:
             film = pasted(film, self._simulated[index], rng)
         return np.concatenate([looks.filmed(film[..., :3], rng), film[..., 3:]], axis=-1)
@@ -191,7 +199,7 @@ def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.
     target = np.argwhere(np.isin(film[frames // 2, ..., 3], inference.TARGET_LABELS))
     if len(target) and rng.random() < 0.8:
         middle = target[rng.integers(len(target))] + rng.integers(-size // 6, size // 6 + 1, 2)
-    zoom = np.exp(rng.uniform(np.log(0.5), np.log(3.0)))
+    zoom = np.exp(rng.uniform(np.log(0.5), np.log(2.5)))
     angle = rng.normal(0.0, 20.0) if rng.random() < 0.7 else rng.uniform(-180.0, 180.0)
     speed = rng.random() ** 1.5
     shift, turn, grow = speed * rng.uniform(-8.0, 8.0, 2), speed * rng.uniform(-2.0, 2.0), 1.0 + speed * rng.uniform(-0.02, 0.02)
@@ -208,11 +216,14 @@ def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.
 
 
 def pasted(film: NDArray[np.uint8], over: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A film (frames, h, w, 4) with the robot and the occluders of another in front; half of the time its person, too."""
-    front = [Label.ROBOT, Label.OCCLUDER]
+    """A film (frames, h, w, 6) with the robot and the occluders of another in front, and what is known of this robot; half of the
+    time its person, too, and then of its arms the one or the others are known."""
+    front, out = [Label.ROBOT, Label.OCCLUDER], film.copy()
+    out[..., 4] = over[..., 4]
     if rng.random() < 0.5:
         front += [Label.TORSO, Label.UPPER_ARM, Label.FOREARM, Label.HAND]
-    out = film.copy()
+        if rng.random() < 0.5:
+            out[..., 5] = over[..., 5]
     for below, above in zip(out, over, strict=True):
         cover = np.isin(above[..., 3], front)
         soft = cv2.GaussianBlur(cover.astype(np.float32), (0, 0), 0.7)[..., None]  # as the lens does along an edge
@@ -239,9 +250,9 @@ class Trainer(training.Trainer[PredNet, Data]):
         size = min(size, data.side)
         rng = np.random.default_rng([self.seed, 1, self.step])
         chosen = [data[int(i)] for i in rng.integers(data.count, size=batch)]
-        images, labels = draw_batch(chosen, self.schedule.frames, size, rng, data.jitter)
+        images, labels, known = draw_batch(chosen, self.schedule.frames, size, rng, data.jitter)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
-            parts = self._losses(images, labels, self.schedule.before(rng))
+            parts = self._losses(images, labels, known, self.schedule.before(rng))
         schedule = self.schedule
         weights = {"focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
         total = parts["dice"] + sum(weight * parts[name] for name, weight in weights.items())
@@ -249,19 +260,19 @@ class Trainer(training.Trainer[PredNet, Data]):
         self.descend(total, rate, schedule.clip, schedule.averaging)
         return {name: float(value.detach()) for name, value in parts.items()} | {"total": float(total.detach())}
 
-    def _losses(self, images: torch.Tensor, labels: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
-        """images (batch, frames, 3, h, w) in [0, 1], labels (batch, frames, h, w). `before`: frames played without learning,
-        forth and back through the sequence, so that the network is also trained with a state that has seen much. Without it
-        masks decay within seconds of use."""
+    def _losses(self, images: torch.Tensor, labels: torch.Tensor, known: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
+        """images (batch, frames, 3, h, w) in [0, 1], labels (batch, frames, h, w), known: priors (batch, frames, 2, h, w), for a
+        network that has any. `before`: frames played without learning, forth and back through the sequence, so that the network
+        is also trained with a state that has seen much. Without it masks decay within seconds of use."""
         frames = images.shape[1]
         state = self.net.initial_state(images.shape[0], *images.shape[-2:])
         with torch.no_grad():
             for n in range(before, 0, -1):  # the last one played is the second frame, from which the first is one step
                 turn, t = divmod(n, frames - 1)
-                _, _, state = self.net(images[:, t if turn % 2 == 0 else frames - 1 - t], state)
+                _, _, state = self._play(images, known, t if turn % 2 == 0 else frames - 1 - t, state)
         logits, errors = [], []
         for t in range(frames):
-            out, missed, state = self.net(images[:, t], state)
+            out, missed, state = self._play(images, known, t, state)
             logits.append(out.float())
             if t > 0 or before:  # nothing can be predicted from nothing
                 errors.append(loss.prediction_error([m.float() for m in missed]))
@@ -273,14 +284,26 @@ class Trainer(training.Trainer[PredNet, Data]):
             "error": torch.stack(errors).mean(),
         }
 
+    def _play(
+        self, images: torch.Tensor, known: torch.Tensor, t: int, state: State
+    ) -> tuple[torch.Tensor, list[torch.Tensor], State]:
+        return self.net(images[:, t], state, known[:, t] if self.settings.priors else None)
+
     @classmethod
-    def begin(cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None) -> Trainer:
-        """A trainer that starts from weights with a card, grown to more channels where these are given; the card it writes says
-        of them. Raises ValueError where they are fewer."""
+    def begin(
+        cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None, has_priors: bool = False
+    ) -> Trainer:
+        """A trainer that starts from weights with a card, grown to more channels or layers where channels are given, and to
+        priors where it shall have them; the card it writes says of them. Raises ValueError where they are fewer."""
         net, card = prednet.load(path)
+        larger = net.settings
         if channels is not None:
+            larger = replace(larger, channels=channels, kernels=kernels_of(len(channels)))
+        if has_priors:
+            larger = replace(larger, priors=len(PRIORS))
+        if larger != net.settings:
             torch.manual_seed(seed)
-            net = prednet.grown(net, replace(net.settings, channels=channels))
+            net = prednet.grown(net, larger)
         trainer = cls(net.settings, schedule, seed)
         trainer.net.load_state_dict(net.state_dict())
         trainer.average.load_state_dict(net.state_dict())
@@ -288,15 +311,27 @@ class Trainer(training.Trainer[PredNet, Data]):
         trainer.started_from |= {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
         return trainer
 
+    def with_priors(self) -> Trainer:
+        """This training with priors from its next step on, with an optimiser that gathers its moments anew; itself where it has
+        them already."""
+        if self.settings.priors:
+            return self
+        trainer = Trainer(replace(self.settings, priors=len(PRIORS)), self.schedule, self.seed)
+        trainer.net.load_state_dict(prednet.grown(self.net, trainer.settings).state_dict())
+        trainer.average.load_state_dict(prednet.grown(self.average, trainer.settings).state_dict())
+        trainer.step, trainer.minutes, trainer.started_from = self.step, self.minutes, self.started_from
+        trainer.warm_from = self.step
+        return trainer
+
 
 def draw_batch(
     chosen: Iterable[Any], frames: int, size: int, rng: np.random.Generator, amount: float
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Patches of so many frames of sequences (n, h, w, 4): images (batch, frames, 3, size, size) in [0, 1] and labels
-    (batch, frames, size, size). Three of five lie around a pixel of the target; mirrored, played backwards and coloured anew at
-    random, by `amount`.
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Patches of so many frames of sequences (n, h, w, 4 or 6): images (batch, frames, 3, size, size) in [0, 1], labels
+    (batch, frames, size, size) and priors (batch, frames, 2, size, size), made of the labels where a sequence has none. Three of
+    five lie around a pixel of the target; mirrored, played backwards and coloured anew at random, by `amount`.
     """
-    images, labels = [], []
+    images, labels, known = [], [], []
     for sequence in chosen:
         start = rng.integers(0, len(sequence) - frames + 1)
         sequence = sequence[start : start + frames]
@@ -315,7 +350,9 @@ def draw_batch(
         picture = training.recoloured(patch[..., :3].astype(np.float32) / 255.0, rng, amount)
         images.append(torch.from_numpy(picture).movedim(-1, 1))
         labels.append(torch.from_numpy(patch[..., 3].astype(np.int64)))
-    return torch.stack(images), torch.stack(labels)
+        prior = priors.unpacked(patch[..., 4:]) if patch.shape[-1] > 4 else priors.of_labels(patch[..., 3], rng)
+        known.append(torch.from_numpy(prior).movedim(-1, 1))
+    return torch.stack(images), torch.stack(labels), torch.stack(known)
 
 
 def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
@@ -348,6 +385,7 @@ def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
     flags.Option("--delay/--no-delay", default=False, help="axonal delays between the layers"),
     flags.Option("--recurrence", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations"),
     flags.Option("--error-weight", type=float, show_default="0.3; 0: without", help="of the prediction errors in the loss"),
+    flags.Option("--priors", is_flag=True, help="the network also receives what is known of the robot and the target"),
     flags.Option("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate"),
     flags.Option(
         "--start",
@@ -386,12 +424,16 @@ def main(options: flags.Options) -> int:
         schedule = replace(schedule, error_weight=options.error_weight)
     if checkpoint := training.begun(options):
         trainer = Trainer.restore(checkpoint, schedule)
+        if options.priors:
+            trainer = trainer.with_priors()
     elif options.start:
-        trainer = Trainer.begin(options.start, schedule, options.seed, tuple(options.size) if options.size else None)
+        channels = tuple(options.size) if options.size else None
+        trainer = Trainer.begin(options.start, schedule, options.seed, channels, options.priors)
     else:
         channels = tuple(options.size or Settings.channels)
-        kernels = (*(3 for _ in channels[:-2]), 5, 5)
-        trainer = Trainer(Settings(channels, kernels, delay=options.delay, cell=options.recurrence), schedule, options.seed)
+        known = len(PRIORS) if options.priors else 0
+        settings = Settings(channels, kernels_of(len(channels)), delay=options.delay, cell=options.recurrence, priors=known)
+        trainer = Trainer(settings, schedule, options.seed)
     simulated = Simulated(trainer.seed, options.held_out)
     data: Data = simulated
     try:

@@ -14,12 +14,9 @@ from rich.table import Table
 from penumbra.services.segmentation import files, inference
 from penumbra.services.segmentation.training.recordings import Frame
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
-from penumbra.shared.perception.lookout import MARGIN_M, Window, whole_frame, window_of
+from penumbra.shared.perception.lookout import ARM_M, MARGIN_M, Window, whole_frame, window_of
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
-ARM_M = 0.09
-"""Width [m] of a forearm's belly (circumference 0.28 to 0.31 m) and of a hand with its thumb laid on (ANSUR II, Gordon et al.
-2014): says what MARGIN_M is in a picture of unknown depth."""
 GOAL = 0.75
 
 
@@ -29,10 +26,10 @@ def window_about(target: NDArray[np.bool_]) -> Window:
     rows, columns = np.flatnonzero(target.any(1)), np.flatnonzero(target.any(0))
     padded = np.pad(target.astype(np.uint8), 1)  # beyond the picture there is no arm
     arm_px = 2.0 * float(cv2.distanceTransform(padded, cv2.DIST_L2, 5).max())
-    margin = MARGIN_M * arm_px / ARM_M
+    margin = MARGIN_M * arm_px / ARM_M  # of a depth that only the arm's width tells
     picture = Window(0, 0, width, height)
     low, high = np.array([columns[0], rows[0]]) - margin, np.array([columns[-1], rows[-1]]) + margin
-    return window_of(picture, low, high) or whole_frame(picture)
+    return window_of(picture, low, high, arm_px) or whole_frame(picture)
 
 
 def measure(segmenter: inference.Segmenter, frames: Iterable[Frame], overlays: Path | None = None) -> Result:

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from penumbra.services.segmentation import files, inference
-from penumbra.services.segmentation.prednet import Settings
+from penumbra.services.segmentation import files, inference, prednet
+from penumbra.services.segmentation.prednet import PredNet, Settings
 from penumbra.services.segmentation.training import recordings
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED
 from penumbra.sim.sets import sequences
@@ -38,6 +38,19 @@ def test_the_benchmark_writes_the_agreed_numbers(tmp_path, capsys):
     assert all(set(row) >= keys for row in found["rows"])
     assert 0 < sum(row["frames"] for row in found["rows"]) <= 22
     assert "0.93" in capsys.readouterr().out  # the goal beside it
+
+
+@pytest.mark.slow
+def test_a_network_that_has_priors_is_measured_without_with_right_and_with_wrong_ones(tmp_path, capsys):
+    net = PredNet(Settings((4, 4, 8), (3, 3, 3), 4, priors=2))
+    prednet.save(tmp_path / "net.npz", net, {"calibration": {"target_logit_offset": 0.0}})
+    flags = ["--seed", "3", "--frames", "20", "--films", "0", "--weights", str(tmp_path / "net.npz")]
+    assert segmentation.main([*flags, "--json", str(tmp_path / "out.json")]) == 0
+    found = json.loads((tmp_path / "out.json").read_text())
+    measured = [found[name] for name in ("rows", "with_priors", "with_wrong_priors")]
+    assert all([row["frames"] for row in rows] == [row["frames"] for row in measured[0]] for rows in measured)
+    assert len({json.dumps(rows) for rows in measured}) == 3
+    assert "with wrong priors" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow

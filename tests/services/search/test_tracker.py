@@ -12,7 +12,6 @@ from msgspec.structs import replace
 from penumbra.services.search import detect, evidence, paper_search
 from penumbra.services.search.contour import Model
 from penumbra.services.search.mask_fit import Noise, fit
-from penumbra.services.search.robot_depth import RobotDepth
 from penumbra.services.search.tracker import Search, Searched
 from penumbra.shared.body import anatomy
 from penumbra.shared.cell import description
@@ -20,6 +19,7 @@ from penumbra.shared.contract.labels import Label
 from penumbra.shared.contract.messages import FusedPose, Mask
 from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.perception.prediction import predict
+from penumbra.shared.perception.robot_depth import RobotDepth
 
 CELL = description.load("table")
 CAMERA = CELL.cameras["front"]

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -204,9 +205,10 @@ def test_the_rate_rises_once_stays_and_falls_at_the_end():
     assert np.all(np.diff(rates[801:]) <= 0.0) and 0.0 < rates[-1] < 0.01
 
 
-def test_a_network_grown_from_another_gives_its_masks_and_learns_to_use_its_new_channels():
+@pytest.mark.parametrize(("channels", "kernels"), [((8, 4, 24), (3, 3, 3)), ((8, 4, 8, 12), (3, 3, 3, 5))])
+def test_a_network_grown_from_another_gives_its_masks_and_learns_to_use_what_is_new(channels, kernels):
     net = PredNet(SMALL)
-    larger = prednet.grown(net, Settings((8, 4, 24), SMALL.kernels, SMALL.decoder_channels))
+    larger = prednet.grown(net, Settings(channels, kernels, SMALL.decoder_channels))
     first, second = net.initial_state(1, 32, 32), larger.initial_state(1, 32, 32)
     for _ in range(3):
         image = torch.rand(1, 3, 32, 32)
@@ -218,8 +220,56 @@ def test_a_network_grown_from_another_gives_its_masks_and_learns_to_use_its_new_
     assert isinstance(first_layer, torch.nn.Conv2d)
     grad = first_layer.weight.grad
     assert grad is not None and (grad[:, 4:].abs().sum((0, 2, 3)) > 0).all()
+    last = larger.decode[-1]
+    assert isinstance(last, torch.nn.Conv2d) and last.weight.grad is not None and last.weight.grad.abs().sum() > 0
     with pytest.raises(ValueError, match=r"expected at least the channels \(4, 4, 8\)"):
         prednet.grown(net, Settings((4, 2, 8), SMALL.kernels, SMALL.decoder_channels))
+
+
+def test_a_network_given_priors_gives_the_same_masks_until_it_learns_to_use_them():
+    net = PredNet(SMALL)
+    with_priors = prednet.grown(net, replace(SMALL, channels=(4, 8, 8), priors=2))
+    first, second = net.initial_state(1, 32, 32), with_priors.initial_state(1, 32, 32)
+    for _ in range(3):
+        image, known = torch.rand(1, 3, 32, 32), 2.0 * torch.rand(1, 2, 32, 32) - 1.0
+        logits, _, first = net(image, first)
+        more, _, second = with_priors(image, second, known)
+        torch.testing.assert_close(more, logits, rtol=1e-4, atol=1e-5)
+    loss.focal(more, torch.randint(0, len(Label), (1, 32, 32))).backward()
+    for name, value in with_priors.named_parameters():
+        assert not name.startswith("prior_") or (value.grad is not None and value.grad.abs().sum() > 0.0), name
+    with pytest.raises(ValueError, match="and 2 priors"):
+        prednet.grown(with_priors, replace(SMALL, channels=(4, 8, 8)))
+    with pytest.raises(ValueError, match=r"expected 0 or 2 channels \(robot, target\), got 1"):
+        replace(SMALL, priors=1)
+
+
+def test_where_nothing_is_known_priors_are_zero():
+    net = PredNet(replace(SMALL, priors=2))
+    image, state = torch.rand(1, 3, 32, 32), net.initial_state(1, 32, 32)
+    nothing, zero, known = (net(image, state, prior)[0] for prior in (None, torch.zeros(1, 2, 32, 32), torch.ones(1, 2, 32, 32)))
+    torch.testing.assert_close(nothing, zero)
+    assert (nothing - known).abs().max() > 1e-3
+
+
+def test_a_training_goes_on_with_priors_where_it_was(data, tmp_path):
+    schedule = train.Schedule(frames=2, patches=((0.0, 64, 2),), warm_up=3)
+    trainer = train.Trainer(SMALL, schedule, seed=1)
+    for _ in range(2):
+        trainer.train_step(data, 0.1)
+    training.save(trainer, tmp_path / "exact", tmp_path / "compact")
+    for name in ("exact", "compact"):
+        before = train.Trainer.restore(tmp_path / name, schedule)
+        again = before.with_priors()
+        assert (again.step, again.warm_from, again.minutes, again.settings.priors) == (2, 2, before.minutes, 2)
+        for old, new in ((before.net, again.net), (before.average, again.average)):
+            kept = new.state_dict()
+            assert all((kept[key] == value).all() for key, value in old.state_dict().items())
+        assert again.with_priors() is again
+        again.train_step(data, 0.1)
+        assert again.net.prior_input is not None and again.net.prior_input.weight.abs().sum() > 0.0
+        again.save(tmp_path / "later")
+        assert train.Trainer.restore(tmp_path / "later", schedule).settings.priors == 2
 
 
 def test_training_may_start_from_weights_and_its_card_names_them(tmp_path):
@@ -293,7 +343,14 @@ def scene(frames=6, size=96):
 
 @pytest.mark.parametrize(
     "settings",
-    [SMALL, Settings(), Settings(SMALL.channels, SMALL.kernels, delay=True), Settings(cell="convlstm"), Settings(cell="conv")],
+    [
+        SMALL,
+        Settings(),
+        Settings(SMALL.channels, SMALL.kernels, delay=True),
+        Settings(cell="convlstm"),
+        Settings(cell="conv"),
+        Settings(priors=2),
+    ],
 )
 def test_compiled_the_network_gives_torch_s_logits_and_state(settings):
     net = PredNet(settings).eval()
@@ -303,11 +360,14 @@ def test_compiled_the_network_gives_torch_s_logits_and_state(settings):
     for images in (scene(4, 96), scene(4, 96)[:, :64]):
         height, width = images.shape[1:3]
         state, other = net.initial_state(1, height, width), quick.initial_state(height, width)
-        for image in images:
+        for t, image in enumerate(images):
             picture = inference.cut(image, Window(0, 0, width, height))
+            known = np.random.default_rng(t).uniform(-1.0, 1.0, (height, width, 2)).astype(np.float32)
+            given = known if settings.priors and t else None  # nothing is known of the first picture
             with torch.inference_mode():
-                logits, _, state = net(torch.from_numpy(picture).permute(2, 0, 1)[None], state)
-            found, other = quick(picture, other)
+                prior = None if given is None else torch.from_numpy(given).permute(2, 0, 1)[None]
+                logits, _, state = net(torch.from_numpy(picture).permute(2, 0, 1)[None], state, prior)
+            found, other = quick(picture, other, given)
             # both are sums of thousands of products in single precision, in another order
             np.testing.assert_allclose(found, logits[0].numpy(), rtol=1e-3, atol=1e-3)
             for a, b in zip(other, state, strict=True):
@@ -327,7 +387,7 @@ def test_masks_of_the_running_network_are_torch_s_but_for_rounding():
 
 
 def test_a_network_of_other_channels_and_more_inputs_runs_with_nothing_but_its_weights():
-    """As one would that also sees where the robot is: nothing but the settings and the arrays says how large it is."""
+    """Nothing but the settings and the arrays says how large it is."""
     rng, settings = np.random.default_rng(0), Settings((8, 12, 16), (3, 5, 3), decoder_channels=6)
     weights = prednet.stored(PredNet(settings)).weights
     for name in ("predict.0.weight", "predict.0.bias"):

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.evidence import Intrinsics
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell.description import Cell
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.raster import Raster
 from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 
 class RobotDepth:
