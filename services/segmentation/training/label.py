@@ -31,7 +31,7 @@ from penumbra.services.segmentation.training.recordings import PIECE
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 from penumbra.shared.perception import landmarks
 from penumbra.shared.perception.landmarks import Hand, Landmarks, Points, Pose, Region
-from penumbra.shared.perception.lookout import MARGIN_M, Window, window_of
+from penumbra.shared.perception.lookout import ARM_M, MARGIN_M, Window, window_of
 
 RATE_HZ = 15.0
 """Frames a second that are labelled: about the cameras' that the network is trained on."""
@@ -413,13 +413,14 @@ def arms(
 
 def scale(picture: Window, limbs: Iterable[Limb]) -> int:
     """At which scale the service would look at limbs in a picture of this size."""
-    low, high = np.array([np.inf, np.inf]), np.array([-np.inf, -np.inf])
+    low, high, arm_px = np.array([np.inf, np.inf]), np.array([-np.inf, -np.inf]), 0.0
     for limb in limbs:
         end = limb.elbow if limb.elbow is not None else limb.points[0] + SURE * limb.size * limb.back
         points = np.vstack([limb.points, end])
-        margin = MARGIN_M * limb.size / HAND_M
+        metre_px = limb.size / HAND_M
+        margin, arm_px = MARGIN_M * metre_px, max(arm_px, ARM_M * metre_px)
         low, high = np.minimum(low, points.min(0) - margin), np.maximum(high, points.max(0) + margin)
-    window = window_of(picture, low, high)
+    window = window_of(picture, low, high, arm_px)
     return window.scale if window else 1
 
 

@@ -187,7 +187,7 @@ def test_pictures_are_written_at_the_scale_at_which_the_service_would_look():
     picture = label.Window(0, 0, 640, 480)
     limb = Limb(hand_at((320, 240), (0, -1), 30), np.array([320.0, 320.0]))
     assert label.scale(picture, [limb]) == 1
-    assert label.scale(label.Window(0, 0, 5120, 3840), [limb.scaled(8.0)]) == 4
+    assert label.scale(label.Window(0, 0, 2560, 1920), [limb.scaled(4.0)]) == 4
     np.testing.assert_allclose(limb.scaled(4.0).scaled(0.25).points, limb.points)
 
 
