@@ -332,8 +332,10 @@ def label(image: NDArray[np.uint8], limbs: Sequence[Limb], film: Colours) -> tup
     places = [Place.of(limb, height, width) for limb in limbs]
     near = np.min([np.minimum(place.hand, place.forearm) for place in places], axis=0)
     found = [fit(place, bins, near, film) for place in places]
+    doubted = np.zeros((height, width), bool)
     for i, one in enumerate(found):
         if one.place.limb.elbow is not None and one.doubts_elbow:
+            doubted |= (one.place.forearm < 0.1) & (one.place.hand > 0.05)
             place = Place.of(replace(one.place.limb, elbow=None, shoulder=None), height, width)
             found[i] = fit(place, bins, near, film)
     labels = np.full((height, width), Label.BACKGROUND, np.uint8)
@@ -349,6 +351,8 @@ def label(image: NDArray[np.uint8], limbs: Sequence[Limb], film: Colours) -> tup
             edge = wedge & (place.forearm > -0.1) & (beyond > 0.4) & (beyond < SURE)
             if (mine & edge).sum() > 0.3 * edge.sum():  # wider than an arm: there is nothing to tell it from, unless it is bare
                 unknown |= mine & (beyond > 0.0) & (place.hand > 0.05) & (one.hand - place.hand_odds < DOUBT)
+        else:
+            unknown |= (place.forearm < 0.0) & (place.hand > 0.05) & ~mine  # a sleeve, or something in front
         shape = place.hand < -0.03
         if not place.limb.is_seen or (mine & shape).sum() < 0.4 * shape.sum():  # missed or hidden
             unknown |= mine | (np.minimum(place.hand, place.forearm) < 0.1)
@@ -360,6 +364,7 @@ def label(image: NDArray[np.uint8], limbs: Sequence[Limb], film: Colours) -> tup
     colours = Colours(np.mean([one.colours.seen for one in found], axis=0, dtype=np.float32))
     skin, _ = colours.and_(film).ratios(bins)
     strange = cv2.morphologyEx(((skin > 0.7) & (near > 0.1)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    unknown |= doubted & ~np.isin(labels, TARGET_LABELS)
     unknown |= cv2.dilate(strange, np.ones((5, 5), np.uint8)).astype(bool) & ~np.isin(labels, TARGET_LABELS)
     labels[unknown] = UNLABELLED
     return labels, colours
