@@ -20,6 +20,7 @@ References: Lotter, Kreiman, Cox 2017 (arXiv:1605.08104); Linsley, Kim, Veerabad
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -183,22 +184,26 @@ def stored(net: PredNet) -> Model:
 
 
 def grown(net: PredNet, settings: Settings) -> PredNet:
-    """A network with more channels, or with priors, that gives the masks of `net`: its own channels come first and receive
-    nothing from the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641), and priors add nothing yet.
-    Raises ValueError where it would not be larger."""
-    old = net.settings
-    same = replace(settings, channels=old.channels, priors=old.priors) == old and settings.priors >= old.priors
-    if not same or any(new < before for new, before in zip(settings.channels, old.channels, strict=True)):
+    """A network with more channels or layers, or with priors, that gives the masks of `net`: its own channels come first and
+    receive nothing from the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641), and priors add nothing
+    yet. Raises ValueError where it would not be larger."""
+    old, layers = net.settings, len(net.settings.channels)
+    same = replace(settings, channels=old.channels, kernels=settings.kernels[:layers], priors=old.priors) == old
+    fewer = any(new < before for new, before in itertools.zip_longest(settings.channels, old.channels, fillvalue=0))
+    if not same or fewer or settings.priors < old.priors:
         raise ValueError(
             f"expected at least the channels {old.channels} and {old.priors} priors and otherwise those of {old}, got {settings}"
         )
-    larger, parameters = PredNet(settings), dict(net.named_parameters())
+    larger = PredNet(settings)
+    own = dict(net.named_parameters())
+    silent = (f"descend.{layers - 1}.", "decode.", "prior_")  # what old layers and the mask get of new layers and of priors
     with torch.no_grad():
         for name, value in larger.named_parameters():
-            if name not in parameters:  # of priors
-                value.zero_()
+            before = own.get(name)
+            if before is None:
+                if name.startswith(silent):
+                    value.zero_()
                 continue
-            before = parameters[name]
             rows = torch.arange(before.shape[0])
             if before.ndim == 1:
                 value[rows] = before

@@ -15,8 +15,8 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.perception.prediction import predict
 
-STEP = 8
-"""Windows lie and measure in multiples of this many of their own pixels: the stride of the network's coarsest layer."""
+STEP = 16
+"""Windows lie and measure in multiples of this many of their own pixels: the stride of the coarsest of five layers."""
 SIZE_STEP = 32
 """Sizes are rounded up to this, so that the size seldom changes while the target turns."""
 MAX_PIXELS = 224 * 224
@@ -26,6 +26,12 @@ MAX_PIXELS_WIDE = 320 * 240
 HOME_SIGMAS = 2.0
 """Distance from its home, in standard deviations, within which a lost target is looked for: further away nothing would be
 taken for it."""
+ARM_M = 0.09
+"""Width [m] of a forearm's belly (circumference 0.28 to 0.31 m) and of a hand with its thumb laid on (ANSUR II, Gordon et al.
+2014)."""
+WIDEST_ARM_PX = 56
+"""An arm that is wider [px] is shown at a coarser scale, at which the network sees more than smooth skin at once: the widest that
+it is trained with."""
 MARGIN_M = 0.04
 """Margin around the target [m]: the prediction's error, and the surroundings that show the contour."""
 NEAR_M = 0.1
@@ -147,26 +153,36 @@ def window_around(
     camera: Camera, targets: Iterable[tuple[Array, Array]], previous: Window | None = None, most: int = MAX_PIXELS
 ) -> Window | None:
     """The window of at most `most` pixels that holds targets, given as (T_world_target (4, 4), corners (8, 3) of their box), with
-    a margin of MARGIN_M.
+    a margin of MARGIN_M, arms of ARM_M at most WIDEST_ARM_PX wide.
 
     The previous window is kept while it holds them and is not much too large: the less it moves, the more the recurrent state
     is worth. None where no target is in the picture, or one is too near to the camera to say.
     """
-    low, high = np.array([np.inf, np.inf]), np.array([-np.inf, -np.inf])
+    low, high, arm_px = np.array([np.inf, np.inf]), np.array([-np.inf, -np.inf]), 0.0
     for T_world_target, corners in targets:
         points = rigid.apply(rigid.inverse(camera.T_world_camera) @ T_world_target, corners)
         if points[:, 2].min() < NEAR_M:
             return None
         focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
         pixels = points[:, :2] / points[:, 2:] * focal + centre
-        margin = MARGIN_M * focal / points[:, 2].mean()
+        metre_px = focal / points[:, 2].mean()
+        margin, arm_px = MARGIN_M * metre_px, max(arm_px, ARM_M * float(metre_px.max()))
         low, high = np.minimum(low, pixels.min(axis=0) - margin), np.maximum(high, pixels.max(axis=0) + margin)
-    size = np.array([camera.width, camera.height])
+    return window_of(camera, low, high, arm_px, previous, most)
+
+
+def window_of(
+    picture: Sized, low: Array, high: Array, arm_px: float, previous: Window | None = None, most: int = MAX_PIXELS
+) -> Window | None:
+    """The window of at most `most` pixels that holds the rectangle from low (2,) to high (2,), x and y [px], as far as it lies in
+    the picture, an arm so wide in the picture at most WIDEST_ARM_PX wide; the previous one is kept as `window_around` says. None
+    where nothing of it lies in the picture."""
+    size = np.array([picture.width, picture.height])
     low, high = np.maximum(low, 0.0), np.minimum(high, size - 1.0)
     if np.any(high - low < 2.0):
         return None
     scale = 1
-    while np.prod(np.maximum((high - low) / scale, 2 * STEP)) > most:
+    while np.prod(np.maximum((high - low) / scale, 2 * STEP)) > most or arm_px > WIDEST_ARM_PX * scale:
         scale *= 2
     if previous is not None and previous.scale == scale and _fits(previous, low, high):
         return previous

@@ -31,7 +31,7 @@ PERIOD_S = 0.05
 """Time [s] between frames: that of a camera at 20 Hz."""
 ASTRAY = 0.12
 """Share of sequences whose window lies anywhere in the frame."""
-ARM_PX = (8.0, 120.0)
+ARM_PX = (8.0, 56.0)
 """Bounds of the forearm's width in the picture [px] where sequences are drawn as real cameras may show them."""
 ARM_M = 0.085
 """Width of a forearm [m] that the focal length is chosen by."""

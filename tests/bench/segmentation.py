@@ -4,11 +4,15 @@ Rows: sequences of 14 frames in the training's domain, seen through a window of 
 come between and leave. Recovery: films of 10 s in which a board hides all of the target for 0.2 to 2 s every few seconds, seen
 through the window that the service would choose around the true pose. Both by the segmenter that the service runs, and without
 priors; the rows of a network that has priors are measured with right and with wrong ones as well.
+
+With --photographs instead: still pictures with masks drawn by hand, each shown a few times through the window that the service
+would choose around the arm, its margin in relation to the arm's width in the picture.
 """
 
 from __future__ import annotations
 
 import itertools
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,12 +22,12 @@ from rich.progress import track
 from rich.table import Table
 
 from penumbra.services import flags
-from penumbra.services.segmentation import inference
-from penumbra.services.segmentation.training import evaluate, priors
+from penumbra.services.segmentation import files, inference
+from penumbra.services.segmentation.training import evaluate, priors, recordings
 from penumbra.services.segmentation.training.evaluate import WARM_UP, FrameScore
 from penumbra.shared.perception.lookout import Window, corners_of, whole_frame, window_around
 from penumbra.sim.sets import sequences, shots
-from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib import photographs, results
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
 SEED_BASE = 50_000_000
@@ -136,7 +140,9 @@ def priors_table(found: Result) -> list[Part]:
 
 
 def tables(found: Result) -> list[Part]:
-    """Masks by hidden share, recovery and time, beside their goals."""
+    """Masks by hidden share, recovery and time, beside their goals; of photographs the IoU."""
+    if "photographs" in found:
+        return photographs.tables(found)
     title = f"Forearm with hand, visible pixels, seed {found['seed']}"
     table = Table("hidden", "frames", "IoU mean (median)", "goal", "area bias", "contour mean px", "contour RMS px", title=title)
     for row, goal in zip(found["rows"], GOALS["iou"], strict=True):
@@ -171,10 +177,22 @@ def tables(found: Result) -> list[Part]:
     flags.Option("--frames", type=flags.positive, default=1650, help="frames of the rows"),
     flags.Option("--films", type=flags.natural, default=6, help="films of 10 s with full occlusions"),
     flags.Option("--weights", type=Path, default=inference.WEIGHTS, show_default="the committed ones", help="the network"),
+    flags.Option(
+        "--photographs", type=Path, metavar="FOLDER", help="measure only on the pictures of this folder, images/ and masks/"
+    ),
+    flags.Option("--pictures", type=results.folder, metavar="FOLDER", help="with --photographs: write them with their masks"),
     example="penumbra bench segmentation --json segmentation.json",
 )
-def main(options: flags.Options, report: results.Report) -> None:
+def main(options: flags.Options, report: results.Report) -> int | None:
     segmenter = inference.load_segmenter(options.weights)
+    if options.photographs:
+        try:
+            frames = itertools.chain.from_iterable(recordings.find(options.photographs))
+            report.save(photographs.measure(segmenter, frames, options.pictures))
+        except (FileNotFoundError, recordings.DataError, files.FileError) as error:
+            print(f"penumbra bench segmentation: {error}", file=sys.stderr)
+            return 2
+        return None
     ms = inference.speed(segmenter, VARIETY.size, VARIETY.size, 200)
     count = -(-options.frames // (VARIETY.frames - WARM_UP))
 
@@ -188,6 +206,7 @@ def main(options: flags.Options, report: results.Report) -> None:
     for index in track(range(options.films), "films", transient=True):
         recovered += recoveries(*film_scores(segmenter, list(shots.passing(SEED_BASE + options.seed, index))))
     report.save(result(options.seed, scores, recovered, ms) | known)
+    return None
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ PIECE = 40
 """Frames of a longer sequence that are held out, or learned from, together."""
 SHORTEST = 8
 """Frames of a sequence; a shorter one is played forth and back."""
-UNIT = 8
+UNIT = 16
 """Pictures are cut to multiples of this many pixels a side: what the network can take."""
 SMALLEST = 32
 """Pixels a side that a picture has at least."""
@@ -155,15 +155,15 @@ def find(folder: Path) -> list[list[Frame]]:
         raise FileNotFoundError(
             f"{folder}: expected a folder with frames and masks, found none; see `penumbra segmentation train -h`"
         )
+    if (folder / "images").is_dir() and (folder / "masks").is_dir():
+        pictures = {path.relative_to(folder / "images").with_suffix(""): path for path in _pictures(folder / "images")}
+        masks = {path.relative_to(folder / "masks").with_suffix(""): path for path in sorted((folder / "masks").rglob("*.png"))}
+        return in_sequences(folder / "images", _pairs(folder, pictures, masks))
     described = sorted(folder.glob("*.json"))
     if len(described) > 1:
         raise DataError(f"{folder}: expected one .json file in COCO format, got {', '.join(path.name for path in described)}")
     if described:
         return in_sequences(folder, coco(described[0]))
-    if (folder / "images").is_dir() and (folder / "masks").is_dir():
-        pictures = {path.relative_to(folder / "images").with_suffix(""): path for path in _pictures(folder / "images")}
-        masks = {path.relative_to(folder / "masks").with_suffix(""): path for path in sorted((folder / "masks").rglob("*.png"))}
-        return in_sequences(folder / "images", _pairs(folder, pictures, masks))
     every = _pictures(folder)
     stem = lambda path: path.relative_to(folder).with_suffix("")  # noqa: E731
     masks = {stem(path).with_name(path.stem.removesuffix("_mask")): path for path in every if path.stem.endswith("_mask")}

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from penumbra.services import flags
 from penumbra.services.segmentation import inference, prednet
-from penumbra.services.segmentation.model import PRIORS
+from penumbra.services.segmentation.model import PRIORS, kernels_of
 from penumbra.services.segmentation.prednet import PredNet, Settings, State
 from penumbra.services.segmentation.training import loss, priors, recordings
 from penumbra.services.segmentation.training.evaluate import Labelled, calibrate, held_out
@@ -199,7 +199,7 @@ def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.
     target = np.argwhere(np.isin(film[frames // 2, ..., 3], inference.TARGET_LABELS))
     if len(target) and rng.random() < 0.8:
         middle = target[rng.integers(len(target))] + rng.integers(-size // 6, size // 6 + 1, 2)
-    zoom = np.exp(rng.uniform(np.log(0.5), np.log(3.0)))
+    zoom = np.exp(rng.uniform(np.log(0.5), np.log(2.5)))
     angle = rng.normal(0.0, 20.0) if rng.random() < 0.7 else rng.uniform(-180.0, 180.0)
     speed = rng.random() ** 1.5
     shift, turn, grow = speed * rng.uniform(-8.0, 8.0, 2), speed * rng.uniform(-2.0, 2.0), 1.0 + speed * rng.uniform(-0.02, 0.02)
@@ -293,12 +293,14 @@ class Trainer(training.Trainer[PredNet, Data]):
     def begin(
         cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None, has_priors: bool = False
     ) -> Trainer:
-        """A trainer that starts from weights with a card, grown to more channels where these are given, and to priors where
-        it shall have them; the card it writes says of them. Raises ValueError where they are fewer."""
+        """A trainer that starts from weights with a card, grown to more channels or layers where channels are given, and to
+        priors where it shall have them; the card it writes says of them. Raises ValueError where they are fewer."""
         net, card = prednet.load(path)
-        larger = replace(
-            net.settings, channels=channels or net.settings.channels, priors=len(PRIORS) if has_priors else net.settings.priors
-        )
+        larger = net.settings
+        if channels is not None:
+            larger = replace(larger, channels=channels, kernels=kernels_of(len(channels)))
+        if has_priors:
+            larger = replace(larger, priors=len(PRIORS))
         if larger != net.settings:
             torch.manual_seed(seed)
             net = prednet.grown(net, larger)
@@ -429,9 +431,8 @@ def main(options: flags.Options) -> int:
         trainer = Trainer.begin(options.start, schedule, options.seed, channels, options.priors)
     else:
         channels = tuple(options.size or Settings.channels)
-        kernels = (*(3 for _ in channels[:-2]), 5, 5)
         known = len(PRIORS) if options.priors else 0
-        settings = Settings(channels, kernels, delay=options.delay, cell=options.recurrence, priors=known)
+        settings = Settings(channels, kernels_of(len(channels)), delay=options.delay, cell=options.recurrence, priors=known)
         trainer = Trainer(settings, schedule, options.seed)
     simulated = Simulated(trainer.seed, options.held_out)
     data: Data = simulated

@@ -3,12 +3,17 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from penumbra.services.segmentation import prednet
+from penumbra.services.segmentation import files, inference, prednet
 from penumbra.services.segmentation.prednet import PredNet, Settings
+from penumbra.services.segmentation.training import recordings
+from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED
+from penumbra.sim.sets import sequences
 from penumbra.tests.bench import ablation, segmentation
+from penumbra.tests.bench.lib import photographs
 
 
 def test_recovery_is_counted_from_half_free_again_to_the_overlap_of_before():
@@ -76,3 +81,54 @@ def test_easy_scenes_show_the_target_and_are_a_function_of_seed_and_index(index)
     first, again = ablation.easy(9, index), ablation.easy(9, index)
     np.testing.assert_array_equal(first.images, again.images)
     assert first.images.shape == (8, ablation.SIDE, ablation.SIDE, 3) and first.labels.max() > 0
+
+
+@pytest.fixture
+def photograph(tmp_path):
+    """A folder with one picture, as large as a photograph and two thirds of it beside the arm, and its mask."""
+    drawn = sequences.render(11, 4, sequences.Variety(frames=5, size=192))
+    image, mask = np.zeros((300, 400, 3), np.uint8), np.zeros((300, 400), np.uint8)
+    image[60:252, 120:312], mask[60:252, 120:312] = drawn.images[-1], drawn.labels[-1]
+    for folder, picture in (("images", image[..., ::-1]), ("masks", mask)):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "arm.png"), picture)
+    return tmp_path
+
+
+def test_photographs_are_scored_without_their_unlabelled_pixels(photograph, tmp_path, capsys):
+    (photograph / "index.json").write_text("[]")  # what else lies there does not matter
+    written = tmp_path / "out.json"
+    call = ["--photographs", str(photograph), "--pictures", str(tmp_path / "seen"), "--json", str(written)]
+    assert segmentation.main(call) == 0
+    found = json.loads(written.read_text())
+    assert set(found) == {"photographs", "run"}
+    (row,) = found["photographs"].pop("rows")
+    assert set(row) == {"name", "iou"} and row["name"] == "arm" and 0.0 < row["iou"] < 1.0
+    assert found["photographs"] == {"pictures": 1, "iou_mean": row["iou"], "iou_median": row["iou"]}
+    assert files.read(tmp_path / "seen" / "arm.png").shape == (300, 400, 3)
+    assert "0.75" in capsys.readouterr().out  # the goal beside it
+
+    path = photograph / "masks" / "arm.png"
+    mask = recordings.read_mask(path)
+    (frame,) = recordings.find(photograph)[0]
+    before = photographs.measure(inference.load_segmenter(), [frame])["photographs"]["rows"][0]["iou"]
+    assert before == row["iou"]
+    target = np.isin(mask, TARGET_LABELS)
+    cv2.imwrite(str(path), np.where(target, mask, UNLABELLED).astype(np.uint8))
+    (more,) = photographs.measure(inference.load_segmenter(), [frame])["photographs"]["rows"]
+    assert more["iou"] > before  # what was found beside the arm is no fault any more
+
+
+def test_the_window_of_a_photograph_is_as_the_service_would_choose_it():
+    target = np.zeros((480, 640), bool)
+    target[200:240, 100:300] = True  # 40 px wide: 0.04 m are 18 px
+    window = photographs.window_about(target)
+    assert (window.width, window.height, window.scale) == (256, 96, 1)
+    assert window.x0 <= 100 - 17 and window.right >= 300 + 17 and window.y0 <= 200 - 17 and window.bottom >= 240 + 17
+    large = photographs.window_about(target.repeat(2, 0).repeat(2, 1))
+    assert large == replace(window, x0=2 * window.x0, y0=2 * window.y0, scale=2)
+
+
+def test_a_folder_without_masks_is_told(tmp_path, capsys):
+    assert segmentation.main(["--photographs", str(tmp_path / "none")]) == 2
+    assert "expected a folder with frames and masks" in capsys.readouterr().err

@@ -205,9 +205,10 @@ def test_the_rate_rises_once_stays_and_falls_at_the_end():
     assert np.all(np.diff(rates[801:]) <= 0.0) and 0.0 < rates[-1] < 0.01
 
 
-def test_a_network_grown_from_another_gives_its_masks_and_learns_to_use_its_new_channels():
+@pytest.mark.parametrize(("channels", "kernels"), [((8, 4, 24), (3, 3, 3)), ((8, 4, 8, 12), (3, 3, 3, 5))])
+def test_a_network_grown_from_another_gives_its_masks_and_learns_to_use_what_is_new(channels, kernels):
     net = PredNet(SMALL)
-    larger = prednet.grown(net, Settings((8, 4, 24), SMALL.kernels, SMALL.decoder_channels))
+    larger = prednet.grown(net, Settings(channels, kernels, SMALL.decoder_channels))
     first, second = net.initial_state(1, 32, 32), larger.initial_state(1, 32, 32)
     for _ in range(3):
         image = torch.rand(1, 3, 32, 32)
@@ -219,6 +220,8 @@ def test_a_network_grown_from_another_gives_its_masks_and_learns_to_use_its_new_
     assert isinstance(first_layer, torch.nn.Conv2d)
     grad = first_layer.weight.grad
     assert grad is not None and (grad[:, 4:].abs().sum((0, 2, 3)) > 0).all()
+    last = larger.decode[-1]
+    assert isinstance(last, torch.nn.Conv2d) and last.weight.grad is not None and last.weight.grad.abs().sum() > 0
     with pytest.raises(ValueError, match=r"expected at least the channels \(4, 4, 8\)"):
         prednet.grown(net, Settings((4, 2, 8), SMALL.kernels, SMALL.decoder_channels))
 
