@@ -34,7 +34,7 @@ def test_sequences_as_real_cameras_show_them_have_arms_of_all_sizes():
         sequence = sequences.render(4, index, real)
         shares.append(np.isin(sequence.labels, TARGET_LABELS).mean())
         assert sequence.images.shape == (1, 96, 96, 3) and sequence.labels.max() <= max(Label)
-    assert np.quantile(shares, 0.9) > 0.25 and np.median([share for share in shares if share > 0.0]) < 0.25
+    assert np.quantile(shares, 0.9) > 0.14 and np.median([share for share in shares if share > 0.0]) < 0.14
 
 
 def test_a_cheap_camera_changes_a_film_s_colours_and_not_its_size():

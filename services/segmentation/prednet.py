@@ -184,9 +184,9 @@ def stored(net: PredNet) -> Model:
 
 
 def grown(net: PredNet, settings: Settings) -> PredNet:
-    """A network with more channels or layers, or with priors, that gives the masks of `net`: its own channels come first and
-    receive nothing from the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641), and priors add nothing
-    yet. Raises ValueError where it would not be larger."""
+    """A network with more channels, layers or priors that gives the masks of `net`: its own channels come first and receive
+    nothing from the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641), and priors add nothing yet.
+    Raises ValueError where it would not be larger."""
     old, layers = net.settings, len(net.settings.channels)
     same = replace(settings, channels=old.channels, kernels=settings.kernels[:layers], priors=old.priors) == old
     fewer = any(new < before for new, before in itertools.zip_longest(settings.channels, old.channels, fillvalue=0))
@@ -194,14 +194,13 @@ def grown(net: PredNet, settings: Settings) -> PredNet:
         raise ValueError(
             f"expected at least the channels {old.channels} and {old.priors} priors and otherwise those of {old}, got {settings}"
         )
-    larger = PredNet(settings)
-    own = dict(net.named_parameters())
-    silent = (f"descend.{layers - 1}.", "decode.", "prior_")  # what old layers and the mask get of new layers and of priors
+    larger, own = PredNet(settings), dict(net.named_parameters())
+    ignored = (f"descend.{layers - 1}.", "decode.", "prior_")  # what the old layers and the mask get of what is new
     with torch.no_grad():
         for name, value in larger.named_parameters():
             before = own.get(name)
             if before is None:
-                if name.startswith(silent):
+                if name.startswith(ignored):
                     value.zero_()
                 continue
             rows = torch.arange(before.shape[0])

@@ -6,7 +6,7 @@ through the window that the service would choose around the true pose. Both by t
 priors; the rows of a network that has priors are measured with right and with wrong ones as well.
 
 With --photographs instead: still pictures with masks drawn by hand, each shown a few times through the window that the service
-would choose around the arm, its margin in relation to the arm's width in the picture.
+would choose around the arm, its margin in relation to the arm's width in the picture, without priors.
 """
 
 from __future__ import annotations
