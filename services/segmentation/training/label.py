@@ -368,8 +368,8 @@ def label(image: NDArray[np.uint8], limbs: Sequence[Limb], film: Colours) -> tup
     strange = cv2.morphologyEx(((skin > 0.7) & (near > 0.1)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
     upper = np.zeros((height, width), bool)
     for one in found:
-        beyond = one.place.forearm > 0.25 if one.place.limb.elbow is not None else one.place.along > LONGEST / FOREARM
-        upper |= _connected((skin > DOUBT) | (one.odds > 0.0), one.place.hand < -0.03) & beyond & (one.place.along > 1.0)
+        ended = one.place.forearm > 0.25 if one.place.limb.elbow is not None else one.place.along > LONGEST / FOREARM
+        upper |= _connected((skin > DOUBT) | (one.odds > 0.0), one.place.hand < -0.03) & ended & (one.place.along > 1.0)
     unknown |= doubted & ~np.isin(labels, TARGET_LABELS)
     unknown |= cv2.dilate(strange, np.ones((5, 5), np.uint8)).astype(bool) & ~np.isin(labels, TARGET_LABELS)
     labels[unknown] = UNLABELLED
@@ -481,6 +481,11 @@ class Folder:
         for name in ("images", "masks", "check"):
             (out / name).mkdir(parents=True, exist_ok=True)
 
+    def check(self, film: str) -> None:
+        """Raises FileError where there are frames of a film of this name."""
+        if there := sorted((self._out / "images").glob(f"{film}_*")):
+            raise files.FileError(f"{there[0]}: expected no frames of {film} yet, got some; remove them, or choose another --out")
+
     def add(self, sequence: str, frames: Sequence[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]]) -> None:
         """Write the frames of a sequence that follow one another. Raises FileError."""
         tiles = []
@@ -516,6 +521,7 @@ def main(options: flags.Options) -> int:
         files.check_names(options.films)
         folder = Folder(options.out)
         for path in options.films:
+            folder.check(path.stem)
             every = options.every or max(round(rate(path) / RATE_HZ), 1)
             run: list[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]] = []
             for frame in labelled(models, path, every):

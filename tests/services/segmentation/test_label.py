@@ -181,6 +181,9 @@ def test_what_is_written_is_what_the_training_reads(tmp_path):
     np.testing.assert_array_equal(read, labels)
     assert np.abs(written.astype(float) - image).mean() < 5.0
     assert files.read(tmp_path / "check" / "film_000010-000010.jpg").shape[1] == label.TILE * label.COLUMNS
+    folder.check("other")
+    with pytest.raises(files.FileError, match="expected no frames of film yet"):
+        folder.check("film")
 
 
 def test_pictures_are_written_at_the_scale_at_which_the_service_would_look():
