@@ -483,7 +483,7 @@ class Folder:
 
     def check(self, film: str) -> None:
         """Raises FileError where there are frames of a film of this name."""
-        if there := sorted((self._out / "images").glob(f"{film}_*")):
+        if there := sorted((self._out / "images").glob(f"{film}_{'[0-9]' * 6}")):
             raise files.FileError(f"{there[0]}: expected no frames of {film} yet, got some; remove them, or choose another --out")
 
     def add(self, sequence: str, frames: Sequence[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]]) -> None:
