@@ -45,6 +45,8 @@ SAME = 0.7
 """How far [sizes of the hand] an elbow may be from where it is at other times, as seen from the wrist, to be confirmed by it."""
 FOREARM = 2.7
 """Length of a forearm in sizes of the hand, seen from the side (ANSUR II: 0.25 m and 0.09 m)."""
+LONGEST = 3.1
+"""Length in sizes of the hand that a forearm has at most: bare skin that goes on is the upper arm."""
 SURE = 1.3
 """Length of the forearm, in sizes of the hand, that is labelled where no elbow is known: it may be foreshortened."""
 BINS = 32
@@ -364,9 +366,14 @@ def label(image: NDArray[np.uint8], limbs: Sequence[Limb], film: Colours) -> tup
     colours = Colours(np.mean([one.colours.seen for one in found], axis=0, dtype=np.float32))
     skin, _ = colours.and_(film).ratios(bins)
     strange = cv2.morphologyEx(((skin > 0.7) & (near > 0.1)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    upper = np.zeros((height, width), bool)
+    for one in found:
+        ended = one.place.forearm > 0.25 if one.place.limb.elbow is not None else one.place.along > LONGEST / FOREARM
+        upper |= _connected((skin > DOUBT) | (one.odds > 0.0), one.place.hand < -0.03) & ended & (one.place.along > 1.0)
     unknown |= doubted & ~np.isin(labels, TARGET_LABELS)
     unknown |= cv2.dilate(strange, np.ones((5, 5), np.uint8)).astype(bool) & ~np.isin(labels, TARGET_LABELS)
     labels[unknown] = UNLABELLED
+    labels[upper & (skin > DOUBT) & (near > 0.25)] = Label.UPPER_ARM
     return labels, colours
 
 
@@ -474,6 +481,11 @@ class Folder:
         for name in ("images", "masks", "check"):
             (out / name).mkdir(parents=True, exist_ok=True)
 
+    def check(self, film: str) -> None:
+        """Raises FileError where there are frames of a film of this name."""
+        if there := sorted((self._out / "images").glob(f"{film}_{'[0-9]' * 6}")):
+            raise files.FileError(f"{there[0]}: expected no frames of {film} yet, got some; remove them, or choose another --out")
+
     def add(self, sequence: str, frames: Sequence[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]]) -> None:
         """Write the frames of a sequence that follow one another. Raises FileError."""
         tiles = []
@@ -509,6 +521,7 @@ def main(options: flags.Options) -> int:
         files.check_names(options.films)
         folder = Folder(options.out)
         for path in options.films:
+            folder.check(path.stem)
             every = options.every or max(round(rate(path) / RATE_HZ), 1)
             run: list[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]] = []
             for frame in labelled(models, path, every):

@@ -181,6 +181,9 @@ def test_what_is_written_is_what_the_training_reads(tmp_path):
     np.testing.assert_array_equal(read, labels)
     assert np.abs(written.astype(float) - image).mean() < 5.0
     assert files.read(tmp_path / "check" / "film_000010-000010.jpg").shape[1] == label.TILE * label.COLUMNS
+    folder.check("other")
+    with pytest.raises(files.FileError, match="expected no frames of film yet"):
+        folder.check("film")
 
 
 def test_pictures_are_written_at_the_scale_at_which_the_service_would_look():
@@ -196,3 +199,13 @@ def test_films_without_hands_are_told(finder, tmp_path, capsys):
     cv2.imwrite(str(film), np.full((240, 320, 3), 128, np.uint8))
     assert label.main([str(film), "--out", str(tmp_path / "labels")]) == 2
     assert "found no hand" in capsys.readouterr().err
+
+
+def test_bare_skin_beyond_the_elbow_is_the_upper_arm():
+    image, limb = np.full((240, 320, 3), (90, 110, 140), np.uint8), Limb(hand_at((160, 150), (0, 1), 30), np.array([160.0, 90.0]))
+    for first in range(1, 21, 4):
+        cv2.polylines(image, [np.round(limb.points[[0, *range(first, first + 4)]]).astype(np.int32)], False, (210, 160, 130), 9)
+    cv2.line(image, (160, 155), (160, 90), (210, 160, 130), 20)
+    cv2.line(image, (160, 90), (250, 40), (210, 160, 130), 20)
+    labels, _ = label.label(image, [limb], Colours.none())
+    assert labels[120, 160] == Label.FOREARM and labels[45, 240] == Label.UPPER_ARM and labels[200, 40] == Label.BACKGROUND
