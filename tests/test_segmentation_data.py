@@ -11,6 +11,7 @@ from penumbra.services.segmentation.inference import TARGET_LABELS
 from penumbra.services.segmentation.training import pasted, photographs, recordings, street, train
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import UNLABELLED, Label
+from penumbra.shared.perception import landmarks
 from penumbra.sim.picture import limb, looks
 from penumbra.sim.sets import sequences
 
@@ -46,7 +47,7 @@ def test_a_cheap_camera_changes_a_film_s_colours_and_not_its_size():
     assert looks.filmed(film, np.random.default_rng(0)).shape == film.shape and np.median(changed) > 2.0
 
 
-def person() -> tuple[np.ndarray, street.Pose]:
+def person() -> tuple[np.ndarray, landmarks.Pose]:
     """A person with a coat's body, two bare arms that hang down beside it, and a bag at the right hand, 200 x 120 pixels."""
     parts = np.full((200, 120), NAMES.index("null"), np.uint8)
     parts[40:130, 40:80] = NAMES.index("coat")
@@ -60,7 +61,7 @@ def person() -> tuple[np.ndarray, street.Pose]:
     places |= {23: (70, 130), 25: (70, 165), 27: (70, 199), 24: (50, 130), 26: (50, 165), 28: (50, 199)}
     for index, place in places.items():
         points[index] = place
-    return parts, street.Pose(points, np.ones(33), 1.0)
+    return parts, landmarks.Pose(points, np.ones(33), 1.0)
 
 
 def test_skin_is_forearm_or_hand_by_the_landmarks_and_what_nobody_knows_is_unlabelled():
@@ -73,7 +74,7 @@ def test_skin_is_forearm_or_hand_by_the_landmarks_and_what_nobody_knows_is_unlab
     assert labels[25, 60] == Label.TORSO and labels[60, 60] == Label.TORSO and labels[180, 60] == Label.TORSO
     assert labels[10, 10] == Label.BACKGROUND and labels[142, 17] == Label.OCCLUDER
     assert labels[105, 20] == UNLABELLED, "the contour is coarse"
-    unsure = street.Pose(pose.points, np.where(np.arange(33) == 13, 0.1, 1.0), 1.0)
+    unsure = landmarks.Pose(pose.points, np.where(np.arange(33) == 13, 0.1, 1.0), 1.0)
     labels = street.masks(parts, NAMES, unsure)
     assert labels[105, 95] == UNLABELLED and labels[105, 25] == Label.FOREARM
 

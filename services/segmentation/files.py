@@ -7,7 +7,7 @@ the next. Other pictures stand for themselves: each is shown SETTLE times, as th
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -51,12 +51,7 @@ def main(options: flags.Options) -> int:
     """Writes the masks; returns 2 where a file cannot be read."""
     scale = int(options.scale) if options.scale else None
     try:
-        names = [path.stem for path in options.files]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise FileError(
-                f"expected files of different names, got {twice} twice; run the command once per file, with an --out each"
-            )
+        check_names(options.files)
         options.out.mkdir(parents=True, exist_ok=True)
         segmenter = inference.load_segmenter(options.weights)
         stamp_ns = 0
@@ -78,6 +73,16 @@ def main(options: flags.Options) -> int:
         return 2
     print(f"{len(options.files)} masked: {options.out}")
     return 0
+
+
+def check_names(paths: Sequence[Path]) -> None:
+    """Raises FileError where what is written for one file would overwrite another's."""
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise FileError(
+            f"expected files of different names, got {twice} twice; run the command once per file, with an --out each"
+        )
 
 
 def is_picture(path: Path) -> bool:

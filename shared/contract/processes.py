@@ -125,6 +125,18 @@ PROCESSES = (
             ),
             Tool("infer", "masks of pictures and films", "penumbra.services.segmentation.files:main", extra="segmentation"),
             Tool(
+                "label",
+                "frames and masks for the training from films of yours",
+                "penumbra.services.segmentation.training.label:main",
+                extra="segmentation",
+            ),
+            Tool(
+                "models",
+                "fetch the landmark models that label films and photographs",
+                "penumbra.services.segmentation.training.models:main",
+                extra="segmentation",
+            ),
+            Tool(
                 "photographs",
                 "frames and masks for the training from labelled photographs",
                 "penumbra.services.segmentation.training.photographs:main",

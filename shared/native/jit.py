@@ -14,6 +14,7 @@ from pathlib import Path
 import llvmlite
 import llvmlite.binding as llvm
 
+from penumbra.shared.cache import cache
 from penumbra.shared.native import Kernel, Progress
 from penumbra.shared.native.fingerprint import FORMAT
 
@@ -23,10 +24,9 @@ _ENGINES: list[llvm.ExecutionEngine] = []
 
 
 def folder() -> Path:
-    """Where compiled kernels are kept: PENUMBRA_CACHE, by default penumbra in the user's cache folder. Files are named after the
-    sources' fingerprint, the processor and the versions of the compilers, so none is ever out of date; any may be deleted."""
-    cache = os.environ.get("PENUMBRA_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "penumbra"
-    return Path(cache) / "native"
+    """Where compiled kernels are kept. Files are named after the sources' fingerprint, the processor and the versions of the
+    compilers, so none is ever out of date."""
+    return cache() / "native"
 
 
 def load(kernels: Sequence[Kernel], progress: Progress | None = None) -> list[Callable[[bytes], int]]:

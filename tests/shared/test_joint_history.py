@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from penumbra.shared.perception.joint_history import JointHistory
+from penumbra.shared.perception.joint_history import JointHistory, RobotJoints
 
 MS = 1_000_000
 
@@ -48,3 +48,15 @@ def test_late_messages_are_left_out_and_a_clock_that_was_set_back_begins_anew():
     late.add(-hour_ns, np.array([5.0]))
     assert late.at(-hour_ns) == pytest.approx(5.0)
     assert late.at(10 * MS) is None
+
+
+def test_of_several_robots_those_are_known_that_sent_joints_near_the_stamp():
+    joints = RobotJoints({"left": 2, "right": 1}, 200 * MS, is_carried_on=True)
+    assert joints.at(0) == {}
+    joints.add("left", 0, np.array([0.0, 1.0]))
+    joints.add("left", 10 * MS, np.array([0.1, 1.0]))
+    assert joints.at(20 * MS).keys() == {"left"} and joints.at(20 * MS)["left"] == pytest.approx([0.2, 1.0])
+    with pytest.raises(ValueError, match="robot right: expected 1 joint angles, got shape"):
+        joints.add("right", 0, np.zeros(2))
+    with pytest.raises(ValueError, match="expected a robot of left, right, got 'middle'"):
+        joints.add("middle", 0, np.zeros(1))

@@ -4,7 +4,7 @@ The photographs are not kept in the project. Its folder training/photographs has
 their commits and licences (repositories.csv), the pictures that are used (pictures.csv), and masks that were drawn for it. Three
 folders are written, of what the clones have:
 
-  street   people in the street, from Clothing Co-Parsing and a pose model
+  street   people in the street, from Clothing Co-Parsing and the models that `penumbra segmentation models` fetches
   close    hands and forearms at work, with the project's masks
   scenes   pictures without people, and cut-out hands in front of these
 
@@ -27,9 +27,10 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from penumbra.services import flags
-from penumbra.services.segmentation.training import pasted, street
+from penumbra.services.segmentation.training import models, pasted, street
 from penumbra.services.segmentation.training.recordings import DataError, read_mask
 from penumbra.shared.contract.labels import Label
+from penumbra.shared.perception.landmarks import Landmarks, ModelsError
 
 STREET = "bearpaw/clothing-co-parsing"
 HANDS = "ardamavi/Sign-Language-Digits-Dataset"
@@ -225,10 +226,10 @@ def _empty(
     flags.Argument(
         "clones", type=Path, help="folder with the clones; those that are not there are named, with the commands to get them"
     ),
-    flags.Option("--pose", type=Path, metavar="FILE", help="pose_landmark_full.tflite, for the people in the street"),
+    models.FOLDER,
     flags.Option("--tables", type=Path, default=Path("training/photographs"), help="the project's folder with tables and masks"),
     flags.Option("--out", type=Path, default=Path("photographs"), help="folder to write street/, close/ and scenes/ to"),
-    example="penumbra segmentation photographs clones --pose pose_landmark_full.tflite",
+    example="penumbra segmentation photographs clones",
 )
 def main(options: flags.Options) -> int:
     """Writes the folders that can be made of the clones that are there."""
@@ -239,10 +240,11 @@ def main(options: flags.Options) -> int:
             _tell(f"{options.clones}: expected these clones as well; what needs them is left out:\n{lines}")
         folders = {}
         people = sources.clone(STREET)
-        if people and options.pose:
-            folders["street"] = street.write(people, options.pose, options.out / "street")
-        elif people:
-            _tell("street: expected --pose FILE, got none; it is left out")
+        if people:
+            try:
+                folders["street"] = street.write(people, Landmarks(options.models), options.out / "street")
+            except ModelsError as error:
+                _tell(f"street is left out: {error}")
         folders["close"] = write_close(sources, options.out / "close")
         folders["scenes"] = write_scenes(sources, options.out / "scenes")
     except (OSError, TypeError, ValueError) as error:

@@ -26,9 +26,9 @@ from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.sim.sets.sequences import Sequence
 
 Kind = Literal["right", "wrong", "missing"]
-TARGET_SHARES: dict[Kind, float] = {"right": 0.45, "wrong": 0.2, "missing": 0.35}
-ROBOT_SHARES: dict[Kind, float] = {"right": 0.57, "wrong": 0.08, "missing": 0.35}
-"""How often a sequence has which kind of prior."""
+TARGET_SHARES: dict[Kind, float] = {"right": 0.38, "wrong": 0.24, "missing": 0.38}
+ROBOT_SHARES: dict[Kind, float] = {"right": 0.48, "wrong": 0.14, "missing": 0.38}
+"""How often a sequence has which kind of prior. Wrong ones are far more frequent than in use, so that the picture decides."""
 SWITCHED = 0.25
 """Share of the sequences with a prior in which it is there before, or from, some frame only."""
 STATED_M, STATED_RAD, STATED_PX = (0.002, 0.06), (0.02, 0.5), (2.0, 25.0)

@@ -10,8 +10,8 @@ Pictures may be JPEG or BMP as well. A mask is a PNG with one channel that holds
 2 torso, 3 upper arm, 4 forearm, 5 hand, 6 occluder (`shared.contract.labels.Label`), 255 unlabelled: nothing is learned from
 there; in COCO, categories have these names, and what is not labelled counts as background. The files of a subfolder are the
 frames of one sequence in the order of their names (as text: write 0001.png); pictures that lie in no subfolder are single ones,
-each a sequence that stands still. A tenth of the sequences, or of their pieces of 40 frames, is kept for the calibration, another
-for the score.
+each a sequence that stands still. A tenth of the sequences, or of their pieces of up to 40 frames, is kept for the calibration,
+another for the score.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from penumbra.shared.contract.labels import UNLABELLED, Label
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 PIECE = 40
-"""Frames of a longer sequence that are held out, or learned from, together."""
+"""Frames of a longer sequence that are held out, or learned from, together; less where there are few, so that a tenth is one."""
 SHORTEST = 8
 """Frames of a sequence; a shorter one is played forth and back."""
 UNIT = 16
@@ -152,14 +152,15 @@ class Recordings:
 
 
 def _pieces(folder: Path) -> list[Recorded]:
+    found = find(folder)
+    length = min(max(sum(map(len, found)) // 20, SHORTEST), PIECE)
     pieces = []
-    for sequence in find(folder):
+    for sequence in found:
         size = check(sequence)
-        cuts = range(0, len(sequence), PIECE)
-        pieces += [Recorded(sequence[i : i + PIECE], size) for i in cuts]
+        pieces += [Recorded(sequence[i : i + length], size) for i in range(0, len(sequence), length)]
     if len(pieces) < 3:
         raise DataError(
-            f"{folder}: expected at least 3 sequences, or pieces of {PIECE} frames of them (to learn from, to calibrate and "
+            f"{folder}: expected at least 3 sequences, or pieces of {length} frames of them (to learn from, to calibrate and "
             f"to score with), got {len(pieces)}"
         )
     return pieces

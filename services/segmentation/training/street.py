@@ -2,9 +2,9 @@
 
 The photographs and the class of every pixel (skin, kinds of clothes, bags) are those of Clothing Co-Parsing (Yang, Luo, Lin 2014,
 doi:10.1109/CVPR.2014.407; github.com/bearpaw/clothing-co-parsing, Apache-2.0; the rights of the photographers are not cleared, so
-neither pictures nor masks are kept here). Landmarks of a pose model say where the arms are (BlazePose, arXiv:2006.10204;
-`pose_landmark_full.tflite` of the Python package mediapipe 0.10.21, Apache-2.0, run in OpenVINO). Skin and sleeves near a
-forearm are forearm, beyond the wrist hand; what cannot be decided is UNLABELLED, as is a band along the target's coarse contours.
+neither pictures nor masks are kept here). Landmarks of a pose model say where the arms are (`penumbra segmentation models`).
+Skin and sleeves near a forearm are forearm, beyond the wrist hand; what cannot be decided is UNLABELLED, as is a band along the
+target's coarse contours.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
+from penumbra.shared.perception.landmarks import Landmarks, Pose
 
 SLEEVED = (
     "blazer",
@@ -46,56 +47,12 @@ WORN = ("accessories", "bracelet", "ring", "watch")
 BAGS = ("bag", "purse", "wallet")
 SURE = 0.6
 """Visibility of elbow and wrist from which an arm is used."""
-SIDE = 256
-"""Width and height [px] of the pose model's input."""
 RADII = {Label.UPPER_ARM: 0.19, Label.FOREARM: 0.16, Label.HAND: 0.2}
 """Radii of an arm's parts, as shares of the forearm's length."""
 HAND = 0.75
 """Length of the hand as a share of the forearm's."""
 BAND_PX = 2
 """Half the width of the band along the target's contours that is not learned from."""
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Landmarks of a person in a picture: points (33, 2) x, y [px], visible (33,) in [0, 1], as BlazePose numbers them; found:
-    how sure it is that there is a person."""
-
-    points: NDArray[np.float64]
-    visible: NDArray[np.float64]
-    found: float
-
-
-class PoseModel:
-    """BlazePose's landmark network in OpenVINO."""
-
-    def __init__(self, path: Path):
-        import openvino
-
-        self._compiled = openvino.Core().compile_model(path, "CPU", {"INFERENCE_NUM_THREADS": 1})
-
-    def __call__(self, image: NDArray[np.uint8], person: NDArray[np.bool_]) -> Pose:
-        """The pose of the person whose pixels (h, w) are known in an image (h, w, 3) RGB: first looked at in the square around
-        these, then in the one that the model's own two auxiliary points describe."""
-        rows, columns = np.flatnonzero(person.any(1)), np.flatnonzero(person.any(0))
-        height, width = np.ptp(rows) + 1, np.ptp(columns) + 1
-        centre, side, angle = np.array([columns.mean(), rows.mean()]), 1.2 * float(max(height, width)), 0.0
-        for _ in range(2):
-            points, visible, found = self._look(image, centre, side, angle)
-            hips, circle = points[33], points[34]  # the middle of the hips, and a point on the circle around the whole body
-            up = circle - hips
-            centre, side, angle = hips, 2.5 * float(np.linalg.norm(up)), float(np.arctan2(up[0], -up[1]))
-        return Pose(points[:33], visible[:33], found)
-
-    def _look(self, image: NDArray[np.uint8], centre: NDArray[np.float64], side: float, angle: float):
-        turned: NDArray[np.float64] = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        corners = side * np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5]]) @ turned.T + centre
-        place = np.array([[0, 0], [SIDE, 0], [0, SIDE]], np.float32)
-        crop = cv2.warpAffine(image, cv2.getAffineTransform(corners.astype(np.float32), place), (SIDE, SIDE))
-        outputs = {tuple(port.shape): value for port, value in self._compiled(crop[None].astype(np.float32) / 255.0).items()}
-        marks = outputs[1, 195].reshape(39, 5).astype(float)  # x, y, z, logits of visibility and presence
-        back = cv2.getAffineTransform(place, corners.astype(np.float32))
-        return marks[:, :2] @ back[:, :2].T + back[:, 2], 1.0 / (1.0 + np.exp(-marks[:, 3])), float(outputs[1, 1].item())
 
 
 @dataclass(frozen=True)
@@ -184,16 +141,13 @@ def _distance(ends: NDArray[np.float64], height: int, width: int) -> NDArray[np.
     return np.hypot(x - t * along[0], y - t * along[1]).astype(np.float32)
 
 
-def write(source: Path, model: Path, out: Path) -> int:
-    """Writes images/ and masks/ of the photographs of a copy of Clothing Co-Parsing in which the pose model, a file, finds a
-    person with an arm that it is sure of: how many. Raises FileNotFoundError where there are no labels, or no model."""
+def write(source: Path, find: Landmarks, out: Path) -> int:
+    """Writes images/ and masks/ of the photographs of a copy of Clothing Co-Parsing in which the models find a person with an arm
+    that they are sure of: how many. Raises FileNotFoundError where there are no labels."""
     annotated = sorted((source / "annotations" / "pixel-level").glob("*.mat"))
     if not annotated:
         raise FileNotFoundError(f"{source / 'annotations' / 'pixel-level'}: expected a .mat file for each photograph, found none")
-    if not model.is_file():
-        raise FileNotFoundError(f"{model}: expected the pose model, found no file; see --help")
     names = [str(name[0]) for name in scipy.io.loadmat(source / "label_list.mat")["label_list"][0]]
-    find = PoseModel(model)
     for folder in ("images", "masks"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     written = 0
@@ -203,7 +157,7 @@ def write(source: Path, model: Path, out: Path) -> int:
         image = cv2.imread(str(photograph), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None or image.shape[:2] != parts.shape or not parts.any():
             continue
-        pose = find(np.ascontiguousarray(image[..., ::-1]), parts > 0)
+        pose = find.pose_of(np.ascontiguousarray(image[..., ::-1]), parts > 0)
         if pose.found < 0.8 or not any(Arm.of(pose, first).is_sure for first in (11, 12)):
             continue
         shutil.copyfile(photograph, out / "images" / photograph.name)

@@ -175,7 +175,7 @@ class Mixed:
     def __init__(self, recorded: recordings.Recordings, simulated: Simulated, share: float, seed: int):
         self._recorded, self._simulated, self._share, self._seed = recorded, simulated, share, seed
         self.calibration = simulated.calibration
-        self.held_out = itertools.chain(simulated.held_out, recorded.held_out)
+        self.held_out = itertools.chain[Labelled](simulated.held_out, recorded.held_out)
         of_simulated, of_recorded = simulated.sources[1], recorded.sources[1]
         self.sources = simulated.sources[0], {**of_simulated, **of_recorded, "simulated": share}
 
