@@ -129,7 +129,7 @@ def test_recordings_and_simulated_sequences_are_mixed_by_their_share_and_both_ar
     assert {"seed", "folder", "sequences", "simulated"} <= data.sources[1].keys()
 
 
-MADE_UP = photographs.HANDS, "somebody/pictures", "nobody/cloned"
+MADE_UP = photographs.STREET, photographs.HANDS, "somebody/pictures", "nobody/cloned"
 
 
 @pytest.fixture
@@ -140,6 +140,7 @@ def sources(tmp_path):
     digits, pictures = tmp_path / "Sign-Language-Digits-Dataset" / "Dataset" / "5", tmp_path / "pictures"
     digits.mkdir(parents=True)
     pictures.mkdir()
+    (tmp_path / "clothing-co-parsing").mkdir()
     lines = [f"{name},{'0' * 40},MIT,Somebody" for name in MADE_UP]
     (tmp_path / "tables" / "repositories.csv").write_text("\n".join(["repository,commit,licence,copyright", *lines]))
     lines = [
@@ -205,11 +206,12 @@ def test_what_is_pasted_into_a_scene_has_its_classes_where_it_is_seen():
 
 def test_clones_become_folders_to_train_on_and_what_is_missing_is_named(sources, monkeypatch, capsys):
     monkeypatch.setattr(photographs, "SCENE", (90, 120))
-    call = [str(sources), "--tables", str(sources / "tables"), "--out", str(sources / "out")]
+    call = [str(sources), "--tables", str(sources / "tables"), "--out", str(sources / "out"), "--models", str(sources / "none")]
     assert photographs.main(call) == 0
     said = capsys.readouterr()
     assert f"git clone https://github.com/nobody/cloned && git -C cloned checkout {'0' * 40}" in said.err
     assert "somebody/pictures" not in said.err and not (sources / "out" / "street").exists()
+    assert "street is left out" in said.err and "penumbra segmentation models" in said.err
     close, scenes = (sources / "out" / kind for kind in ("close", "scenes"))
     assert {path.stem for path in (close / "images").iterdir()} == {"large", "white"}
     assert seen(close / "images" / "large.jpg").shape == (480, 960, 3)
@@ -226,7 +228,7 @@ def test_clones_become_folders_to_train_on_and_what_is_missing_is_named(sources,
 
 def test_a_clone_of_another_commit_is_refused(sources, capsys):
     cv2.imwrite(str(sources / "pictures" / "white.png"), np.zeros((91, 120, 3), np.uint8))
-    call = [str(sources), "--tables", str(sources / "tables"), "--out", str(sources / "out")]
+    call = [str(sources), "--tables", str(sources / "tables"), "--out", str(sources / "out"), "--models", str(sources / "none")]
     assert photographs.main(call) == 2
     assert "expected 120 x 90, got 120 x 91; check out the commit" in capsys.readouterr().err
     assert photographs.main([str(sources / "none"), *call[1:]]) == 2
