@@ -63,6 +63,11 @@ class Shape:
     fine: Model
     creases: Creases
 
+    @property
+    def size(self) -> float:
+        """Length of the bounding box's diagonal [m]."""
+        return float(np.linalg.norm(np.ptp(self.coarse.vertices, axis=0)))
+
 
 @dataclass(frozen=True)
 class Level:

@@ -171,16 +171,18 @@ def _lost(T: Array, overlap: float = 0.0) -> ObjectEstimate:
     return ObjectEstimate(T, Limits().covariance, overlap, "lost")
 
 
+GAP = 0.015
+"""Distance from a good pose's contour within which no colours are learned, as a share of the object's size."""
 MARGIN = 2.0
 """How far from the start an object is looked for in a picture, in standard deviations of its position."""
-SUPPORTED = (0.35, 0.55)
-"""Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful: of wrong poses on
-photographs few have more than half."""
-CERTAIN = 0.04
+SUPPORTED = (0.35, 0.65)
+"""Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful: on photographs right poses
+have 0.7 to 1 where nothing hides the object, and of those far off few have more than 0.6."""
+CERTAIN = 0.06
 """Root mean square error of the mesh's points by the covariance, as a share of the diameter, above which a pose is doubtful: one
-in a hundred is then off by more than a tenth, if the error is mostly of one direction, as that of the depth."""
-SHARED = 4.0
-"""How many times longer than `region.CORRELATION` the errors of a contour are alike: those of the mesh and of shadows are."""
+in ten is then off by more than a tenth, if the error is mostly of one direction, as that of the depth."""
+ALIKE = 0.35
+"""Angle [rad] within which poses are averaged by their likelihood; between ones further apart lies none that is right."""
 
 
 class _Colours:
@@ -192,7 +194,7 @@ class _Colours:
     def search(
         self, picture: NDArray[np.uint8], mask: Bool | None, occluder: Bool | None, prior: Prior
     ) -> tuple[ObjectEstimate, NDArray[np.float32] | None]:
-        """The estimate of T_camera_middle from far, and the log-odds of the colours that it was found by."""
+        """The estimate of T_camera_middle from far, and the log-odds of the colours there, None where edges hardly support it."""
         reach = MARGIN * float(np.sqrt(1.0 / prior.information[0, 0]))
         window = region.Window(
             picture, mask, occluder, self._k, self._shape, prior.T, reach * self._k.fx / max(prior.T[2, 3], NEAR)
@@ -200,15 +202,17 @@ class _Colours:
         found = region.search(self._shape, window, prior, reach)
         if not found:
             return _lost(prior.T), None
-        table = window.of_pose(self._shape.coarse, found[0].T, 0.015)
-        return self.judged(found, prior, mask, occluder), table
+        table = window.of_pose(self._shape.coarse, found[0].T, GAP) if found[0].support > SUPPORTED[1] else None
+        return self.judged(found, prior, mask, occluder, picture.shape[:2]), table
 
-    def judged(self, found: list[region.Found], prior: Prior, mask: Bool | None, occluder: Bool | None) -> ObjectEstimate:
-        """The estimate of T_camera_middle from poses, best first."""
+    def judged(
+        self, found: list[region.Found], prior: Prior, mask: Bool | None, occluder: Bool | None, shape: tuple[int, int]
+    ) -> ObjectEstimate:
+        """The estimate of T_camera_middle from poses in a picture (h, w), best first."""
         best = found[0]
         overlap, covered = best.support, 0.0
         if mask is not None or occluder is not None:
-            h, w = (mask if mask is not None else occluder).shape  # type: ignore[union-attr]
+            h, w = shape
             silhouette = self._shape.fine.silhouette(best.T, self._k, (0, 0, w, h))
             free = silhouette if occluder is None else silhouette & ~occluder
             covered = 1.0 - int(np.count_nonzero(free)) / max(int(np.count_nonzero(silhouette)), 1)
@@ -225,12 +229,14 @@ class _Colours:
     def _posterior(self, found: list[region.Found], prior: Prior) -> tuple[Array, Array]:
         """The best pose and the covariance of it, with the other poses by their likelihood."""
         best = found[0]
-        H = region.measured(self._shape, best.level, best.T, SHARED)
-        covariance = np.linalg.inv(H + prior.information)
+        covariance = region.covariance(self._shape, best.level, best.T, prior)
         weights = np.exp(np.array([max(one.score - best.score, -50.0) for one in found]))
         errors = np.array([pose_error(one.T, best.T) for one in found])
-        covariance = covariance + np.einsum("n,ni,nj->ij", weights / weights.sum(), errors, errors)
-        return best.T, np.asarray((covariance + covariance.T) / 2.0, np.float64)
+        weights /= weights.sum()
+        near = weights * (np.linalg.norm(errors[:, 3:], axis=1) < ALIKE)
+        mean = near @ errors / near.sum()
+        covariance = covariance + np.einsum("n,ni,nj->ij", weights, errors - mean, errors - mean)
+        return perturb(best.T, mean), np.asarray((covariance + covariance.T) / 2.0, np.float64)
 
 
 FRAME_WIDTHS = (8.0, 6.0, 5.0, 5.0, 5.0)
@@ -248,7 +254,7 @@ LONGEST_S = 0.3
 
 
 class Tracker:
-    """A rigid object in a sequence of masks: each pose starts from the last one, moved on at constant velocity.
+    """A rigid object in a sequence of masks or pictures: each pose starts from the last one, moved on at constant velocity.
 
     T_start (4 x 4): T_camera_object before the first frame, known to `spread` [m, rad]; `dt_s`: time between frames.
     """
@@ -301,19 +307,22 @@ class Tracker:
 
     def _look_at_picture(
         self, picture: NDArray[np.uint8], mask: Bool | None, occluder: Bool | None, prior: Prior
-    ) -> ObjectEstimate:
+    ) -> ObjectEstimate | None:
         shape = self._rigid.shape
         if self._missed == 0 and self._table is not None:
             window = region.Window(picture, mask, occluder, self._k, shape, prior.T, 0.0)
             one = region.follow(shape, window, self._table, prior)
             if one.support > max(SUPPORTED[1], self._usual_support - DROP):
-                self._usual_support += 0.1 * (one.support - self._usual_support)
-                newest = window.of_pose(shape.coarse, one.T, 0.015)
-                self._table = self._table + np.float32(LEARNING) * (newest - self._table)
-                return self._colours.judged([one], prior, mask, occluder)
+                found = self._colours.judged([one], prior, mask, occluder, picture.shape[:2])
+                if found.state == "tracking":  # else it may be something else that is seen
+                    self._usual_support += SMOOTHING * (one.support - self._usual_support)
+                    newest = window.of_pose(shape.coarse, one.T, GAP)
+                    self._table = self._table + np.float32(LEARNING) * (newest - self._table)
+                return found
         found, table = self._colours.search(picture, mask, occluder, prior)
-        if found.state != "lost":
-            self._table, self._usual_support = table, 0.0
+        if found.state == "lost" or table is None:
+            return None
+        self._table, self._usual_support = table, 0.0
         return found
 
     def _miss(self, found: ObjectEstimate | None, occluder: Bool | None) -> ObjectEstimate:
