@@ -178,11 +178,12 @@ MARGIN = 2.0
 SUPPORTED = (0.35, 0.65)
 """Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful: on photographs right poses
 have 0.7 to 1 where nothing hides the object, and of those far off few have more than 0.6."""
+TYPICAL = 0.85
+"""Share of the contour that lies on edges from which the covariance is that of the settings; below, it grows with its fourth
+power."""
 CERTAIN = 0.06
 """Root mean square error of the mesh's points by the covariance, as a share of the diameter, above which a pose is doubtful: one
 in ten is then off by more than a tenth, if the error is mostly of one direction, as that of the depth."""
-ALIKE = 0.35
-"""Angle [rad] within which poses are averaged by their likelihood; between ones further apart lies none that is right."""
 
 
 class _Colours:
@@ -219,24 +220,21 @@ class _Colours:
             if mask is not None:
                 seen = mask if occluder is None else mask & ~occluder
                 overlap = int(np.count_nonzero(seen & free)) / max(int(np.count_nonzero(seen | free)), 1)
-        T, covariance = self._posterior(found, prior)
+        T, covariance = best.T, self._covariance(found, prior)
         if best.support < SUPPORTED[0] or (mask is not None and overlap < FITS) or best.length < basin.NOISE.correlation:
             return _lost(T, overlap)
         if best.support < SUPPORTED[1] or self._rigid.error(covariance, T) > CERTAIN * self._rigid.diameter:
             return ObjectEstimate(T, covariance, overlap, "doubtful")
         return ObjectEstimate(T, covariance, overlap, "occluded" if covered > COVERS else "tracking")
 
-    def _posterior(self, found: list[region.Found], prior: Prior) -> tuple[Array, Array]:
-        """The best pose and the covariance of it, with the other poses by their likelihood."""
+    def _covariance(self, found: list[region.Found], prior: Prior) -> Array:
+        """The covariance of the best pose, with the other poses by their likelihood."""
         best = found[0]
-        covariance = region.covariance(self._shape, best.level, best.T, prior)
-        weights = np.exp(np.array([max(one.score - best.score, -50.0) for one in found]))
+        weights = np.exp([one.score - best.score for one in found])
         errors = np.array([pose_error(one.T, best.T) for one in found])
-        weights /= weights.sum()
-        near = weights * (np.linalg.norm(errors[:, 3:], axis=1) < ALIKE)
-        mean = near @ errors / near.sum()
-        covariance = covariance + np.einsum("n,ni,nj->ij", weights, errors - mean, errors - mean)
-        return perturb(best.T, mean), np.asarray((covariance + covariance.T) / 2.0, np.float64)
+        apart = np.einsum("n,ni,nj->ij", weights / weights.sum(), errors, errors)
+        trust = min(1.0, max(best.support, 0.1) / TYPICAL) ** 4  # what hides a part may have pulled the rest along
+        return np.asarray(region.covariance(self._shape, best.level, best.T, prior) / trust + apart, np.float64)
 
 
 FRAME_WIDTHS = (8.0, 6.0, 5.0, 5.0, 5.0)

@@ -47,6 +47,9 @@ BAND_PX, MASK_ODDS = 4.0, 1.5
 """How far a mask's boundary may be off [px of the image], and the log-odds of what lies further inside or outside."""
 RING = 0.35
 """Width of the ring around the silhouette in which the outer colours are learned, as a share of its size."""
+ROBUST = (0.7, 0.25)
+"""Offset beyond which a line counts less and less, as a share of its reach: in a search, and near a prediction, where larger ones
+are those of things that hide the object."""
 SPACING = 2.0
 """Distance of the lines along the contour [px]."""
 TEMPERATURE = 3.0
@@ -69,7 +72,7 @@ BESIDE = 2.5
 """Distance from the contour at which the colours on both sides are compared [px of the small picture]."""
 BY_EDGE, BY_COLOUR = 0.15, 0.04
 """Weights of the log-likelihood of edges and of the log-odds of colours for each pixel of a contour that is shifted."""
-FIRST, KEPT = 14, (7, 4, 3)
+FIRST, KEPT = 12, (6, 4, 3)
 """Number of hypotheses that are followed at first, and after each stage."""
 SAME_START = (0.012, 0.2)
 """Shifted hypotheses nearer than this [m, rad] are one."""
@@ -194,7 +197,7 @@ class Window:
         odds = table[self.plain(factor // n).bins[: h * n, : w * n]]
         if n > 1:
             odds = np.asarray(cv2.resize(odds, (w, h), interpolation=cv2.INTER_AREA), np.float32)
-        return Level(odds if at.prior is None else odds + at.prior, at.gradient, at.guarded, at.k, factor)
+        return Level(odds if at.prior is None else odds + at.prior, at.gradient, at.guarded, at.k, factor * self.scale)
 
     def table(self, inside: Floats, outside: Floats) -> Floats:
         """Log-odds (BINS^3,) of the colours that pixels of these weights (h, w) show, in the size for learning."""
@@ -410,11 +413,20 @@ def information(found: list[tuple[Lines, bool]], at: Level, T: Array, width: flo
     return _marginal(H, g)
 
 
-def descend(shape: Shape, model: Model, at: Level, T: Array, prior: Prior, reaches: tuple[int, ...], creases: bool) -> Array:
+def descend(
+    shape: Shape,
+    model: Model,
+    at: Level,
+    T: Array,
+    prior: Prior,
+    reaches: tuple[int, ...],
+    creases: bool,
+    robust: float = ROBUST[0],
+) -> Array:
     """Steps of least squares, one for each length of the lines in `reaches` [px], with or without creases."""
     for reach in reaches:
         found = [(lines(shape, model, at, T, reach, inside), inside) for inside in ((False, True) if creases else (False,))]
-        H, g = information(found, at, T, 0.7 * reach)
+        H, g = information(found, at, T, robust * reach)
         H += prior.information
         H[_DIAGONAL] *= 1.0 + basin.DAMPING
         step = np.linalg.solve(H, g + prior.information @ rigid.pose_error(prior.T, T))
@@ -595,7 +607,7 @@ def distinct(poses: list[Array], same: tuple[float, float], most: int) -> list[A
 def follow(shape: Shape, window: Window, table: Floats, prior: Prior) -> Found:
     """The pose near a prediction, by the log-odds (BINS^3,) of colours that are known."""
     small, large = window.factors[max(len(window.factors) - 2, 0)], window.factors[-1]
-    T = descend(shape, shape.coarse, window.level(small, table), prior.T, prior, (7, 6), small == large)
+    T = descend(shape, shape.coarse, window.level(small, table), prior.T, prior, (7, 6), small == large, ROBUST[1])
     at = window.level(large, table)
-    T = descend(shape, shape.fine, at, T, prior, (5, 4), True)
+    T = descend(shape, shape.fine, at, T, prior, (5, 4), True, ROBUST[1])
     return scored(shape, shape.fine, at, T, prior, True)

@@ -20,7 +20,7 @@ from penumbra.services.search.objects.pose import RigidObject, Tracker, find_pos
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster
 from penumbra.shared.geometry.lens import Lens
-from penumbra.shared.geometry.rigid import apply, from_rpy, perturb, pose_error
+from penumbra.shared.geometry.rigid import apply, from_rpy, inverse, perturb, pose_error
 from penumbra.sim.picture.distortion import Distortion
 from penumbra.tests.bench import objects as bench
 from penumbra.tests.bench.objects import CONVERGED, HEIGHT, WIDTH, K, Thing, errors, moved, scene, spoiled, thing
@@ -210,7 +210,7 @@ def test_a_picture_alone_gives_the_pose_from_far_starts(drill, rigid):
         T, _ = scene(drill, (79, seed), EXACT)
         picture = photographed(drill, T, seed)
         found = find_pose(rigid, None, K, moved(T, 20.0, 0.03, np.random.default_rng(seed)), picture=picture)
-        assert errors(drill, found.T, T).add < 0.03
+        assert errors(drill, found.T, T).add < CONVERGED / 2
         assert nees(found, T) < 22.5
 
 
@@ -243,10 +243,10 @@ def test_the_creases_of_a_box_are_its_edges_between_two_visible_sides():
     creases = Creases(Model(Mesh(np.asarray(box.vertices, float), np.asarray(box.faces, np.int32), np.zeros(12, np.uint8))))
     T = from_rpy((0.0, 0.0, 1.0), (0.6, 0.5, 0.0))
     points = creases.points(T, K, (HEIGHT, WIDTH), 2.0)
-    inside = apply(np.linalg.inv(T), points["position"])
+    inside = apply(inverse(T), points["position"])
     assert (np.sort(np.abs(inside), axis=1)[:, 1:] > 0.0999).all()  # on an edge: two coordinates are at their ends
     nearest = min(apply(T, box.vertices), key=lambda corner: float(np.linalg.norm(corner)))
-    corner = apply(np.linalg.inv(T), nearest[None])[0]
+    corner = apply(inverse(T), nearest[None])[0]
     assert ((np.abs(inside - corner) < 1e-6).sum(axis=1) >= 2).all()  # the three that meet in the corner towards the camera
     assert 200 < points["length"].sum() < 600
 
