@@ -220,21 +220,25 @@ class _Colours:
             if mask is not None:
                 seen = mask if occluder is None else mask & ~occluder
                 overlap = int(np.count_nonzero(seen & free)) / max(int(np.count_nonzero(seen | free)), 1)
-        T, covariance = best.T, self._covariance(found, prior)
+        T, covariance = self._posterior(found, prior)
         if best.support < SUPPORTED[0] or (mask is not None and overlap < FITS) or best.length < basin.NOISE.correlation:
             return _lost(T, overlap)
         if best.support < SUPPORTED[1] or self._rigid.error(covariance, T) > CERTAIN * self._rigid.diameter:
             return ObjectEstimate(T, covariance, overlap, "doubtful")
         return ObjectEstimate(T, covariance, overlap, "occluded" if covered > COVERS else "tracking")
 
-    def _covariance(self, found: list[region.Found], prior: Prior) -> Array:
-        """The covariance of the best pose, with the other poses by their likelihood."""
+    def _posterior(self, found: list[region.Found], prior: Prior) -> tuple[Array, Array]:
+        """The best pose with the prior, by how exact contours are, and its covariance, with the other poses by likelihood."""
         best = found[0]
+        trust = min(1.0, max(best.support, 0.1) / TYPICAL) ** 4  # what hides a part may have pulled the rest along
+        measured = region.covariance(self._shape, best.level, best.T) / trust
+        gain = measured @ np.linalg.inv(measured + np.linalg.inv(prior.information))
+        T = perturb(best.T, gain @ pose_error(prior.T, best.T))
+        covariance = measured - gain @ measured
         weights = np.exp([one.score - best.score for one in found])
         errors = np.array([pose_error(one.T, best.T) for one in found])
         apart = np.einsum("n,ni,nj->ij", weights / weights.sum(), errors, errors)
-        trust = min(1.0, max(best.support, 0.1) / TYPICAL) ** 4  # what hides a part may have pulled the rest along
-        return np.asarray(region.covariance(self._shape, best.level, best.T, prior) / trust + apart, np.float64)
+        return T, np.asarray((covariance + covariance.T) / 2.0 + apart, np.float64)
 
 
 FRAME_WIDTHS = (8.0, 6.0, 5.0, 5.0, 5.0)
@@ -264,6 +268,7 @@ class Tracker:
         self._growth = np.diag(np.repeat(np.square(UNKNOWN) * dt_s**2, 3))
         self._T = T_start @ rigid.T_object_middle
         self._covariance = np.diag(np.repeat(np.square(spread), 3))
+        self._weak = np.asarray(np.linalg.inv(self._covariance), np.float64)
         self._velocity, self._usual = np.zeros(6), 0.0
         self._colours = _Colours(rigid, k)
         self._table: NDArray[np.float32] | None = None  # log-odds of the colours
@@ -311,7 +316,9 @@ class Tracker:
             window = region.Window(picture, mask, occluder, self._k, shape, prior.T, 0.0)
             one = region.follow(shape, window, self._table, prior)
             if one.support > max(SUPPORTED[1], self._usual_support - DROP):
-                found = self._colours.judged([one], prior, mask, occluder, picture.shape[:2])
+                # the errors of the contour are the same in all frames: the last pose adds nothing
+                alone = Prior(one.T, self._weak)
+                found = self._colours.judged([one], alone, mask, occluder, picture.shape[:2])
                 if found.state == "tracking":  # else it may be something else that is seen
                     self._usual_support += SMOOTHING * (one.support - self._usual_support)
                     newest = window.of_pose(shape.coarse, one.T, GAP)

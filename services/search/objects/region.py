@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from penumbra.services.search.contour import DROPPED, MEASURED, NEAR, POINT, Model
 from penumbra.services.search.evidence import GUARD_PX, Intrinsics
+from penumbra.services.search.mask_fit import Limits
 from penumbra.services.search.objects import basin
 from penumbra.services.search.objects.basin import Contour, Prior, Shape
 from penumbra.services.search.settings import ONE_IN_10_000
@@ -439,8 +440,8 @@ def descend(
 _DIAGONAL = np.diag_indices(6)
 
 
-def covariance(shape: Shape, at: Level, T: Array, prior: Prior) -> Array:
-    """The covariance (6, 6) of a pose by contour, creases and prior, with the errors of the whole contour (WAVES), of the mesh's
+def covariance(shape: Shape, at: Level, T: Array) -> Array:
+    """The covariance (6, 6) of a pose by contour and creases alone, with the errors of the whole contour (WAVES), of the mesh's
     scale (SCALE) and of what rotations it shows (LEVER)."""
     H, g, n = np.zeros((7, 7)), np.zeros((7, 4 * len(WAVES))), 2 * len(WAVES)
     turns = np.arange(1, len(WAVES) + 1)
@@ -458,8 +459,9 @@ def covariance(shape: Shape, at: Level, T: Array, prior: Prior) -> Array:
     scale = np.repeat([1.0, 1.0 / shape.size], 3)
     values, vectors = np.linalg.eigh(np.outer(scale, scale) * (H - np.diag(np.repeat([0.0, lever2], 3))))
     believed = (vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scale, scale)
-    P = np.linalg.inv(believed + prior.information)
-    bent = P @ believed @ np.linalg.solve(H + prior.information, bent)
+    weak = Limits().information
+    P = np.linalg.inv(believed + weak)
+    bent = P @ believed @ np.linalg.solve(H + weak, bent)
     farther = np.concatenate([SCALE * T[:3, 3], np.zeros(3)])  # a larger object further away looks the same
     return np.asarray(P + bent @ bent.T + np.outer(farther, farther), np.float64)
 
