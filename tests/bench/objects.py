@@ -1,4 +1,5 @@
-"""`penumbra bench objects`: `search refine` on household objects, from bad starts and on masks as networks make them."""
+"""`penumbra bench objects`: `search refine` on household objects, from bad starts and on masks as networks make them; with
+--cases on photographs, and `search track` on films."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,25 +20,24 @@ from scipy.spatial import cKDTree
 
 from penumbra.services import flags
 from penumbra.services.search.evidence import Intrinsics
+from penumbra.services.search.objects.meshes import ObjectFileError
 from penumbra.services.search.objects.pose import RigidObject, find_pose
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster
-from penumbra.shared.geometry.rigid import Array, apply, from_rpy, perturb, pose_error, transform
-from penumbra.tests.bench.lib import results
+from penumbra.shared.geometry.rigid import Array, apply, from_rpy, pose_error, transform
+from penumbra.tests.bench.lib import object_cases, results
+from penumbra.tests.bench.lib.object_cases import CONVERGED, STARTS, SURE, moved
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
 Bool = NDArray[np.bool_]
 
 WIDTH, HEIGHT = 640, 480
 K = Intrinsics(572.4, 573.6, 325.3, 242.0)
-STARTS = ((20.0, 0.03), (30.0, 0.05))
-"""Rotation [deg] and distance [m] of the starts from the truth, each exactly, in random directions."""
 GOALS = {20.0: 0.97, 30.0: 0.85}
+WRONG, RECOVERY = 0.01, 5
+"""Goals: share of poses that say "tracking" and are wrong, and frames until a lost object is found again."""
 MASKS = {"exact": (1.0, 1.0), "0.86": (0.83, 0.89)}
 """Range of the masks' IoU with the truth."""
-CONVERGED = 0.1
-"""A pose has converged whose mean distance of the mesh's points from the true pose's is below this share of the diameter (ADD;
-for a symmetric object the distance to the nearest point, ADD-S: Hinterstoisser et al. 2012, doi:10.1007/978-3-642-37331-2_42)."""
 
 
 # --- objects ----------------------------------------------------------------------------------------------------------------
@@ -326,13 +327,6 @@ def drawn_pose(rng: np.random.Generator) -> Array:
     return transform(((centre[0] - K.cx) / K.fx * z, (centre[1] - K.cy) / K.fy * z, z), q / np.linalg.norm(q))
 
 
-def moved(T: Array, degrees: float, metres: float, rng: np.random.Generator) -> Array:
-    """The pose beside T: turned and shifted by exactly this, in random directions."""
-    axis, way = rng.normal(size=3), rng.normal(size=3)
-    error = np.concatenate([metres * way / np.linalg.norm(way), np.radians(degrees) * axis / np.linalg.norm(axis)])
-    return perturb(T, error)
-
-
 @dataclass(frozen=True)
 class Errors:
     """`add`: share of the diameter; `rotation` [rad] modulo the object's symmetry; `position` (3,) [m]; `nearest` true pose."""
@@ -382,8 +376,8 @@ def measure(name: str, seed: int, count: int) -> list[dict[str, Any]]:
                 error = errors(one, result.T, T_true)
                 e = pose_error(error.nearest, result.T)
                 nees, centimetres = float(e @ np.linalg.solve(result.covariance, e)), np.linalg.norm(e[:3]) * 100
-                found.append((error.add, np.degrees(error.rotation), centimetres, nees, result.state == "lost", ms))
-            add, rotation, position, nees_all, lost, ms_all = np.array(found, float).T
+                found.append((error.add, np.degrees(error.rotation), centimetres, nees, result.state in SURE, ms))
+            add, rotation, position, nees_all, sure, ms_all = np.array(found, float).T
             rows.append(
                 {
                     "object": name,
@@ -401,7 +395,7 @@ def measure(name: str, seed: int, count: int) -> list[dict[str, Any]]:
                     "within_5_cm": round(float((position < 5.0).mean()), 3),
                     "nees_median": round(float(np.median(nees_all)), 2),
                     "nees_mean": round(float(np.mean(nees_all)), 2),
-                    "wrong_but_tracking": round(float(((add >= CONVERGED) & (lost == 0)).mean()), 3),
+                    "wrong_but_tracking": round(float(((add >= CONVERGED) & (sure == 1)).mean()), 3),
                     "ms_median": round(float(np.median(ms_all)), 1),
                 }
             )
@@ -409,7 +403,9 @@ def measure(name: str, seed: int, count: int) -> list[dict[str, Any]]:
 
 
 def tables(result: Result) -> list[Part]:
-    """A row for each object, mask and start, and for all objects."""
+    """A row for each object, mask and start, and for all objects; of photographs a row for each case, and for all."""
+    if "cases" in result:
+        return [_cases_table(result), _sequences_table(result)]
     title = f"search refine, seed {result['seed']}: share converged (ADD below {CONVERGED:.0%} of the diameter), median errors"
     table = Table("object", "mask", "start", "converged", "goal", "< 10 deg", "ADD", "deg", "cm", "NEES", "ms", title=title)
     keys = ("within_10_deg", "add_median", "rotation_deg_median", "position_cm_median", "nees_median")
@@ -435,6 +431,47 @@ def averages(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
+def _cases_table(result: Result) -> Table:
+    title = f"search refine on photographs, seed {result['seed']}: shares of {result['starts']} starts, median error"
+    table = Table("case", "with", "start", "converged", "goal", "tracking", "wrong but tracking", "error", "ms", title=title)
+    for row in [*result["cases"], *overall(result["cases"])]:
+        goal = GOALS[row["start"][0]]
+        table.add_row(
+            row["name"],
+            row["with"],
+            f"{row['start'][0]:.0f}°, {row['start'][1] * 100:.0f} cm",
+            marked(f"{row['converged']:.2f}", row["converged"] >= goal),
+            f">= {goal:.2f}",
+            f"{row['tracking']:.2f}",
+            marked(f"{row['wrong_but_tracking']:.3f}", row["wrong_but_tracking"] <= WRONG),
+            f"{row['error_of_diameter']:.3f}",
+            f"{row['ms']:.0f}",
+        )
+    return table
+
+
+def _sequences_table(result: Result) -> Table:
+    title = f"search track on films, picture alone, seed {result['seed']}"
+    table = Table("sequence", "frames", "right", "wrong but tracking", "frames to recover", "ms", "median ms", title=title)
+    for row in result["sequences"]:
+        wrong = marked(f"{row['wrong_but_tracking']:.3f}", row["wrong_but_tracking"] <= WRONG)
+        recovery = marked(str(row["recovery_frames"]), row["recovery_frames"] <= RECOVERY)
+        times = f"{row['ms']:.0f}", f"{row['ms_median']:.0f}"
+        table.add_row(row["name"], str(row["frames"]), f"{row['right']:.2f}", wrong, recovery, *times)
+    return table
+
+
+def overall(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The means of the rows of all cases, by what was given and start."""
+    out = []
+    for given, start in dict.fromkeys((row["with"], tuple(row["start"])) for row in rows):
+        some = [row for row in rows if row["with"] == given and tuple(row["start"]) == start]
+        keys = [key for key, value in some[0].items() if isinstance(value, float)]
+        mean = {key: round(float(np.mean([row[key] for row in some])), 4) for key in keys}
+        out.append({"name": "all", "with": given, "start": list(start), **mean})
+    return out
+
+
 @results.benchmark(
     "objects",
     __doc__ or "",
@@ -442,14 +479,34 @@ def averages(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     flags.Option("--seed", type=int, default=1, help="draws poses, masks and starts"),
     flags.Option("--starts", type=flags.positive, default=30, help="of each object, mask and distance"),
     flags.Option("--objects", choices=MAKERS, takes="many", default=list(MAKERS), metavar="NAME", help=", ".join(MAKERS)),
+    flags.Option("--cases", type=Path, metavar="FOLDER", help="photographs with true poses, a folder each: see object_cases.py"),
     example="penumbra bench objects --json objects.json",
 )
-def main(options: flags.Options, report: results.Report) -> None:
+def main(options: flags.Options, report: results.Report) -> int | None:
+    if options.cases is not None:
+        return _main_cases(options, report)
     rows: list[dict[str, Any]] = []
     for name in track(options.objects, description="objects", disable=not sys.stderr.isatty()):
         rows += measure(name, options.seed, options.starts)
     rows += averages(rows)
     report.save({"seed": options.seed, "rows": rows})
+    return None
+
+
+def _main_cases(options: flags.Options, report: results.Report) -> int | None:
+    try:
+        found = object_cases.cases(options.cases)
+    except ObjectFileError as error:
+        print(f"penumbra bench objects: {error}", file=sys.stderr)
+        return 2
+    rows: list[dict[str, Any]] = []
+    sequences: list[dict[str, Any]] = []
+    for case in track(found, description="cases", disable=not sys.stderr.isatty()):
+        rows += object_cases.refined(case, options.seed, options.starts)
+        if case.frames:
+            sequences.append(object_cases.tracked(case, options.seed, options.starts))
+        report.save({"seed": options.seed, "starts": options.starts, "cases": rows, "sequences": sequences})
+    return None
 
 
 if __name__ == "__main__":

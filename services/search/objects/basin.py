@@ -22,6 +22,7 @@ from penumbra.services.search import evidence
 from penumbra.services.search.contour import DROPPED, NEAR, Model, Points
 from penumbra.services.search.evidence import COVERED, FREE, TARGET, Evidence, Intrinsics
 from penumbra.services.search.mask_fit import Noise
+from penumbra.services.search.objects.creases import Creases
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
@@ -56,10 +57,16 @@ MAX_STEP = np.array([0.08, 0.08, 0.15, 0.3, 0.3, 0.3])
 
 @dataclass(frozen=True)
 class Shape:
-    """An object about its own middle: with few triangles for the small picture, and with all."""
+    """An object about its own middle: with few triangles for the small picture, and with all; and its creases."""
 
     coarse: Model
     fine: Model
+    creases: Creases
+
+    @property
+    def size(self) -> float:
+        """Length of the bounding box's diagonal [m]."""
+        return float(np.linalg.norm(np.ptp(self.coarse.vertices, axis=0)))
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""One pose of any rigid mesh on any mask (`find_pose`), and a sequence of them (`Tracker`).
+"""One pose of any rigid mesh on any mask or picture (`find_pose`), and a sequence of them (`Tracker`).
 
 The start counts as a weak measurement beside the mask: a mask that is a few per cent too large says less about the depth than a
-start that is a few centimetres off. The covariance is that of both together. The mask's noise is measured on the
-mask itself, by how far the contour stays away from its boundary.
+start that is a few centimetres off. The covariance is that of both together. Of a mask alone its noise is measured on the mask
+itself, by how far the contour stays away from its boundary; where there is a picture, the picture decides (`region`).
 """
 
 from __future__ import annotations
@@ -11,22 +11,21 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search import image_fit as colours
-from penumbra.services.search.contour import MEASURED, Model
+from penumbra.services.search.contour import MEASURED, NEAR, Model
 from penumbra.services.search.evidence import COVERED, FREE, TARGET, Intrinsics
-from penumbra.services.search.mask_fit import Fit, Limits, Noise
-from penumbra.services.search.objects import basin, meshes
+from penumbra.services.search.mask_fit import Limits, Noise
+from penumbra.services.search.objects import basin, meshes, region
 from penumbra.services.search.objects.basin import Level, Prior, Pyramid, Score, Shape
+from penumbra.services.search.objects.creases import Creases
 from penumbra.services.search.settings import ONE_IN_10_000
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry.rigid import Array, inverse, perturb, pose_error, transform
 
 Bool = NDArray[np.bool_]
-State = Literal["tracking", "occluded", "lost"]
+State = Literal["tracking", "occluded", "doubtful", "lost"]
 
 FACES = (800, 4000)
 """Number of triangles that a mesh is simplified to, for small and for full pictures: finer ones are smaller than a pixel."""
@@ -54,8 +53,17 @@ class RigidObject:
         self.T_object_middle = transform((low + high) / 2.0)
         self.T_middle_object = inverse(self.T_object_middle)
         mesh = Mesh(mesh.vertices - (low + high) / 2.0, mesh.faces, mesh.labels)
-        self.shape = Shape(Model(meshes.repaired(mesh, FACES[0])), Model(mesh))
+        coarse = Model(meshes.repaired(mesh, FACES[0]))
+        self.shape = Shape(coarse, Model(mesh), Creases(coarse))
         self.diameter = float(np.linalg.norm(high - low))
+        self._moments = mesh.vertices.T @ mesh.vertices / len(mesh.vertices)
+
+    def error(self, covariance: Array, T: Array) -> float:
+        """Root mean square error [m] of the mesh's points by a covariance (6, 6) of T_camera_middle."""
+        S = T[:3, :3] @ self._moments @ T[:3, :3].T
+        # a rotation vector w moves a point x by w x x: E |w x x|^2 = tr(W (tr(S) 1 - S)), and the middle is at no mean of x
+        turned = float(np.trace(covariance[3:, 3:] @ (np.trace(S) * np.eye(3) - S)))
+        return math.sqrt(float(np.trace(covariance[:3, :3])) + turned)
 
     def published(self, found: ObjectEstimate) -> ObjectEstimate:
         """An estimate of the middle's pose, T_camera_middle, as one of the object's own frame."""
@@ -68,7 +76,11 @@ class RigidObject:
 
 @dataclass(frozen=True)
 class ObjectEstimate:
-    """T_camera_object, covariance (6, 6) along the camera's axes, overlap in [0, 1] and state."""
+    """T_camera_object, covariance (6, 6) along the camera's axes, overlap in [0, 1] and state.
+
+    The overlap is that of mask and silhouette, without a mask the share of the visible contour that lies on an edge. Doubtful:
+    the most probable pose, that may be off by more than a tenth of the object, as the covariance says.
+    """
 
     T: Array
     covariance: Array
@@ -91,28 +103,31 @@ def started(rigid: RigidObject, T_start: Array, spread: tuple[float, float] = ST
 
 def find_pose(
     rigid: RigidObject,
-    mask: Bool,
+    mask: Bool | None,
     k: Intrinsics,
     T_start: Array,
     occluder: Bool | None = None,
     picture: NDArray[np.uint8] | None = None,
     spread: tuple[float, float] = START,
 ) -> ObjectEstimate:
-    """The pose of an object in a mask (h, w), from a start T_camera_object (4 x 4) that may be 30 degrees and 5 cm off.
+    """The pose of an object in a mask (h, w), in a picture (h, w, 3) uint8 RGB or in both, from a start T_camera_object (4 x 4)
+    that may be 30 degrees and 5 cm off. Raises ValueError where neither is given.
 
-    `occluder` (h, w): pixels that show something in front of the object; `picture` (h, w, 3) uint8 RGB: the image that the mask
-    is of, on which the pose is refined; `spread`: standard deviations [m, rad] of the start along and about each axis.
+    `occluder` (h, w): pixels that show something in front of the object; `spread`: standard deviations [m, rad] of the start
+    along and about each axis.
     """
-    state, prior = observed(mask, occluder), started(rigid, T_start, spread)
-    if np.count_nonzero(state == TARGET) < SMALLEST_PX:
+    prior = started(rigid, T_start, spread)
+    if mask is not None and np.count_nonzero(mask if occluder is None else mask & ~occluder) < SMALLEST_PX:
         return rigid.published(_lost(prior.T))
-    masks = basin.pyramid(state, k)
-    return rigid.published(judged(rigid.shape, masks, basin.search(rigid.shape, masks, prior), prior, picture))
+    if picture is not None:
+        return rigid.published(_Colours(rigid, k).search(picture, mask, occluder, prior)[0])
+    if mask is None:
+        raise ValueError("find_pose: expected a mask, a picture or both, got neither")
+    masks = basin.pyramid(observed(mask, occluder), k)
+    return rigid.published(judged(rigid.shape, masks, basin.search(rigid.shape, masks, prior), prior))
 
 
-def judged(
-    shape: Shape, masks: Pyramid, found: list[tuple[Score, Array]], prior: Prior, picture: NDArray[np.uint8] | None = None
-) -> ObjectEstimate:
+def judged(shape: Shape, masks: Pyramid, found: list[tuple[Score, Array]], prior: Prior) -> ObjectEstimate:
     """The estimate of the middle's pose, T_camera_middle, from those that `basin` found, best first."""
     model, at = shape.fine, masks.fine
     noise = measured_noise(model, at, found[0][1])
@@ -128,8 +143,6 @@ def judged(
     errors = [pose_error(other, T) for _, other in found]
     apart = sum((w * np.outer(e, e) for w, e in zip(weights, errors, strict=True)), np.zeros((6, 6)))
     covariance = covariance + apart / weights.sum()
-    if picture is not None:
-        T, covariance = _on_picture(shape, masks, T, covariance, best, noise, picture)
     if prior.cost(T) > ONE_IN_10_000:  # nothing that the start allows explains the mask
         return _lost(T, best.overlap)
     state = _state(best, contour.points["length"][contour.kind == MEASURED].sum() * at.scale)
@@ -148,29 +161,6 @@ def measured_noise(model: Model, at: Level, T: Array) -> Noise:
     return Noise(edge, max(14.0, CORRELATION * edge), DILATION * edge)
 
 
-def _on_picture(
-    shape: Shape, masks: Pyramid, T: Array, covariance: Array, best: Score, noise: Noise, picture: NDArray[np.uint8]
-) -> tuple[Array, Array]:
-    """The pose and covariance with what the colours on both sides of the contour say, on the small picture and then on the full
-    one; unchanged where they say nothing, or what the mask contradicts."""
-    prior = np.asarray(np.linalg.inv(covariance), np.float64)
-    found = Fit(T, covariance, T, 0.0, math.inf, 0.0, best.cost, 0.0, best.both, best.either, best.either - best.both)
-    for model, at in ((shape.coarse, masks.coarse), (shape.fine, masks.fine)):
-        (h, w), e = at.shape, at.evidence
-        window = picture[e.y0 : e.y0 + h * e.scale, e.x0 : e.x0 + w * e.scale]
-        small = np.asarray(cv2.resize(window, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
-        settings = colours.ImageSettings(mask=max(noise.edge / at.scale, 0.8))
-        found = colours.fit_image(model, found, small, replace(e, x0=0, y0=0, scale=1), T, prior, settings)
-    error = pose_error(found.T_searched, T)
-    if found.length < SHORTEST * masks.fine.evidence.boundary_px or error @ prior @ error > ONE_IN_10_000:
-        return T, covariance
-    return found.T_searched, np.asarray(np.linalg.inv(np.linalg.inv(found.covariance) + prior), np.float64)
-
-
-SHORTEST = 0.4
-"""Share of the mask's boundary along which the picture has to show an edge."""
-
-
 def _state(best: Score, length: float) -> State:
     if best.overlap < FITS or length < basin.NOISE.correlation or best.both < SMALLEST_PX / 4:
         return "lost"
@@ -181,12 +171,84 @@ def _lost(T: Array, overlap: float = 0.0) -> ObjectEstimate:
     return ObjectEstimate(T, Limits().covariance, overlap, "lost")
 
 
+GAP = 0.015
+"""Distance from a good pose's contour within which no colours are learned, as a share of the object's size."""
+MARGIN = 2.0
+"""How far from the start an object is looked for in a picture, in standard deviations of its position."""
+SUPPORTED = (0.35, 0.65)
+"""Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful: on photographs right poses
+have 0.7 to 1 where nothing hides the object, and of those far off few have more than 0.6."""
+TYPICAL = 0.85
+"""Share of the contour that lies on edges from which the covariance is that of the settings; below, it grows with its fourth
+power."""
+CERTAIN = 0.06
+"""Root mean square error of the mesh's points by the covariance, as a share of the diameter, above which a pose is doubtful: one
+in ten is then off by more than a tenth, if the error is mostly of one direction, as that of the depth."""
+
+
+class _Colours:
+    """Judges poses of an object by pictures of a camera with intrinsics k."""
+
+    def __init__(self, rigid: RigidObject, k: Intrinsics):
+        self._rigid, self._shape, self._k = rigid, rigid.shape, k
+
+    def search(
+        self, picture: NDArray[np.uint8], mask: Bool | None, occluder: Bool | None, prior: Prior
+    ) -> tuple[ObjectEstimate, NDArray[np.float32] | None]:
+        """The estimate of T_camera_middle from far, and the log-odds of the colours there, None where edges hardly support it."""
+        reach = MARGIN * float(np.sqrt(1.0 / prior.information[0, 0]))
+        window = region.Window(
+            picture, mask, occluder, self._k, self._shape, prior.T, reach * self._k.fx / max(prior.T[2, 3], NEAR)
+        )
+        found = region.search(self._shape, window, prior, reach)
+        if not found:
+            return _lost(prior.T), None
+        table = window.of_pose(self._shape.coarse, found[0].T, GAP) if found[0].support > SUPPORTED[1] else None
+        return self.judged(found, prior, mask, occluder, picture.shape[:2]), table
+
+    def judged(
+        self, found: list[region.Found], prior: Prior, mask: Bool | None, occluder: Bool | None, shape: tuple[int, int]
+    ) -> ObjectEstimate:
+        """The estimate of T_camera_middle from poses in a picture (h, w), best first."""
+        best = found[0]
+        overlap, covered = best.support, 0.0
+        if mask is not None or occluder is not None:
+            h, w = shape
+            silhouette = self._shape.fine.silhouette(best.T, self._k, (0, 0, w, h))
+            free = silhouette if occluder is None else silhouette & ~occluder
+            covered = 1.0 - int(np.count_nonzero(free)) / max(int(np.count_nonzero(silhouette)), 1)
+            if mask is not None:
+                seen = mask if occluder is None else mask & ~occluder
+                overlap = int(np.count_nonzero(seen & free)) / max(int(np.count_nonzero(seen | free)), 1)
+        T, covariance = self._posterior(found, prior)
+        if best.support < SUPPORTED[0] or (mask is not None and overlap < FITS) or best.length < basin.NOISE.correlation:
+            return _lost(T, overlap)
+        if best.support < SUPPORTED[1] or self._rigid.error(covariance, T) > CERTAIN * self._rigid.diameter:
+            return ObjectEstimate(T, covariance, overlap, "doubtful")
+        return ObjectEstimate(T, covariance, overlap, "occluded" if covered > COVERS else "tracking")
+
+    def _posterior(self, found: list[region.Found], prior: Prior) -> tuple[Array, Array]:
+        """The best pose with the prior, by how exact contours are, and its covariance, with the other poses by likelihood."""
+        best = found[0]
+        trust = min(1.0, max(best.support, 0.1) / TYPICAL) ** 4  # what hides a part may have pulled the rest along
+        measured = region.covariance(self._shape, best.level, best.T) / trust
+        gain = measured @ np.linalg.inv(measured + np.linalg.inv(prior.information))
+        T = perturb(best.T, gain @ pose_error(prior.T, best.T))
+        covariance = measured - gain @ measured
+        weights = np.exp([one.score - best.score for one in found])
+        errors = np.array([pose_error(one.T, best.T) for one in found])
+        apart = np.einsum("n,ni,nj->ij", weights / weights.sum(), errors, errors)
+        return T, np.asarray((covariance + covariance.T) / 2.0 + apart, np.float64)
+
+
 FRAME_WIDTHS = (8.0, 6.0, 5.0, 5.0, 5.0)
 """Widths [px] of the steps from the prediction, see `basin.descend`."""
 DROP = 0.12
 """Decrease of the overlap, against its usual value, from which the surroundings are searched too."""
 SMOOTHING = 0.3
 """Weight of the newest frame in the smoothed velocity."""
+LEARNING = 0.1
+"""Weight of the newest frame in the colours."""
 UNKNOWN = (0.6, 3.0)
 """Standard deviations of the change of velocity, [m/s] and [rad/s]; the pose's grow by them with the time bridged."""
 LONGEST_S = 0.3
@@ -194,7 +256,7 @@ LONGEST_S = 0.3
 
 
 class Tracker:
-    """A rigid object in a sequence of masks: each pose starts from the last one, moved on at constant velocity.
+    """A rigid object in a sequence of masks or pictures: each pose starts from the last one, moved on at constant velocity.
 
     T_start (4 x 4): T_camera_object before the first frame, known to `spread` [m, rad]; `dt_s`: time between frames.
     """
@@ -206,19 +268,30 @@ class Tracker:
         self._growth = np.diag(np.repeat(np.square(UNKNOWN) * dt_s**2, 3))
         self._T = T_start @ rigid.T_object_middle
         self._covariance = np.diag(np.repeat(np.square(spread), 3))
+        self._weak = np.asarray(np.linalg.inv(self._covariance), np.float64)
         self._velocity, self._usual = np.zeros(6), 0.0
+        self._colours = _Colours(rigid, k)
+        self._table: NDArray[np.float32] | None = None  # log-odds of the colours
+        self._usual_support = 0.0
         self._missed = -1  # frames since the last pose; there was none before the start
 
-    def update(self, mask: Bool, occluder: Bool | None = None, picture: NDArray[np.uint8] | None = None) -> ObjectEstimate:
+    def update(self, mask: Bool | None, occluder: Bool | None = None, picture: NDArray[np.uint8] | None = None) -> ObjectEstimate:
         """The pose in the next frame; arguments as of `find_pose`. Lost, the pose is the last one and the covariance wide."""
-        state = observed(mask, occluder)
+        if mask is None and picture is None:
+            raise ValueError("Tracker.update: expected a mask, a picture or both, got neither")
         T = perturb(self._T, self._velocity * self._dt)
         bridged = min(1.0 + self._missed, max(LONGEST_S / self._dt, 1.0))
         covariance = self._covariance + bridged**2 * self._growth
         prior = Prior(T, np.asarray(np.linalg.inv(covariance), np.float64))
-        found = self._look(state, prior, picture)
+        if mask is not None and np.count_nonzero(mask if occluder is None else mask & ~occluder) < SMALLEST_PX:
+            found = None
+        elif picture is not None:
+            found = self._look_at_picture(picture, mask, occluder, prior)
+        else:
+            assert mask is not None
+            found = self._look(observed(mask, occluder), prior)
         if found is None or found.state == "lost":
-            return self._miss(state, found)
+            return self._miss(found, occluder)
         if self._missed == 0:
             moved = pose_error(found.T, self._T) / self._dt
             self._velocity = self._velocity + SMOOTHING * (moved - self._velocity)
@@ -226,24 +299,46 @@ class Tracker:
         self._T, self._covariance, self._missed = found.T, found.covariance, 0
         return self._rigid.published(found)
 
-    def _look(self, state: NDArray[np.uint8], prior: Prior, picture: NDArray[np.uint8] | None) -> ObjectEstimate | None:
-        if np.count_nonzero(state == TARGET) < SMALLEST_PX:
-            return None
+    def _look(self, state: NDArray[np.uint8], prior: Prior) -> ObjectEstimate:
         model, masks = self._rigid.shape.fine, basin.pyramid(state, self._k)
         if self._missed == 0:
             T = basin.descend(self._rigid.shape.coarse, masks.coarse, prior.T, prior, FRAME_WIDTHS)
             near = basin.ranked(model, masks.fine, [T], prior, basin.NOISE)
             if near[0][0].overlap > max(FITS, self._usual - DROP):
-                return judged(self._rigid.shape, masks, near, prior, picture)
-        return judged(self._rigid.shape, masks, basin.search(self._rigid.shape, masks, prior), prior, picture)
+                return judged(self._rigid.shape, masks, near, prior)
+        return judged(self._rigid.shape, masks, basin.search(self._rigid.shape, masks, prior), prior)
 
-    def _miss(self, state: NDArray[np.uint8], found: ObjectEstimate | None) -> ObjectEstimate:
+    def _look_at_picture(
+        self, picture: NDArray[np.uint8], mask: Bool | None, occluder: Bool | None, prior: Prior
+    ) -> ObjectEstimate | None:
+        shape = self._rigid.shape
+        if self._missed == 0 and self._table is not None:
+            window = region.Window(picture, mask, occluder, self._k, shape, prior.T, 0.0)
+            one = region.follow(shape, window, self._table, prior)
+            if one.support > max(SUPPORTED[1], self._usual_support - DROP):
+                # the errors of the contour are the same in all frames: the last pose adds nothing
+                alone = Prior(one.T, self._weak)
+                found = self._colours.judged([one], alone, mask, occluder, picture.shape[:2])
+                if found.state == "tracking":  # else it may be something else that is seen
+                    self._usual_support += SMOOTHING * (one.support - self._usual_support)
+                    newest = window.of_pose(shape.coarse, one.T, GAP)
+                    self._table = self._table + np.float32(LEARNING) * (newest - self._table)
+                return found
+        found, table = self._colours.search(picture, mask, occluder, prior)
+        if found.state == "lost" or table is None:
+            return None
+        self._table, self._usual_support = table, 0.0
+        return found
+
+    def _miss(self, found: ObjectEstimate | None, occluder: Bool | None) -> ObjectEstimate:
         """The object is where it was, as far as is known: covered where something stands there."""
         self._missed = max(self._missed, 0) + 1
         self._velocity = np.zeros(6)
-        h, w = state.shape
-        silhouette = self._rigid.shape.fine.silhouette(self._T, self._k, (0, 0, w, h))
-        drawn = int(np.count_nonzero(silhouette))
-        covered = drawn > 0 and np.count_nonzero(silhouette & (state == COVERED)) > COVERS * drawn
+        covered = False
+        if occluder is not None:
+            h, w = occluder.shape
+            silhouette = self._rigid.shape.fine.silhouette(self._T, self._k, (0, 0, w, h))
+            drawn = int(np.count_nonzero(silhouette))
+            covered = drawn > 0 and bool(np.count_nonzero(silhouette & occluder) > COVERS * drawn)
         lost = ObjectEstimate(self._T, Limits().covariance, found.overlap if found else 0.0, "occluded" if covered else "lost")
         return self._rigid.published(lost)

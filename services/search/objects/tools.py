@@ -40,7 +40,7 @@ FURTHEST = 100.0
 """Largest distance [m] of a start: a larger one is in other units."""
 TIMES = 5.0
 """Largest ratio of the lengths of silhouette and mask at the start: beyond it unit, camera or pose are wrong."""
-COLOURS = {"tracking": (80, 220, 80), "occluded": (60, 180, 250), "lost": (60, 60, 230)}
+COLOURS = {"tracking": (80, 220, 80), "occluded": (60, 180, 250), "doubtful": (60, 220, 250), "lost": (60, 60, 230)}
 """Blue, green, red of a contour in the video."""
 FIELDS = (
     "frame",
@@ -78,32 +78,32 @@ COMMON = (
 
 @flags.command(
     "search refine",
-    "Refines one pose of a rigid mesh on one mask.",
+    "Refines one pose of a rigid mesh on a mask, an image or both.",
     *COMMON,
-    flags.Option("--mask", type=Path, required=True, metavar="PNG", help="not black where the object is seen"),
-    flags.Option("--image", type=Path, metavar="PNG", help="the image that the mask is of: the pose is refined on it"),
+    flags.Option("--mask", type=Path, metavar="PNG", help="not black where the object is seen; its boundary may be 4 px off"),
+    flags.Option("--image", type=Path, metavar="PNG", help="the image that the mask is of; needed where there is no mask"),
     flags.Option("--occluder", type=Path, metavar="PNG", help="not black where something stands in front of the object"),
     flags.JSON,
     example="penumbra search refine --mesh cup.stl --mesh-unit mm --camera camera.json --init start.json --mask mask.png",
 )
 def refine(options: flags.Options) -> int:
-    """One pose on one mask: 0, whatever its state, or 2 for input that is wrong."""
+    """One pose on one mask or image: 0, whatever its state, or 2 for input that is wrong."""
     return _reported("refine", _refine, options)
 
 
 @flags.command(
     "search track",
-    "Tracks a rigid mesh through a sequence of masks.",
+    "Tracks a rigid mesh through a sequence of masks, images or both.",
     *COMMON,
-    flags.Option("--masks", type=Path, required=True, metavar="FOLDER", help="one mask a frame, in the order of their names"),
-    flags.Option("--images", type=Path, metavar="FOLDER", help="the images, of the same names"),
+    flags.Option("--masks", type=Path, metavar="FOLDER", help="one mask a frame, in the order of their names"),
+    flags.Option("--images", type=Path, metavar="FOLDER", help="the images, of the same names; needed where there are no masks"),
     flags.Option("--occluders", type=Path, metavar="FOLDER", help="masks of what stands in front, of the same names"),
     flags.Option("--fps", type=flags.above_zero, default=30.0, help="frames a second of masks and video"),
     flags.Option("--out", type=Path, default=Path("track"), metavar="FOLDER", help="for poses.csv and overlay.mp4"),
     example="penumbra search track --mesh cup.stl --camera camera.json --init start.json --masks masks --out track",
 )
 def track(options: flags.Options) -> int:
-    """The poses of a sequence of masks, as a table and a video; the exit code as of `refine`."""
+    """The poses of a sequence, as a table and a video; the exit code as of `refine`."""
     return _reported("track", _track, options)
 
 
@@ -118,11 +118,15 @@ def _reported(name: str, run: Callable[[flags.Options], None], options: flags.Op
 
 def _refine(options: flags.Options) -> None:
     rigid, files, T = _given(options)
-    k, mask, occluder = files.k, files.mask(options.mask), files.occluder(options.occluder)
-    if not mask.any():
-        raise ObjectFileError(f"{options.mask}: expected pixels that show the object (not black), got black ones only")
-    check_mask(mask, options.mask)
-    check_start(rigid, T, k, mask, occluder, options.init)
+    if options.mask is None and options.image is None:
+        raise ObjectFileError("expected --mask, --image or both, got neither")
+    k, occluder = files.k, files.occluder(options.occluder)
+    mask = None if options.mask is None else files.mask(options.mask)
+    if mask is not None:
+        if not mask.any():
+            raise ObjectFileError(f"{options.mask}: expected pixels that show the object (not black), got black ones only")
+        check_mask(mask, options.mask)
+    check_start(rigid, T, files, mask, occluder, options.init)
     picture = None if options.image is None else files.picture(options.image)
     found = pose.find_pose(rigid, mask, k, T, occluder, picture, options.spread)
     print(json.dumps(as_json(found)) if options.json else as_text(found))
@@ -131,7 +135,10 @@ def _refine(options: flags.Options) -> None:
 def _track(options: flags.Options) -> None:
     rigid, files, T = _given(options)
     k, (height, width) = files.k, files.shape
-    names = frames(options.masks)
+    if options.masks is None and options.images is None:
+        raise ObjectFileError("expected --masks, --images or both, got neither")
+    names = frames(options.masks or options.images)
+    masks = None if options.masks is None else names
     images = None if options.images is None else beside(names, options.images)
     occluders = None if options.occluders is None else beside(names, options.occluders)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -143,15 +150,19 @@ def _track(options: flags.Options) -> None:
             table = csv.writer(file)
             table.writerow(FIELDS)
             for i, name in enumerate(progress(names, description="frames", disable=not sys.stderr.isatty())):
-                mask, occluder = files.mask(name), files.occluder(None if occluders is None else occluders[i])
+                mask, occluder = (
+                    None if masks is None else files.mask(name),
+                    files.occluder(None if occluders is None else occluders[i]),
+                )
                 picture = None if images is None else files.picture(images[i])
-                if i == 0 and mask.any():
-                    check_mask(mask, name)
-                    check_start(rigid, T, k, mask, occluder, options.init)
+                if i == 0 and (mask is None or mask.any()):
+                    if mask is not None:
+                        check_mask(mask, name)
+                    check_start(rigid, T, files, mask, occluder, options.init)
                 found = tracker.update(mask, occluder, picture)
                 counts[found.state] += 1
                 table.writerow(row(name.name, found))
-                video.write(overlay(rigid, found, k, mask, picture))
+                video.write(overlay(rigid, found, files, mask, picture))
     finally:
         video.release()
     print(f"{len(names)} frames: " + ", ".join(f"{n} {state}" for state, n in counts.items()) + f"; see {options.out}")
@@ -344,8 +355,9 @@ def check_mask(mask: Bool, path: Path) -> None:
         )
 
 
-def check_start(rigid: RigidObject, T: Array, k: Intrinsics, mask: Bool, occluder: Bool | None, path: Path) -> None:
-    """Raises ObjectFileError for a start T_camera_object from which the mask cannot be reached."""
+def check_start(rigid: RigidObject, T: Array, files: CameraFiles, mask: Bool | None, occluder: Bool | None, path: Path) -> None:
+    """Raises ObjectFileError for a start T_camera_object from which the object cannot be reached."""
+    k, (h, w) = files.k, files.shape
     V = rigid.shape.fine.in_camera(T @ rigid.T_object_middle)
     if V[:, 2].min() < NEAR:
         z = (T @ rigid.T_object_middle)[2, 3]
@@ -355,12 +367,13 @@ def check_start(rigid: RigidObject, T: Array, k: Intrinsics, mask: Bool, occlude
             "the mesh's unit"
         )
     u, v = k.fx * V[:, 0] / V[:, 2] + k.cx, k.fy * V[:, 1] / V[:, 2] + k.cy
-    h, w = mask.shape
     if u.max() < -w or u.min() > 2 * w or v.max() < -h or v.min() > 2 * h:
         raise ObjectFileError(
             f"{path}: camera_from_object: expected an object in or near the image ({w} x {h}), got one at pixel ({u.mean():.0f}, "
             f"{v.mean():.0f}); check that pose and camera belong together"
         )
+    if mask is None:
+        return
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     seen = math.hypot(rows[-1] - rows[0] + 1, columns[-1] - columns[0] + 1)
     expected = math.hypot(float(np.ptp(u)), float(np.ptp(v)))
@@ -407,13 +420,15 @@ def row(name: str, found: ObjectEstimate) -> list[Any]:
 
 
 def overlay(
-    rigid: RigidObject, found: ObjectEstimate, k: Intrinsics, mask: Bool, picture: NDArray[np.uint8] | None
+    rigid: RigidObject, found: ObjectEstimate, files: CameraFiles, mask: Bool | None, picture: NDArray[np.uint8] | None
 ) -> NDArray[np.uint8]:
     """The frame (h, w, 3) uint8 BGR with the mask's boundary in white and the pose's silhouette in its state's colour."""
-    h, w = mask.shape
+    h, w = files.shape
     out = np.zeros((h, w, 3), np.uint8) if picture is None else np.ascontiguousarray(picture[..., ::-1])
-    silhouette = rigid.shape.fine.silhouette(found.T @ rigid.T_object_middle, k, (0, 0, w, h))
+    silhouette = rigid.shape.fine.silhouette(found.T @ rigid.T_object_middle, files.k, (0, 0, w, h))
     for region, colour in ((mask, (255, 255, 255)), (silhouette, COLOURS[found.state])):
+        if region is None:
+            continue
         lines, _ = cv2.findContours(region.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(out, lines, -1, colour, 1 if region is mask else 2, cv2.LINE_AA)
     cv2.putText(

@@ -13,12 +13,14 @@ import pytest
 import trimesh
 
 from penumbra.services.command import cli
+from penumbra.services.search.contour import Model
 from penumbra.services.search.objects import meshes, tools
+from penumbra.services.search.objects.creases import Creases
 from penumbra.services.search.objects.pose import RigidObject, Tracker, find_pose
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster
 from penumbra.shared.geometry.lens import Lens
-from penumbra.shared.geometry.rigid import apply, from_rpy, perturb, pose_error
+from penumbra.shared.geometry.rigid import apply, from_rpy, inverse, perturb, pose_error
 from penumbra.sim.picture.distortion import Distortion
 from penumbra.tests.bench import objects as bench
 from penumbra.tests.bench.objects import CONVERGED, HEIGHT, WIDTH, K, Thing, errors, moved, scene, spoiled, thing
@@ -170,20 +172,83 @@ def test_a_repaired_mesh_has_the_silhouette_of_the_original():
         assert bench.iou(drawn(one, T), drawn(other, T)) > 0.98
 
 
+def photographed(one: Thing, T: np.ndarray, seed: int) -> np.ndarray:
+    """A picture of an object in two colours before a background of patches in many."""
+    rng = np.random.default_rng(seed)
+    patches = cv2.resize(rng.uniform(40, 150, (12, 16, 3)).astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
+    stripes = (np.arange(HEIGHT) // 30 % 2)[:, None, None]
+    inside = np.where(stripes, (200.0, 60.0, 40.0), (220.0, 190.0, 60.0))
+    picture = np.where(drawn(one, T)[..., None], inside, patches) + rng.normal(0.0, 6.0, (HEIGHT, WIDTH, 3))
+    return cv2.GaussianBlur(picture, (0, 0), 0.6).clip(0, 255).astype(np.uint8)
+
+
 def test_the_picture_is_sharper_than_the_mask(drill, rigid):
     better = []
     for seed in range(5):
         T, mask = scene(drill, (76, seed), (0.9, 0.92))
-        truth = drawn(drill, T)[..., None]
-        rng = np.random.default_rng(seed)
-        picture = np.where(
-            truth, rng.normal((190, 60, 40), 6.0, (HEIGHT, WIDTH, 3)), rng.normal((70, 90, 110), 6.0, (HEIGHT, WIDTH, 3))
-        )
-        picture = cv2.GaussianBlur(picture, (0, 0), 0.6).clip(0, 255).astype(np.uint8)
+        picture = photographed(drill, T, seed)
         start = moved(T, 15.0, 0.02, np.random.default_rng(seed))
         by_mask, by_picture = (errors(drill, find_pose(rigid, mask, K, start, picture=p).T, T).add for p in (None, picture))
         better.append(by_picture / by_mask)
     assert np.median(better) < 0.6
+
+
+def test_with_a_picture_a_mask_may_be_four_pixels_too_small_or_too_large(drill, rigid):
+    T, mask = scene(drill, (78, 0), EXACT)
+    picture, start = photographed(drill, T, 0), moved(T, 20.0, 0.03, np.random.default_rng(0))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
+    masks = [change(mask.astype(np.uint8), disc) > 0 for change in (cv2.erode, cv2.dilate)]
+    found = [find_pose(rigid, one, K, start, picture=picture) for one in masks]
+    assert all(errors(drill, one.T, T).add < 0.02 for one in found)
+    assert np.linalg.norm(found[0].T[:3, 3] - found[1].T[:3, 3]) < 0.005
+    alone = [find_pose(rigid, one, K, start) for one in masks]
+    assert np.linalg.norm(alone[0].T[:3, 3] - alone[1].T[:3, 3]) > 0.02  # without the picture it matters
+
+
+def test_a_picture_alone_gives_the_pose_from_far_starts(drill, rigid):
+    for seed in range(3):
+        T, _ = scene(drill, (79, seed), EXACT)
+        picture = photographed(drill, T, seed)
+        found = find_pose(rigid, None, K, moved(T, 20.0, 0.03, np.random.default_rng(seed)), picture=picture)
+        assert errors(drill, found.T, T).add < CONVERGED / 2
+        assert nees(found, T) < 22.5
+
+
+def test_a_picture_without_the_object_is_not_tracked(drill, rigid):
+    T, _ = scene(drill, (79, 0), EXACT)
+    nothing = Thing("nothing", trimesh.creation.box((1e-3, 1e-3, 1e-3)), np.eye(3)[None])
+    assert find_pose(rigid, None, K, T, picture=photographed(nothing, T, 1)).state in ("lost", "doubtful")
+
+
+def test_the_turn_of_a_can_is_not_known_and_makes_the_pose_doubtful():
+    one = thing("soup can", 1)
+    T = from_rpy((0.02, 0.0, 0.6), (1.9, 0.1, 0.2))
+    start = moved(T, 15.0, 0.02, np.random.default_rng(3))
+    found = find_pose(RigidObject(mesh_of(one)), None, K, start, picture=photographed(one, T, 2))
+    axis = found.T[:3, 2]
+    assert np.sqrt(axis @ found.covariance[3:, 3:] @ axis) > np.radians(5.0)
+    assert found.state == "doubtful"
+
+
+def test_without_a_mask_and_a_picture_there_is_no_pose(rigid):
+    start = from_rpy((0.0, 0.0, 0.8), (0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="expected a mask, a picture or both"):
+        find_pose(rigid, None, K, start)
+    with pytest.raises(ValueError, match="expected a mask, a picture or both"):
+        Tracker(rigid, K, start).update(None)
+
+
+def test_the_creases_of_a_box_are_its_edges_between_two_visible_sides():
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    creases = Creases(Model(Mesh(np.asarray(box.vertices, float), np.asarray(box.faces, np.int32), np.zeros(12, np.uint8))))
+    T = from_rpy((0.0, 0.0, 1.0), (0.6, 0.5, 0.0))
+    points = creases.points(T, K, (HEIGHT, WIDTH), 2.0)
+    inside = apply(inverse(T), points["position"])
+    assert (np.sort(np.abs(inside), axis=1)[:, 1:] > 0.0999).all()  # on an edge: two coordinates are at their ends
+    nearest = min(apply(T, box.vertices), key=lambda corner: float(np.linalg.norm(corner)))
+    corner = apply(inverse(T), nearest[None])[0]
+    assert ((np.abs(inside - corner) < 1e-6).sum(axis=1) >= 2).all()  # the three that meet in the corner towards the camera
+    assert 200 < points["length"].sum() < 600
 
 
 # --- sequences --------------------------------------------------------------------------------------------------------------
@@ -218,6 +283,20 @@ def test_behind_a_known_occluder_the_object_is_occluded_and_not_lost(drill, rigi
     everything = np.ones((HEIGHT, WIDTH), bool)
     assert tracker.update(drawn(drill, poses[4]), everything).state == "occluded"
     assert tracker.update(drawn(drill, poses[5])).state == "tracking"
+
+
+def test_a_sequence_of_pictures_is_tracked_and_found_again(drill, rigid):
+    poses = sequence(drill, 12)
+    tracker = Tracker(rigid, K, moved(poses[0], 15.0, 0.02, np.random.default_rng(0)))
+    nothing = Thing("nothing", trimesh.creation.box((1e-3, 1e-3, 1e-3)), np.eye(3)[None])
+    for i, T in enumerate(poses):
+        hidden = 6 <= i < 8
+        found = tracker.update(None, picture=photographed(nothing if hidden else drill, T, 3))
+        if hidden:
+            assert found.state == "lost", i
+        else:
+            assert found.state != "lost", i
+            assert errors(drill, found.T, T).add < CONVERGED, i
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------------
@@ -264,6 +343,51 @@ def test_refine_prints_pose_covariance_overlap_and_state(given, drill, capsys):
 def test_refine_in_words(given, capsys):
     assert cli.main(command(given)) == 0
     assert capsys.readouterr().out.startswith("state      tracking, overlap 0.")
+
+
+def test_refine_on_a_picture_without_a_mask(given, drill, capsys, tmp_path):
+    T = tools.read_pose(given["truth"])
+    image = tmp_path / "image.png"
+    cv2.imwrite(str(image), photographed(drill, T, 1)[..., ::-1])
+    argv = command(given, "--json", image=image)
+    at = argv.index("--mask")
+    assert cli.main(argv[:at] + argv[at + 2 :]) == 0
+    assert errors(drill, np.array(json.loads(capsys.readouterr().out)["camera_from_object"]), T).add < 0.03
+    at = argv.index("--image")
+    argv = argv[:at] + argv[at + 2 :]
+    at = argv.index("--mask")
+    assert cli.main(argv[:at] + argv[at + 2 :]) == 2
+    assert "expected --mask, --image or both, got neither" in capsys.readouterr().err
+
+
+def test_the_benchmark_measures_folders_of_photographs(given, drill, tmp_path, capsys):
+    case, T = tmp_path / "cases" / "drill", tools.read_pose(given["truth"])
+    (case / "frames").mkdir(parents=True)
+    drill.mesh.export(case / "mesh.ply")
+    for name in ("camera.json", "mask.png"):
+        (case / name).write_bytes(given[Path(name).stem].read_bytes())
+    picture = photographed(drill, T, 1)[..., ::-1]
+    frames = [{"file": f"frames/{i}.png", "camera_from_object": T.tolist()} for i in range(2)]
+    for path in ("rgb.png", *(str(frame["file"]) for frame in frames)):
+        cv2.imwrite(str(case / path), picture)
+    (case / "truth.json").write_text(json.dumps({"camera_from_object": T.tolist(), "frames": frames}))
+    argv = ["bench", "objects", "--cases", str(case.parent), "--starts", "1", "--json", str(tmp_path / "result.json")]
+    assert cli.main(argv) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert [(row["with"], row["start"]) for row in result["cases"]] == [
+        (given, start) for given in ("mask+picture", "picture") for start in ([20.0, 0.03], [30.0, 0.05])
+    ]
+    for row in result["cases"]:
+        assert row["name"] == "drill"
+        assert row["converged"] in (0.0, 1.0)
+        assert row["wrong_but_tracking"] <= 1.0 - row["converged"]
+        assert (row["error_of_diameter"] < CONVERGED) == (row["converged"] == 1.0)
+        assert row["ms"] > 0.0
+    assert result["cases"][0]["converged"] == 1.0
+    (sequence,) = result["sequences"]
+    assert (sequence["name"], sequence["frames"]) == ("drill", 2)
+    assert cli.main(["bench", "objects", "--cases", str(tmp_path / "none")]) == 2
+    assert "expected a folder of cases, found none" in capsys.readouterr().err
 
 
 def wrong(given: dict[str, Path], folder: Path, what: str) -> tuple[list[str], str]:
@@ -436,7 +560,7 @@ def test_track_writes_a_table_and_a_video(given, drill, tmp_path, capsys):
     files = {"mesh": given["mesh"], "camera": given["camera"], "init": init, "masks": masks, "out": out}
     argv = ["search", "track", "--mesh-unit", "mm", *(word for name, path in files.items() for word in (f"--{name}", str(path)))]
     assert cli.main(argv) == 0
-    assert capsys.readouterr().out == f"12 frames: 10 tracking, 0 occluded, 2 lost; see {out}\n"
+    assert capsys.readouterr().out == f"12 frames: 10 tracking, 0 occluded, 0 doubtful, 2 lost; see {out}\n"
     rows = list(csv.DictReader((out / "poses.csv").open()))
     assert [row["frame"] for row in rows] == [f"frame{i}.png" for i in range(12)]  # by number: 2 before 10
     assert [i for i, row in enumerate(rows) if row["state"] == "lost"] == [5, 6]
