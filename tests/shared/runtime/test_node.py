@@ -425,7 +425,7 @@ def test_where_no_replica_is_fit_one_keeps_all_streams_until_the_others_are_fit(
     with monkeypatch.context() as overloaded:
         overloaded.setattr(Pace, "judge", lambda *_: "stalled")
         kept = wait_for(lambda: (found := owners(nodes)) and len(set(map(id, found))) == 1 and found, 10, "a single owner")
-        assert living(nodes[0]) == {kept[0].instance}
+        wait_for(lambda: living(nodes[0]) == {kept[0].instance}, 10, "the others to withdraw")
         kept[0].close()
         left = [node for node in nodes if node is not kept[0]]
         wait_for(lambda: len(living(left[0])) == 1 and owners(left), 10, "one of the others to serve")
