@@ -132,7 +132,7 @@ def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
             raise Failed(f"nothing of {missing} in cell {cell} within {PATIENCE_S:.0f} s: {_words(log)}")
     names = [name for name in (*listener.names, processes.LAUNCHER.name) if name in listener.first_s]
     return Start(
-        {name: round(listener.first_s[name] - began_s, 2) for name in names}, {name: used_s.get(name, 0.0) for name in names}
+        {name: round(listener.first_s[name] - began_s, 3) for name in names}, {name: used_s.get(name, 0.0) for name in names}
     )
 
 

@@ -15,7 +15,7 @@ def test_a_start_tells_when_each_process_showed_itself_and_when_the_pose_was_tra
     assert set(found.seconds) >= names
     assert all(0 < found.seconds["router"] <= seconds for name, seconds in found.seconds.items() if name != "launcher")
     assert found.seconds["segmentation"] > found.seconds["emulator"], "there is no mask before the first frame"
-    assert found.seconds["search"] >= found.seconds["segmentation"], "no pose before the first mask; one look may see both"
+    assert found.seconds["search"] > found.seconds["segmentation"]
     assert all(found.cpu_s[name] > 0 for name in names)
 
 
