@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from penumbra.services.segmentation.inference import TARGET_LABELS
-from penumbra.services.segmentation.training import pasted, photographs, recordings, street, train
+from penumbra.services.segmentation.training import data, pasted, photographs, recordings, street
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import UNLABELLED, Label
 from penumbra.shared.perception import landmarks
@@ -95,7 +95,7 @@ def folder(tmp_path):
 
 def test_photographs_are_turned_moved_and_seen_nearer_with_their_labels_and_unlabelled_outside(folder):
     recorded = recordings.Recordings([folder], 1)
-    films = [train.moved(recorded[0], 3, 64, np.random.default_rng(seed)) for seed in range(8)]
+    films = [data.moved(recorded[0], 3, 64, np.random.default_rng(seed)) for seed in range(8)]
     assert all(film.shape == (3, 64, 64, 4) for film in films)
     values = set(np.unique([film[..., 3] for film in films]))
     assert values == {Label.BACKGROUND, Label.FOREARM, UNLABELLED}
@@ -107,26 +107,29 @@ def test_what_is_pasted_lies_in_front_with_its_labels():
     over = np.full((2, 32, 32, 6), 200, np.uint8)
     over[..., 3] = Label.BACKGROUND
     over[:, :, :8, 3], over[:, :, 8:16, 3] = Label.ROBOT, Label.OCCLUDER
-    out = train.pasted(below, over, np.random.default_rng(0))
+    out = data.pasted(below, over, np.random.default_rng(0))
     assert (out[:, :, :8, 3] == Label.ROBOT).all() and (out[:, :, 8:16, 3] == Label.OCCLUDER).all()
     assert (out[:, :, :13, :3] == 200).all() and not out[:, :, 20:, :4].any() and not below.any()
     assert (out[..., 4] == 200).all(), "what is known of the robot"
 
 
 def test_recordings_and_simulated_sequences_are_mixed_by_their_share_and_both_are_scored(folder):
-    tiny = sequences.Variety(frames=5, size=train.VARIETY.size)
+    tiny = sequences.Variety(frames=5, size=data.VARIETY.size)
 
     def learned(seed, index):
         sequence = sequences.render(seed, 0, tiny)
         return sequences.Sequence(sequence.images, np.full_like(sequence.labels, Label.TORSO), sequence.hidden)
 
-    simulated = train.Simulated(1, 2, learned, lambda seed, index: sequences.render(seed, index, tiny), most=1)
-    data = train.Mixed(recordings.Recordings([folder], 1), simulated, 0.5, 1)
-    simulated.count = train.ENDLESS
-    share = np.mean([(data[index][..., 3] == Label.TORSO).all() for index in range(30)])
+    simulated = data.Simulated(1, 2, learned, lambda seed, index: sequences.render(seed, index, tiny), most=1)
+    mixed = data.Mixed(recordings.Recordings([folder], 1), simulated, 0.5, 1)
+    simulated.count = data.ENDLESS
+    share = np.mean([(mixed[index][..., 3] == Label.TORSO).all() for index in range(30)])
     assert 0.2 < share < 0.8  # 30 draws of a half
-    assert len(list(data.held_out)) == 3
-    assert {"seed", "folder", "sequences", "simulated"} <= data.sources[1].keys()
+    for kept in (list(mixed.calibration), list(mixed.held_out)):
+        is_recorded = [bool(np.isnan(sequence.hidden).all()) for sequence in kept]
+        assert is_recorded == [False, False, True, True]
+        assert all(sequence.images.shape[1:3] == (data.VARIETY.size,) * 2 for sequence in kept)
+    assert {"seed", "folder", "sequences", "simulated"} <= mixed.sources[1].keys()
 
 
 MADE_UP = photographs.STREET, photographs.HANDS, "somebody/pictures", "nobody/cloned"

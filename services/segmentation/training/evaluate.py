@@ -22,8 +22,6 @@ WARM_UP = 3
 """Frames at the start of a sequence that do not count: the recurrent state is still empty."""
 HIDDEN = (0.0, 0.33, 0.66, 0.95)
 """Borders of the classes of hidden share in the score."""
-GOOD = 0.8
-"""Frames of this IoU and more calibrate the size: in others wholes are wrong, not contours."""
 FEWEST = 50
 """Least number of pixels of the target in a frame that counts."""
 NEAR_PX = 6.0
@@ -78,24 +76,26 @@ def run(net: PredNet, images: NDArray[np.uint8], known: NDArray[np.float32] | No
 
 
 def calibrate(net: PredNet, data: Iterable[Labelled]) -> tuple[float, dict[str, Any]]:
-    """The offset of the target classes' logits that makes the median ratio of masked to true area 1, and the bias without it. A
+    """The offset of the target classes' logits with which the mean IoU is greatest, and that IoU without it and with it. A
     network that has priors gets them as in the training."""
     offsets = np.linspace(-3.0, 3.0, 241)
     target, other = list(TARGET_LABELS), [i for i in Label if i not in TARGET_LABELS]
-    ratios = []
+    scores = []
     for index, sequence in enumerate(data):
         found = run(net, sequence.images, priors_of(sequence, index) if net.settings.priors else None)
         for logits, labels in itertools.islice(zip(found, sequence.labels, strict=True), WARM_UP, None):
             labelled = labels != UNLABELLED
-            m = (logits[target].amax(0) - logits[other].amax(0)).numpy()[labelled]
-            t = np.isin(labels[labelled], TARGET_LABELS)
-            if t.any() and ((m > 0) & t).sum() >= GOOD * ((m > 0) | t).sum():
-                ratios.append((m.size - np.searchsorted(np.sort(m.ravel()), -offsets, side="right")) / t.sum())
-    if not ratios:
-        return 0.0, {"area_bias_before": None, "frames": 0}
-    median = np.median(ratios, axis=0)
-    best = int(np.argmin(np.abs(median - 1.0)))
-    return round(float(offsets[best]), 3), {"area_bias_before": round(float(median[120] - 1.0), 4), "frames": len(ratios)}
+            margin = (logits[target].amax(0) - logits[other].amax(0)).numpy()[labelled]
+            truth = np.isin(labels[labelled], TARGET_LABELS)
+            if truth.sum() > FEWEST:
+                masked, both = (len(m) - np.searchsorted(np.sort(m), -offsets, side="right") for m in (margin, margin[truth]))
+                scores.append(both / (masked + truth.sum() - both))
+    if not scores:
+        return 0.0, {"frames": 0}
+    iou = np.mean(scores, axis=0)
+    best = int(np.argmax(iou))
+    scored = {"iou_mean_before": round(float(iou[len(offsets) // 2]), 4), "iou_mean": round(float(iou[best]), 4)}
+    return round(float(offsets[best]), 3), {**scored, "frames": len(scores)}
 
 
 def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str, Any]:

@@ -30,21 +30,18 @@ from penumbra.services.segmentation.training.models import FOLDER
 from penumbra.services.segmentation.training.recordings import PIECE
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 from penumbra.shared.perception import landmarks
-from penumbra.shared.perception.landmarks import Hand, Landmarks, Points, Pose, Region
+from penumbra.shared.perception.landmarks import Hand, Landmarks, Points
+from penumbra.shared.perception.limbs import FOREARM, Limb, find, limb_of
 from penumbra.shared.perception.lookout import ARM_M, MARGIN_M, Window, window_of
 
 RATE_HZ = 15.0
 """Frames a second that are labelled: about the cameras' that the network is trained on."""
-HANDS = 1.0
-"""How far, in sizes of the hand (wrist to knuckles), a wrist of the body's landmarks may be from the hand's own to be it."""
 GAP_S = 0.4
 """Time [s] for which a hand that is not found, or its elbow, may be taken to move evenly."""
 FASTEST = 12.0
 """Speed of a hand [sizes of the hand a second] up to which it is the same: 1 m/s."""
 SAME = 0.7
 """How far [sizes of the hand] an elbow may be from where it is at other times, as seen from the wrist, to be confirmed by it."""
-FOREARM = 2.7
-"""Length of a forearm in sizes of the hand, seen from the side (ANSUR II: 0.25 m and 0.09 m)."""
 LONGEST = 3.1
 """Length in sizes of the hand that a forearm has at most: bare skin that goes on is the upper arm."""
 SURE = 1.3
@@ -70,80 +67,7 @@ Bool = NDArray[np.bool_]
 Field = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class Limb:
-    """A hand and where its forearm comes from: points (21, 2) of the hand, elbow and shoulder (2,) where they are known [px]; or
-    where a hand must be that is not seen."""
-
-    points: Points
-    elbow: Points | None = None
-    shoulder: Points | None = None
-    is_seen: bool = True
-
-    @property
-    def size(self) -> float:
-        """From the wrist to the knuckles [px]."""
-        return Hand(self.points, 1.0, 0.5).size
-
-    @property
-    def middle(self) -> Points:
-        """The middle of the palm."""
-        return np.asarray(self.points[list(landmarks.PALM)].mean(0))
-
-    @property
-    def back(self) -> Points:
-        """The direction (2,) from the knuckles to the wrist."""
-        way = self.points[0] - self.points[[5, 9, 13, 17]].mean(0)
-        return np.asarray(way / max(float(np.linalg.norm(way)), 1e-6))
-
-    def scaled(self, factor: float) -> Limb:
-        """In a picture so many times as large; pixels' middles are at whole numbers."""
-        elbow, shoulder = (None if p is None else (p + 0.5) * factor - 0.5 for p in (self.elbow, self.shoulder))
-        return replace(self, points=(self.points + 0.5) * factor - 0.5, elbow=elbow, shoulder=shoulder)
-
-
 # ---- where the arms are
-
-
-def find(
-    models: Landmarks, image: NDArray[np.uint8], before: Iterable[Hand], pose: Pose | None
-) -> tuple[list[Hand], Pose | None]:
-    """Hands and body in an image (h, w, 3) RGB; they were here before.
-
-    A body is looked for where its head is seen and, since cells seldom show one, where a person behind a table would be: such a
-    pose is kept only while it agrees with a hand.
-    """
-    height, width = image.shape[:2]
-    short, long = min(height, width), max(height, width)
-    count = 3 if long > 1.2 * short else 1
-    ends = np.array([[short, short], [2 * width - short, 2 * height - short]]) / 2.0
-    tiles = [Region(ends[0] + t * (ends[1] - ends[0]), float(short)) for t in np.linspace(0.0, 1.0, count)]
-    hands = models.hands(image, before, tiles if count > 1 else ())
-    found = models.pose(image, pose)
-    if found is None and hands:
-        for down in (0.5, 0.8):
-            begin = models.pose_in(image, Region(np.array([0.5 * width, down * height]), 1.6 * long))
-            guess = models.pose_in(image, begin.region)
-            if guess.found > landmarks.FOUND and any(limb_of(hand, guess).elbow is not None for hand in hands):
-                return hands, guess
-    return hands, found
-
-
-def limb_of(hand: Hand, pose: Pose | None) -> Limb:
-    """A hand with the elbow of the arm whose wrist is at its own; of bodies that are not seen the model invents arms, so the
-    elbow is believed only where it lies opposite the knuckles, at a forearm's distance."""
-    limb, nearest = Limb(hand.points), HANDS * hand.size
-    if pose is None:
-        return limb
-    alone = limb
-    for first in (11, 12):
-        shoulder, elbow, wrist = pose.points[[first, first + 2, first + 4]]
-        away = float(np.linalg.norm(wrist - hand.points[0]))
-        length = float(np.linalg.norm(elbow - hand.points[0]))
-        opposite = (elbow - hand.points[0]) @ alone.back > 0.3 * length
-        if pose.visible[first + 2] > 0.5 and away < nearest and opposite and 0.8 < length / hand.size < 1.5 * FOREARM:
-            limb, nearest = Limb(hand.points, elbow, shoulder if pose.visible[first] > 0.5 else None), away
-    return limb
 
 
 def follow(seen: Sequence[Sequence[Limb]], period_s: float) -> list[list[Limb]]:

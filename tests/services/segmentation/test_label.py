@@ -10,11 +10,12 @@ import pytest
 
 from penumbra.services.segmentation import files
 from penumbra.services.segmentation.training import label, models, recordings
-from penumbra.services.segmentation.training.label import Colours, Limb
+from penumbra.services.segmentation.training.label import Colours
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 from penumbra.shared.geometry import rigid
-from penumbra.shared.perception import landmarks
+from penumbra.shared.perception import landmarks, limbs
 from penumbra.shared.perception.landmarks import Hand, Pose, Region
+from penumbra.shared.perception.limbs import Limb
 from penumbra.sim.sets import shots
 
 
@@ -96,12 +97,12 @@ def test_the_models_are_fetched(tmp_path):
 
 def test_an_elbow_is_believed_where_it_lies_opposite_the_knuckles_at_a_forearm_s_distance():
     hand = Hand(hand_at((200, 100), (0, -1), 40), 1.0, 0.5)
-    believed = label.limb_of(hand, body_with((210, 200), (205, 110)))
+    believed = limbs.limb_of(hand, body_with((210, 200), (205, 110)))
     assert believed.elbow is not None
     np.testing.assert_allclose(believed.elbow, (210, 200))
     for elbow, wrist in (((200, 20), (205, 110)), ((210, 120), (205, 110)), ((210, 200), (300, 110))):
-        assert label.limb_of(hand, body_with(elbow, wrist)).elbow is None
-    assert label.limb_of(hand, None).elbow is None
+        assert limbs.limb_of(hand, body_with(elbow, wrist)).elbow is None
+    assert limbs.limb_of(hand, None).elbow is None
 
 
 def test_limbs_are_followed_over_gaps_and_what_appears_once_is_none():

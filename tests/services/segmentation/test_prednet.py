@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import torch
 
+from penumbra.services.replay.chain import Replay, ReplayNode
 from penumbra.services.segmentation import inference, model, openvino_step, prednet, service
 from penumbra.services.segmentation.prednet import PredNet, Settings
 from penumbra.services.segmentation.shift import shift_state
 from penumbra.services.segmentation.training import evaluate, loss, train
+from penumbra.services.segmentation.training.data import Simulated
 from penumbra.shared import training
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import topics
@@ -24,7 +26,6 @@ from penumbra.shared.perception.lookout import Lookout, Window, corners_of, wind
 from penumbra.sim.sets import sequences, shots
 from penumbra.tests.support import nodes
 from penumbra.tests.support.live import wait_for
-from penumbra.tests.support.replay import Replay, ReplayNode
 
 SMALL = Settings(channels=(4, 4, 8), kernels=(3, 3, 3), decoder_channels=4)
 TINY = sequences.Variety(frames=4, size=64)
@@ -159,7 +160,7 @@ def test_sequences_are_a_function_of_seed_and_index_and_show_the_target():
 
 @pytest.fixture(scope="module")
 def data():
-    return train.Simulated(1, learned=lambda seed, index: sequences.render(seed, index, TINY), most=24)
+    return Simulated(1, learned=lambda seed, index: sequences.render(seed, index, TINY), most=24)
 
 
 def trained(data, steps: int, checkpoint, resume_at: int | None = None) -> train.Trainer:
@@ -308,6 +309,19 @@ def test_the_committed_weights_segment_new_scenes_as_well_as_their_card_says():
         assert score[key][value] > card["held_out"][key][value] - 0.12
 
 
+def test_the_calibration_finds_the_offset_that_masks_are_best_with():
+    net, _ = prednet.load(inference.WEIGHTS)
+    scenes = [sequences.render(987_655, index) for index in range(6)]
+    offset, scored = evaluate.calibrate(net, scenes)
+    assert scored["iou_mean"] >= scored["iou_mean_before"]
+    assert net.head.bias is not None
+    label = torch.arange(len(net.head.bias)) // 4  # four pixels a position
+    net.head.bias.data -= torch.isin(label, torch.tensor(inference.TARGET_LABELS)).float()
+    lowered, again = evaluate.calibrate(net, scenes)
+    assert lowered - offset == pytest.approx(1.0, abs=0.1)
+    assert again["iou_mean"] == pytest.approx(scored["iou_mean"], abs=0.005) and again["iou_mean_before"] < scored["iou_mean"]
+
+
 def test_the_committed_weights_know_a_bare_arm_before_a_plain_wall():
     net, card = prednet.load(inference.WEIGHTS)
     films = []
@@ -378,7 +392,7 @@ def test_masks_of_the_running_network_are_torch_s_but_for_rounding():
     net, card = prednet.load(inference.WEIGHTS)
     offset = torch.zeros(len(Label), 1, 1)
     offset[list(inference.TARGET_LABELS)] = card["calibration"]["target_logit_offset"]
-    ours = inference.load_segmenter()
+    ours = inference.Segmenter(prednet.stored(net), card["calibration"]["target_logit_offset"], has_colours=False)
     for t, (image, logits) in enumerate(zip(images, evaluate.run(net, images), strict=True)):
         mask = ours(image, window, (t + 1) * 50_000_000)
         assert (mask != (logits + offset).argmax(0).numpy()).mean() < 0.02  # bfloat16, where the processor has it

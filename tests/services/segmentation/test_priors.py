@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from penumbra.services.replay.chain import Replay
 from penumbra.services.segmentation import inference, model, prednet, priors
 from penumbra.services.segmentation.prednet import PredNet, Settings
 from penumbra.services.segmentation.training import evaluate
@@ -21,7 +22,6 @@ from penumbra.shared.perception.lookout import Window
 from penumbra.shared.perception.prediction import extrapolate
 from penumbra.sim.sets import sequences, shots
 from penumbra.tests.support import nodes
-from penumbra.tests.support.replay import Replay
 
 ROBOT, TARGET = (model.PRIORS.index(name) for name in ("robot", "target"))
 SURE = 1e-10 * np.eye(6)
@@ -192,8 +192,10 @@ def test_the_service_gives_a_network_what_is_known_at_the_frame_and_waits_for_no
             assert ((mask.labels != without).mean() > 0.01) == (has_joints or has_pose)
 
 
-def test_a_network_without_priors_needs_no_joints(shot):
-    replay = Replay(cells.load("arm"), ("segmentation",))
+def test_a_network_without_priors_needs_no_joints(tmp_path):
+    card = {"seed": 0, "date": "2026-01-01", "calibration": {"target_logit_offset": 0.0}}
+    prednet.save(tmp_path / "plain.npz", PredNet(Settings((4, 4, 8), (3, 3, 3), 4)), card)
+    replay = Replay(cells.load("arm"), ("segmentation",), {"segmentation": ["--weights", str(tmp_path / "plain.npz")]})
     assert {topic for topic, _, _ in replay._listeners} == {topics.FRAME, topics.FUSED}
 
 

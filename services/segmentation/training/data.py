@@ -1,0 +1,266 @@
+"""What the segmentation network learns from: simulated sequences, recordings, and both mixed."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from penumbra.services.segmentation import inference
+from penumbra.services.segmentation.training import clothes, priors, recordings
+from penumbra.services.segmentation.training.evaluate import WARM_UP, Labelled
+from penumbra.shared import training
+from penumbra.shared.contract.labels import UNLABELLED, Label
+from penumbra.shared.perception.lookout import WIDEST_ARM_PX
+from penumbra.sim.picture import looks
+from penumbra.sim.sets import sequences
+
+VALIDATION_SEED = 1_000_000
+"""Added to the seed for held-out data: nothing there was ever trained on."""
+VARIETY = sequences.Variety(frames=5, size=176, real=0.7)
+"""Variety of the training sequences."""
+ARM_PX = (12.0, float(WIDEST_ARM_PX))
+"""Width [px] that arms of recordings get."""
+ARM_SHARE = 0.08
+"""Width of an arm that a recording without any might show, as a share of its longer side."""
+CLOTHED = 0.35
+"""Share of the sequences of recordings whose arms get other sleeves or gloves."""
+ENDLESS = 2**31
+"""Number of sequences of a set that has no end."""
+
+
+class Data(Protocol):
+    """Sequences to learn from, and others for the calibration and the score. The first are red, green, blue and class
+    (frames, h, w, 4), and, where more is known than what the labels say, priors beside them (frames, h, w, 6), packed.
+    jitter: how much their colours are changed; side: the largest patch [px] that fits in all; sources: what a card says of the
+    calibration's and the score's."""
+
+    jitter: float
+    side: int
+
+    @property
+    def sources(self) -> tuple[dict[str, Any], dict[str, Any]]: ...
+    @property
+    def calibration(self) -> Iterable[Labelled]: ...
+    @property
+    def held_out(self) -> Iterable[Labelled]: ...
+    @property
+    def count(self) -> int:
+        """How many sequences there are to choose from."""
+
+    def __getitem__(self, index: int, /) -> Any: ...
+    def close(self) -> None:
+        """Make no more."""
+
+
+Render = Callable[[int, int], sequences.Sequence]
+
+
+def _varied(seed: int, index: int) -> sequences.Sequence:
+    return sequences.render(seed, index, VARIETY)
+
+
+class Simulated:
+    """Sequences rendered when they are asked for. `each`: for the calibration, and for the score; `learned`, `scored`: sequence
+    of a seed and an index, to learn from, and for calibration and score; `most`: how many to learn from, kept in memory then."""
+
+    jitter = 0.2
+    """Less than the authors' of photographs: our renderer varies the light itself."""
+    side = VARIETY.size
+
+    def __init__(
+        self,
+        seed: int,
+        each: int = 60,
+        learned: Render = _varied,
+        scored: Render = sequences.render,
+        most: int | None = None,
+    ):
+        self._seed, self.each, self._learned, self._scored = seed, each, learned, scored
+        self.count = ENDLESS if most is None else most
+        self._kept = functools.lru_cache(maxsize=most or 0)(self._rendered)
+
+    def __getitem__(self, index: int) -> NDArray[np.uint8]:
+        """Red, green, blue, class and priors (frames, h, w, 6) of a sequence."""
+        return self._kept(index)
+
+    def _rendered(self, index: int) -> NDArray[np.uint8]:
+        sequence = self._learned(self._seed, index)
+        known = priors.of_sequence(sequence, np.random.default_rng([self._seed, 6, index]))
+        return np.concatenate([sequence.images, sequence.labels[..., None], priors.packed(known)], axis=-1)
+
+    @property
+    def sources(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Seeds that nothing else is made of."""
+        return {"seed": VALIDATION_SEED + self._seed}, {"seed": VALIDATION_SEED + self._seed + 1}
+
+    @property
+    def calibration(self) -> Iterator[sequences.Sequence]:
+        """Sequences for the calibration, rendered as they are asked for."""
+        return (self._scored(VALIDATION_SEED + self._seed, index) for index in range(self.each))
+
+    @property
+    def held_out(self) -> Iterator[sequences.Sequence]:
+        """Sequences for the score."""
+        return (self._scored(VALIDATION_SEED + self._seed + 1, index) for index in range(self.each))
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class Mixed:
+    """Recordings and simulated sequences. `share`: how many of those that are learned from are simulated; of the recordings, half
+    have simulated robots and occluders in front, some of these an arm, too. Calibrated and scored on as many of both."""
+
+    jitter = 0.3
+    """Jitter of the colours, between that of simulated sequences and that of recordings alone."""
+    side = VARIETY.size
+    count = ENDLESS
+
+    def __init__(self, recorded: recordings.Recordings, simulated: Simulated, share: float, seed: int):
+        self._recorded, self._simulated, self._share, self._seed = recorded, simulated, share, seed
+        calibration, scored = ({**a, **b} for a, b in zip(simulated.sources, recorded.sources, strict=True))
+        self.sources = calibration, {**scored, "simulated": share}
+
+    @property
+    def calibration(self) -> Iterator[Labelled]:
+        """Simulated sequences, and as many patches of recordings."""
+        yield from self._simulated.calibration
+        yield from patches(self._recorded.calibration, self._simulated.each, VALIDATION_SEED + self._seed)
+
+    @property
+    def held_out(self) -> Iterator[Labelled]:
+        """Others of both."""
+        yield from self._simulated.held_out
+        yield from patches(self._recorded.held_out, self._simulated.each, VALIDATION_SEED + self._seed + 1)
+
+    def __getitem__(self, index: int) -> NDArray[np.uint8]:
+        """Red, green, blue, class and priors (frames, h, w, 6) of a sequence."""
+        rng = np.random.default_rng([self._seed, 5, index])
+        if rng.random() < self._share:
+            return self._simulated[index]
+        film = moved(self._recorded[int(rng.integers(self._recorded.count))], VARIETY.frames, VARIETY.size, rng)
+        if rng.random() < CLOTHED:
+            film = clothes.worn(film, rng)
+        known = priors.packed(priors.of_labels(film[..., 3], np.random.default_rng([self._seed, 6, index])))
+        film = np.concatenate([film, known], axis=-1)
+        if rng.random() < 0.5:
+            film = pasted(film, self._simulated[index], rng)
+        return np.concatenate([looks.filmed(film[..., :3], rng), film[..., 3:]], axis=-1)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A piece of a recording as a window shows it; `evaluate.Labelled`."""
+
+    images: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+
+    @property
+    def hidden(self) -> NDArray[np.float64]:
+        return np.full(len(self.labels), np.nan)
+
+
+def patches(films: Sequence[recordings.Recorded], count: int, seed: int) -> Iterator[Patch]:
+    """So many pieces of films, each as often as the others, as windows show their arms."""
+    order = np.random.default_rng([seed, 7]).permutation(len(films))
+    for index in range(count):
+        rng = np.random.default_rng([seed, 8, index])
+        film = moved(films[order[index % len(films)]], VARIETY.frames + WARM_UP, VARIETY.size, rng)
+        yield Patch(film[..., :3], film[..., 3])
+
+
+def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """So many frames of a recording as a camera of `size` pixels a side that is turned and moves shows them, from where its arms
+    are as wide as windows show them: (frames, size, size, 4); what lies outside of the picture is UNLABELLED."""
+    start = int(rng.integers(0, len(recorded) - frames + 1))
+    film = recorded[start : start + frames]
+    arms = np.isin(film[frames // 2, ..., 3], inference.TARGET_LABELS)
+    arm_px = (
+        2.0 * cv2.distanceTransform(arms.astype(np.uint8), cv2.DIST_L2, 5).max() if arms.any() else ARM_SHARE * max(arms.shape)
+    )
+    zoom = np.exp(rng.uniform(*np.log(ARM_PX))) / arm_px
+    if (shrink := int(1.0 / zoom)) > 1:  # no detail finer than a pixel is left to be sampled
+        film = np.stack([_smaller(frame, shrink) for frame in film])
+        arms, zoom = arms[::shrink, ::shrink], zoom * shrink
+    middle = rng.integers(0, film.shape[1:3])
+    target = np.argwhere(arms)
+    if len(target) and rng.random() < 0.8:
+        middle = target[rng.integers(len(target))] + rng.integers(-size // 6, size // 6 + 1, 2)
+    angle = rng.normal(0.0, 20.0) if rng.random() < 0.7 else rng.uniform(-180.0, 180.0)
+    speed = rng.random() ** 1.5
+    shift, turn, grow = speed * rng.uniform(-8.0, 8.0, 2), speed * rng.uniform(-2.0, 2.0), 1.0 + speed * rng.uniform(-0.02, 0.02)
+    out = np.empty((frames, size, size, 4), np.uint8)
+    for t, frame in enumerate(film):
+        since = t - frames // 2
+        place = cv2.getRotationMatrix2D((float(middle[1]), float(middle[0])), angle + since * turn, zoom * grow**since)
+        place[:, 2] += size / 2.0 - middle[::-1] + since * shift
+        picture, labels = np.ascontiguousarray(frame[..., :3]), np.ascontiguousarray(frame[..., 3])
+        out[t, ..., :3] = cv2.warpAffine(picture, place, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        out[t, ..., 3] = cv2.warpAffine(labels, place, (size, size), flags=cv2.INTER_NEAREST, borderValue=float(UNLABELLED))
+    return out
+
+
+def _smaller(frame: NDArray[np.uint8], by: int) -> NDArray[np.uint8]:
+    height, width = (n // by for n in frame.shape[:2])
+    picture = cv2.resize(
+        np.ascontiguousarray(frame[: height * by, : width * by, :3]), (width, height), interpolation=cv2.INTER_AREA
+    )
+    return np.dstack([picture, frame[by // 2 :: by, by // 2 :: by, 3][:height, :width]])
+
+
+def pasted(film: NDArray[np.uint8], over: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A film (frames, h, w, 6) with the robot and the occluders of another in front, and what is known of this robot; half of the
+    time its person, too, and then of its arms the one or the others are known."""
+    front, out = [Label.ROBOT, Label.OCCLUDER], film.copy()
+    out[..., 4] = over[..., 4]
+    if rng.random() < 0.5:
+        front += [Label.TORSO, Label.UPPER_ARM, Label.FOREARM, Label.HAND]
+        if rng.random() < 0.5:
+            out[..., 5] = over[..., 5]
+    for below, above in zip(out, over, strict=True):
+        cover = np.isin(above[..., 3], front)
+        soft = cv2.GaussianBlur(cover.astype(np.float32), (0, 0), 0.7)[..., None]  # as the lens does along an edge
+        below[..., :3] = (soft * above[..., :3] + (1.0 - soft) * below[..., :3] + 0.5).astype(np.uint8)
+        below[cover, 3] = above[cover, 3]
+    return out
+
+
+def draw_batch(
+    chosen: Iterable[Any], frames: int, size: int, rng: np.random.Generator, amount: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Patches of so many frames of sequences (n, h, w, 4 or 6): images (batch, frames, 3, size, size) in [0, 1], labels
+    (batch, frames, size, size) and priors (batch, frames, 2, size, size), made of the labels where a sequence has none. Three of
+    five lie around a pixel of the target; mirrored, played backwards and coloured anew at random, by `amount`.
+    """
+    images, labels, known = [], [], []
+    for sequence in chosen:
+        start = rng.integers(0, len(sequence) - frames + 1)
+        sequence = sequence[start : start + frames]
+        height, width = sequence.shape[1:3]
+        middle = rng.integers(0, [height, width])
+        if rng.random() < 0.6:
+            target = np.argwhere(np.isin(sequence[rng.integers(len(sequence)), ..., 3], inference.TARGET_LABELS))
+            if len(target):
+                middle = target[rng.integers(len(target))] + rng.integers(-size // 3, size // 3 + 1, size=2)
+        y, x = np.clip(middle - size // 2, 0, [height - size, width - size])
+        patch = sequence[:, y : y + size, x : x + size]
+        if rng.random() < 0.5:
+            patch = patch[:, :, ::-1]
+        if rng.random() < 0.5:
+            patch = patch[::-1]
+        picture = training.recoloured(patch[..., :3].astype(np.float32) / 255.0, rng, amount)
+        images.append(torch.from_numpy(picture).movedim(-1, 1))
+        labels.append(torch.from_numpy(patch[..., 3].astype(np.int64)))
+        prior = priors.unpacked(patch[..., 4:]) if patch.shape[-1] > 4 else priors.of_labels(patch[..., 3], rng)
+        known.append(torch.from_numpy(prior).movedim(-1, 1))
+    return torch.stack(images), torch.stack(labels), torch.stack(known)
