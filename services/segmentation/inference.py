@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.segmentation import model
+from penumbra.services.segmentation.colours import Colours
 from penumbra.services.segmentation.model import Model
 from penumbra.services.segmentation.openvino_step import Compiled, Precision, State
 from penumbra.services.segmentation.shift import shift_state
@@ -27,12 +28,14 @@ picture. Chosen, not measured."""
 class Segmenter:
     """Masks of one camera's frames, in order. `offset`: added to the logits of forearm and hand, calibrated so that their masks
     are on average as large as they should be (the search would take a mask too large for an arm too near). `precision`: that of
-    the computation, by default the fastest of this processor; masks differ by rounding only."""
+    the computation, by default the fastest of this processor; masks differ by rounding only. `has_colours`: whether the
+    colours of the picture count beside the network (`colours.py`)."""
 
-    def __init__(self, network: Model, offset: float = 0.0, precision: Precision | None = None):
+    def __init__(self, network: Model, offset: float = 0.0, precision: Precision | None = None, has_colours: bool = True):
         self._compiled = Compiled(network, precision or ("bf16" if processor.has_bfloat16() else "f32"))
         self._strides, self._offset = network.settings.strides, np.float32(offset)
         self._has_priors = network.settings.priors > 0
+        self._colours = Colours() if has_colours else None
         self._state: State | None = None
         self._window: Window | None = None
         self._stamp_ns = 0
@@ -49,20 +52,26 @@ class Segmenter:
         priors (window.height, window.width, 2): what is known of the window beside the picture (`model.PRIORS`), None where
         nothing is.
 
-        The state is forgotten where the scale changes, time stands, goes back or jumps by more than MAX_GAP_S.
+        The state is forgotten where the scale changes, and with the colours where time stands, goes back or jumps by more than
+        MAX_GAP_S.
         Raises ValueError where the window does not lie in the image.
         """
-        picture = cut(image, window)
-        logits, self._state = self._compiled(picture, self._remembered(window, stamp_ns), priors)
+        picture, elapsed_s = cut(image, window), (stamp_ns - self._stamp_ns) * 1e-9
+        if not 0.0 < elapsed_s <= MAX_GAP_S:
+            self._forget()
+        logits, self._state = self._compiled(picture, self._remembered(window), priors)
         self._window, self._stamp_ns = window, stamp_ns
         for label in TARGET_LABELS:
             logits[label] += self._offset
+        if self._colours is not None:
+            logits = self._colours.weighed(np.rint(255.0 * picture).astype(np.uint8), logits, elapsed_s)
         return classes(logits)
 
     def twin(self) -> Segmenter:
         """Another one of the same network, for another camera: what one has compiled the other need not."""
         twin = copy.copy(self)
-        twin._state, twin._window, twin._stamp_ns = None, None, 0
+        twin._stamp_ns, twin._colours = 0, Colours() if self._colours is not None else None
+        twin._forget()
         twin._compiled = self._compiled.twin()
         return twin
 
@@ -74,9 +83,13 @@ class Segmenter:
         """Whether a window of this size waits for nothing."""
         return self._compiled.is_prepared((window.height, window.width))
 
-    def _remembered(self, window: Window, stamp_ns: int) -> State:
-        follows = 0 < stamp_ns - self._stamp_ns <= MAX_GAP_S * 1e9
-        if self._state is None or self._window is None or self._window.scale != window.scale or not follows:
+    def _forget(self) -> None:
+        self._state = self._window = None
+        if self._colours is not None:
+            self._colours.forget()
+
+    def _remembered(self, window: Window) -> State:
+        if self._state is None or self._window is None or self._window.scale != window.scale:
             return self._compiled.initial_state(window.height, window.width)
         if self._window == window:
             return self._state

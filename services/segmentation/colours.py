@@ -1,0 +1,143 @@
+"""What the colours of a picture say of the target, learned from the network's own masks while it runs.
+
+A network is surest along edges, and least sure inside a smooth, evenly lit arm that looks like none of its training. There the
+picture itself helps: a pixel whose colour surely recognised parts of the target have, and their surroundings do not, is
+probably the target's, too. Histograms over colour, of the target, of the rest of the body (often in the same sleeve), of the
+robot and of all else, are gathered from the network's probabilities; the logarithms of their ratios (Jones and Rehg,
+doi:10.1023/A:1013200319198) are added to the network's logits. As in GrabCut (doi:10.1145/1015706.1015720), they are estimated
+a second time from what the first estimate says. Nothing else is fed back: the histograms of a frame begin with the network's
+masks, so that they cannot walk away from them.
+
+The constants were chosen by the IoU of photographs of training/photographs, of which the network had seen none, and of simulated
+sequences of seeds 424242 and 424243. With two groups, target and rest, photographs are as good, and simulated targets that are
+a third to two thirds hidden worse; with one for each class, photographs are worse.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from penumbra.shared.contract.labels import TARGET_LABELS, Label
+
+SHAPE = (16, 16, 16)
+"""Bins of L*, a* and b*: 16, 8 and 8 levels wide; a* and b* beyond 64 of 128 either way, which are rare, count as 64. L* in 8
+bins was worse, a* and b* in narrower ones no better."""
+GROUPS = (tuple(TARGET_LABELS), (Label.TORSO, Label.UPPER_ARM), (Label.ROBOT,), (Label.BACKGROUND, Label.OCCLUDER))
+"""Classes that share a histogram, the target's first."""
+HALF_LIFE_S = 1.0
+"""Age at which a frame counts half. 0.2 and 4 s are as good where looks do not change."""
+WEIGHT = 2.5
+"""Of a colour's log-likelihood ratio beside the network's logits, which say too little where a look is new."""
+GREATEST = 2.0
+"""Largest log-likelihood ratio of a colour, either way: without it, the colours of few pixels decide."""
+ENOUGH_PX = 1000.0
+"""Pixels of a group, over the time that counts, with which its colours count half: of a target that is nearly hidden few are
+known, some of these wrongly."""
+EVERY = 2
+"""Histograms are made of every second pixel of every second row: as good, and a quarter of the time."""
+FEW_PX = 1.0
+"""Pixels of a colour with which it counts half."""
+UNSURE = 0.5
+"""Pixels in doubt, as a share of the target's, from which on colours count wholly: to sure masks they add little but blur."""
+SMOOTH_PX = 1.0
+"""Standard deviation of the filter over the picture: a pixel's own colour is noisy."""
+OWN_SHARE = 0.05
+"""Share of a connected region that the network itself calls the target, at least: others are things of the same colours."""
+
+
+class Colours:
+    """The colours of the target and of what surrounds it, before one camera."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Start anew, as before another scene."""
+        self._seen = np.zeros((len(GROUPS), *SHAPE), np.float32)
+
+    def weighed(self, picture: NDArray[np.uint8], logits: NDArray[np.float32], elapsed_s: float) -> NDArray[np.float32]:
+        """The network's logits (classes, h, w) with what the colours say.
+
+        picture: RGB (h, w, 3). elapsed_s: since the frame before.
+        """
+        index = _bins(picture)
+        some, of_some = np.ascontiguousarray(logits[:, ::EVERY, ::EVERY]), np.ascontiguousarray(index[::EVERY, ::EVERY])
+        probability = _probability(some)
+        target = probability[0]
+        doubt = float(np.minimum(target, 1.0 - target).sum()) / max(float(target.sum()), 1.0)
+        weight = WEIGHT * min(doubt / UNSURE, 1.0)
+        first = _with(some, _evidence(_histograms(of_some, probability), of_some), weight)
+        self._seen *= np.float32(0.5 ** (elapsed_s / HALF_LIFE_S))
+        self._seen += _histograms(of_some, _probability(first))
+        found = _with(logits, _evidence(self._seen, index), weight)
+        strays = _strays(_is_target(found), _is_target(logits))
+        np.copyto(found, logits, where=strays)
+        return found
+
+
+def _bins(picture: NDArray[np.uint8]) -> NDArray[np.intp]:
+    """The bin of each pixel (h, w) in a flattened histogram."""
+    lab = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB), np.uint8)
+    light, a, b = lab[..., 0] >> 4, *(np.clip(lab[..., k] >> 3, 8, 23) - 8 for k in (1, 2))
+    return np.asarray((light.astype(np.intp) << 8) | (a.astype(np.intp) << 4) | b)
+
+
+def _probability(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Of each group (groups, h, w)."""
+    each = np.exp(logits - logits.max(0))
+    of_groups = np.stack([each[list(group)].sum(0) for group in GROUPS])
+    return of_groups / of_groups.sum(0)
+
+
+def _histograms(index: NDArray[np.intp], probability: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Pixels of each colour in each group (groups, *SHAPE), of which index and probability have one in EVERY squared."""
+    flat, size = index.ravel(), int(np.prod(SHAPE))
+    counts = np.stack([np.bincount(flat, of.ravel(), size).reshape(SHAPE) for of in probability])
+    return (EVERY**2 * counts).astype(np.float32)
+
+
+def _evidence(seen: NDArray[np.float32], index: NDArray[np.intp]) -> list[NDArray[np.float32]]:
+    """For each group, the log-likelihood ratio of each pixel's colour (h, w) between it and the others."""
+    seen = _smoothed(seen)
+    of_colour, of_group, tiny = seen.sum(0), seen.sum((1, 2, 3)), np.float32(1e-6)
+    known, everything, found = of_colour / (of_colour + FEW_PX), of_group.sum(), []
+    for inside, pixels in zip(seen, of_group, strict=True):
+        prior = np.log((pixels + tiny) / (everything - pixels + tiny))
+        ratio = np.clip(np.log((inside + tiny) / (of_colour - inside + tiny)) - prior, -GREATEST, GREATEST)
+        ratio *= known * (pixels / (pixels + ENOUGH_PX))
+        found.append(cv2.GaussianBlur(ratio.ravel()[index], (0, 0), SMOOTH_PX))
+    return found
+
+
+def _smoothed(seen: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Histograms with half of each bin given to its neighbours along every axis in turn; the sums stay."""
+    for axis in range(1, 4):
+        old = np.moveaxis(seen, axis, 0)
+        new = 0.5 * old
+        new[1:] += 0.25 * old[:-1]
+        new[:-1] += 0.25 * old[1:]
+        new[[0, -1]] += 0.25 * old[[0, -1]]
+        seen = np.moveaxis(new, 0, axis)
+    return seen
+
+
+def _with(logits: NDArray[np.float32], evidence: list[NDArray[np.float32]], weight: float) -> NDArray[np.float32]:
+    out = logits.copy()
+    for group, found in zip(GROUPS, evidence, strict=True):
+        for label in group:
+            out[label] += np.float32(weight) * found
+    return out
+
+
+def _is_target(logits: NDArray[np.float32]) -> NDArray[np.bool_]:
+    inside, outside = list(GROUPS[0]), [label for group in GROUPS[1:] for label in group]
+    return logits[inside].max(0) > logits[outside].max(0)
+
+
+def _strays(target: NDArray[np.bool_], own: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The connected regions (h, w) of the target of which hardly anything is the network's own."""
+    count, region = cv2.connectedComponents(target.astype(np.uint8), connectivity=4)
+    pixels, seen = (np.bincount(region[chosen], minlength=count) for chosen in (target, own & target))
+    return (seen < OWN_SHARE * pixels)[region]
