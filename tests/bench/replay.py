@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 
 from penumbra.services import flags
+from penumbra.services.replay.chain import SERVICES, Replay
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import topics
 from penumbra.sim.world.world import record
 from penumbra.tests.bench.lib import accuracy, results
 from penumbra.tests.bench.lib.accuracy import SENSES
 from penumbra.tests.bench.lib.results import Part, Result
-from penumbra.tests.support.replay import SERVICES, Replay
 
 
 def tables(result: Result) -> list[Part]:

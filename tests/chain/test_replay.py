@@ -1,5 +1,5 @@
 """A recorded quarter of a minute through all services: a changed output is a mistake, or a new reference in the same commit
-(`python -m penumbra.tests.support.replay`)."""
+(`python -m penumbra.tests.chain.test_replay`)."""
 
 import json
 from pathlib import Path
@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from penumbra.services.replay.chain import Heard, Replay
 from penumbra.services.segmentation.inference import load_segmenter
 from penumbra.shared.cell import description
+from penumbra.shared.contract import topics
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.contract.topics import FRAME
 from penumbra.shared.perception.lookout import whole_frame
 from penumbra.sim.world.world import record
-from penumbra.tests.support.replay import Heard, Replay, digest
 
 REFERENCE = Path(__file__).parents[1] / "references" / "replay_table.json"
 SEED = 11
@@ -36,6 +37,19 @@ def masks() -> list[list[int]]:
     frames: list[Any] = [message for topic, _, message in record(table, SEED, 5.0) if topic is FRAME]
     found = [np.bincount(segmenter(frame.image, window, frame.stamp_ns).ravel(), minlength=len(Label)) for frame in frames]
     return [counts.tolist() for counts in found[::20]]
+
+
+def digest(heard: list[Heard], period_s: float = 1.0) -> dict[str, list[Any]]:
+    """What each service said of the pose, thinned to one message a period: states and positions."""
+    out: dict[str, list[Any]] = {topic.name: [] for topic in (topics.VISION, topics.HAPTIC, topics.FUSED)}
+    due = dict.fromkeys(out, 0)
+    for item in heard:
+        name = item.topic.name
+        if name not in out or item.time_ns < due[name]:
+            continue
+        due[name] = item.time_ns + round(period_s * 1e9)
+        out[name].append([item.message.state, *np.round(item.message.position, 5).tolist()])
+    return out
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +77,7 @@ def test_each_sense_gives_the_reference_s_poses(played, reference, sense, tolera
     assert np.mean(same_state) > 0.95
     off = [np.linalg.norm(np.subtract(a[1:], b[1:])) for a, b, same in zip(ours, theirs, same_state, strict=True) if same]
     assert np.median(off) < tolerance_m
+
+
+if __name__ == "__main__":  # writes the reference again
+    REFERENCE.write_text(json.dumps({"mask": masks(), **digest(play())}, indent=None).replace("], [", "],\n  [") + "\n")

@@ -1,7 +1,7 @@
-"""A recording played through the services in one process, deterministically: the stamps in the data drive everything.
+"""Messages played through the services in one process, to the bit the same every time: the times in the data drive everything.
 
-Each service is wired by its own `start`, to a `ReplayNode` in place of the bus; a message is delivered after the time that its
-making takes on a real machine, so that fusion sees vision late, as it does live.
+Each service is wired by its own `start`, to a `ReplayNode` in place of the bus; what a service publishes is delivered after the
+time that its making takes on a real machine, so that fusion sees vision late, as it does live.
 """
 
 from __future__ import annotations
@@ -9,18 +9,16 @@ from __future__ import annotations
 import heapq
 import importlib
 import itertools
-import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from penumbra.services import flags
 from penumbra.shared.cell import description as cells
-from penumbra.shared.contract import topics
+from penumbra.shared.contract import processes, topics
 from penumbra.shared.contract.messages import Message, decode, encode
 from penumbra.shared.contract.topics import Topic
+from penumbra.shared.recording.reading import Played
 from penumbra.shared.runtime import logs
 from penumbra.shared.runtime.hang import HANG_S
 from penumbra.shared.runtime.node import ServiceNode
@@ -28,6 +26,9 @@ from penumbra.shared.runtime.node import ServiceNode
 SERVICES = ("segmentation", "search", "haptics", "fusion")
 DELAY_NS = {topics.FRAME: 2_000_000, topics.MASK: 30_000_000, topics.VISION: 5_000_000, topics.HAPTIC: 1_000_000}
 """From the cause of a message to its arrival; what is not named arrives at once."""
+
+DEFAULTS = {"search": ["--landmarks", "off"]}
+"""Arguments of services: a replay shall say the same whether or not a machine has the landmark models."""
 
 
 @dataclass(frozen=True)
@@ -41,35 +42,63 @@ class Heard:
 
 
 class Replay:
-    """The clock, the messages on their way and who listens. `heard`: all messages delivered, in order."""
+    """The clock, the messages on their way and who listens.
 
-    def __init__(self, cell: cells.Cell, services: Iterable[str] = SERVICES, arguments: dict[str, list[str]] | None = None):
+    services: which of them, as far as the cell has work for them; arguments: their flags. hear: is called with every message that
+    is delivered; None: they are kept in `heard`, in order.
+    """
+
+    def __init__(
+        self,
+        cell: cells.Cell,
+        services: Iterable[str] = SERVICES,
+        arguments: Mapping[str, Sequence[str]] | None = None,
+        hear: Callable[[Heard], None] | None = None,
+    ):
         self.cell, self.now_ns = cell, 0
         self.heard: list[Heard] = []
+        self._hear = hear or self.heard.append
         self._listeners: list[tuple[Topic, dict[str, str], Callable[[Any, dict[str, str]], None]]] = []
         self._timers: list[tuple[int, Callable[[], None]]] = []
         self._answers: dict[str, Callable[[dict[str, str], bytes], Any]] = {}
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._count = itertools.count()
+        chosen = {**DEFAULTS, **(arguments or {})}
         for name in services:
+            if (process := processes.find(name)) is not None and not process.is_needed(cell):
+                continue
             module = importlib.import_module(f"penumbra.services.{name}.service")
-            module.start(ReplayNode(self, name), flags.parse(module.FLAGS, (arguments or {}).get(name, [])))
+            module.start(ReplayNode(self, name), flags.parse(module.FLAGS, list(chosen.get(name, ()))))
 
     def run(self, recording: Iterable[tuple[Topic, dict[str, str], Message]]) -> list[Heard]:
-        """Plays messages in the order of their stamps; returns all that was heard."""
-        for topic, names, message in recording:
+        """Plays messages in the order of their stamps, each delivered after the delay that its sensor has; returns `heard`."""
+        return self._play(
+            Heard(message.stamp_ns + DELAY_NS.get(topic, 0), topic, names, message) for topic, names, message in recording
+        )
+
+    def run_recorded(self, recording: Iterable[Played]) -> list[Heard]:
+        """Plays messages as they came, at the times of their arrival; returns `heard`."""
+        return self._play(Heard(each.received_ns, each.topic, each.names, each.message) for each in recording)
+
+    def _play(self, recording: Iterable[Heard]) -> list[Heard]:
+        for item in recording:
+            begins_ns = item.time_ns - DELAY_NS.get(item.topic, 0)
             if not self.now_ns:
-                self.now_ns = message.stamp_ns
+                self.now_ns = begins_ns
                 for period_ns, function in self._timers:
-                    self._tick(message.stamp_ns, period_ns, function)
-            self._advance(message.stamp_ns)
-            self.send(topic, names, message, message.stamp_ns)
+                    self._tick(begins_ns, period_ns, function)
+            self._advance(max(begins_ns, self.now_ns))
+            self._send(item)
         self._advance(self.now_ns + max(DELAY_NS.values()))
         return self.heard
 
-    def send(self, topic: Topic, names: dict[str, str], message: Message, cause_ns: int) -> None:
-        copy = decode(topic.message, encode(message))  # as over the wire: nobody shares an array
-        self._at(cause_ns + DELAY_NS.get(topic, 0), lambda: self._deliver(topic, names, copy))
+    def publish(self, topic: Topic, names: dict[str, str], message: Message) -> None:
+        """Sends what is made now: it arrives after the time that its making takes."""
+        self._send(Heard(self.now_ns + DELAY_NS.get(topic, 0), topic, names, message))
+
+    def _send(self, item: Heard) -> None:
+        copy = decode(item.topic.message, encode(item.message))  # as over the wire: nobody shares an array
+        self._at(item.time_ns, lambda: self._deliver(item.topic, item.names, copy))
 
     def listen(self, topic: Topic, names: dict[str, str], handler: Callable[[Any, dict[str, str]], None]) -> None:
         self._listeners.append((topic, names, handler))
@@ -101,7 +130,7 @@ class Replay:
         self.now_ns = until_ns
 
     def _deliver(self, topic: Topic, names: dict[str, str], message: Any) -> None:
-        self.heard.append(Heard(self.now_ns, topic, names, message))
+        self._hear(Heard(self.now_ns, topic, names, message))
         for wanted, chosen, handler in self._listeners:
             if wanted is topic and chosen.items() <= names.items():
                 handler(message, names | {"publisher": topic.publishers[0]})
@@ -144,7 +173,7 @@ class ReplayNode(ServiceNode):
         return self._replay.now_ns
 
     def publish(self, topic: Topic, message: Message, **names: str) -> None:
-        self._replay.send(topic, names, message, self._replay.now_ns)
+        self._replay.publish(topic, names, message)
 
     def subscribe(
         self,
@@ -189,27 +218,3 @@ class ReplayNode(ServiceNode):
 
     def rank(self, stream: str) -> float:
         return 0.0
-
-
-def digest(heard: list[Heard], period_s: float = 1.0) -> dict[str, list[Any]]:
-    """What each service said of the pose, thinned to one message a period: states and positions."""
-    out: dict[str, list[Any]] = {topic.name: [] for topic in (topics.VISION, topics.HAPTIC, topics.FUSED)}
-    due = dict.fromkeys(out, 0)
-    for item in heard:
-        name = item.topic.name
-        if name not in out or item.time_ns < due[name]:
-            continue
-        due[name] = item.time_ns + round(period_s * 1e9)
-        out[name].append([item.message.state, *np.round(item.message.position, 5).tolist()])
-    return out
-
-
-def main() -> None:
-    """`python -m penumbra.tests.support.replay`: writes the reference of tests/chain/test_replay.py again."""
-    from penumbra.tests.chain.test_replay import REFERENCE, masks, play
-
-    REFERENCE.write_text(json.dumps({"mask": masks(), **digest(play())}, indent=None).replace("], [", "],\n  [") + "\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,198 @@
+"""Files on a disk, one after another: each ends whole, at a size, at an age, and before the disk is full."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from penumbra.shared.recording.entries import Entry
+from penumbra.shared.recording.file import File
+from penumbra.shared.runtime.logs import Log
+
+AGAIN_S = 1.0
+"""How often it is tried whether a full disk takes files again [s]: what is recorded again may be that much late."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """roll_bytes, roll_s: size and age at which a file ends and the next one begins. free_bytes: that stay free on the disk."""
+
+    roll_bytes: float
+    roll_s: float
+    free_bytes: float
+
+
+class Disk:
+    """out: a file (.mcap), of which the ones that follow have a number, or a folder, in which files are named by cell and time.
+    about, attached: what each file says of itself. stage: the entries with which each begins, at a time [ns].
+
+    fault: why nothing is written now; empty while all is well. bytes, messages, files: what was written so far. lost: messages
+    that were not, because the disk was full.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        cell: str,
+        about: Mapping[str, Mapping[str, str]],
+        attached: Mapping[str, bytes],
+        stage: Callable[[int], Iterable[Entry]],
+        limits: Limits,
+        log: Log,
+    ):
+        self._out, self._cell, self._about, self._attached = out, cell, about, attached
+        self._stage, self._limits, self._log = stage, limits, log
+        self._file: File | None = None
+        self._began_s = self._tried_s = float("-inf")
+        self._bytes = 0
+        self.fault, self.name = "", ""
+        self.messages = self.files = self.lost = 0
+
+    @property
+    def bytes(self) -> int:
+        return self._bytes + (self._file.size if self._file else 0)
+
+    @property
+    def folder(self) -> Path:
+        """Where files are made."""
+        return self._out.parent if self._out.suffix == ".mcap" else self._out
+
+    def check(self) -> None:
+        """Raises OSError where no file can be made."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        probe = next(self._names())
+        probe.open("x").close()
+        probe.unlink()
+
+    def write(self, entries: Iterable[Entry], now_ns: int) -> None:
+        """Adds entries, to the next file where it is time for it. Those of a full disk are lost, and counted."""
+        now_s = time.monotonic()
+        file = self._file
+        if file is not None and (file.size >= self._limits.roll_bytes or now_s - self._began_s >= self._limits.roll_s):
+            self.close()
+        if self._file is None and now_s - self._tried_s >= AGAIN_S:
+            self._begin(now_ns, now_s)
+        waiting = iter(entries)
+        if self._file is not None:
+            try:
+                for entry in waiting:
+                    self._file.write(entry)
+                    self.messages += 1
+            except OSError as error:
+                self._fail(self._file, error)
+        self.lost += sum(1 for _ in waiting)
+
+    def flush(self) -> None:
+        """Hands all to the kernel; ends the file in time before the disk is full."""
+        if self._file is None:
+            return
+        try:
+            self._file.flush()
+        except OSError as error:
+            self._fail(self._file, error)
+            return
+        if not self._has_room():
+            self.close()
+            self._pause(f"less than {self._limits.free_bytes / 1e6:g} MB are free in {self.folder}")
+
+    def save(self, entries: Iterable[Entry], now_ns: int) -> Path:
+        """Writes a file of its own. Raises OSError where the disk has no room for it."""
+        if not self._has_room():
+            raise OSError(28, f"less than {self._limits.free_bytes / 1e6:g} MB are free in {self.folder}")
+        file = self._new(now_ns)
+        try:
+            for entry in entries:
+                file.write(entry)
+                self.messages += 1
+            file.close()
+        except OSError:
+            file.cut()
+            raise
+        finally:
+            self._bytes += file.size
+        return file.path
+
+    def sync(self) -> None:
+        """Has the disk write what the kernel has. Any thread may call it."""
+        if (file := self._file) is not None:
+            with suppress(OSError):  # closed meanwhile, or full: `flush` finds out
+                file.sync()
+
+    def close(self) -> None:
+        """Ends the file that is open."""
+        if (file := self._file) is None:
+            return
+        try:
+            file.close()
+        except OSError as error:
+            self._fail(file, error)
+            return
+        self._ended(file)
+
+    def _begin(self, now_ns: int, now_s: float) -> None:
+        self._tried_s = now_s
+        if not self._has_room():
+            self._pause(f"less than {self._limits.free_bytes / 1e6:g} MB are free in {self.folder}")
+            return
+        try:
+            self._file = self._new(now_ns)
+        except OSError as error:
+            self._pause(f"{self.folder}: {error.strerror}")
+            return
+        self._began_s = now_s
+        self._log.info("recording" if not self.fault else "recording again", file=str(self._file.path))
+        self.fault = ""
+
+    def _new(self, now_ns: int) -> File:
+        for path in self._names():
+            try:
+                file = File(path, self._about, self._attached, now_ns)
+            except FileExistsError:
+                continue
+            self.name, self.files = str(path), self.files + 1
+            try:
+                for entry in self._stage(now_ns):
+                    file.write(entry)
+                file.flush()
+            except OSError:
+                file.cut()
+                raise
+            return file
+        raise AssertionError("names have no end")
+
+    def _names(self) -> Iterator[Path]:
+        """Paths of the next file that are not there yet, as far as one can know."""
+        first = self._out
+        if first.suffix != ".mcap":
+            first = self._out / f"{self._cell}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
+        number = 1
+        while True:
+            path = first if number == 1 else first.with_stem(f"{first.stem}-{number}")
+            if not path.exists():
+                yield path
+            number += 1
+
+    def _has_room(self) -> bool:
+        return shutil.disk_usage(self.folder).free >= self._limits.free_bytes
+
+    def _fail(self, file: File, error: OSError) -> None:
+        """The disk took no more in the middle of a file."""
+        with suppress(OSError):
+            file.cut()
+        self._ended(file)
+        self._pause(f"{file.path}: {error.strerror}")
+
+    def _ended(self, file: File) -> None:
+        self._bytes += file.size
+        self._file = None
+        self._tried_s = float("-inf")
+
+    def _pause(self, why: str) -> None:
+        self._tried_s = time.monotonic()
+        if not self.fault:
+            self._log.error("recording pauses until there is room again; the file before is whole", why=why)
+        self.fault = why

@@ -1,0 +1,1 @@
+"""Plays what was recorded: onto the bus, in place of sensors or of everything, or through the methods in one process."""
