@@ -23,6 +23,8 @@ FATES = ("accepted", "gated", "late", "duplicate", "nothing", "future", "pose", 
 """What may become of a measurement: taken; too far from the prediction; older than the history; known already; observing nothing.
 The others are faults of its own, for which it is refused."""
 ACCEPTED, GATED, LATE, DUPLICATE, NOTHING, FUTURE, POSE_FAULT, INFORMATION_FAULT = range(len(FATES))
+PROMISED = 3.0
+"""Standard deviations of the position that tracking promises to be within its bound."""
 NO_CLOCK = (1 << 63) - 1
 """The latest stamp where nobody looks at a clock."""
 ROUNDING = 1e-6
@@ -71,13 +73,15 @@ class Limits:
 
     tracking_age : age [s] of the newest measurement above which the target is not tracked: three periods of a camera at 20 Hz and
         the delay of vision.
-    tracking_sigma, lost_sigma : standard deviation of the position [m] along its worst direction. A forearm is 8 cm thick: beyond
-        that the estimate no longer overlaps it; beyond 15 cm it is no help as a place to look at.
+    tracking_bound : what tracking promises [m]: PROMISED standard deviations of the position along its worst direction are
+        within it. The cell file sets it.
+    lost_sigma : standard deviation of the position [m] along its worst direction beyond which it is no help as a place to look
+        at. Chosen, not measured.
     lost_age : time [s] without a measurement after which nothing is known about a limb. Chosen, not measured.
     """
 
     tracking_age: float = 0.25
-    tracking_sigma: float = 0.08
+    tracking_bound: float = 0.15
     lost_sigma: float = 0.15
     lost_age: float = 3.0
 
@@ -95,7 +99,7 @@ def state_of(age_s, covariance, limits):  # type: ignore[no-untyped-def]
     sigma = math.sqrt(position[2, 2])
     if sigma > limits[2] or age_s > limits[3]:
         return LOST
-    return TRACKING if age_s <= limits[0] and sigma <= limits[1] else COASTING
+    return TRACKING if age_s <= limits[0] and PROMISED * sigma <= limits[1] else COASTING
 
 
 @dataclass

@@ -1,7 +1,8 @@
 """The default observer's filter, compiled: an error-state Kalman filter that knows that the errors of a sense last.
 
 State: position p, rotation R, linear and angular velocity, and a bias of every sense. Errors are along fixed axes, the rotation's
-applied from the left (`shared.geometry.rigid.perturb`). Velocities are constant but for white acceleration, and decay slowly.
+applied from the left (`shared.geometry.rigid.perturb`). Velocities are constant but for white acceleration, which grows
+with speed, and decay slowly: a limb at rest stays, one under way may do anything.
 
 A sense is wrong by nearly the same amount from one measurement to the next: a mask a pixel too large is a forearm 2 cm too near
 for as long as nobody moves. A filter that takes 100 such measurements a second for independent assumes a tenth of the error
@@ -138,7 +139,8 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
         now.distance, now.rank = distance, m.rank
         sense.surprise, sense.measured_ns = distance / m.rank, m.stamp_ns
         contradicted = _is_contradicted(one, state, m)
-        passes = distance <= model.senses[m.source].threshold[1 if contradicted else 0, m.rank]
+        gate = 0 if not contradicted else 1 if sense.refused < one.refusals else 2
+        passes = distance <= model.senses[m.source].threshold[gate, m.rank]
         if not passes and not contradicted:
             learn(model, state, m, innovation, REFUSED_RATE)
         elif passes:
@@ -170,6 +172,17 @@ def _is_contradicted(one, state, m):  # type: ignore[no-untyped-def]
     for s in range(len(state.senses)):
         other = state.senses[s]
         if m.stamp_ns - other.measured_ns < one.agreement_time * 1e9 and other.surprise < surprise:
+            return True
+    return False
+
+
+@inner
+def is_contested(state):  # type: ignore[no-untyped-def]
+    """Whether a sense contradicts the state and nothing newer has confirmed it: the limb may be elsewhere. A sense that is wrong
+    for long is answered by the next measurement of another one that is accepted."""
+    for s in range(len(state.senses)):
+        sense = state.senses[s]
+        if sense.refused and sense.refused_ns >= state.now.accepted_ns:
             return True
     return False
 
@@ -270,7 +283,7 @@ def move(one, dt, p, R, velocity, P, agility):  # type: ignore[no-untyped-def]
     velocity; agility (2,). F and Q are its transition and process noise, P = F P F' + Q; entries beyond the 12th stay."""
     tau = one.velocity_time
     decay, reach, twice = math.exp(-dt / tau), -tau * math.expm1(-dt / tau), -0.5 * tau * math.expm1(-2.0 * dt / tau)
-    rotation, turn = np.empty(3), np.empty((3, 3))
+    rotation, turn, noise = np.empty(3), np.empty((3, 3)), np.empty(2)
     for i in range(3):
         rotation[i] = reach * velocity[3 + i]
     so3.exp(rotation, turn)
@@ -279,8 +292,11 @@ def move(one, dt, p, R, velocity, P, agility):  # type: ignore[no-untyped-def]
         for i in range(len(P)):
             for j in range(i):
                 P[i, j], P[j, i] = P[j, i], P[i, j]
+    for half in range(2):  # the mean over dt: on the way the speed decays
+        of = velocity[3 * half : 3 * half + 3]
+        noise[half] = agility[half] * one.acceleration[half] + one.unsteadiness * so3.dot(of, of) * twice / max(dt, 1e-9)
     for i in range(POSE):
-        density = agility[i // 3] * one.acceleration[i // 3]
+        density = noise[i // 3]
         P[i, i] += density * max(0.0, tau**2 * (dt - 2.0 * reach + twice))
         P[i, i + 6] += density * 0.5 * reach**2
         P[i + 6, i] += density * 0.5 * reach**2
@@ -290,6 +306,18 @@ def move(one, dt, p, R, velocity, P, agility):  # type: ignore[no-untyped-def]
     so3.turn(turn, R, 0)
     for i in range(POSE):
         velocity[i] *= decay
+
+
+@inner
+def within_reach(one, p, R):  # type: ignore[no-untyped-def]
+    """Takes a position p (3,) back to where its arm can be: the elbow stays within the upper arm's length of the shoulder."""
+    away = np.empty(3)
+    for i in range(3):
+        away[i] = p[i] - one.elbow * R[i, 0] - one.shoulder[i]
+    distance = math.sqrt(so3.dot(away, away))
+    if distance > one.upper_arm:
+        for i in range(3):
+            p[i] -= (1.0 - one.upper_arm / distance) * away[i]
 
 
 @inner

@@ -17,8 +17,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, GATED, LATE, LOST, NOTHING, fault, state_of
-from penumbra.services.fusion.filter import Model, State, forget, move, reduce, spread, step
+from penumbra.services.fusion.estimate import (
+    ACCEPTED,
+    COASTING,
+    DUPLICATE,
+    GATED,
+    LATE,
+    LOST,
+    NOTHING,
+    TRACKING,
+    fault,
+    state_of,
+)
+from penumbra.services.fusion.filter import Model, State, forget, is_contested, move, reduce, spread, step, within_reach
 from penumbra.services.fusion.records import (
     ESTIMATE,
     MEASUREMENT,
@@ -230,7 +241,11 @@ def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, 
                 velocity[i] = now.velocity[i]
             dt = max(0.0, (stamp_ns - now.stamp_ns) * 1e-9)
             move(one, dt, p, R, velocity, covariance, now.agility)
+            if stamp_ns > now.accepted_ns:  # a guess; what is measured is believed
+                within_reach(one, p, R)
             found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)
+            if found.state == TRACKING and is_contested(State(now, of_senses, P[n, slot])):
+                found.state = COASTING
         for i in range(3):
             for j in range(3):
                 found.pose[i, j] = R[i, j]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from penumbra.services.fusion import history
 from penumbra.services.fusion.estimate import ACCEPTED, FUTURE, STATES, Array, Estimate, Log, latest, refusal, shaped
 from penumbra.services.fusion.records import ESTIMATE, MEASUREMENT, MODEL, NEVER, POSE, SENSE_ESTIMATE, History, size
-from penumbra.services.fusion.settings import FusionSettings, model, sense_models
+from penumbra.services.fusion.settings import FusionSettings, Subject, model, sense_models
 from penumbra.shared.contract.messages import FusedPose, Source
 from penumbra.shared.contract.senses import SENSES, Sense
 from penumbra.shared.geometry import rigid
@@ -22,23 +22,21 @@ from penumbra.shared.geometry import rigid
 class Bank:
     """The observers of n targets, which share nothing but the calls.
 
-    homes : expected poses (n, 4, 4) before anything is known, with standard deviations `spreads` (n, 2), of position [m] and
-    rotation [rad]. senses : whose measurements are taken.
+    subjects : what is known of each beforehand. senses : whose measurements are taken.
     """
 
     def __init__(
         self,
-        homes: Array,
-        spreads: Sequence[tuple[float, float]],
+        subjects: Sequence[Subject],
         settings: FusionSettings | None = None,
         senses: Sequence[Sense] = SENSES,
     ):
-        self.settings = settings or FusionSettings()
+        self.settings, self.subjects = settings or FusionSettings(), tuple(subjects)
         self.names = tuple(sense.name for sense in senses)
-        self.logs = [Log(self.names) for _ in homes]
-        self._models = np.array([model(self.settings, *given) for given in zip(homes, spreads, strict=True)], MODEL)
+        self.logs = [Log(self.names) for _ in subjects]
+        self._models = np.array([model(self.settings, subject) for subject in subjects], MODEL)
         self._sense_models = sense_models(senses)
-        self._history = History.empty(len(homes), self.settings.capacity * len(senses), len(senses))
+        self._history = History.empty(len(subjects), self.settings.capacity * len(senses), len(senses))
         self._room = np.empty(1, MEASUREMENT), np.empty((size(len(senses)), POSE))
         history.clear_all(*self._history)
 
@@ -143,7 +141,7 @@ class ErrorStateObserver:
         settings: FusionSettings | None = None,
         senses: Sequence[Sense] = SENSES,
     ):
-        self._join(Bank(np.asarray(home)[None], [spread], settings, senses), 0)
+        self._join(Bank([Subject(home, spread)], settings, senses), 0)
 
     @classmethod
     def of(cls, bank: Bank, target: int) -> ErrorStateObserver:
@@ -154,7 +152,7 @@ class ErrorStateObserver:
 
     def _join(self, bank: Bank, target: int) -> None:
         self._bank, self._target = bank, target
-        self.settings, self.log = bank.settings, bank.logs[target]
+        self.settings, self.subject, self.log = bank.settings, bank.subjects[target], bank.logs[target]
 
     def measure(
         self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None, now_ns: int | None = None

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 POSE, MOTION = 6, 12  # sizes of the pose, and of the pose with its velocities, within the state
 UNITS = (0.1, 0.1, 0.1, 1.0, 1.0, 1.0)
 """Units [m, rad] in which translations and rotations compare: a turn by 1 rad moves the ends of a forearm by about 10 cm."""
+GATES = 3
+"""How many gates a sense has: see `senses.Errors`."""
 NEVER = -(1 << 62)
 """The stamp of what has not happened."""
 
@@ -26,10 +28,12 @@ def size(senses: int) -> int:
 MODEL = np.dtype(
     [
         *((name, "f8", 2) for name in ("acceleration", "velocity_spread", "agility", "learning")),  # as in FusionSettings
-        *((name, "f8") for name in ("velocity_time", "doubt", "patience", "source_patience", "refusals", "unobserved")),
-        ("agreement_time", "f8"),
-        *((name, "f8") for name in ("horizon", "weight_time", "lost_age")),
+        *((name, "f8") for name in ("velocity_time", "unsteadiness", "doubt", "patience", "source_patience", "refusals")),
+        *((name, "f8") for name in ("unobserved", "agreement_time", "horizon", "weight_time", "lost_age")),
         ("limits", "f8", 4),  # as in Limits
+        ("shoulder", "f8", 3),  # as in Arm
+        ("upper_arm", "f8"),
+        ("elbow", "f8"),
         ("home", "f8", (4, 4)),
         ("home_covariance", "f8", (POSE, POSE)),
     ]
@@ -39,7 +43,7 @@ MODEL = np.dtype(
 SENSE_MODEL = np.dtype(
     [
         *((name, "f8") for name in ("lasting", "time_constant", "floor")),  # as in `senses.Errors`
-        ("threshold", "f8", (2, POSE + 1)),  # squared Mahalanobis distances that its `gate` lets pass, by rank
+        ("threshold", "f8", (GATES, POSE + 1)),  # squared Mahalanobis distances that its `gate` lets pass, by rank
     ]
 )
 """The same of one sense."""

@@ -10,14 +10,12 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from penumbra.services import flags
 from penumbra.services.fusion import paper
 from penumbra.services.fusion.estimate import Estimate, RefusedMeasurement, latest, measured
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
-from penumbra.services.fusion.paper import PaperObserver
-from penumbra.shared.cell import description
+from penumbra.services.fusion.paper import PaperObserver, PaperSettings
+from penumbra.services.fusion.settings import Subject
 from penumbra.shared.contract import messages, outline, topics
 from penumbra.shared.contract.senses import SENSES, Sense
 from penumbra.shared.geometry import rigid
@@ -52,7 +50,8 @@ def start(node: ServiceNode, options: flags.Options, senses: Sequence[Sense] = S
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
     if options.observer == "paper":
         senses = [sense for sense in senses if sense.name in paper.SENSES]
-    group = Group(options.observer, [node.cell.targets[name] for name in names], node.now_ns, senses)
+    subjects = [Subject.of(node.cell.targets[name], node.cell.body) for name in names]
+    group = Group(options.observer, subjects, node.now_ns, senses)
     described = outline.of(node.cell).encode(), "application/json"
     node.answer(topics.description(node.cell.name), lambda parameters, payload: described)
     fusions = [Fusion(node, name, group, observer, senses) for name, observer in zip(names, group.observers, strict=True)]
@@ -70,18 +69,16 @@ def start(node: ServiceNode, options: flags.Options, senses: Sequence[Sense] = S
 class Group:
     """The observers of the cell's targets, of which all can be asked at once, and their clock now_ns()."""
 
-    def __init__(self, kind: str, targets: list[description.Target], now_ns: Callable[[], int], senses: Sequence[Sense] = SENSES):
-        homes = [target.home.transform for target in targets]
-        spreads = [(target.home_spread.position, target.home_spread.rotation) for target in targets]
+    def __init__(self, kind: str, subjects: list[Subject], now_ns: Callable[[], int], senses: Sequence[Sense] = SENSES):
         self.lock = threading.Lock()
         self._now_ns, self._last_ns = now_ns, now_ns()
         self.observers: Sequence[ErrorStateObserver | PaperObserver]
         if kind == "paper":
-            self.observers = [PaperObserver(home, spread) for home, spread in zip(homes, spreads, strict=True)]
+            self.observers = [PaperObserver(each.home, each.spread, PaperSettings(limits=each.limits)) for each in subjects]
             self._bank = None
         else:
-            self._bank = Bank(np.array(homes), spreads, senses=senses)
-            self.observers = [ErrorStateObserver.of(self._bank, i) for i in range(len(targets))]
+            self._bank = Bank(subjects, senses=senses)
+            self.observers = [ErrorStateObserver.of(self._bank, i) for i in range(len(subjects))]
 
     def now_ns(self) -> int:
         """The time, asked with the lock held. Where the clock was set back, all that is known is of the future and

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.fusion.estimate import Array, Limits
+from penumbra.services.fusion.estimate import Limits
 from penumbra.services.fusion.records import MODEL, POSE, SENSE_MODEL
+from penumbra.shared.cell.description import Body, Target
 from penumbra.shared.chi_square import quantile
 from penumbra.shared.contract.senses import Sense
+from penumbra.shared.geometry import rigid
 
 
 @dataclass(frozen=True)
@@ -25,18 +28,21 @@ class FusionSettings:
 
     # ---- How a limb moves
 
-    acceleration: tuple[float, float] = (0.1, 1.5)
+    acceleration: tuple[float, float] = (0.07, 1.5)
     """Density of the white acceleration, linear [m^2/s^3] and angular [rad^2/s^3], before it is adapted. By the NEES."""
     velocity_time: float = 0.35
     """Time constant [s] with which a velocity decays: limbs reach to places and stop there. By the NEES."""
+    unsteadiness: float = 2.0
+    """Density of the white acceleration per squared speed [1/s], beside `acceleration`: a limb under way speeds up, turns and
+    stops within about half a second, while one at rest stays where it is. By the NEES."""
     velocity_spread: tuple[float, float] = (0.4, 1.0)
     """Standard deviation of an unknown velocity, linear [m/s] and angular [rad/s]. Chosen, not measured."""
 
     # ---- What is learned from the innovations
 
-    agility: tuple[float, float] = (0.08, 30.0)
-    """Bounds of the learned factors on `acceleration`: from a resting arm to a hand at 2 m/s. Chosen; the lower one by
-    the NEES."""
+    agility: tuple[float, float] = (0.3, 30.0)
+    """Bounds of the learned factors on `acceleration`: from a resting arm to a hand at 2 m/s. Chosen; the lower one by the
+    share of poses beyond three sigma: with 0.08 a limb that sets out from a rest leaves its covariance behind."""
     doubt: float = 100.0
     """Largest learned factor on the covariance of a sense. Chosen, not measured."""
     learning: tuple[float, float] = (0.1, 5.0)
@@ -69,17 +75,52 @@ class FusionSettings:
     weight_time: float = 0.5
     """Time constant [s] with which the information that a sense has brought decays in its published weight. Chosen, not
     measured."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What bounds where a forearm can be.
+
+    shoulder : where it is [m]. upper_arm : its length [m]; infinite: nothing is known, and nothing bounded. elbow : how far it is
+    behind the target's origin, along the limb [m].
+    """
+
+    shoulder: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    upper_arm: float = math.inf
+    elbow: float = 0.0
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is known of a target beforehand.
+
+    home : its expected pose (4, 4), with standard deviations `spread` (position [m], rotation [rad]).
+    """
+
+    home: rigid.Array
+    spread: tuple[float, float]
     limits: Limits = Limits()
+    arm: Arm = Arm()
+
+    @classmethod
+    def of(cls, target: Target, body: Body) -> Subject:
+        """A target of a cell, whose person has a body."""
+        arm = Arm()
+        if target.shoulder is not None:
+            length = target.size.length if target.size else 1.0
+            arm = Arm(target.shoulder, body.upper_arm_length, 0.5 * length * body.forearm_length)
+        spread = target.home_spread.position, target.home_spread.rotation
+        return cls(target.home.transform, spread, Limits(tracking_bound=target.tracking_bound), arm)
 
 
-def model(settings: FusionSettings, home: Array, spread: tuple[float, float]) -> NDArray[np.void]:
-    """A MODEL of a target expected at the pose home (4, 4) with standard deviations spread (position [m], rotation [rad])."""
+def model(settings: FusionSettings, subject: Subject) -> NDArray[np.void]:
+    """The MODEL of a target."""
     out = np.zeros((), MODEL)
-    values = vars(settings) | {"lost_age": settings.limits.lost_age, "limits": astuple(settings.limits), "home": home}
+    values = vars(settings) | vars(subject.limits) | vars(subject.arm) | {"limits": astuple(subject.limits), "home": subject.home}
     for name in MODEL.names or ():
         if name in values:
             out[name] = values[name]
-    out["home_covariance"] = np.diag(np.repeat(np.square(spread), 3))
+    out["home_covariance"] = np.diag(np.repeat(np.square(subject.spread), 3))
     return out
 
 

@@ -10,10 +10,11 @@ where the solve looks, and through what changes slowly (`size_and_rest.py`). A w
    track, is kept as its rival and solved as well, until the windows have decided between the two
 5. learn how far each pad is to be believed (`trust.py`), the limb's size close to the pads, the electrodes' rests while nothing
    is near
-6. publish the likelihood: size and roll marginalised, the model's error counted as nearly the same in several windows; where a
+6. add up the evidence on whether the thing that is felt is a limb (`identity.py`)
+7. publish the likelihood: size and roll marginalised, the model's error counted as nearly the same in several windows; where a
    rival is possible, the likelihood of the two together
 
-Voltages that no limb explains (a metal part, a block) are reported as out of range.
+Voltages that no limb explains (a metal part, a block) are reported as an object, and as unidentified while it is not decided.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from penumbra.services.haptics.identity import Identity
 from penumbra.services.haptics.paper_network import PoseNetwork, Relative, features
 from penumbra.services.haptics.settings import HapticSettings
 from penumbra.services.haptics.size_and_rest import PERSON_S, SIZE_GAP, SIZE_LASTING, Size, Tare
@@ -30,6 +32,7 @@ from penumbra.services.haptics.solve import LEVER, Prior, Reading, Solution, Sol
 from penumbra.services.haptics.starts import Limb, Starts
 from penumbra.services.haptics.track import Home, Place, Track
 from penumbra.services.haptics.trust import PadTrust, SmoothedMisfit
+from penumbra.shared.contract.messages import HapticState
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
@@ -37,20 +40,37 @@ from penumbra.shared.skin.response import Response
 
 FOREIGN = "the signals fit no limb: another object is near"
 """`HapticEstimate.why` of voltages that no limb explains."""
+UNIDENTIFIED = "the signals do not show yet whether a limb or another object is near"
+"""`HapticEstimate.why` of voltages that a limb explains as well as other things do."""
+NOTHING = "nothing near"
+"""`HapticEstimate.why` of voltages that are those of empty space."""
+WHY = {"in_range": "", "unidentified": UNIDENTIFIED, "object": FOREIGN, "out_of_range": NOTHING}
+"""`HapticEstimate.why` of the states that a solve gives."""
 
 
 @dataclass(frozen=True)
 class HapticEstimate:
-    """T_world_target (4, 4) and information (6, 6) of the voltages alone, zero along what they do not show; gap [m]: the
-    smallest from an electrode to the skin, at most `HapticSettings.farthest_gap`; in_range: worth using; why: the reason where it
-    is not; residuals (n,): what the limb leaves unexplained, in standard deviations."""
+    """T_world_target (4, 4) and information (6, 6) of the voltages alone, zero along what they do not show, and all zero where
+    they are not a limb's; gap [m]: the smallest from an electrode to the skin, at most `HapticSettings.farthest_gap`; state: see
+    `HapticPose`, only what is in range is worth using; why: the reason where it is not; residuals (n,): what the limb leaves
+    unexplained, in standard deviations."""
 
     T: Array
     information: Array
     gap: float
-    in_range: bool
+    state: HapticState
     why: str
     residuals: Array
+
+    @property
+    def in_range(self) -> bool:
+        """Whether a limb is felt."""
+        return self.state == "in_range"
+
+    @property
+    def may_be_limb(self) -> bool:
+        """Whether a limb is felt, or something that may be one."""
+        return self.state in ("in_range", "unidentified")
 
 
 class Estimator:
@@ -77,6 +97,7 @@ class Estimator:
         self.skin, self.surface, self.network, self.method = skin, surface, network, method
         self.settings = settings or HapticSettings()
         self.size, self.tare = Size(measured), Tare(skin.noise)
+        self.identity = Identity(skin, response.error, self.settings)
         self._response, self._solver = response, Solver(skin, response)
         self._home = Home(home, spread, self.settings)
         self._limb, self._pads = Limb(skin, surface), PadTrust(skin, self.settings)
@@ -88,13 +109,15 @@ class Estimator:
         """Forget the past."""
         self._stamp_ns, self._away_s = 0, 0.0
         self._is_tracking, self._untracked = False, -1  # windows without a track since the last one with it
-        self._misfit, self._track_misfit = SmoothedMisfit(self.settings), SmoothedMisfit(self.settings)
-        for part in (self._track, self._starts, self._pads, self.size, self.tare):
+        self._track_misfit = SmoothedMisfit(self.settings)
+        for part in (self._track, self._starts, self._pads, self.size, self.tare, self.identity):
             part.forget()
 
     def nothing(self, why: str) -> HapticEstimate:
         """The estimate when nothing can be felt: home, without information."""
-        return HapticEstimate(self._home.T, np.zeros((6, 6)), self.settings.farthest_gap, False, why, np.zeros(len(self.skin)))
+        return HapticEstimate(
+            self._home.T, np.zeros((6, 6)), self.settings.farthest_gap, "out_of_range", why, np.zeros(len(self.skin))
+        )
 
     def warm_up(self, joints: int) -> None:
         """Compile and touch everything once, so that the first real window takes no longer than the others."""
@@ -126,9 +149,12 @@ class Estimator:
         elapsed_s = self._predict(stamp_ns)
         is_expected = expected is not None and self._track.expect(*expected)
         reading = self._reading(amplitude, samples, T_world_pads, joints)
-        estimate = self._by_network(reading) if self.method == "paper" else self._by_solve(reading, is_expected)
-        self.tare.update(reading.signal, samples, elapsed_s, estimate.in_range)
-        self._watch_absence(estimate.in_range, elapsed_s)
+        if self.method == "paper":
+            estimate = self._by_network(reading)
+        else:
+            estimate = self._by_solve(reading, self._track.place if is_expected else None, elapsed_s)
+        self.tare.update(reading.signal, samples, elapsed_s, estimate.may_be_limb)
+        self._watch_absence(estimate.may_be_limb, elapsed_s)
         return estimate
 
     # ---- the steps of a window
@@ -158,21 +184,27 @@ class Estimator:
         self._track.place = Place(self.network.posterior(x), self._home.place.covariance)
         relative = Relative.of(self.skin, self.surface, reading.T_world_pads, np.isfinite(reading.variance), self.pose)
         T, information = self.network.likelihood(x, relative)
-        return self._estimate(T, information, self._limb.gap(reading, T, self.size.mean), "", np.zeros(len(self.skin)))
+        gap = self._limb.gap(reading, T, self.size.mean)
+        state: HapticState = "in_range" if self._is_felt(information, gap) else "out_of_range"
+        return self._estimate(T, information, gap, state, np.zeros(len(self.skin)))
 
-    def _by_solve(self, reading: Reading, is_expected: bool) -> HapticEstimate:
-        solution = self._solution(reading, is_expected)
+    def _by_solve(self, reading: Reading, expected: Place | None, elapsed_s: float) -> HapticEstimate:
+        """expected: where a camera has just seen the limb."""
+        before = self._track.place
+        solution = self._solution(reading, expected is not None)
+        if before.is_apart(self._track.place, self.settings):
+            self.identity.doubt()
         gap = self._limb.gap(reading, solution.T, solution.size)
         self._judge(solution)
-        self._pads.update(solution.residuals, np.isfinite(reading.variance))
         self._learn_size(reading, solution, gap)
-        if self._is_foreign():
-            return self._estimate(solution.T, np.zeros((6, 6)), gap, FOREIGN, solution.residuals)
         information, gradient = self._pose_likelihood(reading, solution)
         information, gradient = self._home.without_roll(solution.T, information, gradient)
         information, gradient = self._track.mixed(information, gradient)
         T, information = self._peak(solution, information, gradient)
-        return self._estimate(T, information, gap, "", solution.residuals)
+        is_felt = self._is_felt(information, gap)
+        state = self._identified(reading, solution, gap, expected, elapsed_s) if is_felt else self._absent(elapsed_s)
+        self._pads.update(solution.residuals, np.isfinite(reading.variance))
+        return self._estimate(T, information, gap, state, solution.residuals)
 
     def _watch_absence(self, in_range: bool, elapsed_s: float) -> None:
         """Forgets the size of a limb that has been away: the next one may be another person's."""
@@ -197,7 +229,7 @@ class Estimator:
         self._track.place = self._place(reading, solution, prior)
         if self._track.rival is not None:
             return self._compared(reading, solution, prior, self._track.rival)
-        if self._is_tracking and not is_expected and self._starts.is_due():
+        if self._is_tracking and not is_expected and (self._starts.is_due() or self.identity.odds < 0.0):
             self._look_elsewhere(reading, solution)
         return solution
 
@@ -255,10 +287,9 @@ class Estimator:
     # ---- what a solution tells
 
     def _judge(self, solution: Solution) -> None:
-        """Whether the track still explains the voltages, and whether any limb does."""
+        """Whether the track still explains the voltages."""
         self._track_misfit.take(solution.misfit)
         self._is_tracking = self._track_misfit.value <= self.settings.track_misfit
-        self._misfit.take(solution.misfit)
 
     def _learn_size(self, reading: Reading, solution: Solution, gap: float) -> None:
         """Learns the size where it can be told from the pose: close to the pads, with one place possible."""
@@ -266,8 +297,25 @@ class Estimator:
             likelihood = self._solver.likelihood(reading, solution, SIZE_LASTING)
             self.size.learn(solution.size, *likelihood, self._home.information)
 
-    def _is_foreign(self) -> bool:
-        return self._misfit.value > self.settings.limb_misfit or self.size.strangeness > self.settings.strange_size
+    def _identified(
+        self, reading: Reading, solution: Solution, gap: float, expected: Place | None, elapsed_s: float
+    ) -> HapticState:
+        """What is felt, after a window so many seconds after the last one, and the limb that explains it best."""
+        free = self._solver.free(reading, solution, self._prior(self._home.place))
+        self.identity.take(reading, solution, free, gap, elapsed_s)
+        if self.size.strangeness > self.settings.strange_size:
+            self.identity.refuse()
+        is_there = expected is not None and not self._track.place.is_apart(expected, self.settings)
+        if is_there and solution.misfit < self.settings.track_misfit:
+            self.identity.see()
+        verdict = self.identity.verdict
+        if verdict == "object":
+            self.size.forget()  # it was no limb's
+        return "in_range" if verdict == "limb" else verdict
+
+    def _absent(self, elapsed_s: float) -> HapticState:
+        self.identity.miss(elapsed_s)
+        return "out_of_range"
 
     def _pose_likelihood(self, reading: Reading, solution: Solution) -> tuple[Array, Array]:
         """Information (6, 6) and gradient (6,) of the pose by the voltages alone, the size marginalised."""
@@ -284,11 +332,14 @@ class Estimator:
         known = turn @ known @ turn.T
         return best, 0.5 * (known + known.T)
 
-    def _estimate(self, T: Array, information: Array, gap: float, why: str, residuals: Array) -> HapticEstimate:
+    def _is_felt(self, information: Array, gap: float) -> bool:
+        """Whether something is near: within range, and known well enough along one direction at least."""
         scale = np.array([1.0, 1.0, 1.0, 1.0 / LEVER, 1.0 / LEVER, 1.0 / LEVER])
         strongest = float(np.linalg.eigvalsh(information * np.outer(scale, scale))[-1])
-        far = gap >= self.settings.range_share * float(self.skin.range.max())
-        if not why and (far or strongest <= 1.0 / self.settings.worst_sigma**2):
-            why = "nothing near"
+        is_near = gap < self.settings.range_share * float(self.skin.range.max())
+        return is_near and strongest > 1.0 / self.settings.worst_sigma**2
+
+    def _estimate(self, T: Array, information: Array, gap: float, state: HapticState, residuals: Array) -> HapticEstimate:
+        known = information if state in ("in_range", "unidentified") else np.zeros((6, 6))
         gap = min(max(gap, 0.0), self.settings.farthest_gap)
-        return HapticEstimate(T, np.zeros((6, 6)) if why else information, gap, not why, why, residuals)
+        return HapticEstimate(T, known, gap, state, WHY[state], residuals)

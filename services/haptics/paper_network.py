@@ -143,12 +143,12 @@ def _left_jacobian(rotation: Array) -> Array:
 
 def fingerprint(cell: cells.Cell, target: str) -> str:
     """What a network was trained for: what the pads respond with, where they are, robots and body. Another cell needs another
-    training; a calibration does not."""
+    training; a calibration or another source of joints does not."""
     parts = {
         "pads": {
             name: [response.fingerprint(cell, name, target), pad.link, pad.position, pad.rpy] for name, pad in cell.pads.items()
         },
-        "robots": {name: robot.model_dump() for name, robot in cell.robots.items()},
+        "robots": {name: robot.model_dump(exclude={"source"}) for name, robot in cell.robots.items()},
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -132,7 +132,7 @@ def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str
 
 class Misfits:
     """Per pad, what the limb leaves unexplained, in the health's report as misfit/PAD: mean squared residual in variances, of
-    windows in which a limb is in range. A pad that is turned, or has another pad's calibration, stands out."""
+    windows in which what is in range may be a limb. A pad that is turned, or has another pad's calibration, stands out."""
 
     def __init__(self, node: ServiceNode):
         self._node = node
@@ -140,7 +140,7 @@ class Misfits:
 
     def update(self, estimate: HapticEstimate, skin: Skin, samples: NDArray[np.int64]) -> None:
         """Takes the residuals (n,) of a window on a skin, with so many samples (n,) each."""
-        if not estimate.in_range:
+        if not estimate.may_be_limb:
             return
         squares = np.minimum(estimate.residuals**2, WORST**2)
         for k, pad in enumerate(skin.pads):
@@ -198,5 +198,5 @@ def _message(estimate: HapticEstimate, window: VoltageWindow, target: str, frame
         orientation=orientation,
         information=estimate.information,
         gap=estimate.gap,
-        state="in_range" if estimate.in_range else "out_of_range",
+        state=estimate.state,
     )

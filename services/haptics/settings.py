@@ -38,9 +38,6 @@ class HapticSettings:
     track_misfit: float = 2.0
     """Smoothed misfit above which the track no longer explains the voltages and the solve starts from scratch. Chosen: the noise
     of a single window far from the pads, where few electrodes feel anything, doubles the misfit without telling places apart."""
-    limb_misfit: float = 2.2
-    """Smoothed misfit above which the thing that is felt is no limb. Chosen above `track_misfit`, so that a fresh start comes
-    before the verdict."""
     misfit_share: float = 0.2
     """Weight of the newest window in a smoothed misfit: five windows are remembered. Chosen."""
     misfit_cap: float = 6.0
@@ -55,6 +52,30 @@ class HapticSettings:
     """Weight of the newest window in a pad's smoothed misfit: some thirty windows are remembered. Chosen."""
     pad_cap: float = 100.0
     """Largest squared residual, in variances, that an electrode contributes to its pad's misfit. Chosen."""
+
+    # ---- Whether a limb is felt
+
+    share_memory_s: float = 0.5
+    """Time constant [s] with which the share of the signal that a thing leaves unexplained changes. Chosen: a thing that moves
+    at 0.3 m/s shows another side by then, one at rest is averaged for so long."""
+    odds_memory_s: float = 30.0
+    """Time constant [s] with which evidence fades while something is felt. Chosen: a limb that a camera saw is one for 15 s
+    more, unless its signals say otherwise."""
+    odds_rate: float = 40.0
+    """Largest change of the log odds [1/s], so that a burst of noise does not decide. Chosen: a limb is known after 0.12 s at
+    the earliest."""
+    limb_odds: float = 4.6
+    """Log odds from which the thing that is felt is a limb, until they fall below zero. Derived: of a hundred objects one may be
+    taken for a limb."""
+    object_odds: float = 6.9
+    """Log odds from which it is an object. Derived: one limb in a thousand may be refused."""
+    most_odds: float = 10.0
+    """Largest log odds, for or against. Chosen: after a change from one to the other 0.4 s decide."""
+    seen_odds: float = 8.0
+    """Log odds of a limb that is felt where a camera has just seen it. Chosen: 0.1 s that says otherwise takes it back."""
+    absent_s: float = 5.0
+    """Time [s] for which nothing was near after which what comes next may be anything. Chosen: a limb that leaves the pads'
+    range behind an occluder, and comes back, stays known."""
 
     # ---- Where else the limb may be
 
@@ -79,7 +100,7 @@ class HapticSettings:
     """Largest change of the log odds by one window, so that a burst of noise does not decide. Chosen."""
     odds_decided: float = 5.0
     """Log odds from which the rival is dropped: 150 to one. Chosen. Below zero the two change places."""
-    slides: tuple[float, ...] = (0.0, -0.08, 0.08, -0.16, 0.16)
+    slides: tuple[float, ...] = (0.0, -0.08, 0.08, -0.16, 0.16, -0.24, 0.24)
     """Displacements along the limb [m] of the starts from scratch, from home. Chosen to cover a forearm: its thick and thin parts
     feel alike."""
     clearance: float = 0.05

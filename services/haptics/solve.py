@@ -41,6 +41,8 @@ SAME_SLOPE = 0.3
 """After a step that changes no signal by a larger share the derivatives of the logs are still good for the next one."""
 CONVERGED = 0.05
 """A step with a smaller expected gain in the log probability is the last one, and is taken on trust."""
+AVERAGED = 25.0
+"""Number of windows after which an error that lasts is told from noise, see `Solver.free`."""
 FELT = 3.0
 """Standard deviations from which an electrode feels something."""
 KNOWN = 4
@@ -137,6 +139,16 @@ class Solver:
         at, z = solution.point, np.zeros(len(self._scale))
         _normal_equations(*self._given(window), at.logs, at.rows, False, lasting, H, g, z)
         return H, g
+
+    def free(self, window: Reading, solution: Solution, prior: Prior) -> Array:
+        """The share (n,) of an electrode's error that a solve with this prior leaves in its residual, when noise is averaged out:
+        one less its leverage. Next to nothing where few electrodes feel anything and pose and size fit them."""
+        J = solution.signal[:, None] * solution.point.rows
+        weight = 1.0 / (window.variance / AVERAGED + (self.response.error * solution.signal) ** 2)
+        A = J.T @ (weight[:, None] * J)
+        A[:6, :6] += prior.information
+        A[6:, 6:] += prior.size_information
+        return np.clip(1.0 - weight * np.einsum("ni,ni->n", J, np.linalg.solve(A, J.T).T), 0.0, 1.0)
 
     def _given(self, window: Reading) -> tuple[Array, Array, Array, Array, Array]:
         return window.signal, window.variance, window.distrust, window.doubt, self.response.error

@@ -10,6 +10,18 @@ one instant, a chi-square with as many degrees of freedom as these runs have tog
 5.4, as OpenVINS plots it); the value beside it is the mean over all instants, and `inside` the share of instants whose mean over
 the runs is within the band of its own, 0.95 for a perfect filter.
 
+Beyond 3 sigma: of the poses called tracking, the share whose squared error in units of its covariance is beyond what 99.73 % of
+normal errors stay within. Even a perfect filter has 0.27 % there.
+
+As of the stamp: at the stamp of every measurement, once it has arrived, the error of the fused pose there beside that of the
+measurement itself: what fusion costs. What delay costs is the rest, up to the error as of now.
+
+Wrong: a sense is off by 10 cm for a second. How far the pose is moved is taken beside the same run in which the sense is right;
+beside it stands how far it moves if the sense is silent for that second, which no gate can avoid.
+
+Jump: the limb is elsewhere from one moment to the next, as where an emulator starts again: the messages of one run until then,
+and those of another one afterwards. Noticed: until the pose is right or not called tracking any more.
+
 Late: every measurement is 0, 50 or 200 ms late, or each by 0 to 200 ms at random, so that they come in a random order. What is
 compared is the pose as of the newest stamp that has arrived, read at the same moments: a filter that goes back and replays is
 not worse at it, one that takes late for new is. Beside it stand the error of the pose as of now, which must be guessed further
@@ -38,9 +50,10 @@ from rich.table import Table
 from scipy.stats import chi2
 
 from penumbra.services import flags
-from penumbra.services.fusion.estimate import Estimate
+from penumbra.services.fusion.estimate import STATES, Estimate
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver
+from penumbra.services.fusion.settings import Subject
 from penumbra.shared.contract import messages
 from penumbra.shared.contract.senses import SENSES
 from penumbra.shared.geometry import rigid
@@ -56,7 +69,14 @@ INSTANTS_S = 0.11
 """Between moments that are scored: it walks through all phases of both senses' periods."""
 LATE_S = {"0": (0.0, 0.0), "50": (0.05, 0.05), "200": (0.2, 0.2), "shuffled": (0.0, 0.2)}
 CONFIDENCE = 0.95
-WRONG_GOAL_CM, LATE_GOAL, STEP_GOAL_MS, CORE_GOAL = 3.0, 1.1, 0.3, 1.0
+THREE_SIGMA = 0.9973
+"""Share of normal errors within three standard deviations."""
+NOTICED_S, GUESSED_S = 0.1, 0.5
+"""Within what time a jump is to be noticed, and a limb that nothing measures is to be known still."""
+WRONG_RUNS = 10
+"""A wrong sense is played in so many runs for each run of a situation."""
+WRONG_GOAL_CM, WRONG_MEDIAN_GOAL_CM, BEYOND_GOAL, STAMP_GOAL, GUESSED_GOAL_CM = 3.0, 1.0, 0.001, 1.05, 2.0
+LATE_GOAL, STEP_GOAL_MS, CORE_GOAL = 1.05, 0.3, 1.0
 PUBLISHED_HZ, TARGETS = 200.0, (1, 10, 100)
 BASELINES = ("oracle", "average", "gtsam", "paper")
 SLOW, SLOW_EVERY = ("gtsam", "paper"), 4
@@ -68,17 +88,19 @@ SOURCES = tuple(sense.name for sense in SENSES)
 @dataclass(frozen=True)
 class Scores:
     """One run: at scored instants [s] (k,) the errors [m] of the observer and of each baseline that was played, the NEES and its
-    degrees of freedom; of every accepted measurement its stamp [s], NIS and degrees of freedom (n,); and counts."""
+    degrees of freedom, and its state; of every accepted measurement its stamp [s], NIS and degrees of freedom (n,); by source the
+    errors [m] of the measurements and of the observer at their stamps (m, 2); how many were refused."""
 
     times: Array
     errors: dict[str, Array]
     nees: Array
     nees_dof: Array
+    states: NDArray[np.str_]
     stamps: Array
     nis: Array
     nis_dof: Array
+    at_stamps: dict[str, Array]
     gated: int
-    states: dict[str, int]
 
 
 def normalised(truth: Array, T: Array, covariance: NDArray[np.floating[Any]], rolls: bool) -> float:
@@ -145,9 +167,16 @@ def scored(name: str, seed: int, index: int, seconds: float) -> Scores:
     ours, paper = ErrorStateObserver(HOME, SPREAD), PaperObserver(HOME, SPREAD)
     newest, smoother = Newest(), FixedLagSmoother(HOME, SPREAD)
     rivals = [taking(paper), smoother.take] if index % SLOW_EVERY == 0 else []
-    player = Player(run, [taking(ours), newest.take, *rivals])
+    at_stamps: dict[str, list[tuple[float, float]]] = {source: [] for source in SOURCES}
+
+    def compare(m: runs.Message) -> None:
+        if run.situation.scored(m.stamp):
+            truth = run.at(m.stamp)
+            at_stamps[m.source].append((_distance(truth, m.T), _distance(truth, ours.estimate(runs.ns(m.stamp)).T)))
+
+    player = Player(run, [taking(ours), compare, newest.take, *rivals])
     errors: dict[str, list[float]] = {key: [] for key in ("ours", *BASELINES)}
-    times, nees, dof, states = instants(run), [], [], {"tracking": 0, "coasting": 0, "lost": 0}
+    times, nees, dof, states = instants(run), [], [], []
     for now in times:
         player.until(now)
         truth, estimate = run.at(now), ours.estimate(runs.ns(now))
@@ -155,23 +184,24 @@ def scored(name: str, seed: int, index: int, seconds: float) -> Scores:
         if rivals:
             poses |= {"gtsam": smoother.pose(now), "paper": paper.estimate(runs.ns(now)).T}
         for key, T in poses.items():
-            errors[key].append(float(np.linalg.norm(truth[:3, 3] - T[:3, 3])))
+            errors[key].append(_distance(truth, T))
         errors["oracle"].append(newest.oracle(now, truth))
         rolls = run.situation.rolls(now)
         nees.append(normalised(truth, estimate.T, estimate.covariance, rolls))
         dof.append(6 if rolls else 5)
-        states[estimate.state] += 1
+        states.append(estimate.state)
     stamps, nis, nis_dof = innovations(run)
     return Scores(
         np.array(times),
         {key: np.array(values) for key, values in errors.items()},
         np.array(nees),
         np.array(dof),
+        np.array(states),
         stamps,
         nis,
         nis_dof,
+        {source: np.array(pairs).reshape(-1, 2) for source, pairs in at_stamps.items()},
         sum(counts.gated for counts in ours.log.counts.values()),
-        states,
     )
 
 
@@ -187,19 +217,54 @@ def innovations(run: runs.Run) -> tuple[Array, Array, Array]:
     return stamps, nis, dof
 
 
-def shift(seed: int, index: int, seconds: float) -> float:
-    """How far [m] a wrong sense moves the pose at most, beside the same run in which it is right: what is missed by not hearing
-    it counts too."""
-    right = runs.drawn("one sense wrong", seed, index, seconds)
-    both = [(run, ErrorStateObserver(HOME, SPREAD)) for run in (right, runs.wronged(right, seed, index))]
-    players = [Player(run, [taking(observer)]) for run, observer in both]
-    most = 0.0
-    for now in np.arange(runs.WRONG_S[0], min(seconds, runs.WRONG_S[1] + 4.0), 0.02):
-        for player in players:
+def shift(seed: int, index: int, seconds: float) -> tuple[float, float]:
+    """How far [m] a wrong sense moves the pose at most, beside the same run in which it is right, and how far the same sense does
+    that is silent for as long."""
+    begin, end = runs.WRONG_S[0], min(seconds, runs.WRONG_S[1] + 4.0)
+    right = runs.drawn("one sense wrong", seed, index, end)
+    wrong, silent = runs.wronged(right, seed, index), runs.silenced(right, index)
+    tracks = []
+    for run in (right, wrong, silent):
+        observer = ErrorStateObserver(HOME, SPREAD)
+        player, track = Player(run, [taking(observer)]), []
+        for now in np.arange(begin, end, 0.02):
             player.until(now)
-        a, b = (observer.estimate(runs.ns(now)).T for _, observer in both)
-        most = max(most, float(np.linalg.norm(a[:3, 3] - b[:3, 3])))
-    return most
+            track.append(observer.estimate(runs.ns(now)).T[:3, 3])
+        tracks.append(np.array(track).reshape(-1, 3))
+    right_track, *others = tracks
+    moved_by, missed_by = (float(np.linalg.norm(track - right_track, axis=1).max(initial=0.0)) for track in others)
+    return moved_by, missed_by
+
+
+@dataclass(frozen=True)
+class Jump:
+    """One jump: until when it was noticed [s]; of the poses called tracking after NOTICED_S, how many there were, and how many
+    beyond three sigma; until when the pose was right and called tracking again [s]."""
+
+    noticed: float
+    tracked: int
+    wrong: int
+    again: float
+
+
+def jump(seed: int, index: int, seconds: float) -> Jump:
+    """One run that goes on as another one after half its time, seen by the skin as well in every other one."""
+    run = runs.jumped("one sense wrong" if index % 2 else "visible", seed, index, seconds)
+    observer, begin = ErrorStateObserver(HOME, SPREAD), seconds / 2.0
+    player, rows = Player(run, [taking(observer)]), []
+    for now in np.arange(begin, min(seconds, begin + 4.0), 1.0 / PUBLISHED_HZ):
+        player.until(now)
+        estimate = observer.estimate(runs.ns(now))
+        off = estimate.T[:3, 3] - run.at(now)[:3, 3]
+        is_right = off @ np.linalg.solve(estimate.covariance[:3, :3], off) <= chi2.ppf(THREE_SIGMA, 3)
+        rows.append((now - begin, estimate.state == "tracking", bool(is_right)))
+    after = [(tracked, right) for t, tracked, right in rows if t > NOTICED_S]
+    return Jump(
+        next((t for t, tracked, right in rows if right or not tracked), seconds),
+        sum(tracked for tracked, _ in after),
+        sum(tracked and not right for tracked, right in after),
+        next((t for t, tracked, right in rows if right and tracked), seconds),
+    )
 
 
 @dataclass(frozen=True)
@@ -276,7 +341,7 @@ def core_shares(seed: int, seconds: float) -> list[dict[str, float]]:
     drawn = [runs.drawn("one sense wrong", seed, i, seconds) for i in range(4)]
     found = []
     for n in TARGETS:
-        bank = Bank(np.tile(HOME, (n, 1, 1)), [SPREAD] * n)
+        bank = Bank([Subject(HOME, SPREAD)] * n)
         batches = _batches(drawn, n, seconds)
         took, told = [], []
         for k, batch in enumerate(batches):
@@ -320,12 +385,15 @@ def _batches(drawn: list[runs.Run], n: int, seconds: float) -> list[tuple[Indice
 def summary(each: list[Scores]) -> dict[str, Any]:
     """What is told of the runs of a situation."""
     times, count = np.concatenate([s.times for s in each]), len(each)
-    nees = consistency(times, np.concatenate([s.nees for s in each]), np.concatenate([s.nees_dof for s in each]), count)
     stamps, nis = np.concatenate([s.stamps for s in each]), np.concatenate([s.nis for s in each])
     told = consistency(stamps, nis, np.concatenate([s.nis_dof for s in each]), count)
     errors = {key: 100.0 * np.concatenate([s.errors[key] for s in each]) for key in ("ours", *BASELINES)}
     there = 100.0 * np.concatenate([s.errors["ours"] for s in each if len(s.errors["gtsam"])])
-    moments = sum(sum(s.states.values()) for s in each)
+    values, dof, states = (np.concatenate([getattr(s, key) for s in each]) for key in ("nees", "nees_dof", "states"))
+    nees = consistency(times, values, dof, count)
+    tracked = states == "tracking"
+    beyond = values[tracked] > chi2.ppf(THREE_SIGMA, dof[tracked])
+    at_stamps = {source: 100.0 * np.concatenate([s.at_stamps[source] for s in each]) for source in SOURCES}
     return {
         "nees": nees["mean"],
         "nees_band": nees["band"],
@@ -338,7 +406,33 @@ def summary(each: list[Scores]) -> dict[str, Any]:
         "error_beside_slow_cm": float(there.mean()),
         "baselines_cm": {key: float(errors[key].mean()) for key in BASELINES},
         "refused": sum(s.gated for s in each),
-        "states": {state: sum(s.states[state] for s in each) / moments for state in each[0].states},
+        "states": {state: float(np.mean(states == state)) for state in STATES},
+        "beyond_3_sigma": float(beyond.mean()) if len(beyond) else None,
+        "at_stamps_cm": {source: pairs.mean(axis=0).tolist() for source, pairs in at_stamps.items() if len(pairs)},
+    }
+
+
+def guessed(each: list[Scores]) -> dict[str, float]:
+    """Position errors [cm] within GUESSED_S of when nothing is seen or felt any more, and after it."""
+    ages = np.concatenate([[t - max(begin for begin, _ in runs.GONE if begin <= t) for t in s.times] for s in each])
+    errors = 100.0 * np.concatenate([s.errors["ours"] for s in each])
+    early, later = errors[ages <= GUESSED_S], errors[ages > GUESSED_S]
+    return {
+        "median": float(np.median(early)),
+        "p95": float(np.percentile(early, 95)),
+        "worst": float(early.max()),
+        "later_worst": float(later.max(initial=0.0)),
+    }
+
+
+def jumps(each: list[Jump]) -> dict[str, float]:
+    """What is told of all jumps."""
+    return {
+        "noticed_median_s": float(np.median([one.noticed for one in each])),
+        "noticed_worst_s": max(one.noticed for one in each),
+        "beyond_3_sigma": sum(one.wrong for one in each) / max(1, sum(one.tracked for one in each)),
+        "again_median_s": float(np.median([one.again for one in each])),
+        "again_worst_s": max(one.again for one in each),
     }
 
 
@@ -351,7 +445,7 @@ def lateness(each: list[dict[str, Lateness]]) -> dict[str, Any]:
     }
 
 
-EXTRA: dict[str, Callable[[int, int, float], Any]] = {"shift": shift, "late": late}
+EXTRA: dict[str, Callable[[int, int, float], Any]] = {"shift": shift, "late": late, "jump": jump}
 
 
 def part(name: str, seed: int, index: int, seconds: float) -> Any:
@@ -361,10 +455,16 @@ def part(name: str, seed: int, index: int, seconds: float) -> Any:
 
 def measured(seed: int, count: int, seconds: float, jobs: int, console: Console) -> dict[str, Any]:
     """The whole benchmark."""
-    every: dict[str, list[Any]] = {name: [None] * count for name in (*runs.SITUATIONS, *EXTRA)}
+    every: dict[str, list[Any]] = {
+        name: [None] * (count * WRONG_RUNS if name == "shift" else count) for name in (*runs.SITUATIONS, *EXTRA)
+    }
     with Progress(console=console, transient=True) as bar, _pool(jobs) as pool:
-        task = bar.add_task("runs", total=count * len(every))
-        waiting = {pool.submit(part, name, seed, index, seconds): (name, index) for name in every for index in range(count)}
+        task = bar.add_task("runs", total=sum(map(len, every.values())))
+        waiting = {
+            pool.submit(part, name, seed, index, seconds): (name, index)
+            for name, each in every.items()
+            for index in range(len(each))
+        }
         for done in as_completed(waiting):
             name, index = waiting[done]
             every[name][index] = done.result()
@@ -376,12 +476,21 @@ def measured(seed: int, count: int, seconds: float, jobs: int, console: Console)
         "seconds": seconds,
         "situations": {name: summary(every[name]) for name in runs.SITUATIONS},
         **lateness(every["late"]),
-        "wrong_sense_cm": 100.0 * max(every["shift"]),
-        "wrong_sense_median_cm": 100.0 * float(np.median(every["shift"])),
+        "guessed_cm": guessed(every["hidden, out of range"]),
+        "jump": jumps(every["jump"]),
+        **{
+            f"{kind}_sense_cm": apart(column)
+            for kind, column in zip(("wrong", "silent"), zip(*every["shift"], strict=True), strict=True)
+        },
         "step_ms": steps["in order"],
         "step_late_ms": steps["late pictures"],
         "targets": core_shares(seed, min(seconds, 5.0)),
     }
+
+
+def apart(distances: Sequence[float]) -> dict[str, float]:
+    """Median and largest of distances [m], in cm."""
+    return {"runs": len(distances), "median": 100.0 * float(np.median(distances)), "worst": 100.0 * max(distances)}
 
 
 def _pool(jobs: int) -> ProcessPoolExecutor:
@@ -393,12 +502,35 @@ def tables(found: Result) -> list[Part]:
     """Consistency, errors, late measurements, what a wrong sense does, and times, beside their goals."""
     title = f"Consistency, seed {found['seed']}: {found['runs']} runs of {found['seconds']:g} s"
     consistent = Table(
-        "situation", "NEES", "95 % band", "inside", "NIS", "95 % band", "inside", "refused", "tracking", title=title
+        "situation",
+        "NEES",
+        "95 % band",
+        "inside",
+        "NIS",
+        "95 % band",
+        "inside",
+        "refused",
+        "tracking",
+        f"beyond 3 sigma (goal {BEYOND_GOAL:.1%} or less)",
+        title=title,
     )
     for name, row in found["situations"].items():
         consistent.add_row(
-            name, *_judged(row, "nees"), *_judged(row, "nis"), str(row["refused"]), f"{row['states']['tracking']:.0%}"
+            name, *_judged(row, "nees"), *_judged(row, "nis"), str(row["refused"]), f"{row['states']['tracking']:.0%}",
+            "-" if (beyond := row["beyond_3_sigma"]) is None else marked(f"{beyond:.2%}", beyond <= BEYOND_GOAL),
         )  # fmt: skip
+    stamps = Table(
+        "situation",
+        *SOURCES,
+        "as of now",
+        title=f"Position error as of the stamp, mean, cm: sense / fused (goal <= {STAMP_GOAL:g} x)",
+    )
+    for name, row in found["situations"].items():
+        pairs = [row["at_stamps_cm"].get(source) for source in SOURCES]
+        told = (
+            "-" if pair is None else marked(f"{pair[0]:.2f} / {pair[1]:.2f}", pair[1] <= STAMP_GOAL * pair[0]) for pair in pairs
+        )
+        stamps.add_row(name, *told, f"{row['error_cm']:.2f}")
     title = f"Position error as of now, mean, cm (goal: ours the least); {' and '.join(SLOW)} of every {SLOW_EVERY}th run"
     errors = Table("situation", "ours", "95 % below", *BASELINES, title=title)
     for name, row in found["situations"].items():
@@ -412,7 +544,9 @@ def tables(found: Result) -> list[Part]:
             name, f"{value:.3f}", marked(f"{ratio:.3f}", ratio <= LATE_GOAL), f"{found['late_now'][name]:.3f}",
             f"{found['late_difference_mm'][name]:.2g}",
         )  # fmt: skip
-    wrong, step = found["wrong_sense_cm"], found["step_ms"]
+    wrong, silent, hidden, jumped, step = (
+        found[key] for key in ("wrong_sense_cm", "silent_sense_cm", "guessed_cm", "jump", "step_ms")
+    )
     bank = Table(
         "targets", "share of a core at 200 Hz", "with messages", title=f"A bank of observers (goal: 100 within {CORE_GOAL:g})"
     )
@@ -422,13 +556,27 @@ def tables(found: Result) -> list[Part]:
     return [
         consistent,
         errors,
+        stamps,
         late,
-        f"A sense that is wrong by 10 cm moves the pose by at most {marked(f'{wrong:.2f} cm', wrong <= WRONG_GOAL_CM)} (goal "
-        f"{WRONG_GOAL_CM:g}; median {found['wrong_sense_median_cm']:.2f}).",
+        f"A sense that is wrong by 10 cm for a second moves the pose by at most {_goal(wrong['worst'], WRONG_GOAL_CM, 'cm')}, in "
+        f"the median by {_goal(wrong['median'], WRONG_MEDIAN_GOAL_CM, 'cm')}, of {wrong['runs']} runs; one that is silent for as "
+        f"long by {silent['worst']:.2f} and {silent['median']:.2f} cm.",
+        f"Nothing seen or felt: within {GUESSED_S:g} s {hidden['median']:.2f} cm off in the median, 95 % below "
+        f"{hidden['p95']:.2f}, at worst {_goal(hidden['worst'], GUESSED_GOAL_CM, 'cm')}; later, "
+        f"at worst, {hidden['later_worst']:.1f} cm.",
+        f"A jump is noticed after {jumped['noticed_median_s']:.3f} s in the median, at worst after "
+        f"{_goal(jumped['noticed_worst_s'], NOTICED_S, 's')}; of the poses called tracking later than that "
+        f"{100 * jumped['beyond_3_sigma']:.2f} % are beyond 3 sigma. It is right again after {jumped['again_median_s']:.2f} s in "
+        f"the median, at worst after {jumped['again_worst_s']:.2f} s.",
         f"One predict, update and publish: {marked(f'{step:.3f} ms', step <= STEP_GOAL_MS)} (goal {STEP_GOAL_MS:g}), of a "
         f"picture behind the skin's measurements {found['step_late_ms']:.3f} ms.",
         bank,
     ]
+
+
+def _goal(value: float, goal: float, unit: str) -> str:
+    """A value beside the goal that it is not to exceed."""
+    return f"{marked(f'{value:.2f} {unit}', value <= goal)} (goal {goal:g})"
 
 
 def _judged(row: dict[str, Any], key: str) -> tuple[str, str, str]:

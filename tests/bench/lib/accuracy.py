@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from penumbra.services import flags
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
+from penumbra.shared.geometry import rigid
 from penumbra.tests.bench.lib.results import Result, marked
 
 VISIBLE = 0.33
@@ -30,6 +32,10 @@ GOALS_CM = {
     ("occluded", "out_of_range"): None,
 }
 """By situation, what the median position error of the fused pose is to be below."""
+CHI2_3_SIGMA = float(chi2.ppf(0.9973, 6))
+"""Squared Mahalanobis distance of six dimensions that 99.73 % of normal errors stay within."""
+BEYOND_GOAL = 0.001
+"""Share of the poses called tracking that may be beyond three sigma."""
 USED_STATES = {"tracking", "in_range", "coasting"}
 
 
@@ -77,6 +83,22 @@ class TruthTrack:
         return nearest, position, np.arccos(cosine.clip(-1, 1))
 
 
+def beyond_3_sigma(truths: list[messages.Truth], fused: list[messages.FusedPose]) -> float | None:
+    """Of the poses called tracking, the share whose squared error in units of their own covariance is beyond what 99.73 % of
+    normal errors of six dimensions stay within; None where there are none."""
+    order = sorted(truths, key=lambda truth: truth.stamp_ns)
+    stamps, wrong = np.array([truth.stamp_ns for truth in order]), []
+    for pose in fused:
+        if pose.state != "tracking" or not stamps[0] <= pose.stamp_ns <= stamps[-1]:
+            continue
+        near = order[int(np.argmin(np.abs(stamps - pose.stamp_ns)))]
+        T_near = rigid.transform(near.position, near.orientation)
+        T_true = rigid.perturb(T_near, near.velocity * ((pose.stamp_ns - near.stamp_ns) * 1e-9))
+        error = rigid.pose_error(T_true, rigid.transform(pose.position, pose.orientation))
+        wrong.append(error @ np.linalg.solve(pose.covariance, error) > CHI2_3_SIGMA)
+    return float(np.mean(wrong)) if wrong else None
+
+
 def long_runs(flags: np.ndarray, stamps_ns: np.ndarray, seconds: float) -> np.ndarray:
     """`flags`, without the runs of true that last less than `seconds`."""
     out = np.zeros_like(flags)
@@ -116,6 +138,7 @@ def summary(
     result["fused_states"] = {
         state: round(states.count(state) / max(len(states), 1), 4) for state in ("tracking", "coasting", "lost")
     }
+    result["fused_beyond_3_sigma"] = beyond_3_sigma(truths, estimates["fused"])
     result["situation_s"] = {
         sight: {skin: round(float(situations[sight, skin].mean()) * seconds, 1) for skin in ("in_range", "out_of_range")}
         for sight in ("visible", "occluded")
@@ -128,6 +151,8 @@ def table(result: Result) -> Table:
     title = f"Cell {result['cell']}, seed {result['seed']}: position error cm, median (p95); limb axis deg, median"
     lost, coasting = (result["fused_states"][state] for state in ("lost", "coasting"))
     caption = f"Fused poses: {lost:.1%} lost, which do not count, {coasting:.1%} coasting, which do."
+    if (beyond := result.get("fused_beyond_3_sigma")) is not None:
+        caption += f" Of those tracking {marked(f'{beyond:.2%}', beyond <= BEYOND_GOAL)} are beyond three sigma."
     table = Table("situation", "s", *SENSES, "goal", title=title, caption=caption)
     for (sight, skin), goal_cm in GOALS_CM.items():
         columns = []

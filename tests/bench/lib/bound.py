@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.search import evidence
-from penumbra.services.search.evidence import COVERED, Intrinsics
+from penumbra.services.search.evidence import COVERED
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.shared.perception.robot_depth import RobotDepth
 from penumbra.sim.sets.shots import Shot
 

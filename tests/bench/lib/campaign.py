@@ -26,7 +26,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from penumbra.tests.bench.lib import results
 from penumbra.tests.bench.lib.results import ROOT, Result
 
-DEPENDS = ("shared", "sim", "services", "tests/support/replay.py", "tests/bench/lib/trials.py")
+DEPENDS = ("shared", "sim", "services", "tests/bench/lib/trials.py")
 """What a trial's result depends on, of the project's files."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Every process computes on one thread: they share the cores."""

@@ -212,17 +212,29 @@ def drawn(name: str, seed: int, index: int, seconds: float) -> Run:
     return Run(situation, seconds, at, sorted(messages, key=lambda m: m.arrival))
 
 
+def silenced(run: Run, index: int) -> Run:
+    """The same run without the measurements that `wronged` makes wrong."""
+    return replace(run, messages=[m for m in run.messages if not _is_wrong(m, index)])
+
+
+def jumped(name: str, seed: int, index: int, seconds: float) -> Run:
+    """A run of a situation whose limb goes on, from half its time, where that of another run is."""
+    first, second = (drawn(name, seed, i, seconds) for i in (2 * index, 2 * index + 1))
+    middle = seconds / 2.0
+    messages = [m for m in first.messages if m.stamp < middle] + [m for m in second.messages if m.stamp >= middle]
+    at = lambda t: (first if t < middle else second).at(t)  # noqa: E731
+    return Run(first.situation, seconds, at, sorted(messages, key=lambda m: m.arrival))
+
+
+def _is_wrong(m: Message, index: int) -> bool:
+    return m.source == list(PERIOD_S)[index % 2] and WRONG_S[0] <= m.stamp < WRONG_S[1]
+
+
 def wronged(run: Run, seed: int, index: int) -> Run:
     """The same run with one sense off by 10 cm for a second; each of the two in every other run."""
     direction = np.random.default_rng([seed, index]).normal(size=3)
     shift = np.concatenate([WRONG_M * direction / np.linalg.norm(direction), np.zeros(3)])
-    source = list(PERIOD_S)[index % 2]
-
-    def moved(m: Message) -> Message:
-        wrong = m.source == source and WRONG_S[0] <= m.stamp < WRONG_S[1]
-        return replace(m, T=rigid.perturb(m.T, shift)) if wrong else m
-
-    return replace(run, messages=[moved(m) for m in run.messages])
+    return replace(run, messages=[replace(m, T=rigid.perturb(m.T, shift)) if _is_wrong(m, index) else m for m in run.messages])
 
 
 def delayed(run: Run, delay: Callable[[], float]) -> Run:

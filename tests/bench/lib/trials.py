@@ -1,6 +1,6 @@
 """Trials of the paper's experiment played through the services in one process, and the errors of every frame.
 
-A trial (`sim.sets.trial`) is rendered once and then replayed (`tests.support.replay`) through three chains: ours, PoseCNN in
+A trial (`sim.sets.trial`) is rendered once and then replayed (`services.replay.chain`) through three chains: ours, PoseCNN in
 place of our vision, and the paper's own method throughout. A frame's vision is the pose of that frame, if its state is tracking.
 What was fused is the pose at the frame's exposure, asked for as soon as the frame's vision has been taken in: the paper knows no
 delays. `live` is what was published nearest to the exposure, before anything was known of the frame. Poses that are lost do not
@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from penumbra.services.replay.chain import Replay
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.messages import FusedPose, Truth, VisionPose, decode
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.sim.sets.trial import HIDDEN, LEAD_S, SECONDS, Setting, Trial
-from penumbra.tests.support.replay import Replay
 
 EPOCH_NS = 10**18
 """Time zero of a trial."""

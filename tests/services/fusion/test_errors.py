@@ -160,13 +160,15 @@ def test_a_limb_that_is_faster_than_expected_is_followed() -> None:
     errors: dict[int, list[float]] = {id(learning): [], id(stubborn): []}
     for k in range(160):
         t = 0.05 * k
-        T = perturb(HOME, [0.0, 0.15 * np.sin(2 * np.pi * t), 0.15 * np.cos(2 * np.pi * t), 0.0, 0.0, 0.0])  # 0.9 m/s, 6 m/s^2
+        s = min(t % 1.0 / 0.35, 1.0)  # every second a reach of 30 cm in 0.35 s by minimum jerk, to and fro: 1.6 m/s, 14 m/s^2
+        way = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        T = perturb(HOME, [0.0, 0.3 * (way if int(t) % 2 == 0 else 1.0 - way), 0.0, 0.0, 0.0, 0.0])
         measured = perturb(T, 0.003 * rng.normal(size=6))
         for observer in (learning, stubborn):
             observer.measure("vision", ns(t), measured, VISION)
             if t > 2.0:
                 errors[id(observer)].append(float(np.linalg.norm(pose_error(T, observer.estimate(ns(t)).T)[:3])))
-    assert np.median(errors[id(learning)]) < 0.8 * np.median(errors[id(stubborn)])
+    assert np.mean(errors[id(learning)]) < 0.2 * np.mean(errors[id(stubborn)]), "it loses the limb at each reach"
     assert learning.log.counts["vision"].gated < 5
 
 

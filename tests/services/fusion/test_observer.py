@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from penumbra.services.fusion import history
-from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, RefusedMeasurement
+from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, Limits, RefusedMeasurement
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver
-from penumbra.services.fusion.settings import FusionSettings
+from penumbra.services.fusion.settings import Arm, FusionSettings, Subject
 from penumbra.shared.contract.messages import MAX_FUTURE_S
 from penumbra.shared.contract.senses import SENSES
 from penumbra.shared.geometry import rigid, so3
@@ -186,6 +186,77 @@ def test_a_limb_that_jumps_is_found_again_within_three_quarters_of_a_second(make
     assert estimate.state == "tracking"
 
 
+def test_a_limb_that_jumps_is_not_called_tracking_from_the_first_measurement_that_shows_it() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    still(observer, HOME, 0.0, 1.0)
+    assert observer.estimate(ns(1.0)).state == "tracking"
+    far = perturb(HOME, [0.2, 0.0, 0.1, 0.0, 0.0, 0.0])
+    wrong = set()
+    for t in np.arange(1.0, 2.0, 0.05):
+        observer.measure("vision", ns(t), far, VISION)
+        estimate = observer.estimate(ns(t))
+        if np.linalg.norm(pose_error(far, estimate.T)[:3]) > 0.03:
+            wrong.add(estimate.state)
+    assert wrong == {"coasting"}
+    assert observer.estimate(ns(2.0)).state == "tracking"
+
+
+def test_a_sense_that_is_wrong_beside_another_ends_tracking_only_until_the_other_confirms_the_pose() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    still(observer, HOME, 0.0, 1.0)
+    observer.measure("haptic", ns(1.0), perturb(HOME, [0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), VISION)
+    assert observer.estimate(ns(1.0)).state == "coasting"
+    still(observer, HOME, 1.05, 1.1)
+    observer.measure("haptic", ns(1.06), perturb(HOME, [0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), VISION)
+    assert observer.estimate(ns(1.06)).state == "tracking"
+
+
+def test_a_sense_that_was_wrong_is_used_again_when_it_agrees_and_not_when_it_is_nearly_plausible() -> None:
+    def accepted(refusals: int) -> bool:
+        """Whether the skin, 5 cm off, is accepted after 20 measurements that were 10 cm off."""
+        observer = ErrorStateObserver(HOME, SPREAD, FusionSettings(refusals=refusals))
+        still(observer, HOME, 0.0, 1.0)
+        for k in range(20):
+            t = 1.0 + 0.01 * k
+            if k % 5 == 0:
+                still(observer, HOME, t, t + 0.01)
+            observer.measure("haptic", ns(t), perturb(HOME, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]), 2.0 * VISION)
+        still(observer, HOME, 1.2, 1.21)
+        return observer.measure("haptic", ns(1.205), perturb(HOME, [0.05, 0.0, 0.0, 0.0, 0.0, 0.0]), 2.0 * VISION)
+
+    assert accepted(refusals=100) and not accepted(refusals=5)
+
+
+def test_tracking_promises_its_bound_at_three_standard_deviations() -> None:
+    observers = [
+        ErrorStateObserver.of(Bank([Subject(HOME, SPREAD, Limits(tracking_bound=bound))]), 0) for bound in (0.01, 0.05, 0.15)
+    ]
+    for observer in observers:
+        still(observer, HOME, 0.0, 1.0)
+    assert [observer.estimate(ns(0.95)).state for observer in observers] == ["coasting", "tracking", "tracking"]
+    for age in np.arange(0.0, 0.5, 0.01):
+        for observer in observers:
+            estimate = observer.estimate(ns(0.95 + age))
+            promised = 3.0 * np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])
+            limits = observer.subject.limits
+            assert (estimate.state == "tracking") == (promised <= limits.tracking_bound and age <= limits.tracking_age)
+
+
+def test_a_guess_stays_within_the_reach_of_an_arm_whose_shoulder_is_known_and_what_is_measured_is_believed() -> None:
+    elbow, upper_arm = 0.13, 0.3
+    shoulder = HOME[:3, 3] + [-elbow, 0.0, upper_arm - 0.01]  # the elbow, when at home, is 1 cm within reach
+    subjects = [Subject(HOME, SPREAD, arm=arm) for arm in (Arm(tuple(shoulder), upper_arm, elbow), Arm())]
+    held, free = (ErrorStateObserver.of(Bank([subject]), 0) for subject in subjects)
+    for k in range(20):
+        for observer in (held, free):  # down, at 0.5 m/s
+            observer.measure("vision", ns(0.05 * k), perturb(HOME, [0.0, 0.0, 0.5 * (0.95 - 0.05 * k), 0.0, 0.0, 0.0]), VISION)
+    away = [np.linalg.norm(observer.estimate(ns(1.5)).T[:3, 3] - [elbow, 0.0, 0.0] - shoulder) for observer in (held, free)]
+    assert away[0] == pytest.approx(upper_arm, abs=1e-6) and away[1] > upper_arm + 0.05
+    for observer in (held, free):
+        still(observer, perturb(HOME, [0.0, 0.0, -0.1, 0.0, 0.0, 0.0]), 1.5, 3.0)
+        assert observer.estimate(ns(2.95)).T[2, 3] == pytest.approx(HOME[2, 3] - 0.1, abs=0.005)
+
+
 def test_a_sense_that_disagrees_for_long_is_used_again_beside_one_that_is_accepted() -> None:
     observer = ErrorStateObserver(HOME, SPREAD)
     wrong = perturb(HOME, [0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
@@ -293,7 +364,7 @@ def test_a_source_that_nobody_knows_is_refused(make: type) -> None:
 
 def test_a_bank_of_targets_does_what_each_of_them_does_alone() -> None:
     homes = [perturb(HOME, [0.1 * i, 0, 0, 0, 0, 0.3 * i]) for i in range(3)]
-    bank = Bank(np.array(homes), [SPREAD] * 3)
+    bank = Bank([Subject(home, SPREAD) for home in homes])
     alone = [ErrorStateObserver(home, SPREAD) for home in homes]
     streams = [stream(0.5, seed=i) for i in range(3)]
     for rows in zip(*streams, strict=True):
@@ -312,7 +383,7 @@ def test_a_bank_of_targets_does_what_each_of_them_does_alone() -> None:
 
 
 def test_a_bank_takes_what_is_good_beside_what_is_bad() -> None:
-    bank = Bank(np.array([HOME, HOME]), [SPREAD] * 2)
+    bank = Bank([Subject(HOME, SPREAD)] * 2)
     targets, sources, stamps = np.array([0, 1, 1, 1]), np.zeros(4, np.int64), np.full(4, ns(0.0))
     seen = np.array([-VISION, VISION, VISION, VISION])
     fates = bank.measure(targets, sources, stamps, np.array([HOME, np.zeros((4, 4)), FAR, FAR]), seen, now_ns=ns(0.0))

@@ -201,7 +201,7 @@ def test_the_rows_of_the_table_have_names_and_topics_of_their_own() -> None:
 
 def test_each_sense_is_gated_by_its_own_row() -> None:
     def fate(gate: float) -> bool:
-        rows = tuple(replace(sense, errors=replace(sense.errors, gate=(gate, gate))) for sense in SENSES)
+        rows = tuple(replace(sense, errors=replace(sense.errors, gate=(gate, gate, gate))) for sense in SENSES)
         observer = ErrorStateObserver(HOME, SPREAD, senses=rows)
         for k in range(20):
             observer.measure("vision", ns(0.05 * k), HOME, VISION)

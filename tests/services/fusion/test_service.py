@@ -15,6 +15,7 @@ import pytest
 from penumbra.services import flags
 from penumbra.services.fusion import service
 from penumbra.services.fusion.estimate import RefusedMeasurement, information
+from penumbra.services.fusion.settings import Arm, Subject
 from penumbra.shared.cell import description
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.runtime import bus
@@ -272,11 +273,28 @@ def test_another_publisher_of_a_stream_is_accepted_after_the_silence_of_the_firs
 
 
 @pytest.mark.parametrize("kind", sorted(service.OBSERVERS))
+def test_the_cell_file_says_what_tracking_promises(table: description.Cell, kind: str) -> None:
+    for bound, state in ((0.005, "coasting"), (0.3, "tracking")):
+        target = table.targets["forearm"].model_copy(update={"tracking_bound": bound})
+        group = service.Group(kind, [Subject.of(target, table.body)], lambda: ns(0.0))
+        group.observers[0].measure("vision", ns(0.0), target.home.transform, 1e4 * np.eye(6), 0.0)
+        assert group.estimates()[1][0].state == state
+
+
+def test_the_cell_file_s_person_says_how_far_an_arm_reaches(table: description.Cell) -> None:
+    target = table.targets["forearm"].model_copy(update={"shoulder": (-0.4, 0.1, 0.4)})
+    assert Subject.of(target, table.body).arm == Arm(
+        (-0.4, 0.1, 0.4), table.body.upper_arm_length, table.body.forearm_length / 2.0
+    )
+    assert Subject.of(table.targets["forearm"], table.body).arm == Arm(), "nobody knows where the shoulder is"
+
+
+@pytest.mark.parametrize("kind", sorted(service.OBSERVERS))
 def test_a_clock_that_is_set_makes_the_pose_lost_until_the_next_measurement_and_never_an_old_one_tracking(
     table: description.Cell, kind: str
 ) -> None:
     now_ns = ns(10_000.0)
-    group = service.Group(kind, list(table.targets.values()), lambda: now_ns)
+    group = service.Group(kind, [Subject.of(target, table.body) for target in table.targets.values()], lambda: now_ns)
 
     def state(measured: bool) -> str:
         with group.lock:

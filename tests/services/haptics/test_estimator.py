@@ -224,7 +224,7 @@ def test_from_a_broad_prior_a_limb_of_unknown_size_is_found(skin: Skin, response
         home = rigid.perturb(T, np.repeat([0.04, 0.2], 3) * rng.standard_normal(6))
         which = estimator(skin, response, forearm, home)
         *_, last = windows(which, skin, signal(skin, response, T), 30, seed=k)
-        assert last.in_range and last.gap == pytest.approx(gap, abs=0.005 + 0.3 * gap)
+        assert last.may_be_limb and last.gap == pytest.approx(gap, abs=0.005 + 0.3 * gap)
         errors.append(rigid.pose_error(T, which.pose))
         squares.append(nees(T, last))
     lateral, height = np.sqrt(np.mean(np.square(errors), axis=0))[1:3]
@@ -278,7 +278,7 @@ def test_the_size_is_learnt_close_in_and_makes_the_height_sure_farther_away(
 def test_a_limb_out_of_reach_gives_no_information(skin: Skin, response: Response, forearm: Surface) -> None:
     which = estimator(skin, response, forearm, rigid.transform([0, 0, 0.2]))
     estimates = windows(which, skin, signal(skin, response, rigid.transform([0, 0, 0.60])), 20, seed=3)
-    assert not any(e.in_range for e in estimates) and estimates[-1].why == "nothing near"
+    assert not any(e.may_be_limb for e in estimates) and estimates[-1].why == "nothing near"
     assert all((e.information == 0).all() and np.isfinite(e.gap) for e in estimates)
 
 
@@ -307,7 +307,7 @@ def test_of_two_places_that_feel_alike_far_away_neither_is_called_certain(
             T = rigid.from_rpy((along, across, 0.04 + max(0.24 - 0.012 * i, 0.08)), rpy)
             felt = feel(skin, signal(skin, response, T, size), rng, 20)
             estimate = which.update(step_ns * (i + 1), felt, np.full(len(skin), 20), pads)
-            if estimate.in_range:
+            if estimate.may_be_limb:  # it is one
                 observer.measure("haptic", step_ns * (i + 1), estimate.T, estimate.information)
             fused = observer.estimate(step_ns * (i + 1))
             if fused.state == "tracking":
@@ -332,6 +332,43 @@ def test_a_metal_bar_is_no_arm(table: cells.Cell, skin: Skin, response: Response
     assert all((e.information == 0).all() for e in estimates[-10:])
 
 
+def test_a_limb_close_to_the_pads_is_told_from_other_things_by_touch_alone(
+    skin: Skin, response: Response, forearm: Surface
+) -> None:
+    T = rigid.from_rpy((0.01, -0.01, 0.07), (0, 0.05, 0.1))
+    which = estimator(skin, response, forearm, rigid.transform([0, 0, 0.1]))
+    estimates = windows(which, skin, signal(skin, response, T), 100, seed=10)
+    assert estimates[0].state == "unidentified" and (estimates[0].information != 0).any()
+    assert {e.state for e in estimates[-20:]} == {"in_range"}
+
+
+def test_far_from_the_pads_a_limb_stays_unidentified_until_a_camera_has_seen_it_there(
+    skin: Skin, response: Response, forearm: Surface, pads: np.ndarray
+) -> None:
+    T, used = rigid.transform([0.0, 0.0, 0.15]), np.full(len(skin), 10)
+    which = estimator(skin, response, forearm, rigid.transform([0, 0, 0.16]))
+    signals, rng = signal(skin, response, T), np.random.default_rng(11)
+    assert {e.state for e in windows(which, skin, signals, 50, seed=12)} <= {"unidentified", "out_of_range"}
+    seen = T, np.diag(np.repeat([0.005, 0.05], 3) ** 2)
+    assert which.update(510 * MS, feel(skin, signals, rng), used, pads, (), seen).in_range
+    after = windows(which, skin, signals, 100, seed=13, begin=51)
+    assert np.mean([e.in_range for e in after]) > 0.9  # it has not left
+
+
+def test_a_camera_that_sees_the_limb_elsewhere_makes_no_limb_of_an_object(
+    table: cells.Cell, skin: Skin, response: Response, forearm: Surface, pads: np.ndarray
+) -> None:
+    body = field.Body(field.shell(np.array(trimesh.creation.box((0.12, 0.12, 0.03)).vertices)), np.inf)
+    pad = field.PadField(table.pad_types["five"])
+    T = rigid.transform([0.02, 0.01, 0.05])
+    change = np.concatenate([pad.change(body, rigid.inverse(each) @ T) for each in pads])
+    which, rng = estimator(skin, response, forearm, rigid.transform([0, 0, 0.2])), np.random.default_rng(14)
+    seen = rigid.transform([0.0, 0.0, 0.45]), np.diag(np.repeat([0.005, 0.05], 3) ** 2)
+    signals, used = skin.gain * skin.sensitivity * change, np.full(len(skin), 10)
+    estimates = [which.update(10 * MS * (i + 1), feel(skin, signals, rng), used, pads, (), seen) for i in range(100)]
+    assert not any(e.in_range for e in estimates)
+
+
 @pytest.mark.parametrize("fault", ["dead", "left out", "saturated", "drifting"])
 def test_a_faulty_electrode_does_not_carry_the_pose_away(skin: Skin, response: Response, forearm: Surface, fault: str) -> None:
     T = rigid.transform([0, 0, 0.08])
@@ -346,7 +383,7 @@ def test_a_faulty_electrode_does_not_carry_the_pose_away(skin: Skin, response: R
     rng = np.random.default_rng(8)
     for i in range(20, 40):
         last = which.update(10 * MS * (i + 1), feel(skin, signals, rng), samples, skin.T_world_pads())
-    assert last.in_range and nees(T, last) < 3.0
+    assert last.may_be_limb and nees(T, last) < 3.0
     assert np.abs(rigid.pose_error(before, which.pose)[:3]).max() < 0.008
 
 
@@ -369,7 +406,7 @@ def test_against_the_full_field_a_resting_limb_stays_where_its_covariance_says(
         change = np.concatenate([pad.change(body, rigid.inverse(each) @ T) for each in pads])
         which = estimator(skin, response, forearm, T)
         estimates = windows(which, skin, skin.gain * skin.sensitivity * change, 150, seed=int(1e3 * gap))
-        squares += [nees(T, e) for e in estimates[50:] if e.in_range]
+        squares += [nees(T, e) for e in estimates[50:] if e.may_be_limb]
     assert len(squares) > 300 and np.mean(squares) < 1.6
 
 

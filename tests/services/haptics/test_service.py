@@ -224,7 +224,8 @@ def test_the_service_answers_every_window_within_milliseconds_and_goes_on_withou
     assert np.diff([pose.stamp_ns for _, pose in poses]).min() > 0
     last = poses[-1][1]
     truth = truths[last.sample_stamp_ns]
-    assert last.state == ("in_range" if truth.gap < 0.12 else last.state)
+    # without a camera it may be anything that is as near as a limb
+    assert truth.gap > 0.12 or last.state in ("in_range", "unidentified")
     assert last.gap == pytest.approx(truth.gap, abs=0.03 + 0.3 * truth.gap)
     misfits = haptics.report().report
     if any(pose.state == "in_range" for _, pose in poses):
