@@ -9,12 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.evidence import COVERED, LEAST_KNOWN, TAPS, Evidence, Intrinsics, count_compared
+from penumbra.services.search.evidence import COVERED, FORESHORTENED, LEAST_KNOWN, TAPS, Evidence, count_compared
 from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.contract.labels import Label
 from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.raster import draw_silhouette
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 NEAR = 0.05
 """Edges nearer to the camera than this are left out [m]."""
@@ -63,15 +65,30 @@ class Matched:
 
 
 class Model:
-    """A triangle mesh prepared for contours. `edges` (n, 4): two vertices and two faces (-1: none) each."""
+    """A triangle mesh prepared for contours. `edges` (n, 4): two vertices and two faces (-1: none) each; `wrist`: where its hand
+    begins along x [m], infinite where it has none."""
 
     def __init__(self, mesh: Mesh):
         self.vertices = np.ascontiguousarray(mesh.vertices, np.float64)
         self.faces = np.ascontiguousarray(mesh.faces, np.int32)
         self.edges = _edges(self.faces)
+        in_hand = mesh.vertices[mesh.faces[mesh.labels == Label.HAND], 0]
+        self.wrist = float(in_hand.min(initial=math.inf))
         self.closed = bool((self.edges[:, 3] >= 0).all())
         # the output of a pass: as large for every pose, so that its kernel's arguments are checked once
         self._memory = np.empty(MOST, POINT), np.empty(MOST), np.empty(MOST, np.uint8), np.empty(2, np.int64)
+
+    def beyond_wrist(self, T: Array, k: Intrinsics, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        """The pixels (h, w) beyond the wrist at a pose T_camera_target; none where the limb points at the camera."""
+        ends = T[:3, 3] + np.outer([0.0, self.wrist], T[:3, 0]) if math.isfinite(self.wrist) else np.zeros((2, 3))
+        if ends[:, 2].min() < NEAR:
+            return np.zeros(shape, np.bool_)
+        (u0, v0), (u, v) = ends[:, :2] / ends[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
+        along = np.array([u - u0, v - v0])
+        if np.hypot(*along) < FORESHORTENED * k.fx * self.wrist / ends[0, 2]:
+            return np.zeros(shape, np.bool_)
+        rows, columns = np.arange(shape[0])[:, None], np.arange(shape[1])
+        return np.asarray((columns - u) * along[0] + (rows - v) * along[1] > 0.0)
 
     def in_camera(self, T: Array) -> Array:
         """The vertices (n, 3) [m] in the camera's frame."""
@@ -89,15 +106,18 @@ class Model:
         intrinsics = np.array([k.fx, k.fy, k.cx, k.cy])
         return points[: _outline(V, self.faces, self.edges, self.closed, intrinsics, *shape, spacing, points)]
 
-    def matched(self, T: Array, evidence: Evidence, spacing: float, reach: float) -> Matched:
-        """The outer contour at a pose T_camera_target, compared with a mask's boundary within `reach` [px]."""
+    def matched(self, T: Array, evidence: Evidence, spacing: float, reach: float, hand: float = 1.0) -> Matched:
+        """The outer contour at a pose T_camera_target, compared with a mask's boundary within `reach` [px]. Beyond the wrist,
+        where offsets are `hand` times as uncertain, a point stands for `hand`^-2 of its length."""
         V, k = self.in_camera(T), evidence.intrinsics
         found, intrinsics = self._memory, np.array([k.fx, k.fy, k.cx, k.cy])
         mask = evidence.state, evidence.field, evidence.guarded, evidence.known
         n = _matched(V, self.faces, self.edges, self.closed, intrinsics, *mask, spacing, reach, *found)
         points, r, kind, counts = found
         both, free = counts.tolist()
-        return Matched(points[:n].copy(), r[:n].copy(), kind[:n].copy(), both, free)
+        points = points[:n].copy()
+        points["length"][(points["position"] - T[:3, 3]) @ T[:3, 0] > self.wrist] *= hand**-2.0
+        return Matched(points, r[:n].copy(), kind[:n].copy(), both, free)
 
 
 def _edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -29,6 +29,11 @@ SLIDES = (-0.3, -0.15, 0.0, 0.15, 0.3)
 """Samples of where the visible part's middle is on the limb, in lengths of the limb: one end may be hidden."""
 
 
+def is_shown(mask: Mask, target_labels: Collection[int]) -> bool:
+    """Whether a mask shows as much of a target as a region needs."""
+    return bool(np.count_nonzero(np.isin(mask.labels, list(target_labels))) >= SMALLEST_PX)
+
+
 def regions(mask: Mask, target_labels: Collection[int], reach_px: float) -> Iterator[tuple[Mask, list[Mask]]]:
     """Windows of a mask, each `reach_px` around one of its target-coloured regions, the largest first, and the same with less of
     the region to start from: all of it, then either half, for where the upper arm is bare a network may colour it too, and the

@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.search.contour import MEASURED, POINT, Equations, Model, Points, normal_equations
-from penumbra.services.search.evidence import Evidence, Intrinsics, compare
-from penumbra.services.search.mask_fit import Fit, Limits, marginal, with_prior
+from penumbra.services.search.evidence import Evidence
+from penumbra.services.search.mask_fit import Fit, Limits, marginal, overlap_of, with_prior
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 LINE = 5
 """Reach of the line on both sides of the contour [px], read at every pixel's distance."""
@@ -108,7 +109,7 @@ def fit_image(
     regular = np.zeros((7, 7))
     regular[:6, :6] = prior + limits.information
     regular[6, 6] = settings.dilation**-2
-    pictures = _pyramid(_Picture(model, *native(image, evidence), settings, T_prior, regular), evidence.scale)
+    pictures = _pyramid(_Picture(model, *native(image, evidence), settings, T_prior, regular, first.hand), evidence.scale)
     T = with_prior(first.T, first.covariance, T_prior, prior)
     best = _through(pictures[-1:], T)
     for enough, start, way in _further(pictures, T, T_prior if prior.any() else None):
@@ -117,8 +118,7 @@ def fit_image(
     trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
     waves = trust * best.waves(settings.wave)
     T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits, waves)
-    k = evidence.intrinsics
-    both, free = compare(evidence.state, model.silhouette(best.T, k, (0, 0, *evidence.state.shape[::-1])))
+    both, free, overlap = overlap_of(model, best.T, evidence, first.hand)
     return replace(
         first,
         T=T,
@@ -127,8 +127,8 @@ def fit_image(
         length=best.length / evidence.scale,
         rms=best.rms,
         both=both,
-        either=evidence.seen_px + free,
         free=free,
+        overlap=overlap,
         sharp=best.rms < SHARP,
     )
 
@@ -156,7 +156,8 @@ class _Pass:
 
 @dataclass(frozen=True)
 class _Picture:
-    """An image (h, w, 3) uint8 with the evidence of its pixels, in which the pose is looked for."""
+    """An image (h, w, 3) uint8 with the evidence of its pixels, in which the pose is looked for; hand: as of
+    `mask_fit.Fit`."""
 
     model: Model
     image: NDArray[np.uint8]
@@ -164,6 +165,7 @@ class _Picture:
     settings: ImageSettings
     T_prior: Array
     regular: Array
+    hand: float
 
     def halved(self) -> _Picture:
         """The same at half the resolution: twice the reach."""
@@ -199,7 +201,7 @@ class _Picture:
 
     def _at(self, T: Array, moved: Array) -> _Pass:
         evidence, settings, k = self.evidence, self.settings, self.evidence.intrinsics
-        found = self.model.matched(T, evidence, settings.spacing, LINE)
+        found = self.model.matched(T, evidence, settings.spacing, LINE, self.hand)
         points = found.points
         noise = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
         r, sigma, kind = offsets(points, self.image, evidence.guarded, found.r, found.kind, *noise)

@@ -8,6 +8,9 @@ One pass, from a pose T_camera_target:
 The passes are Levenberg-Marquardt with Huber's weights; where they end badly, they start again after coarse passes with a longer
 walk. What is hidden is dropped and not scored.
 
+The mesh's hand is stiff, and people bend theirs: where the hand's contour fits much worse than the forearm's, its offsets count
+as so much more uncertain, and the last passes are repeated.
+
 The covariance is that of the measurement alone. Neighbouring points of a mask's boundary err together, so the contour counts as
 one independent point per correlation length; the dilation b is a nuisance with a prior of its own and is marginalised, because
 half a pixel around the limb looks like centimetres of depth.
@@ -21,8 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.contour import Equations, Model, Points, normal_equations
-from penumbra.services.search.evidence import Evidence
+from penumbra.services.search.contour import DROPPED, Equations, Model, Points, normal_equations
+from penumbra.services.search.evidence import TARGET, Evidence, compare
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
@@ -73,6 +76,13 @@ MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
 """Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
 DAMPING = (1e-3, 10.0, 1e2)
 """Marquardt's factor at the start, its change after a pass that gained or lost, and the factor at which the passes end."""
+BENT, MOST_BENT = 2.0, 8.0
+"""Offsets of the hand's contour, as multiples of the forearm's, from which it is taken for bent, as the mesh's stiff hand is not,
+and up to which its standard deviation grows with them."""
+LEAST_ARM_PX = 30.0
+"""Length [px] of the forearm's contour without which its hand is believed."""
+BENDS = 3
+"""Largest number of times that the fit is repeated for a bent hand."""
 KEPT = 0.05
 """Share of the prior's information that stays in the measurement: without any, directions that the contour hardly shows would be
 extrapolated far beyond where the problem is linear."""
@@ -87,8 +97,9 @@ class Fit:
     """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
     `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
     `cost`: chi^2 of contour, dilation and prior together; `misfit`: the same per measurement, 1 to 3 where the pose
-    is right; `both`, `either`, `free`: see `evidence.compare`; `sharp`: whether the image has edges along the contour
-    (`image_fit.fit_image`)."""
+    is right; `both`, `free`: see `evidence.compare`; `overlap`: see `overlap_of`; `hand`: how many times as
+    uncertain as the forearm's the hand's contour was taken for (`_Problem.bent`); `sharp`: whether the image has edges along the
+    contour (`image_fit.fit_image`)."""
 
     T: Array
     covariance: Array
@@ -99,14 +110,26 @@ class Fit:
     cost: float
     misfit: float
     both: int
-    either: int
     free: int
+    overlap: float
+    hand: float = 1.0
     sharp: bool = False
 
-    @property
-    def overlap(self) -> float:
-        """Intersection over union of the mask's target and the silhouette, of the pixels that are scored."""
-        return self.both / self.either if self.either else 0.0
+
+def overlap_of(model: Model, T: Array, evidence: Evidence, hand: float) -> tuple[int, int, float]:
+    """Pixels that show the target, and that are free, in the silhouette at T_camera_target (`evidence.compare`), and the
+    intersection over union of silhouette and mask's target, of the pixels that are scored, in [0, 1]; a pixel beyond the
+    wrist counts 1 / hand."""
+    state = evidence.state
+    shown = model.silhouette(T, evidence.intrinsics, (0, 0, *state.shape[::-1]))
+    both, free = compare(state, shown)
+    if hand == 1.0:
+        return both, free, both / max(evidence.seen_px + free, 1)
+    beyond = model.beyond_wrist(T, evidence.intrinsics, state.shape)
+    both_hand, free_hand = compare(state[beyond][None], shown[beyond][None])
+    seen_hand, less = int(np.count_nonzero(state[beyond] == TARGET)), 1.0 - 1.0 / hand
+    either = evidence.seen_px + free - less * (seen_hand + free_hand)
+    return both, free, (both - less * both_hand) / max(either, 1.0)
 
 
 @dataclass(frozen=True)
@@ -121,23 +144,23 @@ class _Pass:
     H: Array
     g: Array
     cost: float
-    counts: tuple[int, int, int]
 
 
 class _Problem:
     def __init__(self, model: Model, evidence: Evidence, noise: Noise, regular: Array, converged: float):
         self.model, self.evidence, self.noise, self.regular, self.converged = model, evidence, noise, regular, converged
+        self.hand = 1.0
 
     def at(self, T: Array, moved: Array, reach: float, huber: float) -> _Pass:
         evidence = self.evidence
-        found = self.model.matched(T, evidence, SPACING_PX, reach)
-        r, both, free = found.r - moved[6], found.both, found.free
+        found = self.model.matched(T, evidence, SPACING_PX, reach, self.hand)
+        r, both = found.r - moved[6], found.both
         equations = self.normal_equations(T, found.points, r, found.kind, huber, True)
         # parts of the mask without a contour near by exert no force, but must not lower the cost; nor may points that drop out
         unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
         cost = equations.cost * evidence.boundary_px / max(equations.counted, 1.0) + unexplained
         cost += float(np.dot(moved, self.regular @ moved))
-        return _Pass(T, moved, found.points, r, found.kind, equations.H, equations.g, cost, (both, evidence.seen_px + free, free))
+        return _Pass(T, moved, found.points, r, found.kind, equations.H, equations.g, cost)
 
     def normal_equations(
         self, T: Array, points: Points, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
@@ -145,6 +168,32 @@ class _Problem:
         noise, k = self.noise, self.evidence.intrinsics
         weights = points["length"] / (noise.correlation * noise.edge**2)
         return normal_equations(points, r, kind, weights, T[:3, 3], T[:3, 0], k.fx, k.fy, huber, bounded)
+
+    def bent(self, here: _Pass) -> tuple[float, float]:
+        """How many times the offsets of the hand's contour are those of the forearm's, from 1 to MOST_BENT, and how long it is
+        [px]; 1 where too little of the forearm shows to say, or too little is amiss."""
+        points = here.points
+        beyond = (points["position"] - here.T[:3, 3]) @ here.T[:3, 0] > self.model.wrist
+        length = np.where(here.kind == DROPPED, 0.0, points["length"]) * np.where(beyond, self.hand**2, 1.0)
+        hand_px, arm_px = float(length[beyond].sum()), float(length[~beyond].sum())
+        if arm_px < LEAST_ARM_PX or hand_px == 0.0:
+            return 1.0, hand_px
+        square = length * here.r**2
+        arm = max(math.sqrt(square[~beyond].sum() / arm_px), self.noise.edge)
+        ratio = math.sqrt(square[beyond].sum() / hand_px) / arm
+        return (1.0 if ratio < BENT else min(ratio, MOST_BENT)), hand_px
+
+    def loosened(self, here: _Pass) -> tuple[_Pass, float]:
+        """The pass that ends a fit once the hand is trusted as far as it fits, and what that costs: the logarithm of a Gaussian's
+        width, so that a pose that explains the hand wins over one that does not."""
+        hand_px = 0.0
+        for _ in range(BENDS):
+            hand, hand_px = self.bent(here)
+            if abs(hand - self.hand) < 0.2 * self.hand:
+                break
+            self.hand = hand
+            here = self.fine(self.at(here.T, here.moved, *FINE[:2]))
+        return here, 2.0 * math.log(self.hand) * hand_px / self.noise.correlation
 
     def coarse(self, T: Array, moved: Array) -> tuple[Array, Array]:
         """The pose and what it is moved by after steps that are all taken, as the contour points matched change with each."""
@@ -213,17 +262,22 @@ def fit(
     else:  # the start may be too far away for the short walk
         there = problem.fine(problem.at(*problem.coarse(T_start, start), *FINE[:2]))
         here = there if there.cost <= GOOD * independent else min(there, problem.fine(here), key=lambda one: one.cost)
+    here, loose = problem.loosened(here)
+    cost = here.cost + loose
 
     # the pose is final: only what was measured informs
     moved = here.moved
     measured = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False)
     length = measured.length
     rms = math.sqrt(measured.square / length) if length > 0 else math.inf
-    misfit = here.cost / independent
+    misfit = cost / independent
     # a mask or a fit worse than expected: the residuals give the noise
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
+    both, free, overlap = overlap_of(model, here.T, evidence, problem.hand)
     T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, measured.rolls, limits)
-    return Fit(T, covariance, here.T, length, rms, float(moved[6]), here.cost, misfit, *here.counts)
+    return Fit(
+        T, covariance, here.T, length, rms, float(moved[6]), cost, misfit, both, free, overlap, problem.hand
+    )  # fmt: skip
 
 
 def marginal(

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.search.contour import Model
-from penumbra.services.search.evidence import Intrinsics
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 
 @dataclass(frozen=True)

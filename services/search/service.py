@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+
 from penumbra.services import flags
+from penumbra.services.search import detect
+from penumbra.services.search.refinder import Refinder
 from penumbra.services.search.tracker import METHODS, Search
 from penumbra.shared.contract.messages import Frame, Joints, Mask
 from penumbra.shared.contract.topics import FRAME, FUSED, JOINTS, MASK, VISION
 from penumbra.shared.geometry.lens import Undistortion
+from penumbra.shared.perception import landmarks
 from penumbra.shared.perception.joint_history import RobotJoints
 from penumbra.shared.perception.lookout import Lookout
 from penumbra.shared.perception.prediction import predict
@@ -18,10 +23,19 @@ FRAMES_KEPT = 4
 JOINTS_NEAR_NS = 200_000_000
 """Largest distance [ns] of a frame from the joint angles with which robots are drawn into it. Chosen: a mask of which nothing is
 known of the robot is worse than one with a robot that has moved a little."""
-
+LOOK_S = 0.05
+"""Period [s] of the thread that looks for lost arms: how long a picture waits for it."""
+LOAD_S = 30.0
+"""Longest time [s] of a look, in which the landmark models may be loaded."""
 
 FLAGS = (
     flags.Option("--method", choices=METHODS, default="default", help="default: contour least squares; paper: ascent on f_m"),
+    flags.Option(
+        "--landmarks",
+        choices=("auto", "off"),
+        default="auto",
+        help="auto: find lost arms by landmarks, where models are installed",
+    ),
     flags.Option("--camera", show_default="all of the cell", help="search only the masks of this camera"),
     flags.Option("--target", show_default="all of the cell", help="search only this target"),
 )
@@ -32,7 +46,8 @@ def start(node: ServiceNode, options: flags.Options) -> None:
     """Subscribes; every mask is searched for every target that its camera can see and this replica owns.
 
     Threads: the joints of a robot are written by their reader, `frames[camera]` to the reader of that camera's
-    frames. The reader of its masks takes what is there at that moment; the searches of a camera are that reader's alone.
+    frames. The reader of its masks takes what is there at that moment; the searches of a camera are that reader's alone. Lost
+    arms are looked for by landmarks in a timer's thread (`Refinder`).
     """
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
@@ -51,6 +66,15 @@ def start(node: ServiceNode, options: flags.Options) -> None:
     frames: dict[str, tuple[Frame, ...]] = dict.fromkeys(cameras, ())
     undistort = {camera: Undistortion(cell.cameras[camera].lens) for camera in cameras}
 
+    refinder = None
+    if options.landmarks == "auto" and options.method == "default":
+        refinder = Refinder(cell, landmarks.kept())
+        node.add_report("landmarks", refinder.describe)
+        if refinder.missing:
+            node.log.info("lost arms are looked for in the masks alone", why=refinder.missing)
+        else:
+            node.every(LOOK_S, refinder.look, LOAD_S)
+
     def on_frame(message: Frame, names: dict[str, str]) -> None:
         known = frames[names["camera"]]
         frames[names["camera"]] = (*known, message)[-FRAMES_KEPT:]  # a new one each time: `on_mask` may be in the old one
@@ -59,18 +83,24 @@ def start(node: ServiceNode, options: flags.Options) -> None:
         joints.add(names["robot"], message.stamp_ns, message.position)
 
     def on_mask(message: Mask, names: dict[str, str]) -> None:
-        image = next((frame.image for frame in frames[names["camera"]] if frame.stamp_ns == message.stamp_ns), None)
-        if image is not None:
-            (h, w), scale = message.labels.shape, message.scale
-            image = undistort[names["camera"]](image, (message.x0, message.y0, message.x0 + w * scale, message.y0 + h * scale))
-        known = joints.at(message.stamp_ns)
+        frame = next((frame for frame in frames[names["camera"]] if frame.stamp_ns == message.stamp_ns), None)
+        image, whole = None, None
+        if frame is not None:
+            (h, w), scale, whole = message.labels.shape, message.scale, functools.partial(undistort[names["camera"]], frame.image)
+            image = whole((message.x0, message.y0, message.x0 + w * scale, message.y0 + h * scale))
+        known, lost = joints.at(message.stamp_ns), list[str]()
         for (camera, target), search in searches.items():
             if camera != names["camera"] or not node.owns(f"{camera}/{target}"):
                 continue
             T_prior, covariance = predict(fused[target].get(target=target), message.stamp_ns)
-            estimate = search.update(message, T_prior, covariance, known, image)
+            starts = refinder.starts(camera, target, message.stamp_ns) if refinder else ()
+            estimate = search.update(message, T_prior, covariance, known, image, starts)
+            if estimate.state == "lost" and detect.is_shown(message, cell.targets[target].label_values):
+                lost.append(target)
             pose = estimate.message(message.stamp_ns, target, camera, cell.frame)
             node.publish(VISION, pose, target=target)
+        if refinder and whole:
+            refinder.ask(names["camera"], lost, message.stamp_ns, whole)
 
     for robot in cell.robots:
         node.subscribe(JOINTS, on_joints, robot=robot)

@@ -78,6 +78,8 @@ class SearchSettings:
     """Overlap with all of a region, a bare upper arm included, from which no other region is tried. Chosen."""
     detect_fits: int = 4
     """Number of hypotheses that are fitted in a region: those that overlap best. Chosen for time."""
+    start_overlap: float = 0.1
+    """Least overlap with a region of a start that is fitted to it. Chosen low: its depth may be off by a quarter."""
     home_weight: float = 0.005
     """Overlap that one standard deviation from home costs a hypothesis. Chosen small: it decides between mirror images, which
     overlap equally."""
@@ -87,3 +89,6 @@ class SearchSettings:
     paper_sigma: tuple[float, float] = (0.02, 0.09)
     """Standard deviations [m, rad] published by `--method paper`. The position's is from the paper, which gives no covariance but
     an average error of less than 2 cm; the rotation's is chosen."""
+    paper_fails: float = 0.3
+    """Overlap below which an ascent of `--method paper` has lost the target and starts anew. Chosen: what the target shows beside
+    an occluder overlaps more."""

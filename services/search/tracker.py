@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.search import contour, detect, evidence, paper_search
-from penumbra.services.search.evidence import TARGET, Evidence, Intrinsics
+from penumbra.services.search.evidence import TARGET, Evidence
 from penumbra.services.search.image_fit import fit_image
 from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
 from penumbra.services.search.settings import SearchSettings
@@ -19,6 +19,7 @@ from penumbra.shared.cell.description import Cell
 from penumbra.shared.contract.messages import Mask
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.shared.perception.robot_depth import RobotDepth
 from penumbra.shared.perception.vision import State, VisionEstimate
 
@@ -76,12 +77,13 @@ class Search:
         prior_covariance: Array | None = None,
         joints: Mapping[str, Array] | None = None,
         image: NDArray[np.uint8] | None = None,
+        starts: Sequence[Array] = (),
     ) -> Searched:
         """What a mask, and the image it is of, say about the target's pose.
 
         T_prior (4 x 4): the predicted T_world_target, None where nothing is known; `prior_covariance` (6, 6) along the world's
         axes; `joints` (n,) [rad] by robot, to know exactly what the robots hide; `image` (h, w, 3) uint8 RGB: without it the mask
-        alone is used.
+        alone is used; starts (4 x 4 each): first poses T_camera_target for a target that is lost, from elsewhere than the mask.
 
         Raises ValueError for a mask or an image that cannot be this camera's.
         """
@@ -106,8 +108,8 @@ class Search:
             if certain:
                 return self._judge(*tracked, image is not None, T_start, prior_covariance)
         usable = tracked is not None and explains_mask(tracked[1].overlap, tracked[1].misfit, self.settings)
-        due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost")
-        other = self._detect(mask, T_start, joints) if due else None
+        due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost", bool(starts))
+        other = self._detect(mask, T_start, joints, starts) if due else None
         if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
             tracked = other[0], self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
         if tracked is None:
@@ -225,22 +227,24 @@ class Search:
         covariance = (1.0 - share) * first.covariance + share * other.covariance + share * (1.0 - share) * np.outer(apart, apart)
         return replace(first, T=rigid.perturb(first.T, share * apart), covariance=covariance)
 
-    def _is_detection_due(self, stamp_ns: int, case: str) -> bool:
-        if self._detected_ns is not None and 0 < stamp_ns - self._detected_ns < self.settings.detect_every_ns[case]:
+    def _is_detection_due(self, stamp_ns: int, case: str, is_news: bool) -> bool:
+        """is_news: there is something that the last one did not know."""
+        early = self._detected_ns is not None and 0 < stamp_ns - self._detected_ns < self.settings.detect_every_ns[case]
+        if early and not is_news:
             return False
         self._detected_ns = stamp_ns
         return True
 
-    def _detect(self, mask: Mask, T_home: Array, joints: Mapping[str, Array] | None) -> tuple[Evidence, Fit] | None:
-        """The target anywhere in the mask, not too far from home: the pose that explains most of the first region it fits."""
+    def _detect(
+        self, mask: Mask, T_home: Array, joints: Mapping[str, Array] | None, starts: Sequence[Array]
+    ) -> tuple[Evidence, Fit] | None:
+        """The target anywhere in the mask, not too far from home: the pose that explains most of the first region it fits, found
+        from one of the starts or from the mask's shape."""
         information, best, most = self._home_information, None, (False, 0.0)
         reach_px = self._reach * self._camera.fx / mask.scale / max(T_home[2, 3], contour.NEAR)
         for window, pieces in detect.regions(mask, self._target.label_values, reach_px):
             whole = self._gather(window, T_home, joints)
-            for piece in pieces:
-                T = self._best_start(self._gather(piece, T_home, joints), T_home)
-                if T is None:
-                    continue
+            for T in self._first_poses(whole, pieces, T_home, joints, starts):
                 seen = self._gather(window, T, joints, limb=T)
                 found = self._settled(seen, self._fit(seen, T, T_home, information), T_home, information)
                 away = rigid.pose_error(found.T_searched, T_home)
@@ -253,6 +257,18 @@ class Search:
             if most > (True, self.settings.explained):
                 break
         return best
+
+    def _first_poses(
+        self, whole: Evidence, pieces: Sequence[Mask], T_home: Array, joints: Mapping[str, Array] | None, starts: Sequence[Array]
+    ) -> Iterator[Array]:
+        """Poses from which to fit a region: of the starts those that overlap best, and the best of each of its pieces."""
+        overlaps = [(self._overlap(whole, T), T) for T in starts]
+        near = sorted((pair for pair in overlaps if pair[0] > self.settings.start_overlap), key=lambda pair: -pair[0])
+        yield from (T for _, T in near[: self.settings.detect_fits])
+        for piece in pieces:
+            T = self._best_start(self._gather(piece, T_home, joints), T_home)
+            if T is not None:
+                yield T
 
     def _best_start(self, seen: Evidence, T_home: Array) -> Array | None:
         """The pose that best explains the largest region of a mask."""
@@ -325,8 +341,20 @@ class Search:
         return int(np.count_nonzero(self._model.silhouette(T, k, window)))
 
     def _paper(self, seen: Evidence, T_start: Array) -> Searched:
-        T, value = paper_search.ascend(self._model, T_start, seen.state == TARGET, seen.intrinsics)
-        hidden = float(np.clip(1.0 - seen.seen_px / max(self._amodal_px(T, seen.intrinsics), 1), 0.0, 1.0))
+        """The paper's ascent from the prediction. The paper does not say what follows a loss, but its errors imply that the limb
+        is found again: an ascent that ends elsewhere than the mask is repeated from poses that could have made the mask."""
+        if seen.seen_px < detect.SMALLEST_PX:  # f_m is then greatest where the silhouette leaves the picture
+            return self._lost(T_start)
+        mask, k, fails = seen.state == TARGET, seen.intrinsics, self.settings.paper_fails
+        T, value = paper_search.ascend(self._model, T_start, mask, k)
+        if self._overlap(seen, T) < fails:
+            T_home = self._T_camera_world @ self._target.home.transform
+            starts = sorted(detect.hypotheses(self._model, seen, T_home), key=lambda start: -self._overlap(seen, start))
+            again = (paper_search.ascend(self._model, start, mask, k) for start in starts[: self.settings.detect_fits])
+            T, value = max(((T, value), *again), key=lambda found: found[1])
+            if self._overlap(seen, T) < fails:
+                return self._lost(T_start)
+        hidden = float(np.clip(1.0 - seen.seen_px / max(self._amodal_px(T, k), 1), 0.0, 1.0))
         covariance = np.diag(np.repeat(np.square(self.settings.paper_sigma), 3))
         state: State = "occluded" if hidden > self.settings.hidden else "tracking"
         return self._estimate(T, covariance, (value + 1.0) / 2.0, hidden, state, T)

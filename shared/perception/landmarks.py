@@ -7,6 +7,7 @@ They are run in OpenVINO as they are: palms and hands (Zhang et al. 2020, arXiv:
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -228,12 +229,23 @@ def overlap(a: Points, b: Points) -> float:
     return float(inside / max(np.prod(a[1] - a[0]) + np.prod(b[1] - b[0]) - inside, 1e-9))
 
 
+@functools.cache
+def loaded(folder: Path) -> Landmarks:
+    """The models of a folder, once per process; for one thread at a time. Raises ModelsError."""
+    return Landmarks(folder)
+
+
 # ---- the files
 
 
 def kept() -> Path:
     """The folder in which `penumbra segmentation models` keeps the models."""
     return cache() / "mediapipe-0.10.21"
+
+
+def is_installed(folder: Path) -> bool:
+    """Whether a folder holds files of all models; `Landmarks` sees whether they are the right ones."""
+    return all((folder / f"{name}.tflite").is_file() for name in FILES)
 
 
 def checked(folder: Path, name: str) -> Path:

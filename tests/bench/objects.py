@@ -19,12 +19,12 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from penumbra.services import flags
-from penumbra.services.search.evidence import Intrinsics
 from penumbra.services.search.objects.meshes import ObjectFileError
 from penumbra.services.search.objects.pose import RigidObject, find_pose
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster
 from penumbra.shared.geometry.rigid import Array, apply, from_rpy, pose_error, transform
+from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.tests.bench.lib import object_cases, results
 from penumbra.tests.bench.lib.object_cases import CONVERGED, STARTS, SURE, moved
 from penumbra.tests.bench.lib.results import Part, Result, marked

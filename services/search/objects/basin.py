@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 
 from penumbra.services.search import evidence
 from penumbra.services.search.contour import DROPPED, NEAR, Model, Points
-from penumbra.services.search.evidence import COVERED, FREE, TARGET, Evidence, Intrinsics
+from penumbra.services.search.evidence import COVERED, FREE, TARGET, Evidence
 from penumbra.services.search.mask_fit import Noise
 from penumbra.services.search.objects.creases import Creases
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 Bool = NDArray[np.bool_]
 

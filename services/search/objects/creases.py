@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from penumbra.services.search.contour import POINT, Model, Points
-from penumbra.services.search.evidence import Intrinsics
 from penumbra.shared.geometry import raster
 from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 SHARP = 0.5
 """Angle between the faces of a crease [rad] from which it is seen: below it, it may be a facet of a round surface."""

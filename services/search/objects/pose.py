@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.search.contour import MEASURED, NEAR, Model
-from penumbra.services.search.evidence import COVERED, FREE, TARGET, Intrinsics
+from penumbra.services.search.evidence import COVERED, FREE, TARGET
 from penumbra.services.search.mask_fit import Limits, Noise
 from penumbra.services.search.objects import basin, meshes, region
 from penumbra.services.search.objects.basin import Level, Prior, Pyramid, Score, Shape
@@ -23,6 +23,7 @@ from penumbra.services.search.objects.creases import Creases
 from penumbra.services.search.settings import ONE_IN_10_000
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry.rigid import Array, inverse, perturb, pose_error, transform
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 Bool = NDArray[np.bool_]
 State = Literal["tracking", "occluded", "doubtful", "lost"]

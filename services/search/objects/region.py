@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.search.contour import DROPPED, MEASURED, NEAR, POINT, Model
-from penumbra.services.search.evidence import GUARD_PX, Intrinsics
+from penumbra.services.search.evidence import GUARD_PX
 from penumbra.services.search.mask_fit import Limits
 from penumbra.services.search.objects import basin
 from penumbra.services.search.objects.basin import Contour, Prior, Shape
@@ -31,6 +31,7 @@ from penumbra.services.search.settings import ONE_IN_10_000
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 Bool = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]

@@ -17,13 +17,13 @@ from rich.progress import track as progress
 
 from penumbra.services import flags
 from penumbra.services.search.contour import NEAR
-from penumbra.services.search.evidence import Intrinsics
 from penumbra.services.search.objects import meshes, pose
 from penumbra.services.search.objects.meshes import ObjectFileError
 from penumbra.services.search.objects.pose import ObjectEstimate, RigidObject, Tracker
 from penumbra.shared.cell.faults import meant
 from penumbra.shared.geometry.lens import COEFFICIENTS, FOREIGN, Lens, Undistortion
 from penumbra.shared.geometry.rigid import Array, position_orientation
+from penumbra.shared.perception.intrinsics import Intrinsics
 
 Bool = NDArray[np.bool_]
 

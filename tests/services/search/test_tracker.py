@@ -18,8 +18,10 @@ from penumbra.shared.cell import description
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.contract.messages import FusedPose, Mask
 from penumbra.shared.geometry import raster, rigid
+from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.shared.perception.prediction import predict
 from penumbra.shared.perception.robot_depth import RobotDepth
+from penumbra.sim.sets import shots
 
 CELL = description.load("table")
 CAMERA = CELL.cameras["front"]
@@ -153,7 +155,7 @@ def test_a_round_limb_made_of_facets_does_not_show_its_roll():
     vertices, faces = anatomy.loft(np.column_stack([x, 0 * x, 0 * x]), 0.045 - 0.05 * x, 0.045 - 0.05 * x, 18)
     model = Model(anatomy.Mesh(vertices, faces.astype(np.int32), np.full(len(faces), Label.FOREARM, np.uint8)))
     T = T_CAMERA_WORLD @ rigid.from_rpy([0.0, 0.0, 0.2], [0.3, 0.1, 0.2])
-    k = evidence.Intrinsics.of_window(CAMERA, 220, 140, 1)
+    k = Intrinsics.of_window(CAMERA, 220, 140, 1)
     labels = np.where(model.silhouette(T, k, (0, 0, 192, 192)), Label.FOREARM, Label.BACKGROUND).astype(np.uint8)
     found = fit(model, T, evidence.gather(evidence.classify(labels, (Label.FOREARM,)), labels, k))
     roll = np.concatenate([np.zeros(3), T[:3, 0]])
@@ -319,6 +321,19 @@ def test_the_papers_ascent_finds_a_visible_arm():
     assert np.median(errors) < 2.0  # the paper: less than 2 cm on average
 
 
+def test_the_papers_ascent_starts_anew_where_it_lost_the_arm_and_says_so_where_the_mask_shows_none():
+    paper = Search(CELL, method="paper")
+    errors = []
+    for seed in range(1000, 1006):
+        s = scene(seed)
+        elsewhere = rigid.transform([0.0, 0.0, 0.4]) @ s.T_start
+        estimate = paper.update(s.mask, elsewhere, PRIOR)
+        assert estimate.state == "tracking"
+        errors.append(position_cm(s, estimate))
+        assert paper.update(replace(s.mask, labels=np.zeros_like(s.mask.labels)), s.T_start, PRIOR).state == "lost"
+    assert np.median(errors) < 5.0
+
+
 def test_a_mirrored_tilt_points_to_the_same_line_in_the_image():
     T = T_CAMERA_WORLD @ rigid.from_rpy([0.0, 0.0, 0.2], [0.2, 0.1, 0.3])
     mirror = detect.mirrored(T)[0]
@@ -340,7 +355,7 @@ def test_a_robot_is_drawn_where_its_joints_put_it():
     panda = description.Robot(urdf="panda/panda.urdf", joints=tuple(f"panda_joint{i}" for i in range(1, 8)))
     with_robot = CELL.model_copy(update={"robots": {"panda": panda}})
     robots = RobotDepth(with_robot, T_CAMERA_WORLD)
-    k = evidence.Intrinsics.of_window(CAMERA, 0, 0, 2)
+    k = Intrinsics.of_window(CAMERA, 0, 0, 2)
     straight, bent = (
         robots.render({"panda": np.array([q, 0.3, 0.0, -1.5, 0.0, 1.8, 0.0])}, k, (240, 320)).copy() for q in (0.0, 1.5)
     )
@@ -349,7 +364,7 @@ def test_a_robot_is_drawn_where_its_joints_put_it():
         assert np.isfinite(depth).sum() > 2000
         assert depth.min() > base - 0.9
     assert np.count_nonzero(np.isfinite(straight) != np.isfinite(bent)) > 1000
-    window = evidence.Intrinsics.of_window(CAMERA, 200, 100, 2)
+    window = Intrinsics.of_window(CAMERA, 200, 100, 2)
     np.testing.assert_array_equal(
         robots.render({"panda": np.array([0.0, 0.3, 0.0, -1.5, 0.0, 1.8, 0.0])}, window, (64, 96)), straight[50:114, 100:196]
     )
@@ -384,3 +399,14 @@ def test_a_user_mesh_without_an_inside_is_traced_like_a_closed_one():
     )
     model = Model(open_strip)
     assert sorted(model.edges[:, 3].tolist()) == [-1, -1, -1, -1, 1]
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_a_bent_hand_does_not_pull_the_forearm_aside(index):
+    shot = shots.shot(71, index, hands="posed")
+    mask = Mask(stamp_ns=0, labels=shot.labels, x0=0, y0=0, scale=1)
+    T_start = rigid.perturb(shot.T_world_target, [0.01, -0.01, 0.01, 0.03, 0.03, -0.03])
+    found = Search(shot.cell).update(mask, T_start, PRIOR, shot.joints, shot.image)
+    assert found.state == "tracking"
+    assert np.linalg.norm((found.T - shot.T_world_target)[:3, 3]) < 0.04
+    assert rigid.axis_angle_error(shot.T_world_target, found.T) < np.radians(6.0)
