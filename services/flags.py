@@ -110,10 +110,11 @@ def _number(text: str, is_good: Callable[[float], bool], what: str) -> float:
     return value
 
 
-def _address(text: str) -> tuple[str, int]:
-    address, _, digits = text.rpartition(":")
+def address(text: str) -> tuple[str, int]:
+    """Type of a flag: an address to listen at, and a port; without an address that of loopback."""
+    host, _, digits = text.rpartition(":")
     try:
-        return address or "127.0.0.1", port(digits)
+        return host.strip("[]") or "127.0.0.1", port(digits)
     except ValueError:
         raise ValueError(f"expected a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, got {text!r}") from None
 
@@ -459,7 +460,7 @@ LOG = (
 )
 METRICS = Option(
     "--metrics-port",
-    type=_address,
+    type=address,
     envvar="PENUMBRA_METRICS_PORT",
     show_envvar=True,
     metavar="[ADDRESS:]PORT",

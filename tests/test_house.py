@@ -49,7 +49,11 @@ def test_only_the_robots_bodies_know_pybullet():
         ("segmentation", {"numba", "torch", "pybullet", "trimesh", *SCIPY}),
         ("posecnn", {"numba", "openvino", "pybullet", "trimesh", *SCIPY}),
         ("emulator", {"numba", "torch", "pybullet", "trimesh", *SCIPY}),
+        ("camera", {"numba", "torch", "openvino", "pybullet", "trimesh", *SCIPY}),
+        ("ros2", {"numba", "torch", "pybullet", "trimesh", *SCIPY}),
         ("skin", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
+        ("robot", {"torch", "numba", "cv2", "pybullet", "trimesh", *SCIPY}),
+        ("dashboard", {"aiohttp", "cv2", "torch", "numba", "pybullet", "trimesh", *SCIPY}),
         ("router", {"torch", "numba", "pybullet", "trimesh", *SCIPY}),
     ],
 )

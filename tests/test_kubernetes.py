@@ -80,7 +80,7 @@ def test_replicas_of_fusion_are_spread_and_processes_with_devices_stay_with_them
     fusion = built("base")["Deployment", "fusion"]["spec"]
     assert fusion["replicas"] == 2
     assert fusion["template"]["spec"]["topologySpreadConstraints"][0]["topologyKey"] == "kubernetes.io/hostname"
-    for folder, name in (("simulated", "emulator"), ("boards", "skin")):
+    for folder, name in (("simulated", "emulator"), ("boards", "skin"), ("cameras", "camera"), ("robots", "robot")):
         spec = built(folder)["Deployment", name]["spec"]
         assert spec["strategy"] == {"type": "Recreate"}, "two of them would publish the same keys"
         assert list(spec["template"]["spec"]["nodeSelector"].values()) == ["true"]

@@ -3,7 +3,11 @@
     base/        a router per node, two routers that link them, and every service that computes; your drivers are not in it
     simulated/   base and the emulator in place of drivers
     boards/      base and the driver of a skin on nodes that have its boards
+    cameras/     base and the reader of cameras on a node that reaches them
+    robots/      base and the reader of robots on a node that reaches their controllers
     posecnn/     base with PoseCNN in place of segmentation and search
+    ros2/        base and the participant of ROS 2
+    recorded/    base and a recorder, whose files lie on a volume of its own
     secure/      base with TLS; each service has a Secret with its own certificate and no other
 
 Each folder is a kustomization (`kubectl apply -k docker/kubernetes/simulated`). A test compares the files with the table.
@@ -24,8 +28,17 @@ FOLDER = Path(__file__).parent
 HUBS = 2
 """Routers that link the nodes' routers. With two of them the cell stays connected while one is away."""
 PORT = 7447
-SENSORS = {"emulator": "penumbra/sensors", "skin": "penumbra/boards"}
+SENSORS = {
+    "emulator": "penumbra/sensors",
+    "skin": "penumbra/boards",
+    "camera": "penumbra/cameras",
+    "robot": "penumbra/robots",
+}
 """Label of the nodes on which a process may run because its devices are there."""
+ASKED = (*SENSORS, "ros2", "record")
+"""Processes that run only where a kustomization asks for them."""
+VOLUMES = {"record": ("recordings", "/recordings", "100Gi", ["--out", "/recordings"])}
+"""Name, place and size of the volume on which a process writes, and the arguments by which it does."""
 HEADER = "# Written by docker/kubernetes/generate.py from the table of processes: change that, not this.\n"
 Manifest = dict[str, Any]
 
@@ -33,15 +46,23 @@ Manifest = dict[str, Any]
 def manifests() -> dict[str, str]:
     """Every file by its path below this folder."""
     services = {process.name: process for process in PROCESSES if process is not ROUTER}
-    default = [each for name, each in services.items() if name not in SENSORS and each.vision in (None, processes.VISION[0])]
+    default = [each for name, each in services.items() if name not in ASKED and each.vision in (None, processes.VISION[0])]
     files = {f"base/{process.name}.yaml": [_deployment(process)] for process in default}
     files["base/router.yaml"] = _routers()
     files["base/settings.yaml"] = [_settings()]
     files["base/kustomization.yaml"] = [
         _kustomization("settings.yaml", "router.yaml", *(f"{each.name}.yaml" for each in default))
     ]
-    for folder, name in (("simulated", "emulator"), ("boards", "skin"), ("posecnn", "posecnn")):
-        files[f"{folder}/{name}.yaml"] = [_deployment(services[name])]
+    for folder, name in (
+        ("simulated", "emulator"),
+        ("boards", "skin"),
+        ("cameras", "camera"),
+        ("robots", "robot"),
+        ("posecnn", "posecnn"),
+        ("ros2", "ros2"),
+        ("recorded", "record"),
+    ):
+        files[f"{folder}/{name}.yaml"] = [_deployment(services[name]), *_claims(name)]
         files[f"{folder}/kustomization.yaml"] = [_kustomization("../base", f"{name}.yaml")]
     seeing = [_metadata_of(each.name) | {"$patch": "delete"} for each in default if each.vision]
     files["posecnn/kustomization.yaml"][0]["patches"] = [{"patch": yaml.safe_dump(each, sort_keys=False)} for each in seeing]
@@ -90,8 +111,17 @@ def _deployment(process: Process) -> Manifest:
         ]
     if process.name in SENSORS:
         pod["spec"]["nodeSelector"] = {SENSORS[process.name]: "true"}
+    if process.name in VOLUMES:
+        name, place, _, arguments = VOLUMES[process.name]
+        container = pod["spec"]["containers"][0]
+        container["args"] += arguments
+        container["volumeMounts"].append({"name": name, "mountPath": place})
+        pod["spec"]["volumes"].append({"name": name, "persistentVolumeClaim": {"claimName": name}})
+        pod["spec"]["securityContext"]["fsGroup"] = 10001
     if process.name == "skin":  # serial ports: a container reaches a device of its host only with all rights
         pod["spec"]["containers"][0]["securityContext"] = {"privileged": True, "readOnlyRootFilesystem": True}
+    if process.name == "ros2":  # ROS nodes reach the cell's router; where they have one of their own, this names it
+        pod["spec"]["containers"][0]["env"] = [{"name": "PENUMBRA_ROS_CONNECT", "value": f"tcp/router:{PORT}"}]
     # A process that may have no second one beside it ends before its successor starts.
     strategy = {"type": "RollingUpdate", "rollingUpdate": {"maxSurge": 1, "maxUnavailable": 0}}
     spec = {
@@ -101,6 +131,15 @@ def _deployment(process: Process) -> Manifest:
         "template": pod,
     }
     return {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": _metadata(process.name), "spec": spec}
+
+
+def _claims(process: str) -> list[Manifest]:
+    """The claim of the volume on which a process writes."""
+    if process not in VOLUMES:
+        return []
+    name, _, size, _ = VOLUMES[process]
+    spec = {"accessModes": ["ReadWriteOnce"], "resources": {"requests": {"storage": size}}}
+    return [{"apiVersion": "v1", "kind": "PersistentVolumeClaim", "metadata": _metadata(name), "spec": spec}]
 
 
 def _routers() -> list[Manifest]:

@@ -14,8 +14,9 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 State = Literal["tracking", "coasting", "lost"]
-"""`tracking`: a sense measures the target. `coasting`: none does now, and the covariance grows. `lost`: nothing is known any
-more."""
+"""`tracking`: a sense measures the target, and three standard deviations of its position are within the `tracking_bound` of the
+cell file. `coasting`: nothing measures it now, the newest measurement contradicts the pose, or the pose is less certain than that
+bound. `lost`: nothing is known any more."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,7 +100,7 @@ def examine(path: Path, is_whole: bool = False) -> tuple[cells.Cell | None, list
     found = list(_meshes(cell, document))
     if all(fault.is_warning for fault in found):  # what follows needs the meshes
         near = {target: Near.of(cell, target) for target in cell.targets}
-        for look in (_models, _networks, _cameras, _pads, _homes):
+        for look in (_models, _networks, _sources, _cameras, _pads, _homes):
             found += look(cell, document, near)
     if is_whole and all(fault.is_warning for fault in found):
         found += _motion(cell, document)
@@ -197,6 +197,14 @@ def _networks(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fa
             what = f"expected a haptic network for target {target} of cell {cell.name}, {got}; train it with "
             what += f"`penumbra haptics train --cell {document.path}` (until then the skin starts from the target's home)"
             yield document.fault("name", what, is_warning=True)
+
+
+def _sources(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
+    """Films and folders that are not here: they may be where the camera's process runs."""
+    for name, source in cell.sources.items():
+        if source.is_played and not (path := source.path(cell.folder)).exists():
+            what = f"expected a film or a folder of pictures, got nothing at {path}"
+            yield document.fault(f"cameras.{name}.source.url", f"{what}; correct it, or put it there", is_warning=True)
 
 
 def _cameras(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:

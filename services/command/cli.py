@@ -40,6 +40,11 @@ class Entry:
 STEERING = {
     "up": Entry("start every process of a cell with a router, and show what they do", "penumbra.services.launcher.up:main"),
     "down": Entry("end a cell that runs on this machine", "penumbra.services.command.machine:down"),
+    "replay": Entry(
+        "play what was recorded: onto the bus, or through the methods in one process",
+        "penumbra.services.replay.command:main",
+        extra="record",
+    ),
     "restart": Entry(
         "restart services of the running `penumbra up`, one after another, without losing the pose",
         "penumbra.services.command.steer:restart",
@@ -60,6 +65,11 @@ LOOKING = {
     "doctor": Entry("check this machine and report how to fix what is wrong", "penumbra.services.command.doctor:main"),
 }
 TOOLS = {
+    "calibrate": Entry(
+        "measure a camera's lens and where it stands, with a printed board: board, camera, hand-eye",
+        "penumbra.services.calibrate.group:main",
+        extra="calibrate",
+    ),
     "certs": Entry("make certificates for a cell on a network", "penumbra.services.command.certs:main", extra="certs"),
     "bench": Entry("run a benchmark", "penumbra.services.command.cli:bench", extra="test"),
     "completion": Entry("print the completion of bash, zsh or fish", "penumbra.services.command.cli:completion"),
@@ -285,9 +295,10 @@ def _complain(command: str, line: str) -> None:
 def _is_ours(error: Exception) -> bool:
     """Whether the text of an error already says what was expected, what was received and what to do."""
     from penumbra.shared.cell.faults import CellError
+    from penumbra.shared.recording.faults import RecordingError
     from penumbra.shared.runtime.bus import BusError, Refused
 
-    return isinstance(error, BusError | Refused | CellError | FileNotFoundError)
+    return isinstance(error, BusError | Refused | CellError | RecordingError | FileNotFoundError)
 
 
 def _explain_import(command: str, argv: list[str], error: ImportError) -> int:

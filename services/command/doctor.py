@@ -81,6 +81,7 @@ def findings(cell: str, connection: bus.Connection) -> Iterator[Finding]:
     yield _shared_memory()
     yield from _cell(cell)
     yield from _weights()
+    yield from _landmarks()
     router = _router(connection)
     yield router
     if router.status == "ok":
@@ -182,6 +183,20 @@ def _weights() -> Iterator[Finding]:
             yield Finding("fail", f"{process.name} has no weights", train)
         for path in weights:
             yield _card(path, train)
+
+
+def _landmarks() -> Iterator[Finding]:
+    """Models that are no part of an installation, and help where they are there."""
+    try:
+        from penumbra.shared.perception import landmarks
+    except ImportError:  # told above
+        return
+    folder = landmarks.kept()
+    if landmarks.is_installed(folder):
+        yield Finding("ok", f"landmark models in {folder}: lost arms are looked for with them")
+    else:
+        mend = "optional: penumbra segmentation models fetches them"
+        yield Finding("ok", "no landmark models: lost arms are looked for in the masks alone", mend)
 
 
 def _card(path: Path, train: str) -> Finding:

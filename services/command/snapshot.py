@@ -7,6 +7,7 @@ coasting, red: lost), each pad as its outline, filled the brighter the more it f
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from penumbra.shared.contract.labels import COLOURS, Label
 from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.lens import Undistortion
 from penumbra.shared.runtime import bus
-from penumbra.shared.skin.layout import Skin, link_names
+from penumbra.shared.skin.layout import Skin, link_names, pad_poses
 
 PATIENCE_S = 5.0
 """How long to wait until every topic has been heard."""
@@ -117,15 +118,17 @@ def draw(
     camera_name: str,
     target_name: str,
     frame: messages.Frame,
-    mask: messages.Mask,
+    mask: messages.Mask | None,
     pose: messages.FusedPose,
-    joints: dict[str, NDArray],
-    volts: dict[str, NDArray],
+    joints: Mapping[str, NDArray],
+    volts: Mapping[str, NDArray],
 ) -> NDArray[np.uint8]:
-    """The picture (h, w, 3) uint8 RGB. joints: by robot; volts: mean electrode amplitudes by pad."""
+    """The picture (h, w, 3) uint8 RGB. mask: of the frame, None where there is none; joints: by robot; volts: mean electrode
+    amplitudes by pad."""
     camera = cell.cameras[camera_name]
     picture = Undistortion(camera.lens)(frame.image).copy()
-    _tint(picture, mask)
+    if mask is not None:
+        _tint(picture, mask)
     _pads(picture, cell, camera, joints, volts)
     mesh = anatomy.target_mesh(cell.targets[target_name], cell)
     T = rigid.inverse(camera.T_world_camera) @ rigid.transform(pose.position, pose.orientation)
@@ -158,21 +161,34 @@ def _tint(picture: NDArray[np.uint8], mask: messages.Mask) -> None:
     region[shown] = (0.55 * region[shown] + 0.45 * colours[labels[shown]]).astype(np.uint8)
 
 
-def _pads(picture: NDArray[np.uint8], cell: cells.Cell, camera: cells.Camera, joints: dict, volts: dict) -> None:
-    """Draws the pads that face the camera, filled by their strongest signal, in place."""
+def pad_levels(cell: cells.Cell, volts: Mapping[str, NDArray]) -> dict[str, float]:
+    """How much each pad feels by its strongest electrode, from 0 to 1. volts: mean electrode amplitudes [V] by pad."""
+    if not volts:
+        return {}
     skin = Skin(cell)
-    links = link_names({name: model.link_transforms(joints[name]) for name, model in robot_models(cell).items()})
+    out = {}
+    for name, found in volts.items():
+        own = skin.of(skin.pads.index(name))
+        signal = float(np.max(skin.polarity[own] * (found - skin.a3[own])))
+        out[name] = float(np.clip(np.log1p(max(signal, 0.0) / 0.003) / np.log1p(FULL_SIGNAL / 0.003), 0.0, 1.0))
+    return out
+
+
+def _pads(picture: NDArray[np.uint8], cell: cells.Cell, camera: cells.Camera, joints: Mapping, volts: Mapping) -> None:
+    """Draws the pads that face the camera, filled by their strongest signal, in place: those whose place is known."""
+    links = link_names(
+        {name: model.link_transforms(joints[name]) for name, model in robot_models(cell).items() if name in joints}
+    )
+    levels = pad_levels(cell, volts)
     T_camera_world = rigid.inverse(camera.T_world_camera)
     corners = np.array([(x * PAD_HALF[0], y * PAD_HALF[1], 0.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-    for name, T_world_pad in zip(cell.pads, skin.T_world_pads(links), strict=True):
+    for name, T_world_pad in pad_poses(cell, links).items():
         T = T_camera_world @ T_world_pad
         points = rigid.apply(T, corners)
         if points[:, 2].min() < raster.NEAR or T[:3, 2] @ T[:3, 3] > 0:
             continue
         outline = (points @ camera.K.T / points[:, 2:])[:, :2].round().astype(np.int32)
-        own = skin.of(skin.pads.index(name))
-        signal = float(np.max(skin.polarity[own] * (volts[name] - skin.a3[own])))
-        level = np.clip(np.log1p(max(signal, 0.0) / 0.003) / np.log1p(FULL_SIGNAL / 0.003), 0.0, 1.0)
+        level = levels.get(name, 0.0)
         lit = picture.copy()
         cv2.fillPoly(lit, [outline], (int(60 + 195 * level), int(60 + 150 * level), int(90 * (1 - level))), cv2.LINE_AA)
         cv2.addWeighted(lit, 0.35 + 0.5 * level, picture, 0.65 - 0.5 * level, 0, picture)

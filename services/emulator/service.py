@@ -58,7 +58,7 @@ def start(node: Node, options: flags.Options) -> None:
     world = World(cell, options.seed)
     world.plan(PLAN_S)
     sensors = Sensors(world, node.now_ns())
-    for camera in cell.cameras:  # compiles what the first turn would wait for
+    for camera in cell.cameras.keys() - cell.sources.keys():  # compiles what the first turn would wait for
         sensors.frame(camera, 0)
     sensors.tick(1)
     world_time = Time(node.now_ns)
@@ -98,6 +98,9 @@ def start(node: Node, options: flags.Options) -> None:
     skin = Pacer(0, TICK_NS, world_time.now_ns, late_ns=TICK_NS)
     node.every(AGAIN_S, partial(turn, skin, sensors.tick))
     for camera, description in cell.cameras.items():
+        if camera in cell.sources:
+            node.log.info("left to `penumbra camera`: the cell file gives it a source", camera=camera)
+            continue
         period_ns = 1e9 / description.rate_hz
         pacer = Pacer(0, period_ns, world_time.now_ns, late_ns=period_ns / 10)
         node.every(AGAIN_S, partial(turn, pacer, partial(frame, camera)))

@@ -6,7 +6,6 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,9 @@ from penumbra.shared.contract import report, topics
 from penumbra.shared.contract.messages import BadMessage, FusedPose, Truth, decode
 from penumbra.shared.contract.report import Report
 from penumbra.shared.geometry import rigid
-from penumbra.shared.runtime import bus
+from penumbra.shared.perception.accuracy import Accuracy, accuracy
 from penumbra.shared.runtime.node import Node
+from penumbra.shared.runtime.rates import TopicRow, topic_rows
 
 ANSWER_S = 2.0
 """How long an instance may take to say how it is."""
@@ -32,32 +32,6 @@ LASTS_S = 1.5
 """A change between passing states is shown when it has lasted so long."""
 WIDE = 70
 """Columns from which every column of the tables is shown."""
-
-
-@dataclass
-class TopicRow:
-    """All keys of one topic: rates by key, of all replicas that publish it together; delays to readers; sums of what was dropped
-    and refused."""
-
-    name: str
-    rates: dict[str, float] = field(default_factory=dict)
-    delays_s: list[float] = field(default_factory=list)
-    dropped: int = 0
-    bad: int = 0
-
-    @property
-    def rate_hz(self) -> float:
-        """Mean rate of a key."""
-        return sum(self.rates.values()) / len(self.rates) if self.rates else 0.0
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """The fused pose, and where the truth is known its error: position [m] and limb axis [rad]."""
-
-    pose: FusedPose
-    position: float = math.nan
-    axis: float = math.nan
 
 
 class Watch:
@@ -108,30 +82,7 @@ class Watch:
 
     def topic_rows(self) -> list[TopicRow]:
         """The traffic of the cell: rates as published, delays and losses as received."""
-        rows = {topic.name: TopicRow(topic.name) for topic in topics.TOPICS if self._node.keys(topic, {})}
-        for found in self.health.values():
-            for key, traffic in found.published.items():
-                if (topic := bus.topic_of(key)) is not None and topic.name in rows:
-                    rates = rows[topic.name].rates
-                    rates[key] = rates.get(key, 0.0) + traffic.rate_hz
-            for key, traffic in found.topics.items():
-                if (topic := bus.topic_of(key.partition(" #")[0])) is not None and topic.name in rows:
-                    row = rows[topic.name]
-                    row.delays_s += [traffic.delay_s] if traffic.delay_s is not None else []
-                    row.dropped += traffic.dropped or 0
-                    row.bad += sum(traffic.bad.values())
-        return list(rows.values())
-
-
-def accuracy(pose: FusedPose, truths: Iterable[Truth]) -> Accuracy:
-    """The error of a pose against the truth nearest in time, moved to the pose's stamp by its velocity."""
-    truth = min(truths, key=lambda truth: abs(truth.stamp_ns - pose.stamp_ns), default=None)
-    if truth is None:
-        return Accuracy(pose)
-    elapsed_s = (pose.stamp_ns - truth.stamp_ns) * 1e-9
-    T_true = rigid.perturb(rigid.transform(truth.position, truth.orientation), truth.velocity * elapsed_s)
-    T = rigid.transform(pose.position, pose.orientation)
-    return Accuracy(pose, float(np.linalg.norm(T_true[:3, 3] - T[:3, 3])), rigid.axis_angle_error(T_true, T))
+        return topic_rows(self.health.values(), (topic.name for topic in topics.TOPICS if self._node.keys(topic, {})))
 
 
 class Steady:
@@ -159,15 +110,18 @@ class Steady:
 
 
 class Picture:
-    """What the screen shows: the pose first, then the processes, then the topics, cut to the size of the terminal."""
+    """What the screen shows: the pose first, then the processes, then the topics, cut to the size of the terminal. hint: a
+    command for another terminal; link: the link of the web page, empty while it is not served."""
 
-    def __init__(self, hint: str, watch: Watch):
-        self._hint, self._watch = hint, watch
+    def __init__(self, hint: str, watch: Watch, link: Callable[[], str] = str):
+        self._hint, self._watch, self._link = hint, watch, link
         self._steady = Steady()
 
     def draw(self, processes: list[ProcessRow], width: int, height: int) -> Group:
         """At most `height` rows of `width` columns."""
-        head = [_line(f"{self._hint}   (in another terminal)", "dim"), *self._pose()]
+        link = self._link()
+        page = [Text(link, "dim", no_wrap=True, overflow="fold")] if link else []  # a link that is cut leads nowhere
+        head = [_line(f"{self._hint}   (in another terminal)", "dim"), *page, *self._pose()]
         is_wide = width >= WIDE
         names = ("process", "state", "pid", "CPU %", "MB", "restarts", "") if is_wide else ("process", "state", "")
         left = []
@@ -243,11 +197,13 @@ def pose_line(accuracy: Accuracy | None) -> str:
     return line
 
 
-def plain(processes: list[ProcessRow], watch: Watch) -> str:
-    """The same in one line, for a log."""
+def plain(processes: list[ProcessRow], watch: Watch, link: str = "") -> str:
+    """The same in one line, for a log. link: of the web page, empty while it is not served."""
     states = ", ".join(f"{row.name} {row.state}" + (f" ({row.note})" if row.note else "") for row in processes)
     rates = ", ".join(f"{row.name} {row.rate_hz:.0f}" for row in watch.topic_rows() if row.rates)
-    return f"{time.strftime('%H:%M:%S')} {pose_line(watch.accuracy)}; {states}; Hz: {rates or 'nothing yet'}"
+    return f"{time.strftime('%H:%M:%S')} {pose_line(watch.accuracy)}; {states}; Hz: {rates or 'nothing yet'}" + (
+        f"; page: {link}" if link else ""
+    )
 
 
 def summary(processes: list[ProcessRow], watch: Watch) -> str:

@@ -6,6 +6,7 @@ import contextlib
 import os
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, TextIO, cast
@@ -20,9 +21,9 @@ from penumbra.services.launcher.fleet import Fleet, Kind
 from penumbra.services.launcher.forkserver import ForkServer
 from penumbra.services.launcher.supervised import ProcessRow, Supervised
 from penumbra.shared.cell import description as cells
-from penumbra.shared.contract import topics
+from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.processes import LAUNCHER, PROCESSES, ROUTER, Process
-from penumbra.shared.runtime import bus, logs
+from penumbra.shared.runtime import bus, logs, page
 from penumbra.shared.runtime.connection import connect_by_environment
 from penumbra.shared.runtime.hang import HANG_S
 from penumbra.shared.runtime.node import Node
@@ -44,7 +45,7 @@ class Launcher:
     """Runs the processes of a cell until it is told to stop, and changes them when it is asked to.
 
     keep_going: also when a process does not start. notify: takes a line of what the start waits for, in place of a screen.
-    hint: the command that the screen names.
+    hint: the command that the screen names. page_key: of the links to the web page; opens: whether a browser opens it.
     """
 
     def __init__(
@@ -55,9 +56,12 @@ class Launcher:
         keep_going: bool = False,
         notify: Callable[[str], None] | None = None,
         hint: str = "penumbra pose",
+        page_key: str | None = None,
+        opens: bool = False,
     ):
         self.node, self.fleet, self.console = node, fleet, console
         self._keep_going, self._notify, self._hint = keep_going, notify, hint
+        self._page_key, self._opens = page_key, opens
         self._first: list[Supervised] = []
         self.watch = display.Watch(node)
         node.add_report("processes", self._processes)
@@ -79,13 +83,17 @@ class Launcher:
             if self._notify is not None:
                 self._loop(deadline, REDRAW_S, self._tell_of_start)
             elif self.console.is_terminal and not self.console.is_dumb_terminal:
-                picture = display.Picture(self._hint, self.watch)
+                picture = display.Picture(self._hint, self.watch, self.page_link)
                 with Live(console=self.console, auto_refresh=False) as screen:
                     self._loop(
                         deadline, REDRAW_S, lambda: screen.update(picture.draw(self._rows(), *self.console.size), refresh=True)
                     )
             else:
-                self._loop(deadline, PLAIN_S, lambda: self._print(display.plain(self._rows(), self.watch)))
+                self._loop(
+                    deadline,
+                    PLAIN_S,
+                    lambda: self._print(display.plain(self._rows(), self.watch, self.page_link(with_key=False))),
+                )
         finally:
             failed, rows = self._failed(), self._rows()
             is_over = not failed and not self.node.stopping.is_set()
@@ -102,6 +110,19 @@ class Launcher:
     def _print(self, text: str) -> None:
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
+    def page_link(self, with_key: bool = True) -> str:
+        """The link of the web page, empty while it is not served. with_key: as only who sees this screen may have it."""
+        address = page.address_in(self.watch.local().values())
+        return page.link(address, self._page_key if with_key else None) if address else ""
+
+    def _open_page(self) -> None:
+        """Has a browser open the page, once it is served, where that is asked for; one in the terminal returns when it ends."""
+        if self._opens and (link := self.page_link()):
+            self._opens = False
+            import webbrowser
+
+            threading.Thread(target=webbrowser.open, args=(link,), name="open page", daemon=True).start()
+
     def _failed(self) -> list[str]:
         """The processes of the start without which the cell is not to run: they cannot begin, or have died each time."""
         if self._keep_going:
@@ -113,11 +134,12 @@ class Launcher:
         assert self._notify is not None, "only a launcher in the background reports its start"
         rows = self._rows()
         waiting = [f"{row.name} ({row.note.partition(';')[0] or row.state})" for row in rows if row.state != "running"]
-        cell = f"cell {self.node.cell.name}"
+        cell, link = f"cell {self.node.cell.name}", self.page_link()
+        at = f", its page is {link}" if link else ""
         if self.watch.has_tracked:
-            self._notify(f"{background.UP}{cell} is tracking")
+            self._notify(f"{background.UP}{cell} is tracking{at}")
         elif not self._should_track() and all(process.state == "running" for process in self.fleet.processes):
-            self._notify(f"{background.UP}{cell} runs")
+            self._notify(f"{background.UP}{cell} runs{at}")
         else:
             self._notify(f"waiting for {', '.join(waiting) or 'the first pose that is tracked'}")
             return
@@ -148,6 +170,7 @@ class Launcher:
                 process.heard(report.ready, report.hangs)
 
         self._tell_of_loops()
+        self._open_page()
 
     def _tell_of_loops(self) -> None:
         looping = {process.name: process.note for process in self.fleet.processes if process.is_looping}
@@ -189,11 +212,12 @@ def fleet(
     own = {"PENUMBRA_METRICS_PORT": ""}  # the launcher's port covers all
     kinds, counts = {}, {}
     for process in PROCESSES:
-        if not process.replicas or (process is ROUTER and options.connect):
+        number = process.replicas or int(_started(process, options) is not None)
+        if not number or (process is ROUTER and options.connect):
             continue
         kinds[process.name] = Kind(_command(process, options), process.restart, own, process.beside, process.is_required)
         if process.is_needed(cell) and process.vision in (None, options.vision):
-            counts[process.name] = process.replicas
+            counts[process.name] = number
     for name, number in options.replicas:
         if name not in kinds:
             raise cells.CellError(f"--replicas {name}={number}: expected one of {', '.join(kinds)}, got {name!r}")
@@ -215,7 +239,14 @@ def _command(process: Process, options: flags.Options) -> list[str]:
     for flag in process.flags:
         if (value := getattr(options, flag.name)) is not None:
             command += [f"--{flag.name}", str(value)]
+    if process.starter is not None and (value := _started(process, options)) is not None:
+        command += [process.starter.passes, value]
     return command
+
+
+def _started(process: Process, options: flags.Options) -> str | None:
+    """The value of the flag that starts a process; None where it is not given, or there is no such flag."""
+    return getattr(options, process.starter.name) if process.starter is not None else None
 
 
 def listening(options: flags.Options) -> str:
@@ -306,7 +337,16 @@ def run(options: flags.Options, forkserver: ForkServer) -> int:
                 processes.start()
                 wait_for_router(node, processes, options.port)
                 node.open()
-            launcher = Launcher(node, processes, Console(), options.keep_going, _notifier(options.notify), pose_command(options))
+            launcher = Launcher(
+                node,
+                processes,
+                Console(),
+                options.keep_going,
+                _notifier(options.notify),
+                pose_command(options),
+                page.key(options.secure, access.OPERATOR) if options.secure else None,
+                options.open,
+            )
             with (
                 flags.metrics(options.metrics_port, lambda: launcher.watch.health.values()),
                 runs.recorded(cell.name, meeting_points(options), options.secure, logs_of),

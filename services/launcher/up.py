@@ -37,6 +37,7 @@ PARAMS = (
         is_flag=True,
         help="run in the background: returns once the cell is tracking, or says why it is not; see penumbra ps, logs and down",
     ),
+    flags.Option("--open", is_flag=True, help="open the web page in the browser"),
     flags.Option("--notify", type=int, hidden=True, help="descriptor to which a launcher in the background reports its start"),
     flags.Option("--vision", choices=VISION, default=VISION[0], help="segmentation and search, or PoseCNN"),
     *(
@@ -48,6 +49,17 @@ PARAMS = (
         )
         for process in PROCESSES
         for flag in process.flags
+    ),
+    *(
+        flags.Option(
+            f"--{process.starter.name}",
+            takes="maybe",
+            without=process.starter.without,
+            metavar=process.starter.value,
+            help=f"{process.starter.about} (see penumbra {process.name} --help)",
+        )
+        for process in PROCESSES
+        if process.starter is not None
     ),
     flags.Option(
         "--replicas",

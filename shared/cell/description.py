@@ -11,20 +11,35 @@ from dataclasses import dataclass
 from functools import cached_property
 from math import pi
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from penumbra.shared.body import urdf
 from penumbra.shared.cell import document, names
 from penumbra.shared.cell.document import Document
 from penumbra.shared.cell.explain import explain
 from penumbra.shared.cell.faults import CellError as CellError  # every reader of a cell file catches it from here
-from penumbra.shared.cell.faults import Fault, Faulty, meant, refuse
+from penumbra.shared.cell.faults import Fault, meant, refuse
+from penumbra.shared.cell.fields import (
+    Angles3,
+    Length,
+    Measure,
+    Metres,
+    Model,
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Vector3,
+    Whole,
+)
 from penumbra.shared.cell.names import BUILT_IN as BUILT_IN
-from penumbra.shared.cell.names import NAME, is_file
+from penumbra.shared.cell.names import is_file
 from penumbra.shared.cell.names import source as source
+from penumbra.shared.cell.sources import CameraSource as CameraSource
+from penumbra.shared.cell.sources import JointSource as JointSource
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.contract.messages import Frame
 from penumbra.shared.geometry import rigid
@@ -38,47 +53,7 @@ SAME = 1e-6
 """Points nearer to each other than this [m] are one."""
 
 
-def _number(value: Any) -> Any:
-    if isinstance(value, bool):
-        got = "true" if value else "false"
-        raise Faulty([("", f"expected a number, got {got}; YAML reads yes, no, on and off as true and false")])
-    return value
-
-
-Number = Annotated[float, BeforeValidator(_number)]
-Whole = Annotated[int, BeforeValidator(_number)]
-Metres = Annotated[Number, Field(ge=-1e4, le=1e4)]
-Radians = Annotated[Number, Field(ge=-6.3, le=6.3)]
-"""A turn and a little; what is larger is in degrees."""
-Vector3 = tuple[Metres, Metres, Metres]
-Angles3 = tuple[Radians, Radians, Radians]
-Positive = Annotated[Number, Field(gt=0)]
-NotNegative = Annotated[Number, Field(ge=0)]
-Length = Annotated[Number, Field(gt=0, le=1)]
-"""A length on a pad [m]; what is larger is in millimetres."""
-Measure = Annotated[Number, Field(ge=0.02, le=3)]
-"""A measure of a person [m]."""
-Name = Annotated[str, Field(pattern=NAME)]
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, ignored_types=(cached_property,), protected_namespaces=()
-    )
-
-    def __eq__(self, other: object) -> bool:
-        """By the fields alone: pydantic compares cached arrays too, which have no truth value."""
-        return type(self) is type(other) and all(getattr(self, name) == getattr(other, name) for name in type(self).model_fields)
-
-    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A copy with some fields changed. What is cached belongs to the old fields, so that the copy begins without it."""
-        copied = super().model_copy(update=update, deep=deep)
-        for name in vars(copied).keys() - type(self).model_fields.keys():
-            del copied.__dict__[name]
-        return copied
-
-
-class Placement(_Model):
+class Placement(Model):
     """A pose in a parent frame."""
 
     position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="x, y, z in the parent frame [m]")
@@ -90,7 +65,14 @@ class Placement(_Model):
         return rigid.from_rpy(self.position, self.rpy)
 
 
-class Camera(_Model):
+class Spread(Model):
+    """Standard deviations of a pose."""
+
+    position: Annotated[Number, Field(gt=0, le=5)] = Field(description="of the position along each axis [m]")
+    rotation: Annotated[Number, Field(gt=0, le=pi)] = Field(description="of the rotation about each axis [rad]")
+
+
+class Camera(Model):
     """A camera. Its optical frame has x to the right, y down and z forward; pixel centres are at integer coordinates. Pictures of
     a lens with distortion are undistorted when they arrive; everything else uses the pinhole picture."""
 
@@ -111,6 +93,12 @@ class Camera(_Model):
         default=None, description="the point in the middle of its view [m]; either this or rpy. Looking straight down, +y is up"
     )
     rpy: Angles3 | None = Field(default=None, description="roll, pitch, yaw of its optical frame [rad]; either this or look_at")
+    source: CameraSource | None = Field(
+        default=None, description="where its pictures come from; without it the emulator or a program of yours publishes them"
+    )
+    pose_spread: Spread | None = Field(
+        default=None, description="how well that is known, where it was measured, written by `penumbra calibrate hand-eye`"
+    )
 
     @model_validator(mode="after")
     def _possible(self) -> Camera:
@@ -145,7 +133,7 @@ class Camera(_Model):
         return Lens(**{name: getattr(self, name) for name in ("width", "height", "fx", "fy", "cx", "cy", *COEFFICIENTS)})
 
 
-class Robot(_Model):
+class Robot(Model):
     """A robot."""
 
     urdf: str = Field(description="its URDF: a path beside the cell file, or the built-in panda/panda.urdf")
@@ -153,16 +141,19 @@ class Robot(_Model):
     joints: Annotated[tuple[str, ...], Field(min_length=1)] = Field(
         description="the joints that move, in the order of the joint messages"
     )
+    source: JointSource | None = Field(
+        default=None, description="where its joints come from; without it the emulator or a program of yours publishes them"
+    )
 
 
-class Nominal(_Model):
+class Nominal(Model):
     """An electrode's response as designed, on its pad's gap d [m] to a forearm that lies across: a1 / (1 + a2 d^2) [V]."""
 
     a1: Positive = Field(description="amplitude at contact [V]")
     a2: Positive = Field(description="decay with the gap [1/m^2]")
 
 
-class Electrode(_Model):
+class Electrode(Model):
     """A measurement electrode in its pad's frame (x right, y up, z out of the pad): a disc or an arc around its centre."""
 
     centre: tuple[Metres, Metres] = Field(default=(0.0, 0.0), description="x, y of the disc's or arc's centre [m]")
@@ -196,7 +187,7 @@ class Electrode(_Model):
         return (float(self.centre[0] + radius * np.cos(angle)), float(self.centre[1] + radius * np.sin(angle)))
 
 
-class Board(_Model):
+class Board(Model):
     """A printed board with its electrodes on the front and a ground pour on its back."""
 
     size: tuple[Length, Length] = Field(description="along x and y [m]")
@@ -205,7 +196,7 @@ class Board(_Model):
     permittivity: Annotated[Number, Field(ge=1, le=100)] = Field(default=4.5, description="relative permittivity of the laminate")
 
 
-class Ring(_Model):
+class Ring(Model):
     """The excitation ring."""
 
     radii: tuple[Length, Length] = Field(description="inner and outer radius [m]")
@@ -218,7 +209,7 @@ class Ring(_Model):
         return self
 
 
-class Chain(_Model):
+class Chain(Model):
     """From a change of capacitance to an amplitude. The amplifier works around half of the reference, so amplitudes end there."""
 
     excitation_V: Annotated[Number, Field(gt=0, le=1e4)] = Field(description="amplitude of the excitation [V]")
@@ -233,7 +224,7 @@ class Chain(_Model):
         return self.excitation_V * 2.0 * np.pi * self.frequency_hz * self.feedback_ohm * 1e-15
 
 
-class Rest(_Model):
+class Rest(Model):
     """An amplitude as designed, with nothing near."""
 
     a3: NotNegative = Field(description="offset [V]")
@@ -241,7 +232,7 @@ class Rest(_Model):
     noise: NotNegative = Field(description="variance of the noise in a sample of one millisecond [V^2]")
 
 
-class Law(_Model):
+class Law(Model):
     """An electrode's calibrated response, the paper's law (eq. sensor_approx): v = a3 + polarity * a1 / (1 + a2 d^2), d the gap
     to the skin [m]."""
 
@@ -252,7 +243,7 @@ class Law(_Model):
     noise: NotNegative = Field(description="variance of the noise in a sample of one millisecond [V^2]")
 
 
-class PadType(_Model):
+class PadType(Model):
     """A design of pads."""
 
     board: Board = Field(description="the printed board, for the field model")
@@ -283,7 +274,7 @@ class PadType(_Model):
         return Law(a1=nominal.a1, a2=nominal.a2, a3=self.rest.a3, polarity=self.rest.polarity, noise=self.rest.noise)
 
 
-class SensingBoard(_Model):
+class SensingBoard(Model):
     """A sensing board of a pad."""
 
     port: str | None = Field(default=None, description="its serial port; without it, `penumbra skin --device` names it")
@@ -307,7 +298,7 @@ class SensingBoard(_Model):
         return self
 
 
-class Pad(_Model):
+class Pad(Model):
     """A pad. Its frame's z axis points out of the skin."""
 
     type: str = Field(description="its design, a key of pad_types")
@@ -327,21 +318,14 @@ class Pad(_Model):
         return rigid.from_rpy(self.position, self.rpy)
 
 
-class Spread(_Model):
-    """Standard deviations of a pose."""
-
-    position: Annotated[Number, Field(gt=0, le=5)] = Field(description="of the position along each axis [m]")
-    rotation: Annotated[Number, Field(gt=0, le=pi)] = Field(description="of the rotation about each axis [rad]")
-
-
-class Size(_Model):
+class Size(Model):
     """Factors by which a target's mesh is stretched."""
 
     length: Annotated[Number, Field(ge=0.2, le=5)] = Field(default=1.0, description="along its x axis")
     girth: Annotated[Number, Field(ge=0.2, le=5)] = Field(default=1.0, description="across its x axis")
 
 
-class Target(_Model):
+class Target(Model):
     """What is tracked."""
 
     mesh: str = Field(
@@ -358,6 +342,16 @@ class Target(_Model):
     )
     home: Placement = Field(description="where it is expected before anything is known, in the world")
     home_spread: Spread = Field(default=Spread(position=0.15, rotation=0.4), description="how well its home is known")
+    tracking_bound: Annotated[Number, Field(ge=0.005, le=0.45)] = Field(
+        default=0.15,
+        description="what the state `tracking` promises: the position is within so much of the truth, at three standard "
+        "deviations [m]; beyond it the state is `coasting`",
+    )
+    shoulder: Vector3 | None = Field(
+        default=None,
+        description="where the person's shoulder is in the world, if it stays there, as that of somebody seated [m]: a limb that "
+        "nothing measures stays within the arm's reach of it; for the mesh body:forearm",
+    )
 
     @model_validator(mode="after")
     def _known(self) -> Target:
@@ -365,6 +359,9 @@ class Target(_Model):
         if self.mesh.startswith("body:") and self.mesh != "body:forearm":
             what = f"expected body:forearm, or a mesh file beside the cell file, got {self.mesh!r:.60}"
             faults.append(("mesh", f"{what}; body:forearm is the only parametric body"))
+        if self.shoulder is not None and self.mesh != "body:forearm":
+            what = "expected a shoulder with the mesh body:forearm, whose elbow is known, got one with another mesh; leave it out"
+            faults.append(("shoulder", what))
         if twice := sorted({label for label in self.labels if self.labels.count(label) > 1}):
             faults.append(("labels", f"expected each class once, got {', '.join(twice)} several times; remove one"))
         refuse(faults)
@@ -375,7 +372,7 @@ class Target(_Model):
         return tuple(int(Label[name.upper()]) for name in self.labels)
 
 
-class Body(_Model):
+class Body(Model):
     """The person's measures. Defaults: 50th percentile of men, ANSUR II (Gordon et al. 2014)."""
 
     forearm_length: Measure = Field(default=0.267, description="elbow to wrist [m]")
@@ -390,7 +387,7 @@ class Body(_Model):
     shoulder_height: Measure = Field(default=0.58, description="shoulder above the seat [m]")
 
 
-class Motion(_Model):
+class Motion(Model):
     """The region in which the emulator moves the target."""
 
     low: Vector3 = Field(description="lower bounds of x, y, z [m]")
@@ -412,7 +409,7 @@ class Motion(_Model):
         return self
 
 
-class Payload(_Model):
+class Payload(Model):
     """What a robot carries: a point mass."""
 
     mass: Annotated[Number, Field(gt=0, le=1000)] = Field(description="of the load [kg]")
@@ -420,7 +417,7 @@ class Payload(_Model):
     position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="x, y, z in the frame of the link [m]")
 
 
-class Sim(_Model):
+class Sim(Model):
     """What only the emulator needs."""
 
     motion: Motion = Field(description="where and how fast the target moves")
@@ -438,7 +435,7 @@ class Sim(_Model):
     table_middle: tuple[Metres, Metres] = Field(default=(0.0, 0.0), description="x, y of the table's middle [m]")
 
 
-class Cell(_Model):
+class Cell(Model):
     """A work cell. Everything is in metres, radians and volts, in the world frame unless it says otherwise."""
 
     name: Name = Field(description="of the cell; part of every topic's key")
@@ -455,6 +452,9 @@ class Cell(_Model):
     @model_validator(mode="after")
     def _references(self) -> Cell:
         faults = [*self._pad_faults(), *self._mesh_faults(), *self._robot_faults()]
+        if self.sim is not None:
+            what = "expected no source beside `sim`, whose emulator moves the robot; remove one of them"
+            faults += [(f"robots.{name}.source", what) for name in self.joint_sources]
         refuse(faults)
         return self
 
@@ -536,6 +536,16 @@ class Cell(_Model):
                     )
                 )
         return faults
+
+    @property
+    def sources(self) -> dict[str, CameraSource]:
+        """Where pictures come from, by camera, where the file says so."""
+        return {name: camera.source for name, camera in self.cameras.items() if camera.source is not None}
+
+    @property
+    def joint_sources(self) -> dict[str, JointSource]:
+        """Where joints come from, by robot, where the file says so."""
+        return {name: robot.source for name, robot in self.robots.items() if robot.source is not None}
 
     def one(self, kind: Literal["cameras", "robots", "pads", "targets"], name: str | None) -> str:
         """The name of a camera, robot, pad or target, checked; None means the first one. Raises CellError."""

@@ -1,8 +1,8 @@
 """Who may say what on a secured bus: the router's rules, from the tables of topics and of processes.
 
-A certificate's common name is the name of its holder. Sensors and methods publish what the table says, report no health
-but their own, and read everything; a viewer only reads and asks; an operator also steers the emulator and the launcher. What no
-rule allows, the router drops, without an answer to the sender.
+A certificate's common name is the name of its holder. Sensors and methods publish what the table says, report no health but
+their own, and read everything; a viewer only reads and asks; an operator also steers the emulator, the launcher and the
+recorder. What no rule allows, the router drops, without an answer to the sender.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES)
         _rule("read", ["declare_subscriber"], keys),
         _rule("see who lives", ["liveliness_query", "declare_liveliness_subscriber"], [topics.alive("*")]),
         _rule("ask", ["query"], [topics.current_pose("*", "*"), topics.description(), topics.health("*")]),
-        _rule("steer", ["query"], [topics.control("*"), topics.launcher("*")]),
+        _rule("steer", ["query"], [topics.control("*"), topics.launcher("*"), topics.recorder("*")]),
     ]
     reader = ["receive", "read", "see who lives", "ask"]
     policies = {ROUTER: ["receive", "pass on"], OPERATOR: [*reader, "steer"], VIEWER: reader}

@@ -211,9 +211,14 @@ class VisionPose(Message, frozen=True, kw_only=True):
     state: Literal["tracking", "occluded", "lost"]
 
 
+HapticState = Literal["in_range", "unidentified", "object", "out_of_range"]
+
+
 class HapticPose(Message, frozen=True, kw_only=True):
     """What the skin says. `information` (6 x 6, inverse covariance) is zero along directions that it does not observe.
-    `stamp_ns` is the time that the pose belongs to, `sample_stamp_ns` that of the newest voltage sample in it."""
+    `stamp_ns` is the time that the pose belongs to, `sample_stamp_ns` that of the newest voltage sample in it. `state`: in_range
+    (a limb), unidentified (a limb or something else: the pose is that of the limb that would feel so), object (no limb: the same,
+    without information) or out_of_range (nothing near). Use in_range alone as the target's pose."""
 
     target: Name
     frame: Name
@@ -222,7 +227,7 @@ class HapticPose(Message, frozen=True, kw_only=True):
     orientation: Quaternion
     information: Covariance
     gap: Quantity
-    state: Literal["in_range", "out_of_range"]
+    state: HapticState
 
 
 class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -241,8 +246,10 @@ FusedState = Literal["tracking", "coasting", "lost"]
 
 
 class FusedPose(Message, frozen=True, kw_only=True):
-    """The one pose. `velocity`: linear [m/s] and angular [rad/s] along the frame's axes. `sources` by name (of the
-    table of senses); a sense that has sent nothing is absent."""
+    """The one pose. `velocity`: linear [m/s] and angular [rad/s] along the frame's axes. `state`: tracking (a sense measures the
+    target, and three standard deviations of the position are within the target's `tracking_bound`), coasting (no sense does, the
+    newest measurement contradicts the pose, or it is less certain: do not rely on it within the bound) or lost. `sources` by name
+    (of the table of senses); a sense that has sent nothing is absent."""
 
     target: Name
     frame: Name

@@ -35,6 +35,18 @@ class Flag:
 
 
 @dataclass(frozen=True)
+class Starter:
+    """A flag of `penumbra up` that starts a process of which it starts none otherwise. `passes`: the process' own flag that gets
+    its value; `without`: that value, where none is given; `value`: what help calls it."""
+
+    name: str
+    about: str
+    passes: str
+    without: str
+    value: str
+
+
+@dataclass(frozen=True)
 class Metric:
     """A number in a service's own health report that becomes a metric, one per entry of the report.
 
@@ -59,6 +71,7 @@ class Process:
     `about`: the line of `penumbra --help`; `extra`: what it needs of `pip install -e '.[EXTRA]'`; `needs`: the part of the cell
     without which it has nothing to do; `vision`: the way to see that it belongs to, None where to all; `replicas`: how many
     `penumbra up` starts; `restart`: whether one that died is started again; `flags`: those that `penumbra up` passes on;
+    `starter`: the flag of `penumbra up` that starts one, where it starts none otherwise;
     `beside`: whether a second one may run, which shares the streams with the first; `is_required`: whether the cell is cut off
     without it; `tools`: commands beside the service; `trained_by`: the tool that makes its weights; `answers`: names of the
     queryables that it answers beside its health (`shared.contract.topics.QUERYABLES`); `metrics`: what of its report becomes
@@ -68,11 +81,12 @@ class Process:
     name: str
     about: str
     extra: str
-    needs: Literal["cameras", "pads", "sim"] | None = None
+    needs: Literal["cameras", "pads", "sim", "sources", "joint_sources"] | None = None
     vision: str | None = None
     replicas: int = 1
     restart: Literal["always", "never"] = "always"
     flags: tuple[Flag, ...] = ()
+    starter: Starter | None = None
     beside: bool = True
     is_required: bool = False
     tools: tuple[Tool, ...] = ()
@@ -109,6 +123,25 @@ PROCESSES = (
         beside=False,
         answers=("control",),
         imports_sim=True,
+    ),
+    Process(
+        "camera",
+        "pictures of real cameras, films and folders to frames",
+        extra="camera",
+        needs="sources",  # belongs to a machine with cameras, which the cell file or --source names
+        beside=False,
+        metrics=(
+            Metric(
+                "camera_state",
+                "1 for the state of the camera",
+                each="camera",
+                field="state",
+                values=("opening", "streaming", "lost", "ended"),
+            ),
+            Metric("camera_opened", "times that the camera was opened", each="camera", field="opened", is_counter=True),
+            Metric("camera_late", "pictures of a backlog, left out", each="camera", field="late", is_counter=True),
+        ),
+        in_compose=False,
     ),
     Process(
         "segmentation",
@@ -202,6 +235,14 @@ PROCESSES = (
         in_compose=False,
     ),
     Process(
+        "robot",
+        "joints of real robots from their controllers",
+        extra="robot",
+        needs="joint_sources",  # belongs to a machine that reaches the controllers, which the cell file or --source names
+        beside=False,
+        in_compose=False,
+    ),
+    Process(
         "haptics",
         "voltages to the skin's pose",
         extra="haptics",
@@ -223,6 +264,59 @@ PROCESSES = (
                 each="target",
                 field="state",
                 values=("tracking", "coasting", "lost"),
+            ),
+        ),
+    ),
+    Process(
+        "ros2",
+        "poses, frames and diagnostics to ROS 2 on Zenoh; joints and pictures from it",
+        extra="ros2",
+        replicas=0,  # belongs to where ROS runs, whose router it needs
+        starter=Starter(
+            "ros2",
+            "take part in ROS 2 too, at the Zenoh router of its nodes",
+            passes="--ros-connect",
+            without="tcp/127.0.0.1:7447",
+            value="[ENDPOINT]",
+        ),
+        beside=False,
+        in_compose=False,
+    ),
+    Process(
+        "record",
+        "every topic to MCAP files, for Foxglove, Rerun and `penumbra replay`",
+        extra="record",
+        replicas=0,  # fills a disk: only where it is asked for
+        starter=Starter("record", "record too, into a file or folder", passes="--out", without=".", value="[FILE.mcap|FOLDER]"),
+        beside=False,
+        tools=(
+            Tool("save", "have `record --last` write what it keeps", "penumbra.services.record.tools:save", extra="record"),
+            Tool("info", "what a file holds, and whether it is whole", "penumbra.services.record.tools:info", extra="record"),
+            Tool(
+                "mend",
+                "a whole file of one whose recorder was killed",
+                "penumbra.services.record.tools:mend",
+                extra="record",
+            ),
+        ),
+        answers=("recorder",),
+        metrics=(
+            Metric("recorded_bytes", "bytes written to files", "recorder", "bytes", is_counter=True),
+            Metric("recorded_messages", "messages written to files", "recorder", "messages", is_counter=True),
+            Metric("recorder_lost", "messages that were not recorded", "recorder", "lost", is_counter=True),
+        ),
+    ),
+    Process(
+        "dashboard",
+        "a web page that shows the cell and steers it",
+        extra="dashboard",
+        flags=(Flag("page", "where the web page is served: [ADDRESS:]PORT"),),
+        tools=(
+            Tool(
+                "link",
+                "print the links that open the page of a secured cell",
+                "penumbra.services.dashboard.link:main",
+                extra="dashboard",
             ),
         ),
     ),

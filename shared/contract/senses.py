@@ -31,14 +31,15 @@ class Errors:
     time_constant : time constant [s] with which such an error decays. 1 s: chosen, not measured.
     floor : standard deviation of what its covariance does not contain, its calibration, in `records.UNITS` of fusion: 0.006 is
         0.6 mm and 0.34 degrees. All of it lasts. Chosen, not measured.
-    gate : probabilities with which a good measurement passes the gate; the second, while another sense is less surprising. Both
-        are shares in `chi_square.QUANTILES`.
+    gate : probabilities with which a good measurement passes the gate; the second, while another sense is less surprising; the
+        third, while so and after a row of refusals (`FusionSettings.refusals`): a sense that was wrong is used again when it
+        agrees, not when it is nearly plausible. All are shares in `chi_square.QUANTILES`.
     """
 
     lasting: float = 0.75
     time_constant: float = 1.0
     floor: float = 0.006
-    gate: tuple[float, float] = (0.9999, 0.999)
+    gate: tuple[float, float, float] = (0.9999, 0.999, 0.9)
 
 
 @dataclass(frozen=True)

@@ -63,10 +63,16 @@ class Topic:
         wanted = {"cell", "camera", "robot", "pad", "target"}
         return self.key.format(**{name: names.get(name, "*") for name in wanted})
 
+    def names(self, key: str) -> dict[str, str]:
+        """The {names} that a key of this topic holds, without the cell's."""
+        pairs = zip(self.key.split("/"), key.split("/"), strict=True)
+        return {part[1:-1]: value for part, value in pairs if part.startswith("{") and part != "{cell}"}
 
-FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2, ("emulator", "driver"),
-              "one RGB image", Priority.IMAGE, 0)  # fmt: skip
-JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1, ("emulator", "driver"),
+
+FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 20, 1, 0.2,
+              ("emulator", "camera", "ros2", "driver"), "one RGB image", Priority.IMAGE, 0)  # fmt: skip
+JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1,
+               ("emulator", "robot", "ros2", "driver"),
                "joint angles [rad]", Priority.SIGNAL, 20)  # fmt: skip
 VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1,
                  ("emulator", "skin", "driver"), "electrode amplitudes [V], 1 kHz in batches", Priority.SIGNAL, 0)  # fmt: skip
@@ -89,6 +95,7 @@ QUERYABLES = {
     "description": "penumbra/{cell}/description",
     "control": "penumbra/{cell}/sim/control",
     "launcher": "penumbra/{cell}/launcher/control",
+    "recorder": "penumbra/{cell}/record/control",
 }
 """Keys of what processes answer beside their health, by the names that `shared.contract.processes` uses for them."""
 
@@ -111,6 +118,11 @@ def control(cell: str) -> str:
 def launcher(cell: str) -> str:
     """Queryable of `penumbra up`: what `penumbra restart` and `penumbra scale` ask, JSON in and out."""
     return QUERYABLES["launcher"].format(cell=cell)
+
+
+def recorder(cell: str) -> str:
+    """Queryable of `penumbra record`: what `penumbra record save` asks, JSON in and out."""
+    return QUERYABLES["recorder"].format(cell=cell)
 
 
 def alive(cell: str, service: str = "*", instance: str = "*") -> str:

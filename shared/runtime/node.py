@@ -52,6 +52,7 @@ from penumbra.shared.runtime.reader import Latest
 from penumbra.shared.runtime.replicas import Replicas
 from penumbra.shared.runtime.slow_links import SlowLinks
 from penumbra.shared.runtime.streams import Handler, Streams
+from penumbra.shared.runtime.tap import Tap
 
 __all__ = ["CLOSE_S", "LatestMessages", "Node", "ServiceNode"]
 
@@ -123,12 +124,13 @@ class Node:
         self._progress = Progress(self.log)
         self._is_announced = self._is_early = False
         self._announcing = threading.Lock()
-        self._waiting = Waiting(lambda name: self.query(topics.health(cell.name, name), timeout_s=ASK_S))
+        self._waiting = Waiting(self._ask_health)
         self._faults: dict[str, int] = {}
         self._lately = health.Lately()
         self._reports: dict[str, Callable[[], Any]] = {}
         self._reasons: list[Callable[[], Sequence[str]]] = []
         self._warm: list[Callable[[], bool]] = []
+        self._when_closed: list[Callable[[], None]] = []
         self._process = psutil.Process()
         self._cpu = 0.0
         self._started = time.monotonic()
@@ -229,9 +231,15 @@ class Node:
                 signal.signal(number, handler)
 
     def close(self) -> None:
-        """Leaves the bus and ends the node's threads, within about CLOSE_S."""
+        """Leaves the bus and ends the node's threads, within about CLOSE_S; then calls what `when_closed` was given."""
         self.stopping.set()
         self._link.close(reader.thread for reader in self.replicas.leave())
+        while self._when_closed:
+            self._when_closed.pop()()
+
+    def when_closed(self, function: Callable[[], None]) -> None:
+        """Calls `function` once the node has left the bus, before the process ends: it completes what must not stay half done."""
+        self._when_closed.append(function)
 
     def __enter__(self) -> Node:
         return self if self._is_open else self.open()
@@ -276,6 +284,11 @@ class Node:
         decoded, and no thread wakes up when one arrives. They are guarded, counted and missed like those of `subscribe`, except
         for their delay, which is not known. names, from_others: as in `subscribe`."""
         return self._streams.latest(topic, from_others, names)
+
+    def tap(self, wanted: Sequence[Topic], most_bytes: int) -> Tap:
+        """Everything that these topics carry in this cell, as bytes and without a check, until it is taken. most_bytes: that may
+        wait; what comes then is lost, and counted."""
+        return self._streams.tap(wanted, most_bytes)
 
     def keys(self, topic: Topic, names: dict[str, str]) -> dict[str, dict[str, str]]:
         """Every concrete key of a topic in this cell with its names, some of them fixed; none where the cell has no such part.
@@ -408,6 +421,10 @@ class Node:
         self._faults[kind] = self._faults.get(kind, 0) + 1
         if self._faults[kind] == 1:
             self.log.error(f"{type(error).__name__}: {error}", where=where, at=place, exc_info=error)
+
+    def _ask_health(self, service: str) -> list[bytes]:
+        """The health reports of another service; none of its own, for which it would wait itself."""
+        return [] if service == self.service else self.query(topics.health(self.cell.name, service), timeout_s=ASK_S)
 
     def _answer_health(self, parameters: dict[str, str], payload: bytes) -> bytes:
         return json.dumps(self.health()).encode()

@@ -22,6 +22,7 @@ from penumbra.shared.runtime.logs import Log
 from penumbra.shared.runtime.reader import Inbox, Latest, Reader, Stream
 from penumbra.shared.runtime.replicas import Replicas, Share
 from penumbra.shared.runtime.sender import Sender
+from penumbra.shared.runtime.tap import Tap
 from penumbra.shared.runtime.traffic import Traffic
 
 Handler = Callable[[Any, dict[str, str]], None]
@@ -102,6 +103,17 @@ class Streams:
         self._latest.append(latest)
         self._link.declare(latest.open)
         return latest
+
+    def tap(self, wanted: Sequence[Topic], most_bytes: int) -> Tap:
+        """As `Node.tap`."""
+        keys = [
+            (topic, key, names, self._count(key, Traffic(math.inf, topic.publishers)))
+            for topic in wanted
+            for key, names in self.keys(topic, {}).items()
+        ]
+        tap = Tap(keys, most_bytes, self._now_ns)
+        self._link.declare(tap.open)
+        return tap
 
     def drain(self) -> None:
         """Takes in what `latest` keeps: counters and ages are of now then."""

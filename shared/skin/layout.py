@@ -137,3 +137,9 @@ class Near:
 def link_names(robots: Mapping[str, Mapping[str, Array]]) -> dict[str, Array]:
     """Link poses of all robots under the names that pads use: {"panda": {"link7": T}} gives {"panda/link7": T}."""
     return {f"{robot}/{link}": T for robot, links in robots.items() for link, T in links.items()}
+
+
+def pad_poses(cell: cells.Cell, links: Mapping[str, Array]) -> dict[str, Array]:
+    """T_world_pad (4, 4) of the pads on the world and on the links, as in `link_names`, whose poses are known."""
+    known = {"world": np.eye(4), **links}
+    return {name: known[pad.link] @ pad.T_link_pad for name, pad in cell.pads.items() if pad.link in known}

@@ -25,7 +25,7 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.rigid import Array
-from penumbra.sim.picture import appearance
+from penumbra.sim.picture import appearance, limb
 from penumbra.sim.picture.appearance import Appearance, Look, Texture
 from penumbra.sim.picture.occluder import box
 from penumbra.sim.picture.renderer import Body, Renderer, Shape
@@ -36,6 +36,8 @@ from penumbra.sim.world.person import Person
 
 Domain = Literal["wide", "easy"]
 """wide: all looks that the training draws. easy: bare skin before a plain light wall, a plain strong colour for the occluder."""
+Hands = Literal["stiff", "posed"]
+"""stiff: the hand of the mesh that is searched for; posed: one with fingers and a bent wrist (`sim.picture.limb`)."""
 
 LENS = math.radians(60.0)
 """Horizontal field of view."""
@@ -78,7 +80,7 @@ class Shot:
 
     @functools.cached_property
     def mesh(self) -> Mesh:
-        """The target's mesh, exact."""
+        """The mesh that is searched for; with stiff hands that of the target exactly."""
         return anatomy.target_mesh(next(iter(self.cell.targets.values())), self.cell)
 
     @property
@@ -96,9 +98,10 @@ def shot(
     hidden: float = 0.0,
     domain: Domain = "wide",
     images: bool = True,
+    hands: Hands = "stiff",
 ) -> Shot:
     """Picture `index` of the endless set `seed`. See `clip`."""
-    return clip(seed, index, width, height, distance_m, hidden, domain, 1, images)[0]
+    return clip(seed, index, width, height, distance_m, hidden, domain, 1, images, hands=hands)[0]
 
 
 def clip(
@@ -112,6 +115,7 @@ def clip(
     frames: int = 4,
     images: bool = True,
     present: bool = True,
+    hands: Hands = "stiff",
 ) -> list[Shot]:
     """Pictures PERIOD_S apart, of which the last has the hidden share asked for (within WITHIN): target, robot and occluder move
     a little. `distance_m`: depth of the target's middle; images: whether they are painted, or only labelled (much faster);
@@ -120,7 +124,7 @@ def clip(
         raise ValueError(f"hidden: expected a share from 0 to 1, got {hidden}")
     for attempt in itertools.count():
         rng = np.random.default_rng([seed, index, attempt])
-        scene = _Scene(rng, index, (width, height), distance_m, domain, frames)
+        scene = _Scene(rng, index, (width, height), distance_m, domain, frames, hands=hands)
         if (occluder := scene.occluder(hidden, rng)) is not None:
             things = scene.things if present else scene.things[len(scene.person.meshes) :]
             return list(scene.film([*things, *occluder], rng, images))
@@ -166,6 +170,7 @@ class _Scene:
         domain: Domain,
         frames: int,
         T_target: Array | None = None,
+        hands: Hands = "stiff",
     ):
         cell = _cell(sequences.CELLS[index % len(sequences.CELLS)])
         sim = cell.sim
@@ -180,6 +185,8 @@ class _Scene:
         self.T_target = T_target
         target = next(iter(cell.targets.values()))
         person = Person(cell, sim.model_copy(update={"shoulder": tuple(shoulder)}), target)
+        if hands == "posed":
+            person.meshes[0] = limb.mesh(cell.body, rng)
         self.person, self.mesh = person, person.meshes[0]
         self._target_labels = np.unique(self.mesh.labels)
         name, camera = next(iter(cell.cameras.items()))

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from penumbra.shared.body.anatomy import Mesh, target_mesh
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.fields import Vector3
 from penumbra.shared.contract.messages import Message
 from penumbra.shared.contract.topics import Topic
 from penumbra.shared.geometry import raster, rigid
@@ -283,7 +284,7 @@ def _cell(name: str, volume: Volume, setting: Setting, rng: np.random.Generator)
     return cell.model_copy(update={"cameras": {camera_name: _camera(place, middle, BINNING[setting.distance], cell)}})
 
 
-def _camera(position: cells.Vector3, look_at: cells.Vector3, binning: int, cell: cells.Cell) -> cells.Camera:
+def _camera(position: Vector3, look_at: Vector3, binning: int, cell: cells.Cell) -> cells.Camera:
     """The region of the sensor, binned, that shows the limb wherever it may be."""
     width, height = (size // binning for size in SENSOR_PX)
     focal, cx, cy = FOCAL_PX / binning, (width - 1) / 2.0, (height - 1) / 2.0

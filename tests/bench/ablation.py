@@ -22,6 +22,7 @@ from penumbra.services import flags
 from penumbra.services.segmentation import inference, prednet
 from penumbra.services.segmentation.prednet import Settings
 from penumbra.services.segmentation.training import evaluate, train
+from penumbra.services.segmentation.training.data import Data, Simulated
 from penumbra.shared import training
 from penumbra.sim.sets import sequences, shots
 from penumbra.tests.bench import segmentation
@@ -57,7 +58,7 @@ def easy(seed: int, index: int) -> sequences.Sequence:
     return sequences.Sequence(images[cut], labels[cut], np.array([shot.hidden for shot in film]))
 
 
-def learn(name: str, data: train.Data, seed: int, minutes: float, steps: int | None, folder: Path) -> tuple[train.Trainer, Any]:
+def learn(name: str, data: Data, seed: int, minutes: float, steps: int | None, folder: Path) -> tuple[train.Trainer, Any]:
     """A variant trained for so many steps, or minutes, and the parts of the loss at the end."""
     settings, error_weight = VARIANTS[name]
     trainer = train.Trainer(settings, replace(SCHEDULE, error_weight=error_weight), seed)
@@ -65,10 +66,10 @@ def learn(name: str, data: train.Data, seed: int, minutes: float, steps: int | N
     return trainer, {part: round(value, 4) for part, value in last.items()}
 
 
-def score(trainer: train.Trainer, data: train.Data, seed: int) -> dict[str, Any]:
+def score(trainer: train.Trainer, data: Data, seed: int) -> dict[str, Any]:
     """The averaged weights on held-out sequences, calibrated on others."""
     offset, _ = evaluate.calibrate(trainer.average, data.calibration)
-    segmenter = inference.Segmenter(prednet.stored(trainer.average), offset)
+    segmenter = inference.Segmenter(prednet.stored(trainer.average), offset, has_colours=False)  # the network alone, as theirs
     ms = inference.speed(segmenter, segmentation.VARIETY.size, segmentation.VARIETY.size)
     found = segmentation.result(seed, segmentation.rows(segmenter, data.held_out), [], ms)
     return {"rows": found["rows"], "ms_per_frame": found["ms_per_frame"]}
@@ -100,7 +101,7 @@ def main(options: flags.Options, report: results.Report) -> None:
     console, steps = Console(stderr=True), options.steps
     found: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
-        data = train.Simulated(options.seed, HELD_OUT, easy, easy, SEQUENCES)
+        data = Simulated(options.seed, HELD_OUT, easy, easy, SEQUENCES)
         for index in range(SEQUENCES):  # rendered ahead: the variants' minutes are those of learning
             data[index]
         for name in VARIANTS:

@@ -3,6 +3,9 @@
 The arm moves in sight of the camera; a fault strikes the replica that owns the stream. A client of the bus, which knows nothing
 of the fault, counts: the longest time without a fused pose while a sense was alive, how long the service's topics were not what
 they had been, measurements used twice, and poses called tracking that were wrong by more than three sigma.
+
+Services that connect the cell with what is outside it (`tests/bench/lib/connected.py`) have faults of their own, which are
+measured by what each of them does.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from penumbra.services import flags
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.topics import Topic
-from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib import connected, results
 from penumbra.tests.bench.lib.results import Part, Result, marked
 from penumbra.tests.support import injected, observed
 from penumbra.tests.support.live import Running, penumbra_up, service_of, wait_for
@@ -266,8 +269,14 @@ def plan(faults: Sequence[str], services: Sequence[str], replicas: Sequence[int]
 
 def run(options: flags.Options, done: Callable[[Row], None]) -> None:
     """Goes through the plan, and hands every row to `done`."""
+    if options.service and not set(options.service) & set(SERVICES):
+        return
     able = possible(cells.load(options.cell))
-    chosen = options.fault or [name for name in able if FAULTS[name].quick or not options.quick]
+    if options.fault and not set(options.fault) & set(FAULTS):
+        return
+    chosen = [name for name in options.fault if name in FAULTS] or [
+        name for name in able if FAULTS[name].quick or not options.quick
+    ]
     for name in set(chosen) - set(able):
         raise SystemExit(f"--fault {name!r}: expected a cell with a robot, such as --cell arm; {options.cell} has none")
     replicas = options.replicas or ([1] if options.quick else [1, 2])
@@ -283,6 +292,20 @@ def run(options: flags.Options, done: Callable[[Row], None]) -> None:
                 done(measure(chain, name, service))
 
 
+def connected_plan(options: flags.Options) -> dict[str, list[str]]:
+    """The faults to go through of each service that connects, without those that nothing can be struck with here."""
+    out = {}
+    for service, faults in connected.SERVICES.items():
+        able = [name for name in faults if name in (options.fault or faults)]
+        if not able or service not in (options.service or connected.SERVICES) or 1 not in (options.replicas or [1]):
+            continue
+        if why := connected.lacks(service):
+            Console(stderr=True).print(f"[yellow]note[/] {service} is left out: {why}")
+        else:
+            out[service] = able
+    return out
+
+
 def is_back(row: Row) -> bool:
     """Whether the service was back in time. One that is alone cannot be while the fault lasts."""
     goal_s = GOAL_REPLICA_S if row.replicas > 1 else row.lasts_s + GOAL_ALONE_S
@@ -290,6 +313,14 @@ def is_back(row: Row) -> bool:
 
 
 def tables(result: Result) -> list[Part]:
+    """The chain's services, then those that connect it; of each kind what was struck."""
+    return [
+        *([_chain_table(result)] if result["rows"] else ()),
+        *([connected.table(result)] if result.get("connected") else ()),
+    ]
+
+
+def _chain_table(result: Result) -> Table:
     """A row for each fault and number of replicas: what it does where it strikes each service, and the worst of all of these."""
     table = Table(
         *("fault", "of each", "lasts s", *(f"{service}\nback s" for service in (*SERVICES, ALL))),
@@ -315,7 +346,7 @@ def tables(result: Result) -> list[Part]:
             f"{marked(str(false), false == 0)} of {sum(row.tracking for row in own.values())}",
             f"{max(row.worst_cm for row in own.values()):.1f}",
         )
-    return [table]
+    return table
 
 
 def _back(row: Row | None) -> str:
@@ -336,19 +367,27 @@ def _gap(rows: Sequence[Row]) -> str:
     flags.Option("--cell", default="table", help="built-in cell or YAML file"),
     flags.Option("--seed", type=int, default=1, help="draws motion and appearance"),
     flags.Option("--quick", is_flag=True, help="the faults that show most, without replicas"),
-    flags.Option("--fault", choices=FAULTS, multiple=True, help="this fault only; may be repeated"),
-    flags.Option("--service", choices=SERVICES, multiple=True, help="strike this service only; may be repeated"),
+    flags.Option(
+        "--fault",
+        choices=tuple(dict.fromkeys((*FAULTS, *connected.FAULTS))),
+        multiple=True,
+        help="this fault only; may be repeated",
+    ),
+    flags.Option(
+        "--service", choices=(*SERVICES, *connected.SERVICES), multiple=True, help="strike this service only; may be repeated"
+    ),
     flags.Option("--replicas", type=int, choices=(1, 2), multiple=True, help="so many of each service; may be repeated"),
     example="penumbra bench faults --quick --json faults.json",
 )
 def main(options: flags.Options, report: results.Report) -> None:
-    rows: list[dict[str, Any]] = []
+    found: dict[str, list[dict[str, Any]]] = {"rows": [], "connected": []}
 
-    def done(row: Row) -> None:
-        rows.append(asdict(row))
-        report.save({"seed": options.seed, "rows": rows})
+    def done(row: Row | connected.Row) -> None:
+        found["rows" if isinstance(row, Row) else "connected"].append(asdict(row))
+        report.save({"seed": options.seed, **found})
 
     run(options, done)
+    connected.run(options.cell, options.seed, connected_plan(options), done)
 
 
 if __name__ == "__main__":

@@ -37,6 +37,8 @@ SIZES, QUICK_SIZES = (1, 2, 4, 8), (1, 2)
 REPLICAS, QUICK_REPLICAS = (1, 2), (1,)
 SHARED = ("segmentation", "search", "haptics", "fusion")
 """The services that share the streams."""
+SINGLE = ("emulator", "dashboard")
+"""The others that `penumbra up` starts for such a cell, one of each."""
 START_S, SETTLE_S = 180.0, 5.0
 SAMPLES, LISTEN_S = 10, 3.0
 """So many messages of a topic are weighed, where so many come within the time."""
@@ -52,7 +54,7 @@ def row(size: int, replicas: int, seed: int, seconds: float, rate_hz: float | No
         cell = cells.load(path)
         flags = [word for service in SHARED for word in ("--replicas", f"{service}={replicas}")]
         with penumbra_up(str(path), seed, "--log-level", "error", *flags) as running:
-            expected = {"emulator": 1, **dict.fromkeys(SHARED, replicas)}
+            expected = dict.fromkeys(SINGLE, 1) | dict.fromkeys(SHARED, replicas)
             wait_for(lambda: ready(running) == expected, START_S, f"{expected} of cell {cell.name}", 0.5)
             recordings = [Recording(running.session, cell.name, target) for target in cell.targets]
             wait_for(lambda: all(recording.samples["fused"] for recording in recordings), START_S, "a pose of every target", 0.5)

@@ -1,6 +1,6 @@
 """`penumbra bench tracking`: an occluder passes before the moving arm, and the camera alone has to hold it.
 
-Films of 10 s (`sim.sets.shots.passing`) are played through the services in one process (`tests.support.replay`): segmentation,
+Films of 10 s (`sim.sets.shots.passing`) are played through the services in one process (`services.replay.chain`): segmentation,
 search and fusion without the skin, so that the window follows the pose predicted while nothing is seen. Scored are the camera's
 own poses (errors, false reports of tracking, frames until recovered), and the fused one while everything is hidden.
 """
@@ -18,6 +18,7 @@ from rich.progress import track
 from rich.table import Table
 
 from penumbra.services import flags
+from penumbra.services.replay.chain import Replay
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.messages import Frame, FusedPose, Message, VisionPose
 from penumbra.shared.contract.topics import Topic
@@ -28,7 +29,6 @@ from penumbra.sim.sets.shots import Domain, Shot
 from penumbra.tests.bench.lib import results
 from penumbra.tests.bench.lib.results import Part, Result, marked
 from penumbra.tests.bench.search import GONE, LOST
-from penumbra.tests.support.replay import Replay
 
 BACKGROUNDS: dict[str, Domain] = {"plain": "easy", "cluttered": "wide"}
 SERVICES = ("segmentation", "search", "fusion")
@@ -78,8 +78,8 @@ class Film:
         return pose is not None and pose.state == "tracking" and bool(np.less(self.errors(pose, truth), LOST).all())
 
 
-def played(film: Iterator[Shot]) -> Film:
-    """A film through the services."""
+def played(film: Iterator[Shot], arguments: dict[str, list[str]] | None = None) -> Film:
+    """A film through the services, with these arguments of theirs."""
     first = next(film)
     truths: list[Truth] = []
 
@@ -91,7 +91,7 @@ def played(film: Iterator[Shot]) -> Film:
             yield topics.FRAME, {"camera": next(iter(shot.cell.cameras))}, Frame(stamp_ns=shot.stamp_ns, image=shot.image)
             shot = next(film, None)
 
-    heard = Replay(first.cell, SERVICES).run(recording())
+    heard = Replay(first.cell, SERVICES, arguments).run(recording())
     vision = {item.message.stamp_ns: item.message for item in heard if item.topic is topics.VISION}
     said = [item.message for item in heard if item.topic is topics.FUSED]
     stamps = np.array([message.stamp_ns for message in said])

@@ -21,7 +21,7 @@ from penumbra.shared.runtime import bus
 from penumbra.tests.support.live import connect, wait_for
 
 pytestmark = pytest.mark.containers
-SERVICES = {"router", "emulator", "segmentation", "search", "haptics", "fusion"}
+SERVICES = {"router", "emulator", "segmentation", "search", "haptics", "fusion", "dashboard"}
 
 
 SECURE = ("-f", "compose.yaml", "-f", "docker/secure.yaml")
@@ -89,14 +89,14 @@ def test_no_container_can_write_its_image_or_runs_as_root(running):
             assert container["Config"]["User"].startswith("10001"), service
 
 
-def test_only_the_router_is_in_a_network_with_a_way_out(running):
+def test_only_what_has_a_published_port_is_in_a_network_with_a_way_out(running):
     def has_a_way_out(network: str) -> bool:
         return not json.loads(docker("network", "inspect", network))[0]["Internal"]
 
     for service in SERVICES:
         for container in containers(service):
             networks = container["NetworkSettings"]["Networks"]
-            assert any(map(has_a_way_out, networks)) == (service == "router"), service
+            assert any(map(has_a_way_out, networks)) == (service in ("router", "dashboard")), service
 
 
 @pytest.mark.parametrize("service", ["fusion", "segmentation", "router"])

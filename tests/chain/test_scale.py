@@ -54,7 +54,7 @@ def test_the_bench_counts_what_a_cell_does():
     assert (row["cameras"], row["targets"], row["replicas"]) == (1, 1, 1)
     assert 0 < row["masks_per_s"] <= row["offered_per_s"] + 1
     assert row["cpu"] == pytest.approx(sum(row["cpu_of"].values()), abs=0.01) and row["cpu"] > 0.05
-    assert set(row["cpu_of"]) == {"launcher", "router", "emulator", *scale.SHARED}
+    assert set(row["cpu_of"]) == {"launcher", "router", *scale.SINGLE, *scale.SHARED}
     assert row["message_bytes"]["frame"] == pytest.approx(640 * 480 * 3, rel=0.01)
     published, links = row["published_bytes_per_s"], row["link_bytes_per_s"]
     assert published["frame"] == pytest.approx(row["offered_per_s"] * row["message_bytes"]["frame"], rel=0.05)

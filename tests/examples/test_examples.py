@@ -19,6 +19,7 @@ import pytest
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
 from penumbra.sim.world.world import Sensors, World
+from penumbra.tests.support import numbered
 from penumbra.tests.support.live import PATIENCE_S, penumbra_up, wait_for
 from penumbra.tests.support.small import small
 
@@ -169,3 +170,19 @@ def test_own_camera_says_what_it_expected_where_there_is_no_camera(router, tmp_p
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert "expected images from" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_the_adapter_of_an_sdk_publishes_what_its_camera_takes(router, tmp_path):
+    """Pylon emulates a camera, whose pictures are a moving ramp of grey."""
+    pytest.importorskip("pypylon")
+    script = EXAMPLES / "pylon_camera.py"
+    emulated = {**os.environ, "PYLON_CAMEMU": "1"}
+    alone = subprocess.run([sys.executable, str(script)], env=emulated, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert alone.stdout == "a picture of 640 x 480 px\n", alone.stderr
+    path = numbered.cell(tmp_path, {"url": f"adapter:{script.stem}:Basler"})
+    (tmp_path / script.name).write_text(script.read_text())
+    with numbered.viewer(path, router) as seen, numbered.camera_process(path, router, env=emulated):
+        stamps = [frame.stamp_ns for frame in seen.more(20)]
+        assert 0.6 < (stamps[-1] - stamps[0]) * 1e-9 < PATIENCE_S
+        assert seen.front()["stamps"] == "arrival"
+        assert "times of exposure are not known: stamps are of the arrival" in seen.waits_for_reason("measure the latency")

@@ -39,6 +39,7 @@ def test_the_camera_sees_the_target_s_home_near_the_middle_of_its_image():
         ("width: 640", "width: wide", "cameras.front.width", "expected a whole number, got 'wide'"),
         ("p0: {type: five", "p0: {type: six", "pads.p0.type", "expected one of five, got 'six'"),
         ("mesh: body:forearm", "mesh: arm.stl", "targets.forearm.mesh", "got no file"),
+        ("home_spread: {", "tracking_bound: 5\n    home_spread: {", "targets.forearm.tracking_bound", "at most 0.45, got 5"),
         ("low: [-0.08", "low: [0.5", "sim.motion", "lower bound"),
         ("look_at: [0.05, 0.0, 0.15]", "", "cameras.front", "look_at or rpy"),
     ],
@@ -51,6 +52,13 @@ def test_a_fault_is_reported_with_file_line_place_and_reason(tmp_path, old, new,
     assert place in text and reason in text
     told = int(text.split("cell.yaml:")[1].split(":")[0])
     assert line - 12 <= told <= line
+
+
+def test_a_shoulder_belongs_to_the_mesh_whose_elbow_is_known(tmp_path):
+    seated = load_changed(tmp_path, "home_spread: {", "shoulder: [0, 0, 1]\n    home_spread: {")
+    assert seated.targets["forearm"].shoulder == (0, 0, 1)
+    with pytest.raises(description.CellError, match=r"targets\.forearm\.shoulder.*got one with another mesh; leave it out"):
+        load_changed(tmp_path, "mesh: body:forearm", "mesh: arm.stl\n    shoulder: [0, 0, 1]")
 
 
 @pytest.mark.parametrize("read", [description.load, names.read])

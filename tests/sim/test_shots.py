@@ -58,7 +58,7 @@ def test_a_picture_is_a_function_of_seed_and_index_and_its_labels_do_not_depend_
 
 
 def test_robots_stand_where_cell_and_joints_say():
-    from penumbra.services.search.evidence import Intrinsics
+    from penumbra.shared.perception.intrinsics import Intrinsics
     from penumbra.shared.perception.robot_depth import RobotDepth
 
     index = next(i for i in range(1, 40, 2) if shots.shot(36, i, 320, 240, images=False).joints)

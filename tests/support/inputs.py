@@ -63,7 +63,7 @@ KINDS: dict[type[messages.Message], dict[str, Any]] = {
         "sample_stamp_ns": STAMPS,
         "information": covariance(),
         "gap": FINITE,
-        "state": st.sampled_from(["in_range", "out_of_range"]),
+        "state": st.sampled_from(["in_range", "unidentified", "object", "out_of_range"]),
     },
     messages.FusedPose: {
         **POSE,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import threading
 from collections.abc import Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from penumbra.services.skin.calibration import law, recording
 from penumbra.services.skin.calibration.law import Fit, RecordingError
 from penumbra.services.skin.calibration.recording import Recording
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell import edit
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.messages import Voltages
 from penumbra.shared.geometry.rigid import Array
@@ -96,7 +97,7 @@ def main(options: flags.Options) -> int:
 
 def _calibrate(options: flags.Options) -> None:
     cell = cells.load(options.cell)
-    path = destination(options.cell, options.out) if not options.dry_run else None
+    path = edit.destination(options.cell, options.out) if not options.dry_run else None
     console = Console(highlight=False, soft_wrap=True, stderr=options.json)
     if options.csv is not None:
         recordings = _recorded(cell, options)
@@ -116,14 +117,6 @@ def _calibrate(options: flags.Options) -> None:
         console.print(f"{escape(str(path))}: calibration of {', '.join(found)} written")
     if options.json:
         print(json.dumps({pad: {name: describe(fit) for name, fit in fits.items()} for pad, fits in found.items()}))
-
-
-def destination(cell: str, out: Path | None) -> Path:
-    """The file that a calibration goes into. Raises RecordingError for a built-in cell without `out`."""
-    source = cells.source(cell)
-    if out is None and source.parent == cells.BUILT_IN:
-        raise RecordingError(f"the built-in cell {cell} is not overwritten: give --out FILE, and use that with --cell")
-    return out or source
 
 
 # ---- readings
@@ -311,31 +304,21 @@ def _show(console: Console, pad: str, fits: dict[str, Fit], notes: Sequence[str]
 
 def write(source: Path, path: Path, laws: dict[str, dict[str, cells.Law]]) -> None:
     """The cell file at `source` with the laws of these pads, at `path`; its comments and layout stay. The file is replaced
-    only by one that loads. Raises RecordingError where it cannot be written."""
+    only by one that loads. Raises RecordingError where it cannot be read, CellError where it cannot be written."""
     editor = YAML()
     editor.preserve_quotes = True
     editor.width = 1 << 20  # breaks no line
     try:
         data = editor.load(source.read_text())
-        for pad, by_electrode in laws.items():
-            entry = data["pads"][pad]
-            entry["calibration"] = _block({name: _row(found) for name, found in by_electrode.items()})
-            entry.fa.set_block_style()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_name(f".{path.name}.{os.getpid()}.yaml")
-        try:
-            with draft.open("w") as file:
-                editor.dump(data, file)
-            cells.load(draft)
-            draft.replace(path)
-        except cells.CellError as error:
-            raise RecordingError(
-                f"{path}: the cell would not load from there: {str(error).replace(str(draft), str(path))}"
-            ) from None
-        finally:
-            draft.unlink(missing_ok=True)
     except (OSError, YAMLError) as error:
-        raise RecordingError(f"{path}: cannot be written: {error}") from None
+        raise RecordingError(f"{source}: cannot be read: {error}") from None
+    for pad, by_electrode in laws.items():
+        entry = data["pads"][pad]
+        entry["calibration"] = _block({name: _row(found) for name, found in by_electrode.items()})
+        entry.fa.set_block_style()
+    text = StringIO()
+    editor.dump(data, text)
+    edit.write(path, text.getvalue())
 
 
 def _block(entries: dict[str, CommentedMap]) -> CommentedMap:

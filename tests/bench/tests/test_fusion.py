@@ -114,6 +114,23 @@ def test_a_sense_that_is_wrong_is_wrong_by_10_cm_for_a_second_and_the_other_is_n
             assert moved == pytest.approx(0.1 if right.source == source and 10.0 <= right.stamp < 11.0 else 0.0, abs=1e-12)
 
 
+def test_a_sense_is_silent_when_it_would_be_wrong_and_the_other_is_not() -> None:
+    run = runs.drawn("one sense wrong", 5, 0, 12.0)
+    wrong, silent = runs.wronged(run, 5, 0), runs.silenced(run, 0)
+    kept = [m for m, other in zip(run.messages, wrong.messages, strict=True) if m is other]
+    assert len(kept) == len(run.messages) - 20, "pictures of a second"
+    assert all(m is other for m, other in zip(kept, silent.messages, strict=True))
+
+
+def test_a_limb_that_jumps_is_where_another_run_has_it_from_half_the_time_on() -> None:
+    before, after, run = runs.drawn("visible", 5, 6, 4.0), runs.drawn("visible", 5, 7, 4.0), runs.jumped("visible", 5, 3, 4.0)
+    for t, of in ((1.9, before), (2.1, after)):
+        np.testing.assert_array_equal(run.at(t), of.at(t))
+    assert {m.stamp < 2.0 for m in run.messages if any(m is each for each in before.messages)} <= {True}
+    assert [m.arrival for m in run.messages] == sorted(m.arrival for m in run.messages)
+    assert np.linalg.norm(run.at(1.99)[:3, 3] - run.at(2.01)[:3, 3]) > 0.03
+
+
 def test_a_fast_hand_is_as_fast_as_hands_are_and_no_faster() -> None:
     run = runs.drawn("fast hand", 1, 0, 20.0)
     h = 1e-3
@@ -217,7 +234,12 @@ def test_a_tiny_run_writes_the_layout(
         assert sum(row["states"].values()) == pytest.approx(1.0)
     assert set(found["late"]) == {"0", "50", "200", "shuffled"}
     assert max(found["late_difference_mm"].values()) < 1e-6
-    assert found["wrong_sense_cm"] == 0.0  # nothing is wrong in the first four seconds
+    # a jump in the middle; nothing is wrong in the first four seconds
+    assert found["wrong_sense_cm"] == found["silent_sense_cm"] == {"runs": fusion.WRONG_RUNS, "median": 0.0, "worst": 0.0}
+    assert 0.0 <= found["jump"]["noticed_worst_s"] <= found["jump"]["again_worst_s"] < 1.0
+    assert 0.0 < found["guessed_cm"]["median"] <= found["guessed_cm"]["worst"]
+    measured, fused = found["situations"]["visible"]["at_stamps_cm"]["vision"]
+    assert 0.0 < fused < 1.5 * measured
     assert found["step_ms"] > 0.0
     assert [row["n"] for row in found["targets"]] == [1, 3]
     shown = capsys.readouterr().out
@@ -228,15 +250,18 @@ def test_counts_and_states_are_those_of_all_runs() -> None:
     scores = fusion.Scores(
         times=np.array([1.0, 2.0]),
         errors={key: np.array([0.01, 0.03]) for key in ("ours", *fusion.BASELINES)},
-        nees=np.array([6.0, 6.0]),
+        nees=np.array([25.0, 6.0]),
         nees_dof=np.array([6, 6]),
+        states=np.array(["tracking", "coasting"]),
         stamps=np.array([]),
         nis=np.array([]),
         nis_dof=np.array([]),
+        at_stamps={"vision": np.array([[0.02, 0.01]]), "haptic": np.zeros((0, 2))},
         gated=2,
-        states={"tracking": 1, "coasting": 1, "lost": 0},
     )
-    row = fusion.summary([scores, dataclasses.replace(scores, gated=3)])
+    row = fusion.summary([scores, dataclasses.replace(scores, nees=np.array([6.0, 25.0]), gated=3)])
     assert row["refused"] == 5
     assert row["states"] == {"tracking": 0.5, "coasting": 0.5, "lost": 0.0}
-    assert row["error_cm"] == pytest.approx(2.0) and row["nees"] == 6.0 and row["nis"] is None
+    assert row["error_cm"] == pytest.approx(2.0) and row["nees"] == 15.5 and row["nis"] is None
+    assert row["beyond_3_sigma"] == 0.5, "of the two that are called tracking"
+    assert row["at_stamps_cm"] == {"vision": pytest.approx([2.0, 1.0])}

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from penumbra.services.search import contour
-from penumbra.services.search.evidence import Intrinsics
 from penumbra.services.search.tracker import Searched
+from penumbra.shared.body import anatomy
+from penumbra.shared.contract.labels import Label
 from penumbra.shared.contract.messages import FusedPose, VisionPose
 from penumbra.shared.geometry import rigid
+from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.sim.sets import shots
-from penumbra.tests.bench import search, tracking
+from penumbra.tests.bench import lost, search, tracking
 from penumbra.tests.bench.lib import bound
 
 
@@ -180,6 +182,34 @@ def test_tracking_what_is_hidden_is_counted_as_false(monkeypatch):
     told = tracking.scored([film([0.0, 1.0, 0.97, 0.2], ["tracking", "tracking", "occluded", "lost"])])
     assert (told["false_tracking"], told["hidden_frames"]) == (1, 2)
     assert told["tracked"] == 0.5
+
+
+def test_a_lost_stream_is_recovered_in_the_frame_of_its_first_right_pose():
+    wrong = film([0.0] * 4, ["lost", "tracking", "tracking", "lost"])
+    wrong.vision[1] = pose(VisionPose, 1, rigid.transform((0.2, 0.0, 0.0)), "tracking")
+    told = lost.scored([wrong, film([0.0] * 4, ["lost"] * 4)])
+    assert told == {"streams": 2, "recovered": 1, "median": 3.0, "frames": [3, None], "wrong": 1}
+
+
+def test_an_outline_is_compared_with_the_arms_that_it_touches():
+    cell = lost.cell_of(np.zeros((240, 320, 3), np.uint8))
+    T = rigid.transform((0.0, 0.0, 0.8))
+    model = contour.Model(anatomy.target_mesh(cell.targets["arm"], cell))
+    k = Intrinsics.of_window(cell.cameras["camera"], 0, 0, 1)
+    labels = np.where(model.silhouette(T, k, (0, 0, 320, 240)), np.uint8(Label.FOREARM), np.uint8(Label.BACKGROUND))
+    labels[:20, :20] = Label.HAND  # another arm
+    outline = lost.Outline(cell, labels)
+    assert outline.iou(T) == 1.0
+    assert 0.05 < outline.iou(rigid.transform((0.05, 0.05, 0.8))) < 0.5
+    assert outline.iou(rigid.transform((0.0, 0.3, 0.8))) == 0.0
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_lost_streams_runs(tmp_path):
+    out = tmp_path / "lost.json"
+    assert lost.main(["--seed", "47", "--quick", "--json", str(out)]) == 0
+    rows = json.loads(out.read_text())["streams"]
+    assert {row["landmarks"] for row in rows} <= {"off", "auto"} and all(row["streams"] == 1 for row in rows)
 
 
 @pytest.mark.slow

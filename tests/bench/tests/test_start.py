@@ -4,6 +4,7 @@ import os
 
 import pytest
 
+from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.processes import PROCESSES
 from penumbra.tests.bench import start
 
@@ -11,7 +12,9 @@ from penumbra.tests.bench import start
 @pytest.mark.slow
 def test_a_start_tells_when_each_process_showed_itself_and_when_the_pose_was_tracked(tmp_path):
     found = start.start(start.ROOT, "table", 1, tmp_path)
-    names = {process.name for process in PROCESSES if process.replicas and process.vision in (None, "procnet")}
+    cell = cells.load("table")
+    used = [process for process in PROCESSES if process.replicas and process.is_needed(cell)]
+    names = {process.name for process in used if process.vision in (None, "procnet")}
     assert set(found.seconds) >= names
     assert all(0 < found.seconds["router"] <= seconds for name, seconds in found.seconds.items() if name != "launcher")
     assert found.seconds["segmentation"] > found.seconds["emulator"], "there is no mask before the first frame"

@@ -52,6 +52,20 @@ BROKEN = {
     "looks at itself": ("table", "look_at: [0.05, 0.0, 0.15]", "look_at: [0.35, -1.15, 0.9]", "look_at", "got its own position"),
     "no direction": ("table", LOOK, "", "  front:", "expected either look_at or rpy, got neither"),
     "degrees": ("table", LOOK, "    rpy: [-90, 0, 0]\n", "rpy: [-90", "[rad]; either this or look_at); give radians"),
+    "a source of another kind": (
+        "table", LOOK, LOOK + "    source: {url: 'http://192.0.2.1/film'}\n", "source:", "expected v4l2:/dev/video0, rtsp://HOST/PATH"
+    ),
+    "a source mistyped": ("table", LOOK, LOOK + "    source: {url: 'flie:a.mp4'}\n", "source:", "did you mean file"),
+    "a source in a word": ("table", LOOK, LOOK + "    source: file:a.mp4\n", "source:", "a map with url, loop, rate_hz, latency"),
+    "an adapter without a class": (
+        "table", LOOK, LOOK + "    source: {url: 'adapter:my_camera'}\n", "source:", "as in adapter:my_camera:Camera"
+    ),
+    "a camera in a loop": (
+        "table", LOOK, LOOK + "    source: {url: 'v4l2:/dev/video', loop: true}\n", "source:", "or folder: only, got it with"
+    ),
+    "a film's clock": (
+        "table", LOOK, LOOK + "    source: {url: 'file:a.mp4', synchronised: true}\n", "source:", "expected it with rtsp: only"
+    ),
     "unknown design": ("table", "p3: {type: five", "p3: {type: six", "  p3:", "expected one of five, got 'six'"),
     "pads in one place": ("table", P3, P3.replace("0.12", "0.04"), "  p3:", "expected a place of its own, got that of p2"),
     "no such electrode": (
@@ -183,6 +197,7 @@ WARNINGS = {
     "a renamed cell": ("table", "name: table", "name: mine", "name:", "train it with `penumbra haptics train --cell"),
     "a camera that looks away": ("table", "look_at: [0.05, 0.0, 0.15]", "look_at: [0.35, -5, 0.9]", "look_at", "sees none"),
     "a camera that looks beside": ("table", "look_at: [0.05, 0.0, 0.15]", "look_at: [0.8, 0, 0.15]", "look_at", "sees most"),
+    "a film elsewhere": ("table", LOOK, LOOK + "    source: {url: 'file:a.mp4'}\n", "source:", "got nothing at"),
     "a pad far away": ("table", P3, P3.replace("0.12", "3.0"), "  p3:", "nothing can reach it"),
     "a pad turned over": ("table", P3, P3.replace("0.0]}", "0.0], rpy: [3.1416, 0, 0]}"), "  p3:", "points away from it"),
     "a home elsewhere": ("table", "position: [0.0, 0.0, 0.20]", "position: [0.0, 0.0, 2.0]", "home:", "in or near sim.motion"),

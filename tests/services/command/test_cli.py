@@ -18,6 +18,7 @@ from penumbra.services import flags, progress
 from penumbra.services.command import cli, doctor, look
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import processes, topics
+from penumbra.shared.perception import landmarks
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
@@ -64,7 +65,7 @@ def endpoint():
         (["router", "--fly"], "penumbra router: no option --fly (see penumbra router --help)"),
         (
             ["bench", "nothing"],
-            "penumbra bench: expected a benchmark, got 'nothing'; choose one of ablation, faults, fusion, haptics, live",
+            "penumbra bench: expected a benchmark, got 'nothing'; choose one of ablation, calibration, dashboard, faults, fusion",
         ),
         (["bench"], "penumbra bench: expected a benchmark, got none; choose one of ablation, "),
         (["poes"], "penumbra: expected a command, got 'poes'; did you mean pose? (see penumbra --help)"),
@@ -437,6 +438,18 @@ def test_output_that_cannot_be_written_is_one_line_and_no_traceback(argv, endpoi
 def test_a_long_command_whose_output_is_piped_reports_how_far_it_is(capsys):
     assert list(progress.track("abc", "letters")) == ["a", "b", "c"]
     assert capsys.readouterr().err == "letters: 0 of 3\nletters: 3 of 3\n"
+
+
+def test_doctor_says_which_models_may_be_fetched_beside_what_is_installed(tmp_path, monkeypatch):
+    monkeypatch.setenv("PENUMBRA_CACHE", str(tmp_path))
+    (missing,) = doctor._landmarks()
+    assert missing.status == "ok" and "penumbra segmentation models" in missing.mend
+    for name in landmarks.FILES:
+        path = landmarks.kept() / f"{name}.tflite"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"")
+    (there,) = doctor._landmarks()
+    assert there.status == "ok" and not there.mend and str(tmp_path) in there.text
 
 
 def test_doctor_finds_nothing_to_repair_on_a_healthy_installation(endpoint, capsys):

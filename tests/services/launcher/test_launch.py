@@ -25,6 +25,7 @@ from penumbra.shared.contract import topics
 from penumbra.shared.contract.messages import Truth
 from penumbra.shared.contract.processes import PROCESSES
 from penumbra.shared.contract.report import Report, TopicReport
+from penumbra.shared.perception.accuracy import accuracy
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 from penumbra.tests.support.live import PATIENCE_S, connect, free_port, penumbra_command, service_of, stays, wait_for
@@ -222,7 +223,7 @@ def test_the_error_is_measured_against_the_truth_at_the_time_of_the_pose():
         hidden=0.0,
         gap=0.1,
     )
-    found = display.accuracy(base, [moving])
+    found = accuracy(base, [moving])
     assert found.position == pytest.approx(0.02)  # 5 cm away 10 ms ago, 3 cm nearer since
     assert found.axis == pytest.approx(0.03)
 
@@ -254,6 +255,19 @@ def test_up_stops_by_itself_with_exit_code_zero_and_a_summary():
     assert "restarts: none" in out
 
 
+def test_up_prints_where_the_page_is_and_opens_it_in_the_browser(tmp_path, monkeypatch):
+    browser, opened, address = tmp_path / "browser", tmp_path / "opened", f"http://127.0.0.1:{free_port()}/"
+    browser.write_text(f'#!/bin/sh\necho "$1" > {opened}\n')
+    browser.chmod(0o755)
+    monkeypatch.setenv("BROWSER", str(browser))
+    page = address.rpartition(":")[2].strip("/")
+    _, out, _ = up_until(
+        f"page: {address}", "--port", str(free_port()), *NOTHING, "--replicas", "dashboard=1", "--page", page, "--open"
+    )
+    assert f"page: {address}" in out
+    assert opened.read_text() == f"{address}\n"
+
+
 def test_up_says_that_its_port_is_taken_and_what_to_do():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with Node("router", CELL, bus.Connection("router", listen=(endpoint,))):
@@ -269,7 +283,7 @@ def test_up_refuses_replicas_of_what_does_not_exist():
     process = up("--replicas", "magic=2")
     _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
-    assert "--replicas magic=2: expected one of router, emulator, segmentation" in err
+    assert "--replicas magic=2: expected one of router, emulator, camera, segmentation" in err
 
 
 def started_by(process):

@@ -16,6 +16,7 @@ from penumbra.services.posecnn import estimator, network, patch, voting
 from penumbra.services.posecnn.estimator import PoseCNN
 from penumbra.services.posecnn.training import evaluate, loss, train
 from penumbra.services.posecnn.uncertainty import KINDS, Signs, Uncertainty, errors, fitted
+from penumbra.services.replay.chain import Replay
 from penumbra.shared import training
 from penumbra.shared.body import anatomy
 from penumbra.shared.cell import description as cells
@@ -26,7 +27,6 @@ from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.perception.lookout import Window, whole_frame
 from penumbra.sim.sets import sequences, shots
 from penumbra.sim.world.world import record
-from penumbra.tests.support.replay import Replay
 
 TABLE = cells.load("table")
 SMALL = network.PoseCnnSettings(channels=(8, 8, 16, 16), pooled=4, hidden=16)
@@ -344,7 +344,7 @@ def test_the_service_refuses_a_frame_of_another_size():
 def test_up_starts_one_way_to_see(vision, there):
     options = flags.parse(up.PARAMS, ["--vision", vision, "--port", "1"])
     started = {process.service for process in launch.fleet(TABLE, options).processes}
-    assert started == there | {"router", "emulator", "haptics", "fusion"}
+    assert started == there | {"router", "emulator", "haptics", "fusion", "dashboard"}
 
 
 @pytest.mark.slow

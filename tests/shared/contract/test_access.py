@@ -374,7 +374,9 @@ def test_the_switch_is_a_flag_or_the_environment_and_off_without(folder, monkeyp
 def test_the_launcher_stays_on_loopback_unless_secured_and_hands_the_switch_on(folder):
     def options(**changed):
         plain = {"connect": [], "port": 7, "secure": None, "replicas": [], "vision": "procnet", "cell": "table"}
-        flags = {"seed": None, "observer": None, "method": None, "log_level": "info", "log_format": "text"}
+        flags = dict.fromkeys(flag.name for process in PROCESSES for flag in process.flags)
+        flags |= dict.fromkeys(process.starter.name for process in PROCESSES if process.starter)
+        flags |= {"log_level": "info", "log_format": "text"}
         return SimpleNamespace(**{**plain, **flags, **changed})
 
     assert (launch.listening(options()), launch.meeting_points(options())) == ("tcp/127.0.0.1:7", ("tcp/127.0.0.1:7",))

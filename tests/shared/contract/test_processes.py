@@ -271,6 +271,26 @@ def test_there_is_one_way_to_a_command_line():
     assert not [path for path in paths if "argparse" in path.read_text()]
 
 
+def test_up_starts_a_recorder_where_it_is_asked_to_and_gives_it_the_file():
+    def recorders(*words):
+        options = flags.parse(up.PARAMS, words)
+        return [p.command[-2:] for p in launch.fleet(launch.cells.load("table"), options).processes if p.service == "record"]
+
+    assert recorders("--seed", "1") == []
+    assert recorders("--record", "run.mcap") == [["--out", "run.mcap"]]
+    assert recorders("--record", "--seed", "1") == [["--out", "."]]
+
+
+def test_up_takes_part_in_ros_where_it_is_asked_to_and_says_where_its_router_is():
+    def participants(*words):
+        options = flags.parse(up.PARAMS, words)
+        return [p.command[-2:] for p in launch.fleet(launch.cells.load("table"), options).processes if p.service == "ros2"]
+
+    assert participants("--port", "7448") == []
+    assert participants("--port", "7448", "--ros2") == [["--ros-connect", "tcp/127.0.0.1:7447"]]
+    assert participants("--ros2", "tcp/127.0.0.1:7448") == [["--ros-connect", "tcp/127.0.0.1:7448"]]
+
+
 def test_up_gives_every_flag_of_the_table_to_its_process():
     options = flags.parse(up.PARAMS, ["--observer", "paper", "--method", "paper", "--seed", "7", "--port", "7"])
     commands = {process.service: process.command for process in launch.fleet(launch.cells.load("table"), options).processes}

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from penumbra.services.haptics import paper_nearest
+from penumbra.services.replay.chain import Replay
 from penumbra.services.search import contour
 from penumbra.shared.cell import description
 from penumbra.shared.geometry import raster, surface
@@ -22,7 +23,6 @@ from penumbra.shared.native.compiler import LIBC
 from penumbra.shared.native.signature import Signature
 from penumbra.sim.world.world import record
 from penumbra.tests.support import emulated
-from penumbra.tests.support.replay import Replay
 
 ROOT = Path(__file__).parents[3]
 
@@ -192,7 +192,10 @@ def test_a_kernel_is_known_by_its_source_the_functions_it_calls_and_their_consta
 def test_an_edited_kernel_is_compiled_again_and_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("PENUMBRA_CACHE", str(tmp_path / "cache"))
     x, out = np.arange(3.0), np.empty(3)
-    for expression, total in (("FACTOR * x", 6.0), ("FACTOR + x", 9.0)):
+    for expression, total in (
+        ("FACTOR * x", 6.0),
+        ("FACTOR + 1.0 * x", 9.0),
+    ):  # of another length: bytecode is kept by seconds and size
         module = imported(tmp_path / "edited.py", SCALE.format(factor=2.0, expression=expression))
         linecache.checkcache()
         assert module.scale(x, out) == total

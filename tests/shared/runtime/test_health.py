@@ -27,7 +27,7 @@ from penumbra.tests.support.live import wait_for
 from penumbra.tests.support.nodes import node_command, pose
 
 CELL = cells.load("table")
-WAITS = "waiting for camera/front/frame: emulator or driver is not there yet"
+WAITS = "waiting for camera/front/frame: emulator or camera or ros2 or driver is not there yet"
 FUSED = topics.FUSED.at(cell="table", target="forearm")
 
 

@@ -119,7 +119,9 @@ def test_a_service_serves_its_own_page_until_it_ends_and_ends_in_time():
 def test_the_launchers_page_covers_the_processes_that_answer_it():
     port, router = free_port(), free_port()
     nothing = [
-        word for name in ("emulator", "segmentation", "search", "haptics", "fusion") for word in ("--replicas", f"{name}=0")
+        word
+        for name in ("emulator", "segmentation", "search", "haptics", "fusion", "dashboard")
+        for word in ("--replicas", f"{name}=0")
     ]
     process = started("up", "--port", str(router), "--metrics-port", str(port), *nothing)
     try:
