@@ -191,7 +191,8 @@ class Launcher:
         }
 
     def _reasons(self) -> list[str]:
-        return [f"{each.name} {each.state}: {each.note}" for each in self.fleet.processes if each.state in ("waiting", "failed")]
+        down = [each for each in self.fleet.processes if each.state in ("waiting", "failed") or each.is_looping]
+        return [f"{each.name} {each.state}: {each.note}" for each in down]
 
     def _rows(self) -> list[ProcessRow]:
         local = self.watch.local()

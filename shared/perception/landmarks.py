@@ -12,6 +12,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -113,12 +114,10 @@ class Pose:
 
 
 class Model:
-    """A model's file in OpenVINO, on one thread."""
+    """A model's file in OpenVINO, on one thread. core: an `openvino.Core`, whose threads all of its models share."""
 
-    def __init__(self, path: Path):
-        import openvino
-
-        self._compiled = openvino.Core().compile_model(path, "CPU", {"INFERENCE_NUM_THREADS": 1})
+    def __init__(self, core: Any, path: Path):
+        self._compiled = core.compile_model(path, "CPU", {"INFERENCE_NUM_THREADS": 1})
         self.size = int(self._compiled.input(0).shape[1])
 
     def __call__(self, picture: NDArray[np.uint8], low: float = 0.0) -> list[NDArray[np.float32]]:
@@ -132,7 +131,10 @@ class Landmarks:
     """The models of a folder. Raises ModelsError where one is missing or another one."""
 
     def __init__(self, folder: Path):
-        self._palms, self._hand, self._people, self._pose = (Model(checked(folder, name)) for name in FILES)
+        import openvino  # of an extra: without it nothing is looked for
+
+        core = openvino.Core()
+        self._palms, self._hand, self._people, self._pose = (Model(core, checked(folder, name)) for name in FILES)
         self._palm_anchors = anchors(((24, 2), (12, 6)))
         self._people_anchors = anchors(((28, 2), (14, 2), (7, 6)))
 

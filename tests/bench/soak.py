@@ -137,6 +137,15 @@ class Life:
             self._away_until_s = None
             self._set_away(False)
 
+    def warm_up(self) -> None:
+        """The arm is away until it is lost, and a while longer: what is loaded at its first use, such as the models that look for a
+        lost arm, is there before anything is counted."""
+        self._set_away(True)
+        wait_for(lambda: (pose := self.running.pose()) is not None and pose["state"] == "lost", ANSWER_S, "the arm to be lost", 0.2)
+        time.sleep(AWAY_S)
+        self._set_away(False)
+        wait_for(self.running.is_tracking, ANSWER_S, "a tracked pose after the arm was lost", 0.5)
+
     def settle(self) -> None:
         """The arm is back, in sight."""
         self._set_away(False)
@@ -257,6 +266,7 @@ def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
     with chain(cell, seed) as (running, router):
         wait_for(running.is_tracking, 180, "a tracked pose", 0.5)
         life, gauge = Life(running, router, cells.load(cell), seed), Gauge(psutil.Process(running.launcher.pid), router)
+        life.warm_up()
         began_s = time.monotonic()
         periods_s = {name: DAY_S / speed / per_day for name, (per_day, _) in EVENTS.items()}
         due_s = {name: began_s + period_s / 2 for name, period_s in periods_s.items()} | {"look": began_s}

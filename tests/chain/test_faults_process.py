@@ -114,7 +114,8 @@ def test_a_crash_loop_is_reported_by_the_launcher_and_by_doctor_and_affects_no_o
             yield
 
     struck.by(loop())
-    assert "crash loop" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "crash loop" in out, out
     assert {name: pid for name, pid in struck.pids().items() if name != "segmentation"} == {
         name: pid for name, pid in before.items() if name != "segmentation"
     }
