@@ -138,10 +138,17 @@ class Life:
             self._set_away(False)
 
     def warm_up(self) -> None:
-        """The arm is away until it is lost, and a while longer: what is loaded at its first use, such as the models that look for a
-        lost arm, is there before anything is counted."""
+        """The arm is away until it is lost, and a while longer.
+
+        What is loaded at its first use, such as the models that look for a lost arm, is there before anything is counted.
+        """
+
+        def is_lost() -> bool:
+            pose = self.running.pose()
+            return pose is not None and pose["state"] == "lost"
+
         self._set_away(True)
-        wait_for(lambda: (pose := self.running.pose()) is not None and pose["state"] == "lost", ANSWER_S, "the arm to be lost", 0.2)
+        wait_for(is_lost, ANSWER_S, "the arm to be lost", 0.2)
         time.sleep(AWAY_S)
         self._set_away(False)
         wait_for(self.running.is_tracking, ANSWER_S, "a tracked pose after the arm was lost", 0.5)
