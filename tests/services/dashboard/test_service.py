@@ -29,6 +29,7 @@ from penumbra.shared.runtime.node import Node
 from penumbra.tests.services.dashboard.conftest import Served, address, started
 from penumbra.tests.support.live import PATIENCE_S, free_port, wait_for
 from penumbra.tests.support.nodes import node_command
+from penumbra.tests.support.shown import SERVICES
 
 TABLE = cells.load("table")
 FOREIGN = "http://evil.example"
@@ -92,6 +93,17 @@ def of_stream(stream: str, is_it=lambda said: True):
     return lambda said: said["stream"] == stream and is_it(said)
 
 
+def outlined(picture: bytes) -> bool:
+    """Whether a picture shows the mask and the outline of the pose."""
+    header = json.loads(picture[4 : 4 + int.from_bytes(picture[:4], "little")])
+    return bool(header["mask"] and header["outlines"].get("forearm", {}).get("lines"))
+
+
+def running(said) -> set[str]:
+    """The names of the processes that a page is told of."""
+    return {row["name"] for row in said.get("processes", {}).get("rows", ())}
+
+
 def last_state(said) -> dict:
     """The newest entry of the timeline on a pose."""
     return [entry for entry in said["timeline"] if entry["kind"] == "target"][-1]
@@ -101,29 +113,28 @@ def last_state(said) -> dict:
 
 
 def test_a_page_receives_pose_scene_picture_processes_and_rates(served: Served):
+    """Of each stream the first that is whole: the cell may have begun a moment ago."""
+
+    def is_whole(now) -> bool:
+        senses, sources = set(now.get("senses", ())), set(now.get("sources", ()))
+        from_both = senses == {"vision front", "haptic"} and sources == {"vision", "haptic"}
+        return now["state"] == "tracking" and from_both and now["error"] is not None and now["ellipsoid"] is not None
+
     async def look(browser: Browser):
         async with browser.page() as ws:
             hello = await until(ws, lambda said: True)
             assert hello["stream"] == "hello" and not hello["may_steer"], "without the key a page may look"
-            moment = await until(
-                ws, of_stream("moment", lambda said: said["pads"] and len(said["targets"]["forearm"].get("senses", ())) == 2)
-            )
-            picture = await until(ws, of_stream("picture"))
-            slow = await until(ws, of_stream("slow", lambda said: len(said.get("processes", {}).get("rows", ())) >= 6))
+            moment = await until(ws, of_stream("moment", lambda said: said["pads"] and is_whole(said["targets"]["forearm"])))
+            picture = await until(ws, of_stream("picture", lambda said: outlined(said["bytes"])))
+            everything = {"dashboard", *SERVICES, "router"}
+            slow = await until(ws, of_stream("slow", lambda said: everything <= running(said) and said["timeline"]))
         return moment, picture["bytes"], slow
 
     moment, picture, slow = browse(served.url, look)
     now = moment["targets"]["forearm"]
-    assert (
-        now["state"] == "tracking"
-        and set(now["senses"]) == {"vision front", "haptic"}
-        and set(now["sources"]) == {"vision", "haptic"}
-    )
     assert now["error"]["position"] < 0.05 and len(now["ellipsoid"]["radii"]) == 3
     assert set(moment["pads"]) == set(TABLE.pads)
-    header = json.loads(picture[4 : 4 + int.from_bytes(picture[:4], "little")])
-    assert header["mask"] and header["outlines"]["forearm"]["lines"] and picture.rstrip().endswith(b"\xff\xd9")
-    assert {"dashboard", "emulator", "fusion", "router", "search"} <= {row["name"] for row in slow["processes"]["rows"]}
+    assert picture.rstrip().endswith(b"\xff\xd9")
     assert {row["topic"] for row in slow["rates"]} == {topic.name for topic in topics.TOPICS} - {"joints"}
     assert last_state(slow)["state"] == "tracking"
 
