@@ -10,7 +10,7 @@ import numpy as np
 from penumbra.services.ros2 import convert
 from penumbra.services.ros2.cdr import Types
 from penumbra.shared.body.anatomy import Mesh
-from penumbra.shared.cell.description import PadType
+from penumbra.shared.cell.pads import PadType
 from penumbra.shared.chi_square import quantile
 from penumbra.shared.contract.messages import FusedPose
 from penumbra.shared.geometry import rigid

@@ -25,6 +25,7 @@ from penumbra.services import flags
 from penumbra.shared.body.anatomy import Mesh, target_mesh
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import PadType
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.response import FEATURES, FOLDER, Network, Rest, features, fingerprint, networks, save
@@ -78,7 +79,7 @@ class Mounting:
     name: str
     fingerprint: str
     bare: str
-    kind: cells.PadType
+    kind: PadType
     backing: Panels | None
 
 

@@ -17,6 +17,7 @@ from penumbra.services import flags
 from penumbra.services.skin.driver import Batches, Line, PadReader
 from penumbra.services.skin.port import SerialPort
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import SensingBoard
 from penumbra.shared.contract.messages import Voltages
 from penumbra.shared.contract.topics import VOLTAGES
 from penumbra.shared.runtime.node import Node
@@ -60,7 +61,7 @@ def start(node: Node, options: flags.Options) -> None:
         node.every(BACKOFF_S[0], partial(Session.run, session), math.inf)
 
 
-def pads(cell: cells.Cell, ports: Sequence[str], pad: str | None) -> dict[str, tuple[cells.SensingBoard, ...]]:
+def pads(cell: cells.Cell, ports: Sequence[str], pad: str | None) -> dict[str, tuple[SensingBoard, ...]]:
     """The pads to be read, each with its boards on their ports. Raises CellError where the two do not fit."""
     if not ports:
         named = {name: found for name, found in cell.pads.items() if pad in (None, name) and found.boards}
@@ -92,7 +93,7 @@ def pads(cell: cells.Cell, ports: Sequence[str], pad: str | None) -> dict[str, t
 class Session:
     """One pad from opening its boards to losing them, again and again."""
 
-    def __init__(self, node: Node, pad: str, readers: tuple[cells.SensingBoard, ...], cycles: int):
+    def __init__(self, node: Node, pad: str, readers: tuple[SensingBoard, ...], cycles: int):
         self._node, self._pad, self._readers, self._cycles = node, pad, readers, cycles
         self._kind = node.cell.pad_types[node.cell.pads[pad].type]
         self._lsb = self._kind.chain.adc_reference / board.FULL_SCALE

@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import Pad, PadType, SensingBoard
 from penumbra.shared.geometry.rigid import Array
 
 BAUD = 500_000
@@ -209,16 +209,14 @@ def decode(data: bytes) -> Reply:
     raise PacketError(f"expected a reply of {listed} bytes (16 + 24 n for n = 2 to 9 samples a cycle){fit}, got {got}")
 
 
-def readers(pad: cells.Pad, pad_type: cells.PadType) -> tuple[cells.SensingBoard, ...]:
+def readers(pad: Pad, pad_type: PadType) -> tuple[SensingBoard, ...]:
     """The boards of a pad as the cell file has them, or where it has none: two electrodes a board in the order of the pad type,
     the first on channels 0 to 2, the second on 3 to 5. Five electrodes c, r, l, t, b take three boards."""
     if pad.boards:
         return pad.boards
     names = list(pad_type.electrodes)
     pairs = [names[k : k + 2] for k in range(0, len(names), 2)]
-    return tuple(
-        cells.SensingBoard(channels={name: (3 * k, 3 * k + 1, 3 * k + 2) for k, name in enumerate(pair)}) for pair in pairs
-    )
+    return tuple(SensingBoard(channels={name: (3 * k, 3 * k + 1, 3 * k + 2) for k, name in enumerate(pair)}) for pair in pairs)
 
 
 FILLER = b"\xff"

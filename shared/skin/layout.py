@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from penumbra.shared.body import anatomy
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import Pad, PadType
 from penumbra.shared.geometry.rigid import Array
 
 GAIN_GAPS = (0.02, 0.05, 0.10)
@@ -26,7 +27,7 @@ RANGES = 2.0
 """Largest distance of a target, in ranges of a pad, at which the pad belongs to those that may feel it."""
 
 
-def electrode_positions(pad_type: cells.PadType) -> Array:
+def electrode_positions(pad_type: PadType) -> Array:
     """Centroids (e, 3) [m] of a pad's electrodes in the pad's frame (z out of the pad)."""
     return np.array([[*electrode.centroid, 0.0] for electrode in pad_type.electrodes.values()])
 
@@ -123,7 +124,7 @@ class Near:
         limb = float(np.linalg.norm(anatomy.target_mesh(found, cell).vertices, axis=1).max())
         reach = HOME_SIGMAS * found.home_spread.position + limb
 
-        def is_near(pad: cells.Pad) -> bool:
+        def is_near(pad: Pad) -> bool:
             away = np.linalg.norm(np.subtract(pad.position, found.home.position))
             return pad.link != "world" or bool(away < reach + RANGES * cell.pad_types[pad.type].range)
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from penumbra.shared.body.anatomy import Mesh
-from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import PadType
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
 
@@ -172,7 +172,7 @@ class PadField:
     its conductors together.
     """
 
-    def __init__(self, kind: cells.PadType, backing: Panels | None = None):
+    def __init__(self, kind: PadType, backing: Panels | None = None):
         self.panels, owner = _board(kind)
         if backing is not None:
             half = np.append(np.array(kind.board.size) / 2.0 + CLEAR, np.inf)
@@ -224,7 +224,7 @@ class PadField:
         return np.asarray(-FEMTOFARAD * ((at_body @ self._unit[:, 1:]).T @ charges))
 
 
-def _board(kind: cells.PadType) -> tuple[Panels, NDArray[np.int64]]:
+def _board(kind: PadType) -> tuple[Panels, NDArray[np.int64]]:
     """Panels of a board and the owner of each: copper and bare dielectric on the front (z = 0), the ground pour on the back.
 
     The charge bound on the rim and on the millimetre around the pour is left out: with it the conductors hold 2 % more together,
@@ -266,7 +266,7 @@ def _board(kind: cells.PadType) -> tuple[Panels, NDArray[np.int64]]:
     return Panels(np.concatenate(panels)), np.concatenate(owners)
 
 
-def _copper(kind: cells.PadType, points: Array) -> NDArray[np.bool_]:
+def _copper(kind: PadType, points: Array) -> NDArray[np.bool_]:
     """Which points (n, 3) of the front have copper."""
     out = _between_radii(points, kind.ring.centre, *kind.ring.radii)
     for e in kind.electrodes.values():

@@ -24,6 +24,7 @@ from penumbra.services.skin.calibration.law import Fit, RecordingError
 from penumbra.services.skin.calibration.recording import Recording
 from penumbra.shared.cell import description as cells
 from penumbra.shared.cell import edit
+from penumbra.shared.cell.pads import Law
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.messages import Voltages
 from penumbra.shared.geometry.rigid import Array
@@ -302,7 +303,7 @@ def _show(console: Console, pad: str, fits: dict[str, Fit], notes: Sequence[str]
 # ---- the cell file
 
 
-def write(source: Path, path: Path, laws: dict[str, dict[str, cells.Law]]) -> None:
+def write(source: Path, path: Path, laws: dict[str, dict[str, Law]]) -> None:
     """The cell file at `source` with the laws of these pads, at `path`; its comments and layout stay. The file is replaced
     only by one that loads. Raises RecordingError where it cannot be read, CellError where it cannot be written."""
     editor = YAML()
@@ -327,7 +328,7 @@ def _block(entries: dict[str, CommentedMap]) -> CommentedMap:
     return out
 
 
-def _row(found: cells.Law) -> CommentedMap:
+def _row(found: Law) -> CommentedMap:
     """One line; five digits are far below the uncertainty."""
     values = {name: float(f"{getattr(found, name):.5g}") for name in ("a1", "a2", "a3")}
     out = CommentedMap(**values, polarity=found.polarity, noise=float(f"{found.noise:.4g}"))

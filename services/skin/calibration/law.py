@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import Law, Nominal
 from penumbra.shared.geometry.rigid import Array
 
 LAW_ERROR = 0.04
@@ -61,7 +61,7 @@ class Fit:
     (k,): what was read less the law, in standard deviations of all three errors; gain: the signal as a share of the designed
     law's, over the gaps that were read (a1 alone trades with a2 and says less)."""
 
-    law: cells.Law
+    law: Law
     covariance: Array
     residual: Array
     gain: float
@@ -72,17 +72,17 @@ class Fit:
         return np.sqrt(np.diag(self.covariance))
 
 
-def signal(law: cells.Law | cells.Nominal, gap: ArrayLike) -> Array:
+def signal(law: Law | Nominal, gap: ArrayLike) -> Array:
     """What something at gaps [m] adds to the amplitude [V], without its sign; nothing at an infinite gap."""
     return law.a1 / (1.0 + law.a2 * np.asarray(gap, np.float64) ** 2)
 
 
-def snr_db(law: cells.Law, gap: ArrayLike) -> Array:
+def snr_db(law: Law, gap: ArrayLike) -> Array:
     """Signal-to-noise ratio [dB] of one sample at gaps [m] (paper, section "Sensor Model"): 10 log10(v^2 / (2 sigma^2))."""
     return 10.0 * np.log10(signal(law, gap) ** 2 / (2.0 * law.noise))
 
 
-def reach(law: cells.Law, snr: float = SNR_DB) -> float:
+def reach(law: Law, snr: float = SNR_DB) -> float:
     """The gap [m] at which the ratio sinks to `snr` [dB]; zero where it never reaches that."""
     least = np.sqrt(2.0 * law.noise * 10.0 ** (snr / 10.0))
     return float(np.sqrt(max(law.a1 / least - 1.0, 0.0) / law.a2))
@@ -135,7 +135,7 @@ def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str
     return Readings(gap_, mean, error, noise, tuple(notes))
 
 
-def fit(read: Readings, nominal: cells.Law, name: str, placing: float = PLACING) -> Fit:
+def fit(read: Readings, nominal: Law, name: str, placing: float = PLACING) -> Fit:
     """The law that an electrode follows.
 
     nominal: its law as designed (the start, and for a2 a weak prior); placing [m]: standard deviation of the gaps.
@@ -180,7 +180,7 @@ def fit(read: Readings, nominal: cells.Law, name: str, placing: float = PLACING)
         raise RecordingError(
             f"electrode {name}: the fit's offset a3 is {x[2]:.3g} V, an amplitude is never below 0: check the gaps"
         )
-    law = cells.Law(a1=float(np.exp(x[0])), a2=float(np.exp(x[1])), a3=float(x[2]), polarity=polarity, noise=noise)
+    law = Law(a1=float(np.exp(x[0])), a2=float(np.exp(x[1])), a3=float(x[2]), polarity=polarity, noise=noise)
     gain = float(np.exp(np.mean(np.log(signal(law, read.gap[near]) / signal(nominal, read.gap[near])))))
     for gap, r in zip(read.gap, residual, strict=True):
         if abs(r) > 4.0:

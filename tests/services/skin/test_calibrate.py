@@ -11,6 +11,7 @@ from penumbra.services.command import cli
 from penumbra.services.skin.calibration import calibrate, law, recording
 from penumbra.services.skin.calibration.law import RecordingError
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import Law
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.messages import Voltages
 from penumbra.shared.runtime import bus
@@ -90,7 +91,7 @@ def test_the_noise_is_that_of_successive_samples_and_not_of_a_swaying_hand():
 
 
 def test_the_range_ends_where_the_ratio_is_one_decibel():
-    paper = cells.Law(a1=2.66, a2=3.0e4, a3=0.2, noise=6.2e-6)
+    paper = Law(a1=2.66, a2=3.0e4, a3=0.2, noise=6.2e-6)
     assert law.reach(paper) == pytest.approx(0.15, abs=0.002)  # the paper's figure
     assert law.snr_db(paper, law.reach(paper)) == pytest.approx(1.0)
     assert law.reach(paper.model_copy(update={"noise": 100.0})) == 0.0

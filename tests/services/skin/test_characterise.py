@@ -12,6 +12,7 @@ from penumbra.services.skin.calibration import law, recording
 from penumbra.services.skin.calibration.characterise import Places, Regression, characterise, emulated, places
 from penumbra.shared.body.anatomy import target_mesh
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import Law
 from penumbra.shared.geometry.rigid import inverse
 from penumbra.shared.geometry.surface import Surface
 from penumbra.sim.skin import characterisation
@@ -95,7 +96,7 @@ def test_a_recorded_data_set_goes_through_the_same_command(recorded, tmp_path, c
     assert found["planes"] == {}
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"distances.csv", "distances.png", "snr.png", "summary.json"}
     fit = found["electrodes"]["c"]
-    one = cells.Law(**{key: fit[key] for key in ("a1", "a2", "a3", "polarity", "noise")})
+    one = Law(**{key: fit[key] for key in ("a1", "a2", "a3", "polarity", "noise")})
     assert law.snr_db(one, fit["reach_m"]) == pytest.approx(1.0)
 
 
@@ -137,7 +138,7 @@ def test_places_are_means_with_the_deviation_of_means():
 def test_the_regression_is_within_its_own_band_close_in_and_far_out():
     rng = np.random.default_rng(6)
     gap = np.geomspace(0.01, 0.2, 40)
-    truth = cells.Law(a1=2.66, a2=3e4, a3=0.2, noise=6.2e-6)
+    truth = Law(a1=2.66, a2=3e4, a3=0.2, noise=6.2e-6)
     deviation = np.full(40, 3e-4)
     found = Regression(np.log(gap)[:, None], law.signal(truth, gap) + deviation * rng.standard_normal(40), deviation)
     between = np.sqrt(gap[1:] * gap[:-1])

@@ -14,6 +14,7 @@ from penumbra.services.skin import service
 from penumbra.services.skin.driver import Batches, BoardSilent, Line, PadReader, Row, resonance
 from penumbra.services.skin.port import SerialPort
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import SensingBoard
 from penumbra.shared.contract import topics
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
@@ -394,8 +395,8 @@ def test_ports_that_do_not_fit_the_pad_are_refused_in_one_line(argv, text, capsy
 
 def test_the_cell_file_can_name_ports_and_channels():
     boards = [
-        cells.SensingBoard(port="/dev/x", channels={"t": (0, 1), "b": (2, 3), "l": (4, 5)}),
-        cells.SensingBoard(port="/dev/y", channels={"c": (0,), "r": (5,)}),
+        SensingBoard(port="/dev/x", channels={"t": (0, 1), "b": (2, 3), "l": (4, 5)}),
+        SensingBoard(port="/dev/y", channels={"c": (0,), "r": (5,)}),
     ]
     cell = CELL.model_copy(update={"pads": {**CELL.pads, "p2": CELL.pads["p2"].model_copy(update={"boards": tuple(boards)})}})
     assert service.pads(cell, (), None) == {"p2": tuple(boards)}

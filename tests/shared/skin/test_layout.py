@@ -10,6 +10,7 @@ import trimesh
 
 from penumbra.shared.body.anatomy import forearm_mesh
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.pads import Law, Pad
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin import layout
@@ -44,7 +45,7 @@ def table() -> cells.Cell:
     return cells.load("table")
 
 
-def calibrated(cell: cells.Cell, law: cells.Law) -> cells.Cell:
+def calibrated(cell: cells.Cell, law: Law) -> cells.Cell:
     """The cell with this law on every electrode of every pad."""
     pads = {
         name: pad.model_copy(update={"calibration": dict.fromkeys(cell.pad_types[pad.type].electrodes, law)})
@@ -75,7 +76,7 @@ def test_a_law_that_an_electrode_does_not_have_is_refused_with_its_name(table: c
 
 
 def test_electrodes_follow_the_link_that_carries_their_pad(table: cells.Cell) -> None:
-    pads = {"a": cells.Pad(type="five", link="panda/hand", position=(0, 0, 0.1), rpy=(0, 0, np.pi / 2))}
+    pads = {"a": Pad(type="five", link="panda/hand", position=(0, 0, 0.1), rpy=(0, 0, np.pi / 2))}
     robots = {"panda": cells.Robot(urdf="panda/panda.urdf", joints=("panda_joint1",))}
     moving = layout.Skin(table.model_copy(update={"pads": pads, "robots": robots}))
     T = rigid.from_rpy((1, 2, 3), (0, 0, 0))
