@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from penumbra.services.search.contour import MEASURED, NEAR, Model
 from penumbra.services.search.evidence import COVERED, FREE, TARGET
 from penumbra.services.search.mask_fit import Limits, Noise
-from penumbra.services.search.objects import basin, meshes, region
+from penumbra.services.search.objects import basin, contest, meshes, region
 from penumbra.services.search.objects.basin import Level, Prior, Pyramid, Score, Shape
 from penumbra.services.search.objects.creases import Creases
 from penumbra.services.search.settings import ONE_IN_10_000
@@ -201,14 +201,14 @@ class _Colours:
         window = region.Window(
             picture, mask, occluder, self._k, self._shape, prior.T, reach * self._k.fx / max(prior.T[2, 3], NEAR)
         )
-        found = region.search(self._shape, window, prior, reach)
+        found = contest.search(self._shape, window, prior, reach)
         if not found:
             return _lost(prior.T), None
         table = window.of_pose(self._shape.coarse, found[0].T, GAP) if found[0].support > SUPPORTED[1] else None
         return self.judged(found, prior, mask, occluder, picture.shape[:2]), table
 
     def judged(
-        self, found: list[region.Found], prior: Prior, mask: Bool | None, occluder: Bool | None, shape: tuple[int, int]
+        self, found: list[contest.Found], prior: Prior, mask: Bool | None, occluder: Bool | None, shape: tuple[int, int]
     ) -> ObjectEstimate:
         """The estimate of T_camera_middle from poses in a picture (h, w), best first."""
         best = found[0]
@@ -228,7 +228,7 @@ class _Colours:
             return ObjectEstimate(T, covariance, overlap, "doubtful")
         return ObjectEstimate(T, covariance, overlap, "occluded" if covered > COVERS else "tracking")
 
-    def _posterior(self, found: list[region.Found], prior: Prior) -> tuple[Array, Array]:
+    def _posterior(self, found: list[contest.Found], prior: Prior) -> tuple[Array, Array]:
         """The best pose with the prior, by how exact contours are, and its covariance, with the other poses by likelihood."""
         best = found[0]
         trust = min(1.0, max(best.support, 0.1) / TYPICAL) ** 4  # what hides a part may have pulled the rest along
@@ -315,7 +315,7 @@ class Tracker:
         shape = self._rigid.shape
         if self._missed == 0 and self._table is not None:
             window = region.Window(picture, mask, occluder, self._k, shape, prior.T, 0.0)
-            one = region.follow(shape, window, self._table, prior)
+            one = contest.follow(shape, window, self._table, prior)
             if one.support > max(SUPPORTED[1], self._usual_support - DROP):
                 # the errors of the contour are the same in all frames: the last pose adds nothing
                 alone = Prior(one.T, self._weak)

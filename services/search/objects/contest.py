@@ -1,0 +1,104 @@
+"""The hypotheses about an object's pose compete by how well they explain the picture.
+
+`search` follows those of `region.hypotheses` from small to large pictures and keeps the best of each stage; `follow` has one, a
+prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from penumbra.services.search.contour import Model
+from penumbra.services.search.objects import basin
+from penumbra.services.search.objects.basin import Prior, Shape
+from penumbra.services.search.objects.region import ROBUST, Floats, Level, Window, descend, hypotheses, lines
+from penumbra.services.search.settings import ONE_IN_10_000
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+
+FIRST, KEPT = 12, (6, 4, 3)
+"""Number of hypotheses that are followed at first, and after each stage."""
+SAME_START = (0.012, 0.2)
+"""Shifted hypotheses nearer than this [m, rad] are one."""
+SCORED_PX = 30.0
+"""Length of contour whose offsets count as one in the likelihood of a pose [px]."""
+LEAST_SUPPORT = 0.05
+"""Least likelihood of an offset near none, against that of any: what hides the object makes a few lines wrong, not the pose."""
+SCORING = 7
+"""Reach of the lines by which poses are compared [px]."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A pose T_camera_object; `score`: log-likelihood of its contour against any other's, with the start; `support`: share of the
+    contour's length that lies on an edge; `length` of contour that is seen [px of the image]; `level`: where it was compared."""
+
+    T: Array
+    score: float
+    support: float
+    length: float
+    level: Level
+
+
+def scored(shape: Shape, model: Model, at: Level, T: Array, prior: Prior, creases: bool) -> Found:
+    """How well a pose explains a picture."""
+    contour = lines(shape, model, at, T, SCORING)
+    length = float(contour.length.sum())
+    if length <= 0.0:
+        return Found(T, -math.inf, 0.0, 0.0, at)
+    score = float(contour.length @ np.log(np.maximum(contour.support, LEAST_SUPPORT)))
+    if creases:
+        inside = lines(shape, model, at, T, SCORING, True)
+        score += float(inside.length @ np.log(np.maximum(inside.support, LEAST_SUPPORT)))
+    support = float(contour.length @ (contour.support > 1.0)) / length
+    return Found(T, score / SCORED_PX - 0.5 * prior.cost(T), support, length * at.scale, at)
+
+
+def search(shape: Shape, window: Window, prior: Prior, reach: float) -> list[Found]:
+    """The poses T_camera_object near the prior, up to `reach` [m] to the side, that explain the picture best, best first."""
+    model, factors, starts = shape.coarse, window.factors, basin.starts(prior.T)
+    table = window.of_mask()
+    masked = table is not None
+    if table is None:
+        rng = np.random.default_rng(0)
+        shifts = rng.normal(0.0, 0.25 * reach, (len(starts), 3))
+        table = window.of_poses(model, [rigid.perturb(T, [*way, 0.0, 0.0, 0.0]) for T, way in zip(starts, shifts, strict=True)])
+    poses = distinct(hypotheses(model, window.level(factors[0], table), starts, prior, reach), SAME_START, FIRST)
+    stages = [(factors[0], shape.coarse, (7, 7, 6, 6), 0.06), (factors[0], shape.coarse, (6, 5), 0.03)]
+    stages += [(factor, shape.fine, (7, 6, 5), 0.02) for factor in factors[1:]]
+    stages += [(factors[-1], shape.fine, (5, 4, 4, 4), 0.015)]
+    found: list[Found] = []
+    for i, (factor, model, reaches, gap) in enumerate(stages):
+        found, last = [], factor == factors[-1]
+        for T in poses:
+            at = window.level(factor, table if masked else window.of_pose(shape.coarse, T, gap))
+            T = descend(shape, model, at, T, prior, reaches, last)
+            if prior.cost(T) < ONE_IN_10_000:
+                found.append(scored(shape, model, at, T, prior, last))
+        found.sort(key=lambda one: -one.score)
+        poses = distinct([one.T for one in found], basin.SAME, KEPT[min(i, len(KEPT) - 1)])
+    return [one for one in found if any(one.T is T for T in poses)]
+
+
+def distinct(poses: list[Array], same: tuple[float, float], most: int) -> list[Array]:
+    """Those of which none before is nearer than `same` [m, rad], at most so many."""
+    kept: list[Array] = []
+    for T in poses:
+        errors = [rigid.pose_error(T, other) for other in kept]
+        if all(np.linalg.norm(e[:3]) > same[0] or np.linalg.norm(e[3:]) > same[1] for e in errors):
+            kept.append(T)
+        if len(kept) == most:
+            break
+    return kept
+
+
+def follow(shape: Shape, window: Window, table: Floats, prior: Prior) -> Found:
+    """The pose near a prediction, by the log-odds (BINS^3,) of colours that are known."""
+    small, large = window.factors[max(len(window.factors) - 2, 0)], window.factors[-1]
+    T = descend(shape, shape.coarse, window.level(small, table), prior.T, prior, (7, 6), small == large, ROBUST[1])
+    at = window.level(large, table)
+    T = descend(shape, shape.fine, at, T, prior, (5, 4), True, ROBUST[1])
+    return scored(shape, shape.fine, at, T, prior, True)
