@@ -59,6 +59,7 @@ class Segmenter:
         picture, elapsed_s = cut(image, window), (stamp_ns - self._stamp_ns) * 1e-9
         if not 0.0 < elapsed_s <= MAX_GAP_S:
             self._forget()
+            elapsed_s = 0.0  # of what is remembered, nothing
         logits, self._state = self._compiled(picture, self._remembered(window), priors)
         self._window, self._stamp_ns = window, stamp_ns
         for label in TARGET_LABELS:
