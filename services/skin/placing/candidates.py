@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.body.robot import RobotModel
 from penumbra.shared.cell import description as cells
+from penumbra.shared.cell.faults import meant
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
@@ -67,7 +68,7 @@ def surface_points(mesh: Mesh, step: float, count: int = SAMPLES) -> tuple[Array
     return points[kept], normals[faces[kept]]
 
 
-def on_link(mesh: Mesh, board: cells.Board, step: float = STEP) -> list[Array]:
+def on_link(mesh: Mesh, board: cells.Board, step: float) -> list[Array]:
     """T_link_pad (4, 4) of candidates on a link, at most one in `step` [m]."""
     dense, normals = surface_points(mesh, step / 3.0)
     axes = np.linalg.svd(dense - dense.mean(axis=0), full_matrices=False)[2]
@@ -123,8 +124,8 @@ def _heights(corners: Array, points: Array, most: float = 0.05) -> Array:
     return np.where(inside, z, -np.inf).max(axis=1, initial=-np.inf)
 
 
-def in_plane(plane: Plane, board: cells.Board, step: float = STEP) -> list[Array]:
-    """T_world_pad (4, 4) of candidates on a grid in a plane, boards within its bounds."""
+def in_plane(plane: Plane, board: cells.Board, step: float) -> list[Array]:
+    """T_world_pad (4, 4) of candidates every `step` [m] in a plane, boards within its bounds."""
     half = 0.5 * np.asarray(board.size)
     axes = []
     for low, high, inset in zip(plane.low, plane.high, half, strict=True):
@@ -205,7 +206,7 @@ def carriers(cell: cells.Cell, models: Mapping[str, RobotModel], wanted: Iterabl
         full = [link for link in ("world", *known) if name in (link, link.partition("/")[2])]
         if len(full) != 1:
             what = f"one of {', '.join(full)}" if full else f"world or one of {', '.join(solid)}"
-            raise cells.CellError(f"--links: expected {what}, got {name!r}{cells.meant(name, [*known, 'world'])}")
+            raise cells.CellError(f"--links: expected {what}, got {name!r}{meant(name, [*known, 'world'])}")
         if full[0] != "world" and full[0] not in solid:
             raise cells.CellError(f"--links: expected links with a collision mesh ({', '.join(solid)}), got {name!r}")
         chosen.append(full[0])

@@ -159,7 +159,8 @@ class Placing:
         greedy: list[int] = []
         for count in track(range(1, self.number + 1), "choosing pads"):
             greedy = choice.more(greedy, count)
-        if len(greedy) < self.number:
+            if len(greedy) == count:
+                continue
             raise cells.CellError(
                 f"--number: expected at most {len(greedy)} pads, for which there is room where the limb is felt, got "
                 f"{self.number}; give fewer, or more --links"
@@ -205,10 +206,10 @@ class Placing:
         for link in track(self.links, "places on links"):
             if link == "world":
                 assert self.plane is not None
-                found = candidates.in_plane(self.plane, self.board)
+                found = candidates.in_plane(self.plane, self.board, candidates.STEP)
             else:
                 robot, _, name = link.partition("/")
-                found = candidates.on_link(self.models[robot].meshes[name], self.board)
+                found = candidates.on_link(self.models[robot].meshes[name], self.board, candidates.STEP)
             clear = candidates.clear_of_links([self.pad(link, T) for T in found], self.board, links, solids)
             out[link] = [T for T, is_clear in zip(found, clear, strict=True) if is_clear]
         out = {link: own for link, own in out.items() if own}

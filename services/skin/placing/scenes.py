@@ -124,7 +124,8 @@ class Drawing:
         where = "around the target's home" if self.box is None else "in --workspace"
         raise cells.CellError(
             f"expected poses {where} that keep {100 * GAP:g} cm clear of robots and table and come within "
-            f"{100 * room.reach:g} cm of a place for a pad, got {len(poses)} of {count}; give another --workspace, --links or --range"
+            f"{100 * room.reach:g} cm of a place for a pad, got {len(poses)} of {count}; give another --workspace, "
+            "--links or --range"
         )
 
 
