@@ -1,5 +1,7 @@
 """The Cramér-Rao bound of the skin's field model."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -39,7 +41,7 @@ def test_the_information_is_that_of_the_signals_differences_between_poses_and_si
 
 
 def test_an_electrode_at_the_end_of_its_scale_tells_nothing(table: cells.Cell) -> None:
-    near = rigid.transform((-0.04, -0.04, 0.052))  # the belly half a centimetre above the pad
+    near = rigid.transform((-0.04, -0.04, 0.047))  # three millimetres above a pad
     kind = table.pad_types["five"]
     found = {}
     for name, reference in (("as built", 3.3), ("never full", 100.0)):
@@ -49,7 +51,7 @@ def test_an_electrode_at_the_end_of_its_scale_tells_nothing(table: cells.Cell) -
         found[name] = bound.information(skin, response, skin.T_world_pads(), near, (0.0, 0.0), SAMPLES)
     less, all_of_it = (np.trace(found[name], axis1=1, axis2=2) for name in ("as built", "never full"))
     assert less.min() >= 0.0
-    assert (less < 0.9 * all_of_it).any() and (less == all_of_it).any()
+    assert (less < 0.99 * all_of_it).any() and (less == all_of_it).any()
 
 
 def test_more_pads_never_expect_a_larger_error_and_none_expect_the_homes_spread(table: cells.Cell) -> None:
@@ -58,4 +60,4 @@ def test_more_pads_never_expect_a_larger_error_and_none_expect_the_homes_spread(
     prior = bound.prior(table.targets["forearm"])
     errors = [float(bound.position_error(prior + information[:count].sum(axis=0))) for count in range(9)]
     assert errors[0] == pytest.approx(np.sqrt(3.0) * table.targets["forearm"].home_spread.position)
-    assert all(later < earlier for earlier, later in zip(errors, errors[1:], strict=False))
+    assert all(later < earlier for earlier, later in itertools.pairwise(errors))
