@@ -84,13 +84,15 @@ def main(options: flags.Options, report: results.Report) -> None:
             layout: {"pads": len(each.pads), **summary(each.errors(placing.fresh))}
             for layout, each in (("present", present), ("proposed", proposed))
         }
-        layouts = {"present": present, "proposed": proposed}
-        if any(pad.backed for pad in present.pads):
-            layouts = {"present": present, "present, fitted model": _fitted(placing, present), "proposed": proposed}
         scenes = placing.drawing.draw(placing.room, options.scenes, options.seed + 2)
-        for layout, sensing in layouts.items():
-            for row in _rows(placing, sensing, scenes, options.seed):
-                found["rows"].append({"cell": name, "pads": f"{len(sensing.pads)} {layout}", **row})
+        layouts = {"present": {"present": present}, "proposed": {"proposed": proposed}}
+        if any(pad.backed for pad in present.pads):
+            layouts["present"]["present, fitted model"] = _fitted(placing, present)
+        for alike in layouts.values():
+            signals = _signals(placing, next(iter(alike.values())), scenes, options.seed)
+            for layout, sensing in alike.items():
+                for row in _rows(placing, sensing, scenes, signals, options.seed):
+                    found["rows"].append({"cell": name, "pads": f"{len(sensing.pads)} {layout}", **row})
             report.save(found)
 
 
@@ -100,9 +102,8 @@ def _fitted(placing: Placing, present: Sensing) -> Sensing:
     return replace(present, response=Response(placing.cell, placing.target, known))
 
 
-def _rows(placing: Placing, sensing: Sensing, scenes: Scenes, seed: int) -> list[dict[str, Any]]:
-    """The bound and the estimator's errors from home and from a track."""
-    voltages = list(_signals(placing, sensing, scenes, seed))
+def _rows(placing: Placing, sensing: Sensing, scenes: Scenes, signals: Sequence[Array], seed: int) -> list[dict[str, Any]]:
+    """The bound and the estimator's errors from home and from a track, with these true signals (n,) [V] of each scene."""
     information = sensing.information(scenes).sum(axis=1)
     target = placing.drawing.target
     spread = np.repeat([target.home_spread.position, target.home_spread.rotation], 3)
@@ -113,7 +114,7 @@ def _rows(placing: Placing, sensing: Sensing, scenes: Scenes, seed: int) -> list
         total[:, :6, :6] += np.diag(deviation**-2.0) - np.diag(spread**-2.0)
         expected = bound.position_error(total)
         errors = np.empty(len(scenes))
-        for k, (T, T_pads, signal) in enumerate(zip(scenes.targets, scenes.pads(sensing.pads), voltages, strict=True)):
+        for k, (T, T_pads, signal) in enumerate(zip(scenes.targets, scenes.pads(sensing.pads), signals, strict=True)):
             start = target.home.transform if prior == "home" else rigid.perturb(T, TRACKING * rng.standard_normal(6))
             measured = target.size is not None
             estimator = Estimator(sensing.skin, sensing.response, placing.drawing.surface, start, deviation, measured=measured)

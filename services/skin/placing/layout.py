@@ -137,6 +137,10 @@ class Placing:
     def sensing(self, pads: Sequence[cells.Pad]) -> Sensing:
         return self.fields.sensing(self.drawing, tuple(pads), self.scenes)
 
+    def taken(self, layout: Sensing) -> float | None:
+        """The share of a layout's signals that links beside those behind the pads take, see `FieldModels.taken`."""
+        return self.fields.taken(self.drawing, layout.pads, self.fresh, self.room)
+
     def pad(self, link: str, T_link_pad: Array) -> cells.Pad:
         """A pad at a place. Before a link it has the link behind it, unless the pads on links of this cell have not."""
         position, orientation = rigid.position_orientation(T_link_pad)

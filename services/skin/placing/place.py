@@ -21,9 +21,9 @@ from penumbra.shared.cell import edit
 from penumbra.shared.geometry.rigid import Array
 
 LEFT_OUT = (
-    "The bound leaves out: shading by other links than the one behind a pad, and the signal that they give by themselves; other "
-    "objects; roots far from the true pose; wiring; whether the mesh is the hull, and the hull flat enough to mount a board on; "
-    "collisions of a pad with what the robot works on."
+    "The bound leaves out: links beside the one behind a pad, which take signal and give one by themselves; other objects; other "
+    "poses, far from the true one, that would be felt alike; wiring; whether the mesh is the hull, and a board can be mounted "
+    "there; collisions of a pad with what the robot works on."
 )
 
 
@@ -94,11 +94,14 @@ def _place(options: flags.Options) -> None:
     if placing.present:
         layouts = {"present": placing.sensing(tuple(placing.present.values())), **layouts}
     errors = {name: sensing.errors(placing.fresh) for name, sensing in layouts.items()}
+    taken = {name: placing.taken(sensing) for name, sensing in layouts.items()}
     named = names(tuple(cell.pads), proposed.pads)
     if options.json:
-        print(json.dumps(_result(placing, errors, steps, named)))
+        print(json.dumps(_result(placing, errors, taken, steps, named)))
     else:
-        _show(Console(highlight=False, soft_wrap=True), placing, errors, steps, named)
+        console = Console(highlight=False, soft_wrap=True)
+        _show(console, placing, errors, steps, named)
+        _warn(console, taken, named)
     if options.out is not None:
         from penumbra.services.skin.placing import picture  # matplotlib takes a second to import
 
@@ -156,7 +159,11 @@ def line(pad: cells.Pad, before: cells.Pad | None = None) -> str:
 
 
 def _result(
-    placing: Placing, errors: Mapping[str, Array], steps: Sequence[Step], named: Mapping[str, cells.Pad]
+    placing: Placing,
+    errors: Mapping[str, Array],
+    taken: Mapping[str, float | None],
+    steps: Sequence[Step],
+    named: Mapping[str, cells.Pad],
 ) -> dict[str, Any]:
     return {
         "cell": placing.cell.name,
@@ -164,7 +171,10 @@ def _result(
         "links": list(placing.links),
         "seed": placing.wish.seed,
         "scenes": FRESH,
-        **{name: {"pads": _count(placing, name, named), **summary(each)} for name, each in errors.items()},
+        **{
+            name: {"pads": _count(placing, name, named), **summary(each), "taken_by_other_links": taken[name]}
+            for name, each in errors.items()
+        },
         "steps": [step.summary() for step in steps],
         "pads": {name: yaml.safe_load(line(pad)) for name, pad in named.items()},
         "left_out": LEFT_OUT,
@@ -195,10 +205,16 @@ def _show(
     for name, pad in named.items():
         console.print(f"  {name}: {line(pad, placing.cell.pads.get(name))}", markup=False)
     console.print()
+
+
+def _warn(console: Console, taken: Mapping[str, float | None], named: Mapping[str, cells.Pad]) -> None:
+    """What the numbers leave out, and what is to be done with new pads."""
+    known = [f"{100 * share:.0f} % of the signals of the {name} pads" for name, share in taken.items() if share is not None]
+    if known:
+        console.print(f"Not counted: other links than the one behind a pad take {', '.join(known)} (median).")
     if any(pad.backed for pad in named.values()):
-        console.print(f"Each new place before a link needs its field model: penumbra skin model --cell FILE.\n{LEFT_OUT}")
-    else:
-        console.print(LEFT_OUT)
+        console.print("Each new place before a link needs its field model: penumbra skin model --cell FILE.")
+    console.print(LEFT_OUT)
 
 
 def _cells(row: Mapping[str, float]) -> tuple[str, str, str]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.progress import track
-from penumbra.services.skin.placing.scenes import Drawing, Scenes
-from penumbra.services.skin.placing.shading import Shading, behind
+from penumbra.services.skin.placing.scenes import GAP, Drawing, Room, Scenes
+from penumbra.services.skin.placing.shading import Shading, behind, beside
 from penumbra.shared.body.robot import RobotModel
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
@@ -26,6 +27,8 @@ BEHIND = -0.15
 (`penumbra skin model`)."""
 FEWEST = 12
 """A place from which a limb is felt in fewer of the scenes is of no use."""
+MEASURED = 30
+"""Number of limbs for which it is computed what other links take."""
 RANGES = 1.7
 """Largest gap, in ranges of a pad, at which a limb counts for the model of a place: beyond it the signal is lost in the noise."""
 
@@ -91,7 +94,6 @@ class FieldModels:
                 "on the world (without `backed`) into a copy of the cell file, and run penumbra skin model --cell COPY"
             )
         self._bare, self._kind = self._known[bare], cell.pad_types[kind]
-        self._shading: Shading | None = None
 
     def sensing(self, drawing: Drawing, pads: tuple[cells.Pad, ...], scenes: Scenes) -> Sensing:
         """Pads with their field models; those before links are made for the limbs of these scenes."""
@@ -103,16 +105,36 @@ class FieldModels:
             known[fingerprint(cell, _name(k), self._target)] = self._before_link(pads[k], scenes, gaps[:, k], before[:, k])
         return Sensing(drawing, pads, Skin(cell), Response(cell, self._target, known), self.size)
 
+    def taken(self, drawing: Drawing, pads: tuple[cells.Pad, ...], scenes: Scenes, room: Room) -> float | None:
+        """The share of the signals of pads before links, in the median, that the other links take, which no field model has: in
+        the middle of the joints' bounds, for the limbs of these scenes that keep clear then. None where no such pad feels one."""
+        links = {name: T[0] for name, T in drawing.middle.items()}
+        clear = [T for T in scenes.targets if drawing.gaps(T, drawing.middle, room)[0] >= GAP][:MEASURED]
+        meshes = {f"{robot}/{link}": mesh for robot, model in self._models.items() for link, mesh in model.meshes.items()}
+        middle = Scenes(np.array(clear), {name: np.tile(T, (len(clear), 1, 1)) for name, T in links.items()})
+        if not clear or not any(pad.backed for pad in pads):
+            return None
+        gaps, before = meeting(drawing, middle, pads)
+        felt, shares = before & (gaps < self._kind.range), []
+        for k in track([k for k, pad in enumerate(pads) if pad.backed and felt[:, k].any()], "what other links take"):
+            own = behind(meshes[pads[k].link], pads[k].T_link_pad)
+            T = rigid.inverse(links[pads[k].link] @ pads[k].T_link_pad) @ middle.targets[felt[:, k]]
+            alone, among = (self.shading.ratio(each, T) for each in (own, own + beside(meshes, links, pads[k])))
+            shares.append(1.0 - np.exp(among - alone))
+        return float(np.median(np.concatenate(shares))) if shares else None
+
+    @cached_property
+    def shading(self) -> Shading:
+        return Shading(self._cell, self._kind, self._target, self._bare, self.size)
+
     def _before_link(self, pad: cells.Pad, scenes: Scenes, gaps: Array, before: NDArray[np.bool_]) -> Network:
-        if self._shading is None:
-            self._shading = Shading(self._cell, self._kind, self._target, self._bare, self.size)
         robot, _, link = pad.link.partition("/")
         felt = np.flatnonzero(before & (gaps < RANGES * self._kind.range))
         if not len(felt):
             return self._bare  # nothing of it counts: see `Sensing.information`
         T_pad_world = np.stack([rigid.inverse(T @ pad.T_link_pad) for T in scenes.links[pad.link][felt]])
         backing = behind(self._models[robot].meshes[link], pad.T_link_pad)
-        return self._shading.network(backing, T_pad_world @ scenes.targets[felt], gaps[felt])
+        return self.shading.network(backing, T_pad_world @ scenes.targets[felt], gaps[felt])
 
 
 def _name(place: int) -> str:

@@ -11,9 +11,11 @@ On the eight places of the cell `arm` it has the signals of the fitted models wi
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from penumbra.shared.body.anatomy import Mesh, target_mesh
 from penumbra.shared.cell import description as cells
@@ -24,6 +26,10 @@ from penumbra.sim.skin.field import Body, PadField, Panels, limb, shell
 
 LIMB_PANELS = (14, 8)
 """Rows and columns of panels of the limb. Both of the signals in a ratio have the same ones."""
+LINK_PANELS = (6, 6)
+"""Rows and columns of panels of a link that is not behind the pad."""
+JOINED = 0.005
+"""Least distance [m] of such panels from the link behind the pad."""
 POSES = 48
 """Largest number of poses at which the ratio is computed: those nearest to the pad."""
 RIDGE = 0.3
@@ -76,6 +82,21 @@ class Shading:
 def behind(mesh: Mesh, T_link_pad: Array) -> Panels:
     """The panels of a link in the frame of a pad on it."""
     return shell(rigid.apply(rigid.inverse(T_link_pad), mesh.vertices))
+
+
+def beside(meshes: Mapping[str, Mesh], links: Mapping[str, Array], pad: cells.Pad) -> Panels:
+    """The panels of all other links, by ROBOT/LINK at T_world_link (4, 4), in the frame of a pad on one of them; without those in
+    this link, or joined to it."""
+    T_pad_world = rigid.inverse(links[pad.link] @ pad.T_link_pad)
+    own = ConvexHull(rigid.apply(T_pad_world @ links[pad.link], meshes[pad.link].vertices))
+    others = [
+        rigid.apply(T_pad_world @ links[name], shell(mesh.vertices, *LINK_PANELS).corners)
+        for name, mesh in meshes.items()
+        if name != pad.link
+    ]
+    panels = Panels(np.concatenate(others))
+    away = (panels.centroids @ own.equations[:, :3].T + own.equations[:, 3]).max(axis=1) > JOINED
+    return Panels(panels.corners[away])
 
 
 def _change(body: Body, T_pad_body: Array, at: Array, charges: Array) -> Array:
