@@ -99,7 +99,9 @@ def footprint(mesh: Mesh, T_link_pad: Array, board: cells.Board) -> Array:
     """Heights (GRID * GRID,) [m] over the pad's plane of the link's outermost surface behind a board, of what is at most 5 cm
     above that plane; minus infinity where there is none."""
     corners = rigid.apply(rigid.inverse(T_link_pad), mesh.vertices)[mesh.faces]
-    return _heights(corners, _grid(board))
+    half = 0.5 * np.asarray(board.size)
+    near = ((corners[..., :2].min(axis=1) <= half) & (corners[..., :2].max(axis=1) >= -half)).all(axis=1)
+    return _heights(corners[near], _grid(board))
 
 
 def _grid(board: cells.Board) -> Array:

@@ -79,7 +79,7 @@ class Placing:
         self.kind = self._kind()
         self.board = cell.pad_types[self.kind].board
         self.reach = wish.reach or cell.pad_types[self.kind].range
-        self.plane = candidates.plane_of(cell, self.reach)
+        self.plane = candidates.plane_of(cell, self.reach) if "world" in self.links else None
         if "world" in self.links and self.plane is None:
             raise cells.CellError(
                 "--links: expected a pad on the world, in whose plane others may lie, got none; add a first one to the cell file"
