@@ -154,7 +154,8 @@ def _signals(placing: Placing, sensing: Sensing, scenes: Scenes, seed: int) -> S
     out = []
     for k in progress.track(range(len(scenes)), "limbs"):
         size = np.log([own.length, own.girth]) + sensing.size + spread * rng.standard_normal(2)
-        body = limb(mesh, *np.exp(size), *LIMB_PANELS)
+        length, girth = np.exp(size)
+        body = limb(mesh, float(length), float(girth), *LIMB_PANELS)
         change = np.zeros(len(sensing.skin))
         for p, T_pad in enumerate(scenes.pads(sensing.pads)[k]):
             if felt[k, p]:

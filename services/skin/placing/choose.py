@@ -62,9 +62,9 @@ class Choice:
 
     def _free(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
         """Which candidates (c,) can be added."""
-        free = ~self._overlaps[:, list(chosen)].any(axis=1)
+        free = np.asarray(~self._overlaps[:, list(chosen)].any(axis=1))
         free[list(chosen)] = False
-        return np.asarray(free)
+        return free
 
     def _costs(self, chosen: Sequence[int], free: NDArray[np.bool_]) -> Array:
         """The cost (c,) with one more candidate; infinite for one that is not free."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -90,8 +91,8 @@ class Placing:
     @property
     def present(self) -> dict[str, cells.Pad]:
         """The pads of the cell file, as designed: what they would be like anywhere."""
-        keep = {"calibration": {}, "boards": ()}
-        return {name: pad.model_copy(update=keep) for name, pad in self.cell.pads.items() if pad.type == self.kind}
+        designed: dict[str, Any] = {"calibration": {}, "boards": ()}
+        return {name: pad.model_copy(update=designed) for name, pad in self.cell.pads.items() if pad.type == self.kind}
 
     @property
     def number(self) -> int:

@@ -47,12 +47,12 @@ class Slice:
 
 def write(path: Path, placing: Placing, layouts: Mapping[str, Sensing]) -> None:
     """Maps of these layouts beside one another, as PNG. Raises OSError."""
-    figure = Figure(figsize=(4.6 * len(layouts) + 1.2, 8.2), layout="constrained")
+    figure = Figure(figsize=(4.6 * len(layouts) + 1.2, 7.4), layout="constrained")
     grid = figure.subplots(2, len(layouts), squeeze=False)
-    picture = None
+    picture, bounds = None, _bounds(placing, layouts)
     for column, (title, sensing) in enumerate(layouts.items()):
         for row, across in enumerate((2, 0)):
-            cut, axes = slice_of(placing, sensing, across), grid[row, column]
+            cut, axes = slice_of(placing, sensing, across, bounds), grid[row, column]
             picture = axes.imshow(
                 100.0 * cut.errors,
                 origin="lower",
@@ -75,13 +75,20 @@ def write(path: Path, placing: Placing, layouts: Mapping[str, Sensing]) -> None:
     figure.savefig(path, dpi=130)
 
 
-def slice_of(placing: Placing, sensing: Sensing, across: int) -> Slice:
-    """The map of a layout across an axis of the world, through the middle of the workspace: the limb lies as at home, robots are
-    in the middle of their joints' bounds."""
-    positions = placing.fresh.targets[:, :3, 3]
-    low, high = np.percentile(positions, [2.0, 98.0], axis=0)
-    low, high = low - MARGIN, high + MARGIN
-    at = float(np.median(positions[:, across]))
+def _bounds(placing: Placing, layouts: Mapping[str, Sensing]) -> Array:
+    """Corners (2, 3) [m] in the world of what maps show: the workspace, and the pads."""
+    low, high = np.percentile(placing.fresh.targets[:, :3, 3], [2.0, 98.0], axis=0)
+    middle = placing.drawing.middle
+    pads = np.array([(middle[pad.link][0] @ pad.T_link_pad)[:3, 3] for each in layouts.values() for pad in each.pads])
+    edge = 0.6 * max(placing.board.size)
+    return np.stack([np.minimum(low - MARGIN, pads.min(axis=0) - edge), np.maximum(high + MARGIN, pads.max(axis=0) + edge)])
+
+
+def slice_of(placing: Placing, sensing: Sensing, across: int, bounds: Array) -> Slice:
+    """The map of a layout across an axis of the world, through the middle of the workspace, within bounds (2, 3) [m]: the limb
+    lies as at home, robots are in the middle of their joints' bounds."""
+    low, high = bounds
+    at = float(np.median(placing.fresh.targets[:, across, 3]))
     right, up = (axis for axis in range(3) if axis != across)
     side = max(high[right] - low[right], high[up] - low[up]) / CELLS
     columns, rows = (low[axis] + side * (np.arange(round((high[axis] - low[axis]) / side)) + 0.5) for axis in (right, up))

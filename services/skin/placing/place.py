@@ -197,7 +197,7 @@ def _show(
         table.add_row(name, str(_count(placing, name, named)), *_cells(summary(each)))
     table.add_section()
     for step in steps:
-        more = "best of so many" if step.pads < len(named) else "with more" if step.pads > len(named) else "proposed"
+        more = "with fewer" if step.pads < len(named) else "with more" if step.pads > len(named) else "proposed"
         if more != "proposed":
             table.add_row(more, str(step.pads), *_cells(step.summary()))
     console.print(table)

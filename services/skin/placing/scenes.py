@@ -17,8 +17,9 @@ from penumbra.shared.skin.layout import HOME_SIGMAS, link_names
 
 GAP = 0.01
 """No limb is nearer [m] to a link or to the pads' plane."""
-TRIES = 300
-"""Poses drawn for each one that is wanted, before a workspace is called too small."""
+BATCH, BATCHES = 300, 100
+"""Number of poses drawn at once, and how often. A workspace with no free pose in the first batch, or with too few in all, is
+called too small."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class Drawing:
 
     def postures(self, rng: np.random.Generator, count: int) -> Array:
         """Joint angles (count, j), uniform within their bounds."""
-        return rng.uniform(*self._joints, (count, self._joints.shape[1]))
+        low, high = self._joints
+        return rng.uniform(low, high, (count, len(low)))
 
     @property
     def middle(self) -> dict[str, Array]:
@@ -108,10 +110,10 @@ class Drawing:
         rng = np.random.default_rng([seed, 51])
         poses: list[Array] = []
         postures: list[Array] = []
-        for _ in range(TRIES):
-            joints = self.postures(rng, count)
+        for _ in range(BATCHES):
+            joints = self.postures(rng, BATCH)
             links = self.links(joints)
-            for k in range(count):
+            for k in range(BATCH):
                 T = self.pose(rng)
                 clear, away = self.gaps(T, links, room, k)
                 if clear >= GAP and away <= room.reach:

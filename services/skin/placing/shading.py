@@ -50,7 +50,7 @@ class Shading:
         self._size = np.log([own.length, own.girth]) + size
         mesh = target_mesh(cell.targets[target].model_copy(update={"size": None}), cell)
         self._bare, self._field = bare, PadField(kind)
-        self._limb = limb(mesh, *np.exp(self._size), *LIMB_PANELS)
+        self._limb = _body(mesh, self._size)
         self._sources = self._field.sources()
 
     def network(self, backing: Panels, T_pad_limb: Array, gaps: Array) -> Network:
@@ -77,6 +77,12 @@ class Shading:
         changes = [[_change(self._limb, T, *sources) for sources in (link, self._sources)] for T in T_pad_limb]
         with_link, without = np.moveaxis(np.array(changes), 1, 0)
         return np.asarray(np.log(np.maximum(with_link, LEAST * without) / without))
+
+
+def _body(mesh: Mesh, size: Array) -> Body:
+    """A limb of this size (2,), in LIMB_PANELS."""
+    length, girth = np.exp(size)
+    return limb(mesh, float(length), float(girth), *LIMB_PANELS)
 
 
 def behind(mesh: Mesh, T_link_pad: Array) -> Panels:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.table import Table
 
 from penumbra.services.skin.placing.layout import Placing, Wish
 from penumbra.shared.cell import description as cells
@@ -39,5 +40,4 @@ def test_the_benchmark_compares_errors_with_the_bound_for_each_layout(tmp_path) 
     home, track = result["rows"][:2]
     assert track["expected_cm"] < min(home["expected_cm"], 100.0 * np.sqrt(3.0) * bench.TRACKING[0])
     assert all(0.3 < row["median_ratio"] < 3.0 for row in result["rows"])
-    proposed, reached = bench.tables(result)
-    assert proposed.row_count == 2 and reached.row_count == 4
+    assert [part.row_count for part in bench.tables(result) if isinstance(part, Table)] == [2, 4]
