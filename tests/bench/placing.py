@@ -70,7 +70,7 @@ def tables(result: Result) -> list[Part]:
     __doc__ or "",
     tables,
     flags.Option("--cell", multiple=True, default=("table", "arm"), metavar="CELL", help="a cell; may be repeated"),
-    flags.Option("--scenes", type=flags.positive, default=24, metavar="N", help="limbs before each layout"),
+    flags.Option("--scenes", type=flags.positive, default=60, metavar="N", help="limbs before each layout"),
     flags.Option("--seed", type=int, default=5103, help="of the proposal and of the limbs"),
     example="penumbra bench placing --cell table --json placing.json",
 )
