@@ -29,8 +29,8 @@ LEFT_OUT = (
 
 @flags.command(
     "skin place",
-    "Proposes places for pads by what they could tell about the target's pose at most (the Cramér-Rao bound of the field model "
-    "with its noise, of one window of voltages), beside the present ones.",
+    "Proposes places for pads by what they could tell about the target's position at most (the Cramér-Rao bound of the field "
+    "model with its noise, of one window of voltages), and compares them with the present ones.",
     flags.CELL,
     flags.Option("--target", show_default="the cell's first", help="the limb"),
     flags.Option(
@@ -54,7 +54,7 @@ LEFT_OUT = (
         type=flags.above_zero,
         metavar="M",
         show_default="that of the pads",
-        help="largest gap from the limb to a possible place; a limb farther away is none to be felt",
+        help="largest gap from the limb to the nearest possible place: limbs farther away do not count",
     ),
     flags.Option(
         "--joints",
