@@ -69,7 +69,9 @@ def write(path: Path, placing: Placing, layouts: Mapping[str, Sensing]) -> None:
             axes.set_xlim(*(100.0 * side for side in cut.extent[:2]))
             axes.set_ylim(*(100.0 * side for side in cut.extent[2:]))
     if picture is not None:
-        bar = figure.colorbar(picture, ax=grid, label="expected error of the position, cm (line: 2 cm)", shrink=0.7)
+        bar = figure.colorbar(
+            picture, ax=grid, label="expected error of the position, cm (line: 2 cm; white: the limb would touch)", shrink=0.8
+        )
         ticks = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20]
         bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     figure.savefig(path, dpi=130)

@@ -87,7 +87,6 @@ def _place(options: flags.Options) -> None:
         raise cells.CellError(f"--out: expected a file that ends in .png, got {options.out}; give another name")
     placing = Placing(cell, _wish(options))
     if options.write is not None:
-        edit.destination(options.cell, options.write)
         _refuse_fewer(cell, placing.number)
     proposed, steps = placing.choose()
     layouts = {"proposed": proposed}
