@@ -64,6 +64,21 @@ def without_sim(text: str) -> str:
 
 ARM = (cells.BUILT_IN / "arm.yaml").read_text()
 BARE = without_sim(TABLE[: TABLE.index("pads:  ")] + TABLE[TABLE.index("targets:") :])
+JOINTS = ["--joints", "0", "-0.1", "0", "-2", "0", "1.9", "0.8"]
+
+
+def test_a_robot_without_pads_gets_some_on_its_links_at_the_joints_that_are_given(few, tmp_path, capsys) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(without_sim(ARM[: ARM.index("pads:  ")] + ARM[ARM.index("targets:") :]))
+    assert main(["--cell", str(mine), "--links", "panda_link5", "panda_hand", "--number", "2", *JOINTS, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert "present" not in found and found["links"] == ["panda/panda_link5", "panda/panda_hand"]
+    assert len(found["pads"]) == 2 and all(pad["backed"] and pad["link"] in found["links"] for pad in found["pads"].values())
+    assert 0.0 < found["proposed"]["taken_by_other_links"] < 0.9
+    by_number = {step["pads"]: step["mean_cm"] for step in found["steps"]}
+    assert by_number[2] < by_number[1]
+
+
 WRONG = {
     "no robot and no pads": (BARE, [], "expected a robot or a pad, got neither; add a robot"),
     "unknown link": (ARM, ["--links", "panda_link55"], "--links: expected world or one of panda/panda_link0"),
