@@ -19,9 +19,15 @@ def test_the_floors_import_only_downwards_and_services_do_not_know_each_other():
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-LEARNING = {"haptics/train.py", "skin/model.py", "skin/calibration/characterise.py", "command/check.py"}
-"""Commands that use the simulated world outside a folder `training`; without a real pad, one is characterised in it, and what the
-emulator could not start with is found by its own code."""
+LEARNING = {
+    "haptics/train.py",
+    "skin/model.py",
+    "skin/calibration/characterise.py",
+    "skin/placing/shading.py",
+    "command/check.py",
+}
+"""Commands that use the simulated world outside a folder `training`; without a real pad, one is characterised in it, what the
+emulator could not start with is found by its own code, and a link's shading is computed from its field."""
 
 
 def test_only_the_emulator_and_what_learns_know_the_simulated_world():

@@ -11,14 +11,8 @@ from numpy.typing import NDArray
 
 from penumbra.services.haptics.solve import marginal
 from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.skin.response import SIZE, SIZE_MEASURED, SIZE_SPREAD
 
-SIZE = np.array([0.0, -0.08])
-"""Log length and log girth of an average limb, relative to the target's mesh."""
-SIZE_SPREAD = np.array([0.06, 0.11])
-"""Standard deviations of log length and log girth between people: the 5th percentile woman to the 95th man (ANSUR II) lie at log
-girths of -0.27 to 0.11."""
-SIZE_MEASURED = np.array([0.015, 0.03])
-"""The same standard deviations for a person whose size the cell file states, around the stated size."""
 SIZE_GAP = 0.06
 """Largest gap [m] at which the size is learnt. Farther away the size is only considered (see above)."""
 SIZE_MEMORY_S = 20.0

@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 from penumbra.services import flags
 from penumbra.services.haptics.estimator import Estimator
 from penumbra.services.haptics.paper_network import PoseNetwork, Regression, Relative, features, fingerprint
-from penumbra.services.haptics.size_and_rest import SIZE, SIZE_SPREAD
 from penumbra.shared import training
 from penumbra.shared.body.anatomy import target_mesh
 from penumbra.shared.body.robot import robot_models
@@ -33,7 +32,7 @@ from penumbra.shared.geometry.rigid import Array, from_rpy, pose_error
 from penumbra.shared.geometry.surface import Surface, nearest_points
 from penumbra.shared.native import kernel
 from penumbra.shared.skin.layout import Skin, link_names
-from penumbra.shared.skin.response import Response
+from penumbra.shared.skin.response import SIZE, SIZE_SPREAD, Response
 
 WEIGHTS = Path(__file__).parent / "weights"
 VALIDATION_SEED, REGRESSION_SEED = 1_000_000, 2_000_000

@@ -26,8 +26,9 @@ def destination(cell: str | Path, out: Path | None) -> Path:
 
 def with_values(path: Path, place: Sequence[str], values: Mapping[str, str], instead: Mapping[str, str] | None = None) -> str:
     """The text of a cell file in which the map at a place has these values, each given as YAML. A key that is there gets its new
-    value where it stands; a new one follows the key that comes before it in `values`. instead: by a new key, the one whose place
-    it takes. Raises CellError where the file is no YAML, has no such map, or has it by an alias."""
+    value where it stands, and comments within the old one are lost; a new key follows the one that comes before it in `values`.
+    instead: by a new key, the one whose place it takes. Raises CellError where the file is no YAML, has no such map, or has it by
+    an alias."""
     found, text = document.read(path), path.read_text()
     for key, value in values.items():
         at = list(values).index(key)
@@ -97,6 +98,14 @@ def _refuse_alias(found: Document, place: Sequence[str], key: yaml.Node, value: 
         raise CellError(str(found.fault(list(place), f"expected the value of {key.value} itself, got an alias; write it out")))
 
 
+def _end(node: yaml.Node) -> int:
+    """Where a value's text ends. YAML lets a block end where the next key begins, after comments that are not its own."""
+    if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+        last = node.value[-1]
+        return _end(last[1] if isinstance(node, yaml.MappingNode) else last)
+    return int(node.end_mark.index)
+
+
 def _changed(found: Document, text: str, place: Sequence[str], key: str, value: str, before: str, instead: str) -> str:
     """The text with one value more, or another one."""
     node = _map(found, place)
@@ -105,7 +114,7 @@ def _changed(found: Document, text: str, place: Sequence[str], key: str, value: 
     if old in pairs:
         name, each = pairs[old]
         _refuse_alias(found, place, name, each)
-        start, end = name.start_mark.index, each.end_mark.index
+        start, end = name.start_mark.index, _end(each)
         between = text[name.end_mark.index : each.start_mark.index]
         return f"{text[:start]}{key}{between}{value}{text[end:]}"
     if before not in pairs:
@@ -116,6 +125,6 @@ def _changed(found: Document, text: str, place: Sequence[str], key: str, value: 
     _refuse_alias(found, place, name, each)
     if node.flow_style:
         return f"{text[: each.end_mark.index]}, {key}: {value}{text[each.end_mark.index :]}"
-    line_end = text.find("\n", each.end_mark.index)
+    line_end = text.find("\n", _end(each))
     line_end = len(text) if line_end < 0 else line_end
     return f"{text[:line_end]}\n{' ' * name.start_mark.column}{key}: {value}{text[line_end:]}"

@@ -230,6 +230,7 @@ PROCESSES = (
                 "penumbra.services.skin.calibration.characterise:main",
                 extra="skin,emulator",
             ),
+            Tool("place", "where pads should sit, and how many", "penumbra.services.skin.placing.place:main", extra="skin"),
             Tool("model", "fit the field model of a cell's pads", "penumbra.services.skin.model:main", extra="train"),
         ),
         in_compose=False,

@@ -15,6 +15,7 @@ import functools
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,13 @@ class Rest:
         return np.concatenate([np.ones((*z.shape[:-1], 1)), z, z[..., i] * z[..., k]], axis=-1)
 
 
+SIZE = np.array([0.0, -0.08])
+"""Log length and log girth of an average limb, relative to the target's mesh."""
+SIZE_SPREAD = np.array([0.06, 0.11])
+"""Standard deviations of log length and log girth between people: the 5th percentile woman to the 95th man (ANSUR II) lie at log
+girths of -0.27 to 0.11."""
+SIZE_MEASURED = np.array([0.015, 0.03])
+"""The same standard deviations for a person whose size the cell file states, around the stated size."""
 REST = ("coefficients", "middle", "half")
 """The fields of `Rest`."""
 
@@ -124,11 +132,12 @@ class Response:
     `shared.skin.layout.Skin`. size (2,): logs of the target's own length and girth, beside the mesh's. error (n,): standard
     deviation of what the networks get wrong, as a share of the change.
 
-    Raises CellError where a pad's mounting has no network, or pads differ in their number of electrodes.
+    known: networks by fingerprint, those of `networks` unless given. Raises CellError where a pad's mounting has no network, or
+    pads differ in their number of electrodes.
     """
 
-    def __init__(self, cell: cells.Cell, target: str):
-        known = networks(cell)
+    def __init__(self, cell: cells.Cell, target: str, known: Mapping[str, Network] | None = None):
+        known = networks(cell) if known is None else known
         prints = [fingerprint(cell, pad, target) for pad in cell.pads]
         missing = [pad for pad, own in zip(cell.pads, prints, strict=True) if own not in known]
         if missing:

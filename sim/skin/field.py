@@ -173,12 +173,12 @@ class PadField:
     """
 
     def __init__(self, kind: PadType, backing: Panels | None = None):
+        self._kind = kind
         self.panels, owner = _board(kind)
         if backing is not None:
-            half = np.append(np.array(kind.board.size) / 2.0 + CLEAR, np.inf)
-            covered = (np.abs(backing.centroids) < half).all(axis=1) & (backing.centroids[:, 2] > -kind.board.thickness - CLEAR)
-            self.panels = self.panels + Panels(backing.corners[~covered])
-            owner = np.concatenate([owner, np.full((~covered).sum(), GROUND)])
+            backing = self._outside(backing)
+            self.panels = self.panels + backing
+            owner = np.concatenate([owner, np.full(len(backing), GROUND)])
         bare = owner == BARE
         system, field = self.panels.matrices()
         eps = kind.board.permittivity
@@ -208,6 +208,26 @@ class PadField:
         at_body, _, at_pad = self._coupling(panels.points(), panels.normals, np.sqrt(panels.areas))
         system = panels.matrices()[0] - at_body @ (self._inverse @ at_pad)
         return self._lost(at_body, -np.linalg.solve(system, at_body @ self._unit[:, 0]))
+
+    def sources(self, beside: Panels | None = None) -> tuple[Array, Array]:
+        """Points (s, 3) and their charges (s, 1 + e), with the ring or one of the electrodes at one volt, which have the pad's
+        field from a centimetre on. beside: grounded panels in the pad's frame, as a link behind it; what is in the place of the
+        board is left out."""
+        if beside is None:
+            return self.panels.centroids, self._unit
+        beside = self._outside(beside)
+        at_body, _, at_pad = self._coupling(beside.points(), beside.normals, np.sqrt(beside.areas))
+        acts_back = self._inverse @ at_pad
+        charges = -np.linalg.solve(beside.matrices()[0] - at_body @ acts_back, at_body @ self._unit)
+        return np.concatenate([self.panels.centroids, beside.centroids]), np.concatenate(
+            [self._unit - acts_back @ charges, charges]
+        )
+
+    def _outside(self, backing: Panels) -> Panels:
+        """Without the panels in the place of the board."""
+        half = np.append(np.array(self._kind.board.size) / 2.0 + CLEAR, np.inf)
+        behind = backing.centroids[:, 2] > -self._kind.board.thickness - CLEAR
+        return Panels(backing.corners[~((np.abs(backing.centroids) < half).all(axis=1) & behind)])
 
     def _coupling(self, points: Array, normals: Array, size: Array) -> tuple[Array, Array, Array]:
         """Between a body's panels (points (n, 9, 3), normals (n, 3) and sizes (n,) in the pad's frame) and the pad's: potential

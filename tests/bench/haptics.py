@@ -32,7 +32,6 @@ from penumbra.services.haptics import paper_network
 from penumbra.services.haptics.batches import Collector
 from penumbra.services.haptics.estimator import Estimator
 from penumbra.services.haptics.service import WEIGHTS
-from penumbra.services.haptics.size_and_rest import SIZE_SPREAD
 from penumbra.services.skin.model import links, mountings
 from penumbra.shared.body.anatomy import target_mesh
 from penumbra.shared.body.robot import robot_models
@@ -40,8 +39,9 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
+from penumbra.shared.skin import bound
 from penumbra.shared.skin.layout import Skin, link_names
-from penumbra.shared.skin.response import Response, fingerprint
+from penumbra.shared.skin.response import SIZE_SPREAD, Response, fingerprint
 from penumbra.sim.skin import field
 from penumbra.tests.bench.lib import results, things
 from penumbra.tests.bench.lib.results import Part, Result, marked
@@ -179,12 +179,7 @@ class Rig:
     def information(self, signal: Array, T: Array, size: Array) -> Array:
         """Fisher information (8, 8) of a window with these true signals (n,) about pose and size, by the response's
         derivatives."""
-        R = self.pads[:, :3, :3]
-        _, jacobian = self.response.logs(np.stack([rigid.inverse(pad) @ T for pad in self.pads]), size)
-        turned = jacobian.copy()
-        for part in (slice(0, 3), slice(3, 6)):
-            turned[:, part] = np.einsum("nij,nj->ni", R[self.skin.pad_of], jacobian[:, part])
-        J = signal[:, None] * turned
+        J = signal[:, None] * bound.logs(self.skin, self.response, self.pads, T, size)[1]
         return np.asarray(J.T @ (J / (self.skin.noise / SAMPLES)[:, None]))
 
 

@@ -110,3 +110,15 @@ def test_a_built_in_cell_needs_another_place(tmp_path, own_cell):
         edit.destination("table", None)
     assert edit.destination("table", tmp_path / "x.yaml") == tmp_path / "x.yaml"
     assert edit.destination(str(own_cell), None) == own_cell
+
+
+def test_a_value_in_a_block_is_replaced_up_to_its_end_and_what_follows_stays(own_cell):
+    values = {"forearm": '{mesh: "body:forearm", labels: [hand], home: {}}', "other": "{mesh: m.stl, labels: [hand], home: {}}"}
+    block = '  forearm:    # mine\n    mesh: "body:forearm"\n    labels:\n      - hand\n    home:\n'
+    block += "      position: [0, 0, 1]  # high\n"
+    own_cell.write_text(CELL[: CELL.index("  forearm: {")] + block + "\n# of the emulator\nsim: null\n")
+    text = edit.with_values(own_cell, ("targets",), values)
+    expected = (
+        f"  forearm:    # mine\n    {values['forearm']}  # high\n  other: {values['other']}\n\n# of the emulator\nsim: null\n"
+    )
+    assert text[text.index("  forearm:") :] == expected

@@ -16,14 +16,14 @@ from penumbra.services.haptics import train
 from penumbra.services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
 from penumbra.services.haptics.paper_nearest import nearest_points
 from penumbra.services.haptics.paper_network import Relative
-from penumbra.services.haptics.size_and_rest import SIZE, SIZE_SPREAD, Size, Tare
+from penumbra.services.haptics.size_and_rest import Size, Tare
 from penumbra.services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, Prior, Reading, Solver, marginal, peak
 from penumbra.shared.body.anatomy import target_mesh
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
-from penumbra.shared.skin.response import Response
+from penumbra.shared.skin.response import SIZE, SIZE_SPREAD, Response
 from penumbra.sim.skin import field
 
 MS = 1_000_000
