@@ -2,7 +2,8 @@
 
 1. The observer's filter runs over all measurements in the order of their stamps, with its gates: which are used, and where it
    began anew. What lies between two beginnings is a segment; nothing is carried over from one to the next.
-2. The filter runs over the used measurements of each segment, without gates.
+2. The filter runs over the used measurements of each segment, without gates: forwards and backwards in time, which shows how
+   unsteady the limb is at each moment, and then forwards with the mean of both.
 3. A fixed-interval smoother goes back over the states of the filter: pose, velocities, and the biases of the senses.
 4. Every measurement is judged by the smoothed state, its own part in it taken out: one that was used and does not agree is left
    out, one that was refused and agrees is used. Where that changes something, it goes on with 2, at most PASSES times.
@@ -27,24 +28,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.fusion import history
+from penumbra.services.fusion import history, transitions
 from penumbra.services.fusion.estimate import ACCEPTED, GATED, NO_CLOCK, Array, Estimate, Limits, Log, shaped
 from penumbra.services.fusion.records import MEASUREMENT, MODEL, MOTION, POSE, SENSE_STATE, STATE, History, size
 from penumbra.services.fusion.settings import FusionSettings, Subject, model, sense_models
-from penumbra.services.fusion.transitions import linearise, transitions
 from penumbra.shared.contract.senses import SENSES, Sense
 from penumbra.shared.geometry import rigid, so3
 
 PASSES = 4
-"""Largest number of passes over the measurements. Chosen: what changes in later ones is a measurement or two."""
+"""Largest number of times that 2 and 3 are done. Chosen: what changes in later ones is a measurement or two."""
 FOREVER_S = 1e9
 """A horizon [s] beyond all recordings."""
 BLOCK = 256
 """Number of states that are taken on at a time: it bounds the memory for their transitions."""
+LEAST = 1e-3
+"""Least factor on the process noise, where its part of the speed alone is more than there should be. Chosen, not measured."""
 OWN = 0.01
 """Share of a measurement's white noise below which what is left of it says nothing: nothing else measured that direction. Chosen,
 not measured."""
-Indices, Flags = NDArray[np.int64], NDArray[np.bool_]
+Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
 class NothingMeasuredError(ValueError):
@@ -53,7 +56,7 @@ class NothingMeasuredError(ValueError):
 
 @dataclass(frozen=True)
 class States:
-    """States of the filter at k stamps: now (k,) STATE, senses (k, n) SENSE_STATE, P (k, size, size) covariances of all errors."""
+    """States of the filter: now (k,) STATE, senses (k, n) SENSE_STATE, P (k, size, size) covariances of all errors."""
 
     now: NDArray[np.void]
     senses: NDArray[np.void]
@@ -120,7 +123,7 @@ class Filter:
         if not is_gated:
             self.senses["threshold"] = np.inf
 
-    def run(self, taken: Taken) -> tuple[NDArray[np.void], States, Indices]:
+    def known(self, taken: Taken) -> tuple[NDArray[np.void], States, Indices]:
         """The measurements that it knows (k,), the states after them, and the fates of all (m,), of FATES."""
         count, n = len(taken), len(self.senses)
         memory = History.empty(1, count + 1, n)
@@ -134,29 +137,61 @@ class Filter:
         states = States(memory.states[0, known], memory.senses[0, known], memory.P[0, known])
         return memory.measurements[0, known], states, fates
 
+    def run(self, measurements: NDArray[np.void], agility: Array) -> States:
+        """The states after measurements (k,), with the agilities (k, 2) of the motion to each: see `transitions.run`."""
+        k, n = len(measurements) + 1, len(self.senses)
+        states = States(np.zeros(k, STATE), np.zeros((k, n), SENSE_STATE), np.zeros((k, size(n), size(n))))
+        transitions.run(
+            self.one, self.senses, measurements, agility, states.now, states.senses, states.P, np.empty((size(n), POSE))
+        )
+        return states.of(slice(1, None))
+
+    def unsteadiness(self, states: States, dt: Array) -> Array:
+        """The part of the densities (k, 2) of the white acceleration that is of the speeds of states (k,), in the mean over the
+        time dt (k,) [s] that follows: see `filter.move`."""
+        one = self.one[0]
+        fading = -0.5 * one["velocity_time"] * np.expm1(-2.0 * dt / one["velocity_time"]) / np.maximum(dt, 1e-9)
+        squares = np.sum(states.now["velocity"].reshape(-1, 2, 3) ** 2, axis=2)
+        out: Array = one["unsteadiness"] * fading[:, None] * squares
+        return out
+
+    def agility(self, measurements: NDArray[np.void]) -> Array:
+        """Agilities (k, 2) of the motion to each measurement (k,) with which it is as unsteady as the filter finds it in the mean
+        of both directions of time. Forwards it learns late that a limb sets out, backwards that it stops."""
+        learned, back = np.zeros((len(measurements), 2)), measurements[::-1].copy()
+        back["stamp_ns"] = measurements["stamp_ns"][0] + measurements["stamp_ns"][-1] - back["stamp_ns"]
+        dt = np.diff(measurements["stamp_ns"]) * 1e-9
+        before = self.run(measurements, learned).of(slice(None, -1))
+        after = self.run(back, learned).of(slice(None, -1)).of(slice(None, None, -1))
+        mine, theirs = self.unsteadiness(before, dt), self.unsteadiness(after, dt)
+        density = self.one["acceleration"]
+        mean = 0.5 * (density * (before.now["agility"] + after.now["agility"]) + mine + theirs)
+        learned[1:] = np.maximum((mean - mine) / density, LEAST)
+        return learned
+
     def moved(self, states: States, stamps_ns: Indices) -> tuple[States, Array, Array]:
-        """States (k,) at later stamps (k,), with F and Q (k, size, size): see `transitions`."""
+        """States (k,) at later stamps (k,), with F and Q (k, size, size): see `transitions.transit`."""
         later = States(np.empty_like(states.now), np.empty_like(states.senses), np.empty_like(states.P))
         F, Q = np.empty_like(states.P), np.empty_like(states.P)
-        transitions(self.one, self.senses, states.now, states.senses, stamps_ns, later.now, later.senses, F, Q)
+        transitions.transit(self.one, self.senses, states.now, states.senses, stamps_ns, later.now, later.senses, F, Q)
         later.P[:] = F @ states.P @ F.transpose(0, 2, 1) + Q
         return later, F, Q
 
     def linearised(self, measurements: NDArray[np.void], states: States) -> tuple[Array, Array, Array]:
-        """See `linearise`: z (k, 6), H (k, 6, 12) and white (k, 6)."""
+        """See `transitions.linearise`: z (k, 6), H (k, 6, 12) and white (k, 6)."""
         k = len(measurements)
         z, H, white = np.empty((k, POSE)), np.empty((k, POSE, 2 * POSE)), np.empty((k, POSE))
-        linearise(self.one, self.senses, measurements, states.now, states.senses, z, H, white)
+        transitions.linearise(self.one, self.senses, measurements, states.now, states.senses, z, H, white)
         return z, H, white
 
 
 class Segment:
     """What lies between two beginnings: the states after each measurement that is used (k,), by those up to it, and by all."""
 
-    def __init__(self, filter: Filter, taken: Taken):
+    def __init__(self, filter: Filter, measurements: NDArray[np.void]):
         self._filter = filter
-        self.measurements, self._filtered, _ = filter.run(taken)
-        self.stamps_ns = self._filtered.now["stamp_ns"].copy()
+        self._filtered = filter.run(measurements, filter.agility(measurements))
+        self.stamps_ns = measurements["stamp_ns"].copy()
         self.smoothed = self._filtered.copy()
         count = len(self.stamps_ns)
         for end in range(count - 1, 0, -BLOCK):  # backwards, a block of transitions at a time
@@ -258,14 +293,14 @@ class Smoother:
 
     def trajectory(self) -> Trajectory:
         """The trajectory, from the measurements so far. Raises NothingMeasuredError where none of them can be used."""
-        taken, measurements, parts, first_used = self._gated()
+        measurements, parts, first_used = self._gated()
         used = first_used
         open_filter = Filter(self._subject, self._settings, self._senses, is_gated=False)
         for left in range(PASSES - 1, -1, -1):
             segments, revised = [], used.copy()
             for mine in parts:
                 if used[mine].any():
-                    segments.append(Segment(open_filter, taken.of(mine[used[mine]])))
+                    segments.append(Segment(open_filter, measurements[mine[used[mine]]]))
                     revised[mine] = self._judged(segments[-1], measurements[mine], used[mine])
             if not left or (revised == used).all() or not revised.any():
                 break
@@ -273,18 +308,18 @@ class Smoother:
         self.reinstated, self.dismissed = int((used & ~first_used).sum()), int((first_used & ~used).sum())
         return Trajectory(segments, self._subject.limits)
 
-    def _gated(self) -> tuple[Taken, NDArray[np.void], list[Indices], Flags]:
-        """What the filter with its gates makes of all: the measurements that it knows (m,), also as MEASUREMENT, the indices of
-        those of each segment, and which are used."""
+    def _gated(self) -> tuple[NDArray[np.void], list[Indices], Flags]:
+        """What the filter with its gates makes of all: the measurements that it knows (m,), the indices of those of each segment,
+        and which are used."""
         if not self._measured:
             raise NothingMeasuredError(f"expected poses of {' or '.join(self._names)}, got none")
         stamps_ns, sources, T, information = (np.array(column) for column in zip(*self._measured, strict=True))
         order = np.lexsort((*T[:, 2::-1, 3].T, sources, stamps_ns))  # as `history` orders them
         taken = Taken(sources, stamps_ns, T, information).of(order)
-        measurements, states, fates = Filter(self._subject, self._settings, self._senses, is_gated=True).run(taken)
+        measurements, states, fates = Filter(self._subject, self._settings, self._senses, is_gated=True).known(taken)
         for source, stamp_ns, fate in zip(taken.sources, taken.stamps_ns.tolist(), fates.tolist(), strict=True):
             self.log.record(self._names[source], stamp_ns, fate)
-        used = fates[is_known := (fates == ACCEPTED) | (fates == GATED)] == ACCEPTED
+        used = fates[(fates == ACCEPTED) | (fates == GATED)] == ACCEPTED
         if not used.any():
             raise NothingMeasuredError(f"expected poses of {' or '.join(self._names)} that can be used, got {len(order)} others")
         starts = np.flatnonzero(states.now["rank"] == 0)
@@ -294,7 +329,7 @@ class Smoother:
             if age_s <= self._subject.limits.lost_age:  # all was refused until it began anew: it should have begun earlier
                 starts[number] = last + 1
                 used[last + 1 : start] = True
-        return taken.of(is_known), measurements, np.split(np.arange(len(used)), starts[1:]), used
+        return measurements, np.split(np.arange(len(used)), starts[1:]), used
 
     def _judged(self, segment: Segment, measurements: NDArray[np.void], used: Flags) -> Flags:
         """Which of the measurements of a segment (m,) are to be used, by those that were (m,)."""

@@ -1,16 +1,43 @@
-"""What the smoother needs of the filter's steps, compiled: the motion between two states, and a measurement at a state.
+"""What the smoother needs of the filter's steps, compiled: all steps of a run, the motion between two states, and what is
+left of a measurement at a state.
 
-Both are the filter's own (`filter.predict`, `filter.linearised`), so that what is smoothed is what was filtered. Called for as
-many states as there are.
+They are the filter's own (`filter.step`, `filter.predict`, `filter.linearised`), so that what is smoothed is what was filtered.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from penumbra.services.fusion.filter import Model, State, linearised, predict, transition
+from penumbra.services.fusion.filter import Model, State, forget, linearised, predict, step, transition
 from penumbra.services.fusion.records import MEASUREMENT, MODEL, SENSE_MODEL, SENSE_STATE, STATE
+from penumbra.shared.geometry import so3
 from penumbra.shared.native import kernel
+
+
+@kernel(
+    "MODEL[1], SENSE_MODEL[n], MEASUREMENT[t], f8[t, 2], out STATE[k], out SENSE_STATE[k, n], out f8[k, size, size], "
+    "out f8[size, 6]",
+    MODEL=MODEL,
+    SENSE_MODEL=SENSE_MODEL,
+    MEASUREMENT=MEASUREMENT,
+    STATE=STATE,
+    SENSE_STATE=SENSE_STATE,
+)
+def run(models, sense_models, measurements, agility, states, senses, P, PHt):  # type: ignore[no-untyped-def]
+    """The filter over measurements (t,) in the order of their stamps: the state before the first one, without any information,
+    and those after each of them, (t + 1,) in all. agility (t, 2): factors on the process noise of the motion to each measurement,
+    which is what the state before it then has; zero: those that the filter learns."""
+    model = Model(models[0], sense_models)
+    forget(State(states[0], senses[0], P[0]))
+    for i in range(len(measurements)):
+        for half in range(2):
+            if agility[i, half] > 0.0:
+                states[i].agility[half] = agility[i, half]
+        states[i + 1] = states[i]
+        for s in range(senses.shape[1]):
+            senses[i + 1, s] = senses[i, s]
+        so3.copy(P[i], P[i + 1])
+        step(model, State(states[i + 1], senses[i + 1], P[i + 1]), measurements[i], PHt)
 
 
 @kernel(
@@ -21,7 +48,7 @@ from penumbra.shared.native import kernel
     STATE=STATE,
     SENSE_STATE=SENSE_STATE,
 )
-def transitions(models, sense_models, states, senses, stamps_ns, later, later_senses, F, Q):  # type: ignore[no-untyped-def]
+def transit(models, sense_models, states, senses, stamps_ns, later, later_senses, F, Q):  # type: ignore[no-untyped-def]
     """Each state at a later stamp, with the derivative F of its errors by those before, and the process noise Q: a covariance P
     becomes F P F' + Q."""
     for i in range(len(states)):
@@ -45,8 +72,8 @@ def transitions(models, sense_models, states, senses, stamps_ns, later, later_se
     SENSE_STATE=SENSE_STATE,
 )
 def linearise(models, sense_models, measurements, states, senses, z, H, white):  # type: ignore[no-untyped-def]
-    """What is left of each measurement at the state of its stamp, z (6,), its derivative H (6, 12) by the pose and the bias of its
-    sense, and the variances (6,) of its white noise. Directions that it does not observe have zeros and a variance of one."""
+    """What is left of each measurement at the state of its stamp, z (6,), its derivative H (6, 12) by the pose and the bias of
+    its sense, and the variances (6,) of its white noise. Directions that it does not observe have zeros and a variance of one."""
     unused = np.empty((0, 0))
     for i in range(len(states)):
         model, m = Model(models[0], sense_models), measurements[i]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from penumbra.services.command import cli
-from penumbra.services.replay import in_process, live
+from penumbra.services.replay import in_process, live, tracks
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.recording.reading import Played, Recording
@@ -187,7 +187,7 @@ def test_in_process_every_run_gives_the_same_poses_to_the_bit(long, tmp_path):
     again = json.loads(_in_process(out))["poses"]
     assert {name: track["messages"] for name, track in again.items()} == {name: t["messages"] for name, t in poses.items()}
     fused = [each.message for each in Recording(out).messages([topics.FUSED])]
-    digest = in_process.Track()
+    digest = tracks.Track()
     for message in fused:
         digest.add(message)
     assert digest.described()["sha256"] == poses["fused forearm"]["sha256"], "the new recording has these very poses"
@@ -211,7 +211,7 @@ def _in_process(path, *words):
 
 
 def test_how_far_tracks_are_apart_counts_poses_of_the_same_moment_that_are_not_lost():
-    ours, theirs = in_process.Track(), in_process.Track()
+    ours, theirs = tracks.Track(), tracks.Track()
     for i in range(10):
         ours.add(pose(10**18 + i * 10_000_000, x=0.001 * i))
         lost = msgspec.structs.replace(
@@ -219,6 +219,6 @@ def test_how_far_tracks_are_apart_counts_poses_of_the_same_moment_that_are_not_l
         )
         theirs.add(lost)
     assert ours.apart_mm(theirs) == {"median": 2.0, "largest": 2.0}
-    late = in_process.Track()
+    late = tracks.Track()
     late.add(pose(10**18 + 10**9))
-    assert ours.apart_mm(late) is None and in_process.Track().apart_mm(ours) is None
+    assert ours.apart_mm(late) is None and tracks.Track().apart_mm(ours) is None
