@@ -1,7 +1,8 @@
 """The trajectory of a target afterwards: every pose from the measurements before and after it.
 
-1. The observer's filter runs over all measurements in the order of their stamps, with its gates: which are used, and where it
-   began anew. What lies between two beginnings is a segment; nothing is carried over from one to the next.
+1. The observer's filter runs over all measurements in the order of their stamps, with its gates, and backwards in time. What
+   passes in one direction is used: a limb that sets out as nobody expected is refused at first in one, at last in the other, a
+   wrong sense in both. Where the filter began anew a segment begins; nothing is carried over from one to the next.
 2. The filter runs over the used measurements of each segment, without gates: forwards and backwards in time, which shows how
    unsteady the limb is at each moment, and then forwards with the mean of both.
 3. A fixed-interval smoother goes back over the states of the filter: pose, velocities, and the biases of the senses.
@@ -114,6 +115,13 @@ class Taken:
         return len(self.stamps_ns)
 
 
+def reversed_in_time(measurements: NDArray[np.void]) -> NDArray[np.void]:
+    """Measurements (k,) as of a limb that goes its way back: the last one first, at the stamp of the first one."""
+    back = measurements[::-1].copy()
+    back["stamp_ns"] = measurements["stamp_ns"][0] + measurements["stamp_ns"][-1] - back["stamp_ns"]
+    return back
+
+
 class Filter:
     """The observer's filter over measurements that are all there. is_gated: whether it refuses what is too far off."""
 
@@ -158,11 +166,10 @@ class Filter:
     def agility(self, measurements: NDArray[np.void]) -> Array:
         """Agilities (k, 2) of the motion to each measurement (k,) with which it is as unsteady as the filter finds it in the mean
         of both directions of time. Forwards it learns late that a limb sets out, backwards that it stops."""
-        learned, back = np.zeros((len(measurements), 2)), measurements[::-1].copy()
-        back["stamp_ns"] = measurements["stamp_ns"][0] + measurements["stamp_ns"][-1] - back["stamp_ns"]
+        learned = np.zeros((len(measurements), 2))
         dt = np.diff(measurements["stamp_ns"]) * 1e-9
         before = self.run(measurements, learned).of(slice(None, -1))
-        after = self.run(back, learned).of(slice(None, -1)).of(slice(None, None, -1))
+        after = self.run(reversed_in_time(measurements), learned).of(slice(None, -1)).of(slice(None, None, -1))
         mine, theirs = self.unsteadiness(before, dt), self.unsteadiness(after, dt)
         density = self.one["acceleration"]
         mean = 0.5 * (density * (before.now["agility"] + after.now["agility"]) + mine + theirs)
@@ -237,20 +244,16 @@ def smooth(states: States, i: int, later: States, j: int, F: Array, Q: Array, sm
 
 
 class Trajectory:
-    """The poses of a target at all stamps from `begin_ns` to `end_ns`, those of its first and last measurement.
-
-    used (m,): which of the measurements at stamps_ns (m,) are.
-    """
+    """The poses of a target at all stamps from `begin_ns` to `end_ns`, those of its first and last measurement that is used."""
 
     def __init__(self, segments: Sequence[Segment], limits: Limits):
         self._segments, self._limits = segments, limits
         self._begins_ns = np.array([segment.stamps_ns[0] for segment in segments])
-        self._used_ns = np.concatenate([segment.stamps_ns for segment in segments])
-        self.begin_ns, self.end_ns = int(self._used_ns[0]), int(self._used_ns[-1])
+        self.begin_ns, self.end_ns = int(segments[0].stamps_ns[0]), int(segments[-1].stamps_ns[-1])
 
     def estimates(self, stamps_ns: Indices) -> Iterator[Estimate]:
-        """The poses at ascending stamps. The state is of the measurement nearest in time, before or after. Raises ValueError for
-        stamps outside."""
+        """The poses at ascending stamps. The state is of the measurement nearest in time, before or after. Where nothing measured
+        for so long that the filter began anew, they are predictions from before. Raises ValueError for stamps outside."""
         if len(stamps_ns) and not self.begin_ns <= stamps_ns[0] <= stamps_ns[-1] <= self.end_ns:
             raise ValueError(f"stamps: expected {self.begin_ns} to {self.end_ns}, got {stamps_ns[0]} to {stamps_ns[-1]}")
         of = np.searchsorted(self._begins_ns, stamps_ns, side="right") - 1
@@ -259,12 +262,11 @@ class Trajectory:
             for part in (mine[i : i + BLOCK] for i in range(0, len(mine), BLOCK)):
                 states = segment.at(part)
                 for i, stamp_ns in enumerate(part.tolist()):
-                    yield self._estimate(stamp_ns, states.now[i], states.P[i])
+                    yield self._estimate(segment.stamps_ns, stamp_ns, states.now[i], states.P[i])
 
-    def _estimate(self, stamp_ns: int, now: np.void, P: Array) -> Estimate:
-        after = int(np.searchsorted(self._used_ns, stamp_ns))
-        near_ns = self._used_ns[max(0, after - 1) : after + 1]
-        age_s = 1e-9 * float(np.abs(near_ns - stamp_ns).min())
+    def _estimate(self, measured_ns: Indices, stamp_ns: int, now: np.void, P: Array) -> Estimate:
+        after = int(np.searchsorted(measured_ns, stamp_ns))
+        age_s = 1e-9 * float(np.abs(measured_ns[max(0, after - 1) : after + 1] - stamp_ns).min())
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = now["R"], now["p"]
         covariance = P[:POSE, :POSE].copy()
@@ -293,8 +295,7 @@ class Smoother:
 
     def trajectory(self) -> Trajectory:
         """The trajectory, from the measurements so far. Raises NothingMeasuredError where none of them can be used."""
-        measurements, parts, first_used = self._gated()
-        used = first_used
+        measurements, parts, passed, used = self._gated()
         open_filter = Filter(self._subject, self._settings, self._senses, is_gated=False)
         for left in range(PASSES - 1, -1, -1):
             segments, revised = [], used.copy()
@@ -305,31 +306,33 @@ class Smoother:
             if not left or (revised == used).all() or not revised.any():
                 break
             used = revised
-        self.reinstated, self.dismissed = int((used & ~first_used).sum()), int((first_used & ~used).sum())
+        self.reinstated, self.dismissed = int((used & ~passed).sum()), int((passed & ~used).sum())
         return Trajectory(segments, self._subject.limits)
 
-    def _gated(self) -> tuple[NDArray[np.void], list[Indices], Flags]:
+    def _gated(self) -> tuple[NDArray[np.void], list[Indices], Flags, Flags]:
         """What the filter with its gates makes of all: the measurements that it knows (m,), the indices of those of each segment,
-        and which are used."""
+        which have passed, and which are to be used."""
         if not self._measured:
             raise NothingMeasuredError(f"expected poses of {' or '.join(self._names)}, got none")
         stamps_ns, sources, T, information = (np.array(column) for column in zip(*self._measured, strict=True))
         order = np.lexsort((*T[:, 2::-1, 3].T, sources, stamps_ns))  # as `history` orders them
         taken = Taken(sources, stamps_ns, T, information).of(order)
-        measurements, states, fates = Filter(self._subject, self._settings, self._senses, is_gated=True).known(taken)
+        gated = Filter(self._subject, self._settings, self._senses, is_gated=True)
+        measurements, states, fates = gated.known(taken)
         for source, stamp_ns, fate in zip(taken.sources, taken.stamps_ns.tolist(), fates.tolist(), strict=True):
             self.log.record(self._names[source], stamp_ns, fate)
-        used = fates[(fates == ACCEPTED) | (fates == GATED)] == ACCEPTED
-        if not used.any():
+        passed = fates[(fates == ACCEPTED) | (fates == GATED)] == ACCEPTED
+        if not passed.any():
             raise NothingMeasuredError(f"expected poses of {' or '.join(self._names)} that can be used, got {len(order)} others")
-        starts = np.flatnonzero(states.now["rank"] == 0)
+        back = gated.run(reversed_in_time(measurements), np.zeros((len(passed), 2)))
+        used, starts = passed | (back.now["passed"][::-1] == 1), np.flatnonzero(states.now["rank"] == 0)
         for number, start in enumerate(starts[1:], 1):
-            last = int(np.flatnonzero(used[:start])[-1])
+            last = int(np.flatnonzero(passed[:start])[-1])
             age_s = 1e-9 * float(states.now["stamp_ns"][start] - states.now["stamp_ns"][last])
             if age_s <= self._subject.limits.lost_age:  # all was refused until it began anew: it should have begun earlier
                 starts[number] = last + 1
                 used[last + 1 : start] = True
-        return measurements, np.split(np.arange(len(used)), starts[1:]), used
+        return measurements, np.split(np.arange(len(used)), starts[1:]), passed, used
 
     def _judged(self, segment: Segment, measurements: NDArray[np.void], used: Flags) -> Flags:
         """Which of the measurements of a segment (m,) are to be used, by those that were (m,)."""
