@@ -147,34 +147,40 @@ class Filter:
 
     def run(self, measurements: NDArray[np.void], agility: Array) -> States:
         """The states after measurements (k,), with the agilities (k, 2) of the motion to each: see `transitions.run`."""
-        k, n = len(measurements) + 1, len(self.senses)
-        states = States(np.zeros(k, STATE), np.zeros((k, n), SENSE_STATE), np.zeros((k, size(n), size(n))))
-        transitions.run(
-            self.one, self.senses, measurements, agility, states.now, states.senses, states.P, np.empty((size(n), POSE))
-        )
-        return states.of(slice(1, None))
+        return self._run(measurements, agility, len(measurements) + 1).of(slice(1, None))
 
-    def unsteadiness(self, states: States, dt: Array) -> Array:
-        """The part of the densities (k, 2) of the white acceleration that is of the speeds of states (k,), in the mean over the
-        time dt (k,) [s] that follows: see `filter.move`."""
-        one = self.one[0]
-        fading = -0.5 * one["velocity_time"] * np.expm1(-2.0 * dt / one["velocity_time"]) / np.maximum(dt, 1e-9)
-        squares = np.sum(states.now["velocity"].reshape(-1, 2, 3) ** 2, axis=2)
-        out: Array = one["unsteadiness"] * fading[:, None] * squares
-        return out
+    def learned(self, measurements: NDArray[np.void]) -> NDArray[np.void]:
+        """The STATEs after measurements (k,), with the agilities that the filter learns; without covariances, which are large."""
+        return self._run(measurements, np.zeros((len(measurements), 2)), 2).now[1:]
+
+    def _run(self, measurements: NDArray[np.void], agility: Array, kept: int) -> States:
+        k, n = len(measurements) + 1, len(self.senses)
+        states = States(np.zeros(k, STATE), np.zeros((k, n), SENSE_STATE), np.zeros((kept, size(n), size(n))))
+        transitions.run(
+            *(self.one, self.senses, measurements, agility),
+            *(states.now, states.senses, states.P, np.empty((size(n), POSE))),
+        )
+        return states
 
     def agility(self, measurements: NDArray[np.void]) -> Array:
         """Agilities (k, 2) of the motion to each measurement (k,) with which it is as unsteady as the filter finds it in the mean
         of both directions of time. Forwards it learns late that a limb sets out, backwards that it stops."""
-        learned = np.zeros((len(measurements), 2))
-        dt = np.diff(measurements["stamp_ns"]) * 1e-9
-        before = self.run(measurements, learned).of(slice(None, -1))
-        after = self.run(reversed_in_time(measurements), learned).of(slice(None, -1)).of(slice(None, None, -1))
-        mine, theirs = self.unsteadiness(before, dt), self.unsteadiness(after, dt)
+        out, dt = np.zeros((len(measurements), 2)), np.diff(measurements["stamp_ns"]) * 1e-9
+        before = self.learned(measurements)[:-1]
+        after = self.learned(reversed_in_time(measurements))[-2::-1]
+        mine, theirs = self._unsteadiness(before, dt), self._unsteadiness(after, dt)
         density = self.one["acceleration"]
-        mean = 0.5 * (density * (before.now["agility"] + after.now["agility"]) + mine + theirs)
-        learned[1:] = np.maximum((mean - mine) / density, LEAST)
-        return learned
+        mean = 0.5 * (density * (before["agility"] + after["agility"]) + mine + theirs)
+        out[1:] = np.maximum((mean - mine) / density, LEAST)
+        return out
+
+    def _unsteadiness(self, now: NDArray[np.void], dt: Array) -> Array:
+        """The part of the densities (k, 2) of the white acceleration that is of the speeds of STATEs (k,), in the mean over the
+        time dt (k,) [s] that follows: see `filter.move`."""
+        one = self.one[0]
+        fading = -0.5 * one["velocity_time"] * np.expm1(-2.0 * dt / one["velocity_time"]) / np.maximum(dt, 1e-9)
+        out: Array = one["unsteadiness"] * fading[:, None] * np.sum(now["velocity"].reshape(-1, 2, 3) ** 2, axis=2)
+        return out
 
     def moved(self, states: States, stamps_ns: Indices) -> tuple[States, Array, Array]:
         """States (k,) at later stamps (k,), with F and Q (k, size, size): see `transitions.transit`."""
@@ -324,8 +330,8 @@ class Smoother:
         passed = fates[(fates == ACCEPTED) | (fates == GATED)] == ACCEPTED
         if not passed.any():
             raise NothingMeasuredError(f"expected poses of {' or '.join(self._names)} that can be used, got {len(order)} others")
-        back = gated.run(reversed_in_time(measurements), np.zeros((len(passed), 2)))
-        used, starts = passed | (back.now["passed"][::-1] == 1), np.flatnonzero(states.now["rank"] == 0)
+        back = gated.learned(reversed_in_time(measurements))
+        used, starts = passed | (back["passed"][::-1] == 1), np.flatnonzero(states.now["rank"] == 0)
         for number, start in enumerate(starts[1:], 1):
             last = int(np.flatnonzero(passed[:start])[-1])
             age_s = 1e-9 * float(states.now["stamp_ns"][start] - states.now["stamp_ns"][last])

@@ -15,7 +15,7 @@ from penumbra.shared.native import kernel
 
 
 @kernel(
-    "MODEL[1], SENSE_MODEL[n], MEASUREMENT[t], f8[t, 2], out STATE[k], out SENSE_STATE[k, n], out f8[k, size, size], "
+    "MODEL[1], SENSE_MODEL[n], MEASUREMENT[t], f8[t, 2], out STATE[k], out SENSE_STATE[k, n], out f8[w, size, size], "
     "out f8[size, 6]",
     MODEL=MODEL,
     SENSE_MODEL=SENSE_MODEL,
@@ -25,8 +25,9 @@ from penumbra.shared.native import kernel
 )
 def run(models, sense_models, measurements, agility, states, senses, P, PHt):  # type: ignore[no-untyped-def]
     """The filter over measurements (t,) in the order of their stamps: the state before the first one, without any information,
-    and those after each of them, (t + 1,) in all. agility (t, 2): factors on the process noise of the motion to each measurement,
-    which is what the state before it then has; zero: those that the filter learns."""
+    and those after each of them, (t + 1,) in all. P: the covariances of as many of the last states as there is room for, at least
+    two, in turn. agility (t, 2): factors on the process noise of the motion to each measurement, which the state before it then
+    has; zero: those that the filter learns."""
     model = Model(models[0], sense_models)
     forget(State(states[0], senses[0], P[0]))
     for i in range(len(measurements)):
@@ -36,8 +37,9 @@ def run(models, sense_models, measurements, agility, states, senses, P, PHt):  #
         states[i + 1] = states[i]
         for s in range(senses.shape[1]):
             senses[i + 1, s] = senses[i, s]
-        so3.copy(P[i], P[i + 1])
-        step(model, State(states[i + 1], senses[i + 1], P[i + 1]), measurements[i], PHt)
+        slot = (i + 1) % len(P)
+        so3.copy(P[i % len(P)], P[slot])
+        step(model, State(states[i + 1], senses[i + 1], P[slot]), measurements[i], PHt)
 
 
 @kernel(

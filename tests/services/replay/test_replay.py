@@ -178,8 +178,11 @@ def long(tmp_path_factory):
 
 def test_in_process_every_run_gives_the_same_poses_to_the_bit(long, tmp_path):
     out = tmp_path / "now.mcap"
-    found = [json.loads(_in_process(long, *words)) for words in ((), ("--out", str(out)))]
-    assert found[0] == found[1]
+    found = [json.loads(_in_process(long, *words)) for words in ((), ("--smooth", "--out", str(out)))]
+    smoothed = found[1]["poses"].pop("smoothed forearm")
+    assert found[0]["poses"] == found[1]["poses"]
+    assert smoothed["messages"] > 400 and smoothed["from_truth_mm"]["median"] < 40.0
+    assert sum(1 for _ in Recording(out).messages([topics.SMOOTHED])) == smoothed["messages"]
     poses = found[0]["poses"]
     assert poses["fused forearm"]["messages"] > 500 and poses["vision forearm"]["messages"] > 30
     assert poses["fused forearm"]["states"]["tracking"] > 0.3
