@@ -214,15 +214,15 @@ class Segment:
                 smooth(self.smoothed, k, later, k - begin, F[k - begin], Q[k - begin], self.smoothed, k + 1)
 
     def at(self, stamps_ns: Indices) -> States:
-        """The smoothed states at stamps (m,), none of them before the first measurement; after the last one, predictions."""
+        """The smoothed states at stamps (m,), none of them before the first measurement; after the last one, predictions. A block
+        at a time: each state takes 15 kB on the way."""
         nearest = np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1
         out, _, _ = self._filter.moved(self._filtered.of(nearest), stamps_ns)
         within = np.flatnonzero(nearest + 1 < len(self.stamps_ns))
-        for part in (within[i : i + BLOCK] for i in range(0, len(within), BLOCK)):
-            after = nearest[part] + 1
-            later, F, Q = self._filter.moved(out.of(part), self.stamps_ns[after])
-            for j, (i, k) in enumerate(zip(part, after, strict=True)):
-                smooth(out, int(i), later, j, F[j], Q[j], self.smoothed, int(k))
+        after = nearest[within] + 1
+        later, F, Q = self._filter.moved(out.of(within), self.stamps_ns[after])
+        for j, (i, k) in enumerate(zip(within.tolist(), after.tolist(), strict=True)):
+            smooth(out, i, later, j, F[j], Q[j], self.smoothed, k)
         return out
 
     def agreement(self, measurements: NDArray[np.void], states: States, is_used: bool) -> Array:
