@@ -142,7 +142,7 @@ def test_stamps_move_and_the_time_between_samples_shrinks_with_the_rate():
         (["--rate", "0"], "--rate: expected more than 0 and at most 2.5"),
         (["--rate", "3"], "above which readers refuse messages"),
         (["--sensors", "--topics", "fused"], "expected --sensors or --topics, got both"),
-        (["--out", "x.mcap"], "expected --in-process beside --out"),
+        (["--out", "x.mcap"], "expected --in-process or --smooth beside --out"),
         (["--from", "-1"], "expected seconds from the beginning"),
     ],
 )
@@ -201,7 +201,7 @@ def test_a_cell_without_a_skin_is_played_through_the_services_that_it_has(tmp_pa
     frames = [messages.Frame(stamp_ns=10**18 + k * 50_000_000, image=numbered.image(k)) for k in range(5)]
     key = topics.FRAME.at(cell=cell.name, camera="front")
     played = [Played(frame.stamp_ns, topics.FRAME, key, {"camera": "front"}, "", frame) for frame in frames]
-    found = in_process.play(cell, played, {})
+    found = in_process.play(cell, played, {})["poses"]
     assert found["fused forearm"]["states"].keys() == {"lost"} and "haptic forearm" not in found
 
 
