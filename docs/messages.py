@@ -47,7 +47,7 @@ def page() -> str:
         for topic in topics.TOPICS
     ]
     queries = [f"| {name.replace('_', ' ')} | `{key}` |" for name, key in topics.QUERYABLES.items()]
-    kinds = dict.fromkeys(topic.message for topic in topics.TOPICS)
+    kinds = dict.fromkeys(topic.message for topic in (*topics.TOPICS, topics.SMOOTHED))
     return "\n".join([HEAD.rstrip("\n"), *rows, QUERIES.rstrip("\n"), *queries, *(_message(kind) for kind in kinds)]) + "\n"
 
 

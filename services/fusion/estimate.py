@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from penumbra.shared.cell.description import Cell
 from penumbra.shared.contract.messages import MAX_FUTURE_S, FusedPose, FusedState, Message, Source
-from penumbra.shared.contract.senses import Measures
+from penumbra.shared.contract.senses import Measures, Sense
 from penumbra.shared.geometry import rigid, so3
 from penumbra.shared.native import kernel
 
@@ -236,6 +237,21 @@ def measured(message: Message, measures: Measures) -> tuple[Array, Array]:
             seen = np.zeros((6, 6))
             seen[:3, :3] = information(of.covariance)
             return rigid.transform(of.position), seen
+
+
+def stream_of(sense: Sense, message: Any, target: str, cell: Cell) -> str:
+    """The stream that a message of a sense belongs to: the sense, and the part of the cell that measured where a sense has
+    several. Raises RefusedMeasurement for a message of another target, frame or part of the cell."""
+    expected, got = (target, cell.frame), (message.target, message.frame)
+    if got != expected:
+        raise RefusedMeasurement("frame", f"{sense.name}: expected target and frame {expected}, got {got!r:.120}")
+    if sense.part is None:
+        return sense.name
+    part, known = getattr(message, sense.part), getattr(cell, f"{sense.part}s")
+    if part not in known:
+        text = f"{sense.name}: expected a {sense.part} of the cell ({', '.join(known)}), got {part!r:.60}"
+        raise RefusedMeasurement(sense.part, text)
+    return f"{sense.name} of {sense.part} {part}"
 
 
 def information(covariance: Array) -> Array:

@@ -357,6 +357,23 @@ def predict(model, state, stamp_ns):  # type: ignore[no-untyped-def]
 
 
 @inner
+def transition(model, now, stamp_ns, F):  # type: ignore[no-untyped-def]
+    """The derivative F (size, size) of the errors at a later stamp by those of a STATE: `predict` makes P of F P F' + Q."""
+    one, dt = model.one, (stamp_ns - now.stamp_ns) * 1e-9
+    decay, reach = math.exp(-dt / one.velocity_time), -one.velocity_time * math.expm1(-dt / one.velocity_time)
+    rotation, turn = np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        rotation[i] = reach * now.velocity[3 + i]
+    so3.exp(rotation, turn)
+    for i in range(len(F)):
+        for j in range(len(F)):
+            F[i, j] = 1.0 if i == j else 0.0
+    _transit(F, turn, rotation, reach, decay)
+    for i in range(MOTION, len(F)):
+        F[i, i] = math.exp(-dt / model.senses[(i - MOTION) // POSE].time_constant)
+
+
+@inner
 def error(p, R, m, value, derivative):  # type: ignore[no-untyped-def]
     """The error of a pose p (3,), R (3, 3) along the directions of a measurement (k,), and its derivative (k, 6) by the pose.
 

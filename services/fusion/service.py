@@ -12,7 +12,7 @@ from typing import Any
 
 from penumbra.services import flags
 from penumbra.services.fusion import paper
-from penumbra.services.fusion.estimate import Estimate, RefusedMeasurement, latest, measured
+from penumbra.services.fusion.estimate import Estimate, RefusedMeasurement, latest, measured, stream_of
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver, PaperSettings
 from penumbra.services.fusion.settings import Subject
@@ -162,16 +162,7 @@ class Fusion:
 
     def _check_origin(self, sense: Sense, message: Any, publisher: str) -> None:
         """Raises RefusedMeasurement for a message of another target, frame or part of the cell, and for a second publisher."""
-        expected, got = (self.target, self.node.cell.frame), (message.target, message.frame)
-        if got != expected:
-            raise RefusedMeasurement("frame", f"{sense.name}: expected target and frame {expected}, got {got!r:.120}")
-        stream = sense.name
-        if sense.part is not None:
-            part, known = getattr(message, sense.part), getattr(self.node.cell, f"{sense.part}s")
-            if part not in known:
-                text = f"{sense.name}: expected a {sense.part} of the cell ({', '.join(known)}), got {part!r:.60}"
-                raise RefusedMeasurement(sense.part, text)
-            stream = f"{sense.name} of {sense.part} {part}"
+        stream = stream_of(sense, message, self.target, self.node.cell)
         self._publishers.check(stream, publisher, time.monotonic(), sense.topic.stale_s)
 
     def _follow_others(self) -> None:

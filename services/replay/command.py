@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from penumbra.services import flags
-from penumbra.services.replay import in_process, live
+from penumbra.services.replay import in_process, live, smooth
 from penumbra.services.replay.chain import SERVICES
 from penumbra.services.replay.live import SENSORS
+from penumbra.services.replay.tracks import Writer
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.topics import Topic
 from penumbra.shared.recording import provenance
-from penumbra.shared.recording.reading import Played, Recording
+from penumbra.shared.recording.reading import ABOUT, Played, Recording
 from penumbra.shared.runtime import bus
 
 PATIENCE_S = 1.0
@@ -43,7 +44,9 @@ def _seconds(text: str) -> float:
     "replay",
     "Plays files of `penumbra record` onto the bus, with new stamps. With --sensors only what sensors said: the methods that run "
     "(penumbra up --replicas emulator=0) make today's poses of it. With --in-process the methods run here, without a bus, and to "
-    "the bit the same every time; what they make is compared with what was recorded. The exit code is 1 where a file had no end.",
+    "the bit the same every time; what they make is compared with what was recorded. With --smooth nothing is played: the best "
+    "trajectory afterwards is made of the senses' poses in the file, or beside --in-process of those of today's methods. The "
+    "exit code is 1 where a file had no end.",
     flags.Argument(
         "file", nargs=-1, required=True, type=Path, metavar="FILE ...", help="one file, or those that follow each other"
     ),
@@ -55,7 +58,14 @@ def _seconds(text: str) -> float:
     flags.Option("--sensors", is_flag=True, help="only frames, joints and voltages"),
     flags.Option("--topics", choices=NAMES, takes="many", metavar="TOPIC ...", show_default="all", help="only these"),
     flags.Option("--in-process", is_flag=True, help="through the methods in this process, without a bus"),
-    flags.Option("--out", type=Path, metavar="FILE.mcap", help="with --in-process: record what the methods make"),
+    flags.Option("--smooth", is_flag=True, help="poses from the measurements before and after them"),
+    flags.Option(
+        "--out",
+        "-o",
+        type=Path,
+        metavar="FILE.mcap",
+        help="record what the methods make (--in-process), and the smoothed poses beside what was recorded (--smooth)",
+    ),
     *(
         flags.Option(
             f"--{service}", default="", metavar="FLAGS", help=f"with --in-process: flags of {service}, such as '--log-level info'"
@@ -76,30 +86,50 @@ def _seconds(text: str) -> float:
     *flags.LOG,
     example="penumbra replay run.mcap --loop\n"
     "penumbra up --replicas emulator=0 & penumbra replay run.mcap --sensors\n"
-    "penumbra replay run.mcap --in-process --json",
+    "penumbra replay run.mcap --in-process --json\n"
+    "penumbra replay run.mcap --smooth --out smooth.mcap",
 )
 def main(options: flags.Options) -> int:
     """Plays, and prints what was played; 1 where a file had no end."""
-    if options.out is not None and not options.in_process:
-        flags.refuse("expected --in-process beside --out, got --out alone")
+    if options.out is not None and not (options.in_process or options.smooth):
+        flags.refuse("expected --in-process or --smooth beside --out, got --out alone")
+    if options.smooth and (options.sensors or options.topics or options.loop):
+        flags.refuse("expected --smooth without --sensors, --topics and --loop; --in-process smooths what the sensors said")
     if options.sensors and options.topics:
         flags.refuse("expected --sensors or --topics, got both")
+    if options.out is not None and options.out.exists():
+        raise bus.BusError(f"{options.out} is there already: give another --out")
     recordings = [Recording(path) for path in options.file]
     cell = cells.load(options.cell) if options.cell else recordings[0].cell()
-    found = _in_process(options, recordings, cell) if options.in_process else _live(options, recordings, cell)
+    play = _here if options.in_process or options.smooth else _live
+    found = play(options, recordings, cell)
     found["faults"] = [recording.fault for recording in recordings if recording.fault]
     found["unread"] = {str(recording.path): recording.unread for recording in recordings if recording.unread}
     _print(found, options.json)
     return int(bool(found["faults"]))
 
 
-def _in_process(options: flags.Options, recordings: Sequence[Recording], cell: cells.Cell) -> dict[str, Any]:
-    arguments = {service: shlex.split(getattr(options, service)) for service in SERVICES}
-    source = options.cell or recordings[0].about["cell_file"]
-    about = provenance.about(source) if options.out else None
-    attached = provenance.attachments(source) if options.out else None
-    messages = _messages(recordings, topics.TOPICS, options.from_s)
-    return {"poses": in_process.play(cell, messages, arguments, out=options.out, about=about, attached=attached)}
+def _here(options: flags.Options, recordings: Sequence[Recording], cell: cells.Cell) -> dict[str, Any]:
+    """Without a bus: through the methods, or as smoothed poses, or both."""
+    writer = _writer(options, recordings[0], cell) if options.out is not None else None
+    try:
+        if not options.in_process:
+            return smooth.smooth(cell, _messages(recordings, smooth.READ, options.from_s), recordings, writer)
+        arguments = {service: shlex.split(getattr(options, service)) for service in SERVICES}
+        smoothing = smooth.Smoothing(cell) if options.smooth else None
+        messages = _messages(recordings, topics.TOPICS, options.from_s)
+        return in_process.play(cell, messages, arguments, writer=writer, smoothing=smoothing)
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+def _writer(options: flags.Options, recording: Recording, cell: cells.Cell) -> Writer:
+    """A new recording: of this installation where its methods make it, else of that which made the first one."""
+    if not options.in_process:
+        return Writer(cell, options.out, {ABOUT: recording.about}, recording.attachments)
+    source = options.cell or recording.about["cell_file"]
+    return Writer(cell, options.out, provenance.about(source), provenance.attachments(source))
 
 
 def _live(options: flags.Options, recordings: Sequence[Recording], cell: cells.Cell) -> dict[str, Any]:
@@ -146,6 +176,13 @@ def _print(found: dict[str, Any], as_json: bool) -> None:
             if (apart := track[what]) is not None:
                 words = what.removesuffix("_mm").replace("_", " ")
                 print(f"  {words}: median {apart['median']:.1f} mm, largest {apart['largest']:.1f} mm")
+    for name, counts in found.get("measurements", {}).items():
+        passed = ", ".join(
+            f"{count['accepted']} of {count['accepted'] + count['gated']} of {s}" for s, count in counts["senses"].items()
+        )
+        print(f"  {name}: the gates passed {passed}; {counts['reinstated']} others are used, {counts['dismissed']} of these not")
+    for name, why in found.get("not_smoothed", {}).items():
+        print(f"smoothed {name}: none: {why}")
     if "messages" in found:
         counts = ", ".join(f"{name} {count}" for name, count in found["topics"].items())
         print(f"{found['messages']} messages ({counts or 'none'}), at most {1e3 * found['late_s']:.0f} ms late")

@@ -2,67 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from penumbra.services.replay import smooth
 from penumbra.services.replay.chain import SERVICES, Heard, Replay
 from penumbra.services.replay.live import SENSORS
+from penumbra.services.replay.smooth import Smoothing
+from penumbra.services.replay.tracks import Tracks, Writer
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import topics
-from penumbra.shared.contract.messages import encode
-from penumbra.shared.recording.entries import as_on_the_bus
-from penumbra.shared.recording.file import File
-from penumbra.shared.recording.foxglove import Viewers
 from penumbra.shared.recording.reading import Played
-from penumbra.shared.runtime.tap import Taken
 
 RESULTS = (topics.VISION, topics.HAPTIC, topics.FUSED)
-NEAR_S = 0.02
-"""Poses whose stamps are nearer than this [s] are of one moment."""
-
-
-class Track:
-    """Stamps, positions and states of the poses of one topic, and a digest of their bytes in order."""
-
-    def __init__(self) -> None:
-        self.stamps_ns: list[int] = []
-        self.positions: list[list[float]] = []
-        self.states: list[str] = []
-        self._digest = hashlib.sha256()
-
-    def add(self, message: Any) -> None:
-        self.stamps_ns.append(message.stamp_ns)
-        self.positions.append(message.position.tolist())
-        self.states.append(getattr(message, "state", ""))
-        self._digest.update(encode(message))
-
-    def described(self) -> dict[str, Any]:
-        """Number of messages, share of each state, and the digest."""
-        shares = {state: round(self.states.count(state) / len(self.states), 4) for state in sorted(set(self.states))}
-        return {"messages": len(self.states), "states": shares, "sha256": self._digest.hexdigest()}
-
-    def apart_mm(self, other: Track) -> dict[str, float] | None:
-        """How far positions are from those of another track at the same moments [mm]: median and largest; None where there are
-        no such moments, or one of both is lost."""
-        if not self.stamps_ns or not other.stamps_ns:
-            return None
-        order = np.argsort(other.stamps_ns, kind="stable")
-        theirs, stamps = np.array(other.stamps_ns)[order], np.array(self.stamps_ns)
-        after = np.clip(np.searchsorted(theirs, stamps), 1, len(theirs) - 1) if len(theirs) > 1 else np.zeros(len(stamps), int)
-        before = np.maximum(after - 1, 0)
-        nearest = np.where(np.abs(theirs[before] - stamps) <= np.abs(theirs[after] - stamps), before, after)
-        lost = {"lost", "out_of_range", "unidentified", "object", "occluded"}
-        are_good = np.array([state not in lost for state in self.states])
-        are_good &= np.array([other.states[i] not in lost for i in order])[nearest]
-        are_good &= np.abs(theirs[nearest] - stamps) < NEAR_S * 1e9
-        if not are_good.any():
-            return None
-        off = np.linalg.norm(np.array(self.positions) - np.array(other.positions)[order][nearest], axis=1)[are_good]
-        return {"median": round(1e3 * float(np.median(off)), 3), "largest": round(1e3 * float(off.max()), 3)}
 
 
 def play(
@@ -70,20 +22,18 @@ def play(
     recording: Iterable[Played],
     arguments: Mapping[str, Sequence[str]],
     services: Sequence[str] = SERVICES,
-    out: Path | None = None,
-    about: Mapping[str, Mapping[str, str]] | None = None,
-    attached: Mapping[str, bytes] | None = None,
+    writer: Writer | None = None,
+    smoothing: Smoothing | None = None,
 ) -> dict[str, Any]:
-    """Plays the sensors' messages, and describes the poses of now: by topic and target their number, states and digest, and how
-    far they are from the recorded ones and from the truth [mm]. out: a new recording of the sensors' messages and what is made of
-    them, with `about` and `attached`."""
-    now: dict[str, Track] = {}
-    then: dict[str, Track] = {}
-    writer = _Writer(cell, out, about or {}, attached or {}) if out is not None else None
+    """Plays the sensors' messages, and describes the poses of now (`Tracks.described`). writer: a new recording of the sensors'
+    messages and what is made of them. smoothing: smooths what the senses make. Raises RecordingError where they make nothing."""
+    tracks = Tracks()
 
     def hear(item: Heard) -> None:
         if item.topic in RESULTS:
-            now.setdefault(_name(item), Track()).add(item.message)
+            tracks.now(item.topic, item.names, item.message)
+        if smoothing is not None:
+            smoothing.take(item.topic, item.names, item.message)
         if writer is not None:
             writer.write(item)
 
@@ -92,47 +42,8 @@ def play(
             if each.topic in SENSORS:
                 yield each
             elif each.topic in (*RESULTS, topics.TRUTH):
-                then.setdefault(_name(each), Track()).add(each.message)
+                tracks.then(each.topic, each.names, each.message)
 
     Replay(cell, services, arguments, hear).run_recorded(sensors())
-    if writer is not None:
-        writer.close()
-    found = {}
-    for name, track in sorted(now.items()):
-        target = name.partition(" ")[2]
-        truth = then.get(f"{topics.TRUTH.name} {target}", Track())
-        found[name] = track.described() | {
-            "from_recorded_mm": track.apart_mm(then[name]) if name in then else None,
-            "from_truth_mm": track.apart_mm(truth),
-            "recorded_from_truth_mm": then[name].apart_mm(truth) if name in then else None,
-        }
-    return found
-
-
-def _name(item: Heard | Played) -> str:
-    return f"{item.topic.name} {item.names['target']}"
-
-
-class _Writer:
-    """A new recording of what is heard."""
-
-    def __init__(self, cell: cells.Cell, out: Path, about: Mapping[str, Mapping[str, str]], attached: Mapping[str, bytes]):
-        self._cell, self._out, self._about, self._attached = cell, out, about, attached
-        self._viewers = Viewers(cell)
-        self._file: File | None = None
-
-    def write(self, item: Heard) -> None:
-        if self._file is None:
-            self._file = File(self._out, self._about, self._attached, item.time_ns)
-            for entry in self._viewers.stage(item.time_ns):
-                self._file.write(entry)
-        key = item.topic.at(cell=self._cell.name, **item.names)
-        taken = Taken(item.time_ns, item.message.stamp_ns, item.topic, key, item.names, encode(item.message))
-        if item.topic is not topics.FRAME:
-            self._file.write(as_on_the_bus(taken))
-        for entry in self._viewers.of(taken):
-            self._file.write(entry)
-
-    def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
+    found = smooth.add(smoothing, tracks, writer) if smoothing is not None else {}
+    return found | {"poses": tracks.described()}

@@ -261,6 +261,19 @@ class FusedPose(Message, frozen=True, kw_only=True):
     sources: Annotated[dict[Name, Source], msgspec.Meta(max_length=MOST_SOURCES)]
 
 
+class SmoothedPose(Message, frozen=True, kw_only=True):
+    """The pose afterwards, from the measurements before and after its stamp: in files of `penumbra replay --smooth`, never on the
+    bus. Fields as of FusedPose. `state`: as there, by the measurement that is nearest in time, before or after."""
+
+    target: Name
+    frame: Name
+    position: Position
+    orientation: Quaternion
+    velocity: Twist
+    covariance: Covariance
+    state: FusedState
+
+
 class Truth(Message, frozen=True, kw_only=True):
     """What the emulator knows. `hidden`: share of the target's pixels covered in the last frame; `gap`: smallest distance
     from an electrode to the target's skin [m]."""

@@ -89,6 +89,10 @@ FUSED = Topic("fused", "penumbra/{cell}/target/{target}/pose/fused", messages.Fu
 
 TOPICS = (FRAME, JOINTS, VOLTAGES, TRUTH, MASK, VISION, HAPTIC, FUSED)
 
+SMOOTHED = Topic("smoothed", "penumbra/{cell}/target/{target}/pose/smoothed", messages.SmoothedPose, 200, 4, 0.1, (),
+                 "the pose afterwards, in files only", Priority.POSE, 0)  # fmt: skip
+"""What `penumbra replay --smooth` writes to files. It is none of TOPICS: nobody may publish it, and no replay plays it."""
+
 
 QUERYABLES = {
     "current_pose": "penumbra/{cell}/target/{target}/pose",

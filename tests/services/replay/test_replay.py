@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from penumbra.services.command import cli
-from penumbra.services.replay import in_process, live
+from penumbra.services.replay import in_process, live, tracks
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.recording.reading import Played, Recording
@@ -142,7 +142,7 @@ def test_stamps_move_and_the_time_between_samples_shrinks_with_the_rate():
         (["--rate", "0"], "--rate: expected more than 0 and at most 2.5"),
         (["--rate", "3"], "above which readers refuse messages"),
         (["--sensors", "--topics", "fused"], "expected --sensors or --topics, got both"),
-        (["--out", "x.mcap"], "expected --in-process beside --out"),
+        (["--out", "x.mcap"], "expected --in-process or --smooth beside --out"),
         (["--from", "-1"], "expected seconds from the beginning"),
     ],
 )
@@ -178,8 +178,11 @@ def long(tmp_path_factory):
 
 def test_in_process_every_run_gives_the_same_poses_to_the_bit(long, tmp_path):
     out = tmp_path / "now.mcap"
-    found = [json.loads(_in_process(long, *words)) for words in ((), ("--out", str(out)))]
-    assert found[0] == found[1]
+    found = [json.loads(_in_process(long, *words)) for words in ((), ("--smooth", "--out", str(out)))]
+    smoothed = found[1]["poses"].pop("smoothed forearm")
+    assert found[0]["poses"] == found[1]["poses"]
+    assert smoothed["messages"] > 400 and smoothed["from_truth_mm"]["median"] < 40.0
+    assert sum(1 for _ in Recording(out).messages([topics.SMOOTHED])) == smoothed["messages"]
     poses = found[0]["poses"]
     assert poses["fused forearm"]["messages"] > 500 and poses["vision forearm"]["messages"] > 30
     assert poses["fused forearm"]["states"]["tracking"] > 0.3
@@ -187,7 +190,7 @@ def test_in_process_every_run_gives_the_same_poses_to_the_bit(long, tmp_path):
     again = json.loads(_in_process(out))["poses"]
     assert {name: track["messages"] for name, track in again.items()} == {name: t["messages"] for name, t in poses.items()}
     fused = [each.message for each in Recording(out).messages([topics.FUSED])]
-    digest = in_process.Track()
+    digest = tracks.Track()
     for message in fused:
         digest.add(message)
     assert digest.described()["sha256"] == poses["fused forearm"]["sha256"], "the new recording has these very poses"
@@ -198,7 +201,7 @@ def test_a_cell_without_a_skin_is_played_through_the_services_that_it_has(tmp_pa
     frames = [messages.Frame(stamp_ns=10**18 + k * 50_000_000, image=numbered.image(k)) for k in range(5)]
     key = topics.FRAME.at(cell=cell.name, camera="front")
     played = [Played(frame.stamp_ns, topics.FRAME, key, {"camera": "front"}, "", frame) for frame in frames]
-    found = in_process.play(cell, played, {})
+    found = in_process.play(cell, played, {})["poses"]
     assert found["fused forearm"]["states"].keys() == {"lost"} and "haptic forearm" not in found
 
 
@@ -211,7 +214,7 @@ def _in_process(path, *words):
 
 
 def test_how_far_tracks_are_apart_counts_poses_of_the_same_moment_that_are_not_lost():
-    ours, theirs = in_process.Track(), in_process.Track()
+    ours, theirs = tracks.Track(), tracks.Track()
     for i in range(10):
         ours.add(pose(10**18 + i * 10_000_000, x=0.001 * i))
         lost = msgspec.structs.replace(
@@ -219,6 +222,6 @@ def test_how_far_tracks_are_apart_counts_poses_of_the_same_moment_that_are_not_l
         )
         theirs.add(lost)
     assert ours.apart_mm(theirs) == {"median": 2.0, "largest": 2.0}
-    late = in_process.Track()
+    late = tracks.Track()
     late.add(pose(10**18 + 10**9))
-    assert ours.apart_mm(late) is None and in_process.Track().apart_mm(ours) is None
+    assert ours.apart_mm(late) is None and tracks.Track().apart_mm(ours) is None
