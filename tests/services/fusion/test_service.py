@@ -130,9 +130,11 @@ def test_the_next_replica_publishes_while_the_owner_is_silent_and_no_longer(tabl
     for node in nodes:
         service.start(node, options)
     with user, nodes[0], nodes[1]:
-        ready = lambda: see() or (all(node.health()["ready"] for node in nodes) and any(n.owns("forearm") for n in nodes))  # noqa: E731
-        wait_for(ready, 20.0, "both replicas")
-        (owner,) = (node for node in nodes if node.owns("forearm"))
+        owners = lambda: [node for node in nodes if node.owns("forearm")]  # noqa: E731
+        # at first each may be an owner, until it hears of the other one
+        ready = lambda: see() or (all(node.health()["ready"] for node in nodes) and len(owners()) == 1)  # noqa: E731
+        wait_for(ready, 20.0, "both replicas, and an owner")
+        (owner,) = owners()
         wait_for(lambda: len(heard) > 20 and len(set(heard[-20:])) == 1, 5.0, "the owner's poses alone")
         speaker = heard[-1]
         owner.is_silent = True

@@ -162,9 +162,14 @@ def test_frames_that_do_not_move_reach_a_ros_node_that_comes_later_and_links_fol
 
 @pytest.mark.parametrize(("parts", "expected"), [("cell", {"panda_link0"}), ("none", set())])
 def test_frames_that_others_have_are_left_to_them(world, peer, cell, parts, expected):
-    with world.service("--tf", parts):
-        topics_of = wait_for(lambda: {token.split("/")[9] for token in peer.tokens() if "/MP/" in token}, 20, "the tokens")
-        assert ("%tf_static" in topics_of) == (parts != "none")
+    with world.service("--tf", parts) as node:
+
+        def all_there():
+            found = {token.split("/")[9].replace("%", "/") for token in peer.tokens() if "/MP/" in token}
+            return found if found == node.report().report["ros"]["published"].keys() else None
+
+        topics_of = wait_for(all_there, 20, "the tokens of all that is published")
+        assert ("/tf_static" in topics_of) == (parts != "none")
         if expected:
             still = heard(peer, peer.subscribe_latched("/tf_static", convert.TF), convert.TF)
             links = {each.child_frame_id for each in still.transforms if each.child_frame_id.startswith("panda")}
