@@ -13,6 +13,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -137,22 +138,6 @@ class Life:
             self._away_until_s = None
             self._set_away(False)
 
-    def warm_up(self) -> None:
-        """The arm is away until it is lost, and a while longer.
-
-        What is loaded at its first use, such as the models that look for a lost arm, is there before anything is counted.
-        """
-
-        def is_lost() -> bool:
-            pose = self.running.pose()
-            return pose is not None and pose["state"] == "lost"
-
-        self._set_away(True)
-        wait_for(is_lost, ANSWER_S, "the arm to be lost", 0.2)
-        time.sleep(AWAY_S)
-        self._set_away(False)
-        wait_for(self.running.is_tracking, ANSWER_S, "a tracked pose after the arm was lost", 0.5)
-
     def settle(self) -> None:
         """The arm is back, in sight."""
         self._set_away(False)
@@ -258,14 +243,16 @@ def slope(all_series: Sequence[tuple[Sequence[float], Sequence[float]]]) -> floa
 
 @contextmanager
 def chain(cell: str, seed: int) -> Iterator[tuple[Running, injected.Router]]:
-    """`penumbra up --connect` to a router that can be killed."""
-    router = injected.Router(os.environ)
-    try:
-        through = ("--connect", f"tcp/127.0.0.1:{router.port}")
-        with penumbra_up(cell, seed, *through, port=router.port) as running:
-            yield running, router
-    finally:
-        router.kill()
+    """`penumbra up --connect` to a router that can be killed, with an empty cache: models that look for lost arms are loaded when
+    one is lost first, and their hundred megabytes would look like a leak."""
+    with tempfile.TemporaryDirectory() as cache:
+        router = injected.Router(os.environ)
+        try:
+            through = ("--connect", f"tcp/127.0.0.1:{router.port}")
+            with penumbra_up(cell, seed, *through, port=router.port, environment={"PENUMBRA_CACHE": cache}) as running:
+                yield running, router
+        finally:
+            router.kill()
 
 
 def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
@@ -273,7 +260,6 @@ def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
     with chain(cell, seed) as (running, router):
         wait_for(running.is_tracking, 180, "a tracked pose", 0.5)
         life, gauge = Life(running, router, cells.load(cell), seed), Gauge(psutil.Process(running.launcher.pid), router)
-        life.warm_up()
         began_s = time.monotonic()
         periods_s = {name: DAY_S / speed / per_day for name, (per_day, _) in EVENTS.items()}
         due_s = {name: began_s + period_s / 2 for name, period_s in periods_s.items()} | {"look": began_s}
