@@ -77,6 +77,9 @@ def _type(hint: Any) -> str:
         value = typing.get_args(hint)[1]
         inner = ", ".join(f"`{name}`" for name in value.__struct_fields__)
         return f"map of names to maps with {inner},"
+    if typing.get_origin(hint) is tuple:
+        inner = [_type(each) for each in typing.get_args(hint) if each is not Ellipsis]
+        return f"list of {inner[0]}," if len(inner) == 1 else f"list of {len(inner)} numbers"
     return {"int": "integer", "float": "number", "str": "text"}.get(hint.__name__, hint.__name__)
 
 

@@ -105,6 +105,7 @@ def senses(seen: Seen, now_ns: int) -> dict[str, dict[str, Any]]:
             "age": _age_s(said, now_ns),
             "pose": _pose(said) if said.state == "in_range" else None,
             "gap": said.gap if said.gap < FAR_M else None,
+            "contact": _contact(said),
         }
     return out
 
@@ -153,12 +154,23 @@ def _of_vision(said: messages.VisionPose) -> str:
 
 
 def _of_haptic(said: messages.HapticPose) -> str:
+    touched = _contact(said)
+    if touched:
+        return f"haptic: {touched}"
     if said.state == "in_range":
         return f"haptic: in range, gap {100 * said.gap:.0f} cm"
     if said.state != "out_of_range":
         what = "no limb" if said.state == "object" else "not yet known whether it is a limb"
         return f"haptic: something is near, {what}, gap {100 * said.gap:.0f} cm"
     return "haptic: nothing in range" + (f", gap {100 * said.gap:.0f} cm" if said.gap < FAR_M else "")
+
+
+def _contact(said: messages.HapticPose) -> str:
+    """What touches in words, empty where nothing does."""
+    if said.contact == "none":
+        return ""
+    what = {"in_range": "the limb", "object": "an object"}.get(said.state, "something")
+    return f"{what} {'holds' if said.contact == 'grip' else 'touches'} {', '.join(said.touched)}"
 
 
 def _because(topic: topics.Topic, reports: list[Report]) -> str:

@@ -137,8 +137,9 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
             break
         distance = so3.dot(innovation, innovation)
         now.distance, now.rank = distance, m.rank
-        sense.surprise, sense.measured_ns = distance / m.rank, m.stamp_ns
-        contradicted = _is_contradicted(one, state, m)
+        sense.surprise, sense.measured_ns, sense.rank = distance / m.rank, m.stamp_ns, m.rank
+        so3.copy(m.directions, sense.directions)
+        contradicted = _is_contradicted(one, state, m, innovation)
         gate = 0 if not contradicted else 1 if sense.refused < one.refusals else 2
         passes = distance <= model.senses[m.source].threshold[gate, m.rank]
         if not passes and not contradicted:
@@ -165,14 +166,19 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _is_contradicted(one, state, m):  # type: ignore[no-untyped-def]
+def _is_contradicted(one, state, m, innovation):  # type: ignore[no-untyped-def]
     """Whether another sense with a recent measurement, accepted or not, agrees better with the state: then the measurement is
-    wrong rather than the state. To adapt to it would raise the process noise until it passes the gate."""
+    wrong rather than the state. To adapt to it would raise the process noise until it passes the gate. A sense that does not
+    observe what is surprising, as the skin does not the roll of a limb, cannot agree with it. innovation: (6,)."""
     surprise = state.senses[m.source].surprise
     for s in range(len(state.senses)):
         other = state.senses[s]
         if m.stamp_ns - other.measured_ns < one.agreement_time * 1e9 and other.surprise < surprise:
-            return True
+            seen = 0.0
+            for k in range(other.rank):
+                seen += so3.dot(other.directions[k], innovation) ** 2
+            if seen > 0.5 * so3.dot(innovation, innovation):
+                return True
     return False
 
 

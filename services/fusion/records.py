@@ -84,6 +84,8 @@ SENSE_STATE = np.dtype(
     [
         ("measured_ns", "i8"),  # stamp of the last measurement
         ("surprise", "f8"),  # its squared Mahalanobis distance per direction
+        ("rank", "i8"),  # and the directions that it observed: as of a MEASUREMENT
+        ("directions", "f8", (POSE, POSE)),
         ("learned_ns", "i8"),  # stamp of the last measurement that agility and doubt were adapted to
         ("accepted_ns", "i8"),  # and of the last accepted one
         ("refused", "i8"),  # how many were refused since

@@ -18,19 +18,23 @@ from penumbra.shared.skin.layout import Skin
 
 NEVER = -(1 << 62)
 """The stamp [ns] of something that has not come yet: before every other stamp."""
+SATURATED = "saturated: it reads the end of its ADC"
+"""`VoltageWindow.faults` of an electrode whose signal is cut off."""
 
 
 @dataclass(frozen=True)
 class VoltageWindow:
     """The mean voltages of all electrodes over a stretch of time. stamp_ns: the middle of the samples; newest_ns: the last one;
     amplitude (n,) [V]: means; samples (n,): how many are in each, none for electrodes that are not to be believed; faults: the
-    reasons, by PAD or PAD/ELECTRODE."""
+    reasons, by PAD or PAD/ELECTRODE; pressed (n,): electrodes that are left out because they read the end of their ADC that
+    near things drive them to."""
 
     stamp_ns: int
     newest_ns: int
     amplitude: Array
     samples: NDArray[np.int64]
     faults: dict[str, str]
+    pressed: NDArray[np.bool_]
 
 
 class Backlog:
@@ -106,7 +110,7 @@ class Collector:
         # After a cut only the newest stretch is used: an old one would say little about now.
         begin_ns = max(self._done_ns, end_ns - self.length_ns)
         skin = self.skin
-        amplitude, samples = skin.a3.copy(), np.zeros(len(skin), np.int64)
+        amplitude, samples, pressed = skin.a3.copy(), np.zeros(len(skin), np.int64), np.zeros(len(skin), np.bool_)
         faults: dict[str, str] = {}
         middles = []
         for k, name in enumerate(skin.pads):
@@ -118,8 +122,10 @@ class Collector:
                 faults[name] = "silent"
                 continue
             own = skin.of(k)
-            ended = (rows >= skin.full_scale[own] - 0.5 * skin.lsb[own]).any(axis=0) | (rows <= 0.5 * skin.lsb[own]).any(axis=0)
-            reasons = dict.fromkeys(np.flatnonzero(ended).tolist(), "saturated: it reads the end of its ADC")
+            high, low = rows >= skin.full_scale[own] - 0.5 * skin.lsb[own], rows <= 0.5 * skin.lsb[own]
+            pressed[own] = np.where(skin.polarity[own] > 0.0, high, low).mean(axis=0) > 0.5
+            ended = high.any(axis=0) | low.any(axis=0)
+            reasons = dict.fromkeys(np.flatnonzero(ended).tolist(), SATURATED)
             reasons |= {self._watches[k].names.index(e): fault.text for e, fault in self._watches[k].faults.items()}
             faults |= {skin.names[own.start + e]: reason for e, reason in reasons.items()}
             amplitude[own] = rows.mean(axis=0)
@@ -127,7 +133,7 @@ class Collector:
             middles.append(float((stamps - begin_ns).mean()))
         self._done_ns = end_ns
         middle = int(np.mean(middles)) if middles else self.length_ns // 2
-        return VoltageWindow(begin_ns + middle, end_ns, amplitude, samples, faults)
+        return VoltageWindow(begin_ns + middle, end_ns, amplitude, samples, faults, pressed)
 
     def _forget(self) -> None:
         for k in range(len(self.skin.pads)):

@@ -13,26 +13,30 @@ where the solve looks, and through what changes slowly (`size_and_rest.py`). A w
 6. add up the evidence on whether the thing that is felt is a limb (`identity.py`)
 7. publish the likelihood: size and roll marginalised, the model's error counted as nearly the same in several windows; where a
    rival is possible, the likelihood of the two together
+8. beside the pose, and without it: the nearest point of whatever is before each pad (`surface_points.py`), and whether something
+   touches (`contact.py`)
 
 Voltages that no limb explains (a metal part, a block) are reported as an object, and as unidentified while it is not decided.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from penumbra.services.haptics.contact import Contact
 from penumbra.services.haptics.identity import Identity
 from penumbra.services.haptics.paper_network import PoseNetwork, Relative, features
 from penumbra.services.haptics.settings import HapticSettings
 from penumbra.services.haptics.size_and_rest import PERSON_S, SIZE_GAP, SIZE_LASTING, Size, Tare
 from penumbra.services.haptics.solve import LEVER, Prior, Reading, Solution, Solver, peak
 from penumbra.services.haptics.starts import Limb, Starts
+from penumbra.services.haptics.surface_points import Shapes, SurfacePoint, SurfacePoints
 from penumbra.services.haptics.track import Home, Place, Track
 from penumbra.services.haptics.trust import PadTrust, SmoothedMisfit
-from penumbra.shared.contract.messages import HapticState
+from penumbra.shared.contract.messages import ContactState, HapticState
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
@@ -53,7 +57,8 @@ class HapticEstimate:
     """T_world_target (4, 4) and information (6, 6) of the voltages alone, zero along what they do not show, and all zero where
     they are not a limb's; gap [m]: the smallest from an electrode to the skin, at most `HapticSettings.farthest_gap`; state: see
     `HapticPose`, only what is in range is worth using; why: the reason where it is not; residuals (n,): what the limb leaves
-    unexplained, in standard deviations."""
+    unexplained, in standard deviations; surface: the nearest point before each pad that feels something; contact, touched:
+    whether something touches, and which pads."""
 
     T: Array
     information: Array
@@ -61,6 +66,9 @@ class HapticEstimate:
     state: HapticState
     why: str
     residuals: Array
+    surface: tuple[SurfacePoint, ...] = ()
+    contact: ContactState = "none"
+    touched: tuple[str, ...] = ()
 
     @property
     def in_range(self) -> bool:
@@ -76,7 +84,8 @@ class HapticEstimate:
 class Estimator:
     """home (4, 4), spread (6,): where the target is expected; network: None where none was trained (the solve then starts
     from home); method: `solve`, or `paper` for the network alone; measured: whether the limb's size is that of the cell file's
-    target, and not any person's. Raises ValueError for `paper` without a network."""
+    target, and not any person's; shapes: None where they were not measured for these pads (no points of surfaces then). Raises
+    ValueError for `paper` without a network."""
 
     def __init__(
         self,
@@ -89,6 +98,7 @@ class Estimator:
         method: str = "solve",
         measured: bool = False,
         settings: HapticSettings | None = None,
+        shapes: Shapes | None = None,
     ):
         if method not in ("solve", "paper"):
             raise ValueError(f"method: expected solve or paper, got {method!r}")
@@ -103,6 +113,8 @@ class Estimator:
         self._limb, self._pads = Limb(skin, surface), PadTrust(skin, self.settings)
         self._track = Track(self._home, self.settings)
         self._starts = Starts(home, self._limb, self._network_pose, self.settings)
+        self._points = None if shapes is None else SurfacePoints(skin, response, surface, shapes)
+        self._contact = Contact(skin)
         self.reset()
 
     def reset(self) -> None:
@@ -110,7 +122,7 @@ class Estimator:
         self._stamp_ns, self._away_s = 0, 0.0
         self._is_tracking, self._untracked = False, -1  # windows without a track since the last one with it
         self._track_misfit = SmoothedMisfit(self.settings)
-        for part in (self._track, self._starts, self._pads, self.size, self.tare, self.identity):
+        for part in (self._track, self._starts, self._pads, self.size, self.tare, self.identity, self._contact):
             part.forget()
 
     def nothing(self, why: str) -> HapticEstimate:
@@ -140,11 +152,14 @@ class Estimator:
         T_world_pads: Array,
         joints: ArrayLike = (),
         expected: tuple[Array, Array] | None = None,
+        pressed: NDArray[np.bool_] | None = None,
     ) -> HapticEstimate:
         """The estimate at stamp_ns of mean voltages (n,) over so many samples (n,), none for electrodes to leave out, with the
-        pads at T_world_pads (p, 4, 4); expected: T_world_target (4, 4) and covariance (6, 6) by all senses."""
+        pads at T_world_pads (p, 4, 4); expected: T_world_target (4, 4) and covariance (6, 6) by all senses; pressed (n,): see
+        `VoltageWindow`."""
         samples = np.asarray(samples)
         if not (samples > 0).any():
+            self._contact.forget()
             return self.nothing("no electrode is free of faults")
         elapsed_s = self._predict(stamp_ns)
         is_expected = expected is not None and self._track.expect(*expected)
@@ -155,7 +170,7 @@ class Estimator:
             estimate = self._by_solve(reading, self._track.place if is_expected else None, elapsed_s)
         self.tare.update(reading.signal, samples, elapsed_s, estimate.may_be_limb)
         self._watch_absence(estimate.may_be_limb, elapsed_s)
-        return estimate
+        return estimate if self._points is None else self._with_surface(estimate, reading, pressed)
 
     # ---- the steps of a window
 
@@ -177,6 +192,14 @@ class Estimator:
         variance = np.where(samples > 0, self.skin.noise / np.maximum(samples, 1), np.inf)
         doubt = self.settings.links_error * links
         return Reading(signal, variance, T_world_pads, self._pads.distrust(), doubt, joints)
+
+    def _with_surface(self, estimate: HapticEstimate, reading: Reading, pressed: NDArray[np.bool_] | None) -> HapticEstimate:
+        """With the points of surfaces, and what touches."""
+        assert self._points is not None
+        ended = np.zeros(len(self.skin), np.bool_) if pressed is None else pressed
+        points = self._points.find(reading.signal, reading.variance + reading.doubt**2, ended, reading.T_world_pads)
+        contact = self._contact.take(points, reading.T_world_pads)
+        return replace(estimate, surface=tuple(points), contact=contact, touched=self._contact.touched)
 
     def _by_network(self, reading: Reading) -> HapticEstimate:
         assert self.network is not None
@@ -246,7 +269,7 @@ class Estimator:
         home = self._prior(self._home.place)
         other = self._solve(reading, home, self._starts.elsewhere(reading, self.pose, self.size.mean))
         rival = self._place(reading, other, home)
-        if rival.is_apart(self._track.place, self.settings):
+        if not self._track.place.stands_for(rival, self.settings):
             # the track is judged with the same freedom: from its pose, but with home's spread
             same = self._solver.solve(reading, home, solution.T, solution.size, 0, 2)
             self._track.contest(rival, self.settings.beside_odds + self._track.limited(other.cost - same.cost))

@@ -4,26 +4,28 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services import flags
 from penumbra.services.haptics import paper_network
-from penumbra.services.haptics.batches import Backlog, Collector, VoltageWindow
+from penumbra.services.haptics.batches import SATURATED, Backlog, Collector, VoltageWindow
 from penumbra.services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
 from penumbra.services.haptics.pad_poses import PadPoses
+from penumbra.services.haptics.surface_points import Shapes
 from penumbra.shared.body.anatomy import target_mesh
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell.description import Cell
-from penumbra.shared.contract.messages import FusedPose, HapticPose, Joints, Voltages
+from penumbra.shared.contract.messages import FusedPose, HapticPose, Joints, SurfacePoint, Voltages
 from penumbra.shared.contract.topics import FUSED, HAPTIC, JOINTS, VOLTAGES
 from penumbra.shared.geometry.rigid import position_orientation
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.perception.prediction import LONGEST_S, predict
 from penumbra.shared.runtime.node import ServiceNode
 from penumbra.shared.skin.layout import Near, Skin
-from penumbra.shared.skin.response import Response
+from penumbra.shared.skin.response import Response, fingerprint
 
 NAME = "haptics"
 WEIGHTS = Path(__file__).parent / "weights"
@@ -68,7 +70,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
     node.progress("preparing estimators", len(near), len(near))
     backlog = Backlog()
     told = Faults(node)
-    misfits = Misfits(node)
+    misfits, contacts = Misfits(node), Contacts(node)
     fused = {target: node.latest(FUSED, target=target) for target in estimators}
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
@@ -94,11 +96,14 @@ def start(node: ServiceNode, options: flags.Options) -> None:
                 expected = None if T is None or covariance is None else (T, covariance)
                 (T_world_pads, joints), own = found, near[target]
                 amplitude, samples = window.amplitude[own.electrodes], window.samples[own.electrodes]
-                estimate = which.update(window.stamp_ns, amplitude, samples, T_world_pads[own.pads], joints, expected)
+                pressed = window.pressed[own.electrodes]
+                estimate = which.update(window.stamp_ns, amplitude, samples, T_world_pads[own.pads], joints, expected, pressed)
                 misfits.update(estimate, which.skin, samples)
+                contacts.update(target, estimate)
+                faults = {name: why for name, why in faults.items() if not is_by_touch(name, why, estimate)}
             if estimate.why == FOREIGN:
                 faults[target] = FOREIGN
-            node.publish(HAPTIC, _message(estimate, window, target, cell.frame), target=target)
+            node.publish(HAPTIC, _message(estimate, window, target, cell), target=target)
         told.update(faults, window.stamp_ns)
 
     streams = [f"haptic/{target}" for target in estimators]
@@ -114,6 +119,11 @@ def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str
         weights = paper_network.load(path, cell, target)
     except (FileNotFoundError, ValueError) as error:
         node.log.warning("no network: the solve starts from the target's home instead", target=target, why=str(error))
+    shapes = None
+    try:
+        shapes = shapes_of(cell, target, options.weights)
+    except (FileNotFoundError, ValueError) as error:
+        node.log.warning("no points of surfaces, and nothing touches", target=target, why=str(error))
     mesh = target_mesh(cell.targets[target], cell)
     spread = cell.targets[target].home_spread
     made = Estimator(
@@ -125,9 +135,43 @@ def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str
         weights,
         options.method,
         cell.targets[target].size is not None,
+        shapes=shapes,
     )
     made.warm_up(sum(len(robot.joints) for robot in cell.robots.values()))
     return made
+
+
+def shapes_of(cell: Cell, target: str, weights: Path) -> Shapes:
+    """What unknown shapes do to the pads of a cell. Raises FileNotFoundError where it was not measured for their design, and
+    ValueError where they are of several designs."""
+    designs = {fingerprint(cell, pad, target, bare=True) for pad in cell.pads}
+    if len(designs) > 1:
+        raise ValueError(f"expected pads of one design, got {len(designs)}; points of surfaces need equal pads")
+    return Shapes.load(weights, designs.pop())
+
+
+def is_by_touch(name: str, why: str, estimate: HapticEstimate) -> bool:
+    """Whether a fault of PAD/ELECTRODE is that something touches the pad."""
+    return why.startswith(SATURATED.partition(":")[0]) and name.partition("/")[0] in estimate.touched
+
+
+class Contacts:
+    """What touches, in the health's report as `contact`, by target: state and pads; logged when it begins and ends."""
+
+    def __init__(self, node: ServiceNode):
+        self._node = node
+        self._now: dict[str, HapticEstimate] = {}
+        node.add_report("contact", self._told)
+
+    def update(self, target: str, estimate: HapticEstimate) -> None:
+        """Takes the estimate of a window."""
+        before = self._now.get(target)
+        self._now[target] = estimate
+        if (before.contact if before else "none") != estimate.contact:
+            self._node.log.info("contact", state=estimate.contact, pads=" ".join(estimate.touched), target=target)
+
+    def _told(self) -> dict[str, dict[str, Any]]:
+        return {target: {"state": now.contact, "touched": list(now.touched)} for target, now in self._now.copy().items()}
 
 
 class Misfits:
@@ -187,16 +231,24 @@ def seen(fused: FusedPose | None, stamp_ns: int) -> FusedPose | None:
     return fused if camera.age_s + (stamp_ns - fused.stamp_ns) * 1e-9 < LONGEST_S else None
 
 
-def _message(estimate: HapticEstimate, window: VoltageWindow, target: str, frame: str) -> HapticPose:
+def _message(estimate: HapticEstimate, window: VoltageWindow, target: str, cell: Cell) -> HapticPose:
     position, orientation = position_orientation(estimate.T)
     return HapticPose(
         stamp_ns=window.stamp_ns,
         target=target,
-        frame=frame,
+        frame=cell.frame,
         sample_stamp_ns=window.newest_ns,
         position=position,
         orientation=orientation,
         information=estimate.information,
         gap=estimate.gap,
         state=estimate.state,
+        surface={
+            point.pad: SurfacePoint(
+                cell.pads[point.pad].link, tuple(point.position.tolist()), point.distance, point.along, point.across, point.gap
+            )
+            for point in estimate.surface
+        },
+        contact=estimate.contact,
+        touched=estimate.touched,
     )

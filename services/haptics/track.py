@@ -29,6 +29,12 @@ class Place:
         spread = (self.covariance + other.covariance)[:3, :3] + settings.same_place**2 * np.eye(3)
         return float(offset @ np.linalg.solve(spread, offset)) > settings.apart
 
+    def stands_for(self, other: Place, settings: HapticSettings) -> bool:
+        """Whether another place is one that this one, with its covariance, allows: not so of a sharp place beside a vague one."""
+        offset = other.T[:3, 3] - self.T[:3, 3]
+        spread = self.covariance[:3, :3] + settings.same_place**2 * np.eye(3)
+        return float(offset @ np.linalg.solve(spread, offset)) < settings.apart
+
 
 class Home:
     """Where the limb is expected while nothing is felt, and how a place decays towards it. T (4, 4): T_world_target; spread (6,):
@@ -97,7 +103,7 @@ class Track:
 
     def contest(self, rival: Place, odds: float) -> None:
         """Keeps a rival with these log odds of the track to it, where it is another place and still possible."""
-        possible = odds < self._settings.odds_decided and rival.is_apart(self.place, self._settings)
+        possible = odds < self._settings.odds_decided and not self.place.stands_for(rival, self._settings)
         self.rival, self.odds = rival if possible else None, max(odds, 0.0)
 
     def weigh(self, rival: Place, evidence: float) -> bool:

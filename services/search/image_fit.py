@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -117,7 +118,9 @@ def fit_image(
             best = min(best, _through(way, start), key=lambda one: one.rms)
     trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
     waves = trust * best.waves(settings.wave)
-    T, covariance = marginal(best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits, waves)
+    measured = partial(marginal, best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits)
+    bends = trust * best.bends(measured(waves)[1], pictures[-1].evidence.intrinsics)
+    T, covariance = measured(np.hstack([waves, bends]))
     both, free, overlap = overlap_of(model, best.T, evidence, first.hand)
     return replace(
         first,
@@ -126,6 +129,7 @@ def fit_image(
         T_searched=best.T,
         length=best.length / evidence.scale,
         rms=best.rms,
+        cost=best.length / evidence.scale * best.rms**2 / (settings.correlation * settings.edge**2),
         both=both,
         free=free,
         overlap=overlap,
@@ -152,6 +156,17 @@ class _Pass:
     def waves(self, size: float) -> Array:
         """The right sides (7, k) of `ImageSettings.wave` of this size [px]."""
         return np.stack([self.equations(size * wave).g for wave in _waves(self.points, self.T)], axis=1)
+
+    def bends(self, covariance: Array, intrinsics: Intrinsics) -> Array:
+        """The right sides (7, BENDS) of what the equations leave out: a pose that is off by one standard deviation moves the
+        contour by more than its derivative, along the directions that a covariance (6, 6) knows least."""
+        axis = self.T[:3, 0]
+        lever = np.diag([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])
+        lever[3:, 3:] -= LEVER_M * np.outer(axis, axis)  # a roll hardly moves the contour, and has a doubt of its own
+        variances, directions = np.linalg.eigh(lever @ covariance @ lever)
+        off = directions[:, -BENDS:] * np.sqrt(np.maximum(variances[-BENDS:], 0.0))
+        off[3:] /= LEVER_M
+        return np.stack([self.equations(_bend(self.points, self.T, error, intrinsics)).g for error in off.T], axis=1)
 
 
 @dataclass(frozen=True)
@@ -257,6 +272,22 @@ def _waves(points: Points, T: Array) -> list[Array]:
     return [np.where(across == side, shape, 0.0) for side in (False, True) for shape in (s, 1.5 * s**2 - 0.5)]
 
 
+def _bend(points: Points, T: Array, error: Array, intrinsics: Intrinsics) -> Array:
+    """Second-order part (n,) [px] of the way of contour points along their normals as a pose moves by an error (6,)."""
+    focal = np.array([intrinsics.fx, intrinsics.fy])
+
+    def pixels(moved: Array) -> Array:
+        there = (points["position"] - T[:3, 3]) @ rigid.rotation(moved[3:]).T + T[:3, 3] + moved[:3]
+        return there[:, :2] / there[:, 2:] * focal
+
+    second = 0.5 * (pixels(error) + pixels(-error)) - pixels(np.zeros(6))
+    return np.asarray(np.sum(second * points["normal"], axis=1))
+
+
+BENDS = 2
+"""Number of directions of a pose along which its contour is followed to the second order: distance and tilt."""
+LEVER_M = 0.15
+"""Length [m] at which a rotation counts as a way: half of a forearm's."""
 TYPICAL = 0.2
 """Root mean square [px] of the offsets left up to which the covariance is that of the settings; above, it grows with its fourth
 power."""

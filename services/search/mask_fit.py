@@ -96,10 +96,10 @@ MISFIT = 3.0
 class Fit:
     """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
     `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
-    `cost`: chi^2 of contour, dilation and prior together; `misfit`: the same per measurement, 1 to 3 where the pose
-    is right; `both`, `free`: see `evidence.compare`; `overlap`: see `overlap_of`; `hand`: how many times as
-    uncertain as the forearm's the hand's contour was taken for (`_Problem.bent`); `sharp`: whether the image has edges along the
-    contour (`image_fit.fit_image`)."""
+    `cost`: chi^2 of contour, dilation and prior together, or of the contour alone where the image shows it; `misfit`: that of the
+    mask per measurement, 1 to 3 where the pose is right; `both`, `free`: see `evidence.compare`; `overlap`: see `overlap_of`;
+    `hand`: how many times as uncertain as the forearm's the hand's contour was taken for (`_Problem.bent`); `sharp`: whether
+    the image has edges along the contour (`image_fit.fit_image`)."""
 
     T: Array
     covariance: Array

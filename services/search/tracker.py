@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from penumbra.services.search import contour, detect, evidence, paper_search
 from penumbra.services.search.evidence import TARGET, Evidence
-from penumbra.services.search.image_fit import fit_image
+from penumbra.services.search.image_fit import ImageSettings, fit_image
 from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
+from penumbra.services.search.rivals import Rivals
 from penumbra.services.search.settings import SearchSettings
 from penumbra.services.search.verdict import Findings, explains_mask, least_overlap, verdict
 from penumbra.shared.body import anatomy
@@ -58,6 +59,7 @@ class Search:
         self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])  # covariances: camera axes to world axes
         self._robots = RobotDepth(cell, self._T_camera_world)
         self._detected_ns: int | None = None
+        self._rivals = Rivals(self._limits)
 
     def prepare(self) -> None:
         """Compiles what `update` needs, so that the first frame does not wait for it."""
@@ -69,6 +71,7 @@ class Search:
         image = np.repeat(mask.labels[..., None] * np.uint8(20), 3, axis=2)
         self.update(mask, T_home, 1e-4 * np.eye(6), joints, image)
         self._detected_ns = None
+        self._rivals.forget()
 
     def update(
         self,
@@ -106,7 +109,9 @@ class Search:
             seen, best, certain = self._track(mask, T_start, prior_covariance, joints, image)
             tracked = seen, best
             if certain:
+                tracked = seen, self._among_rivals(seen, best, image)
                 return self._judge(*tracked, image is not None, T_start, prior_covariance)
+        self._rivals.forget()
         usable = tracked is not None and explains_mask(tracked[1].overlap, tracked[1].misfit, self.settings)
         due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost", bool(starts))
         other = self._detect(mask, T_start, joints, starts) if due else None
@@ -137,6 +142,18 @@ class Search:
             seen, best = self._behind_unknown(seen, mask.labels, T_start, prior, image) or (seen, best)
         fits = best.sharp or (first.overlap >= self.settings.fits_well and first.misfit < self.settings.wrong_misfit)
         return seen, best, fits or seen.seen_px < detect.SMALLEST_PX
+
+    def _among_rivals(self, seen: Evidence, best: Fit, image: NDArray[np.uint8] | None) -> Fit:
+        """The pose that the image shows, or its rival's."""
+        if image is None or not best.sharp:
+            self._rivals.forget()
+            return best
+
+        def shown(T: Array, passes: int) -> Fit:
+            start = replace(best, T=T, T_searched=T, hand=1.0)
+            return fit_image(self._model, start, image, seen, T, np.zeros((6, 6)), ImageSettings(passes=passes))
+
+        return self._rivals.contested(best, shown)
 
     def _behind_unknown(
         self, seen: Evidence, labels: NDArray[np.uint8], T_start: Array, prior: Array, image: NDArray[np.uint8]

@@ -123,13 +123,14 @@ class Examination:
         error = SLOPE * np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3]).max()) / gap
         pad.moments.append((predicted, measured, self.skin.noise[own] / len(volts), float(error)))
 
-    def judge(self, misfits: dict[str, float]) -> dict[str, Any]:
-        """Everything that was found, as JSON; misfits: of the haptic estimate by pad, mean squared residuals in variances."""
+    def judge(self, misfits: dict[str, float], touched: frozenset[str] = frozenset()) -> dict[str, Any]:
+        """Everything that was found, as JSON; misfits: of the haptic estimate by pad, mean squared residuals in variances;
+        touched: pads that something touches, whose electrodes may read the end of their scale."""
         with self._lock:
             gains = {name: found.gain for name, pad in self.pads.items() if (found := self._suspect(name, pad, 1.0)) is not None}
             # a limb of another size changes every pad's signals alike: only a pad that differs from the others is suspected
             common = float(np.median(list(gains.values()))) if len(gains) >= 3 else 1.0
-            pads = {name: self._verdict(name, pad, common, misfits.get(name)) for name, pad in self.pads.items()}
+            pads = {name: self._verdict(name, pad, common, misfits.get(name), name in touched) for name, pad in self.pads.items()}
         wrong = sum(bool(pad["wrong"]) + sum(e["fault"] is not None for e in pad["electrodes"].values()) for pad in pads.values())
         return {"cell": self.cell.name, "wrong": wrong, "compared": sorted(gains), "pads": pads, "notes": self.notes}
 
@@ -145,9 +146,9 @@ class Examination:
         own = self.skin.of(self.skin.pads.index(name))
         return likely(common * predicted[near], measured[near], noise[near] / TOGETHER, error[near], self.skin.centroids[own])
 
-    def _verdict(self, name: str, pad: Pad, common: float, misfit: float | None) -> dict[str, Any]:
+    def _verdict(self, name: str, pad: Pad, common: float, misfit: float | None, is_touched: bool) -> dict[str, Any]:
         own = self.skin.of(self.skin.pads.index(name))
-        out: dict[str, Any] = {"wrong": None, "mend": None, "misfit": misfit, "electrodes": {}}
+        out: dict[str, Any] = {"wrong": None, "mend": None, "misfit": misfit, "touched": is_touched, "electrodes": {}}
         if not pad.looks:
             out |= {"wrong": "silent: no voltages received", "mend": "start its driver: penumbra skin, or penumbra emulator"}
             return out
@@ -165,6 +166,8 @@ class Examination:
         last = pad.looks[-1]
         for k, electrode in enumerate(pad.watch.names):
             fault = pad.faults.get(electrode) or offsets.get(electrode)
+            if is_touched and fault is not None and fault.kind == "saturated":
+                fault = None
             out["electrodes"][electrode] = {
                 "rest_V": float(self.skin.a3[own][k]),
                 "level_V": float(last.level[k]),
@@ -209,13 +212,13 @@ def examine(cell: cells.Cell, connection: bus.Connection, seconds: float, progre
             node.stopping.wait(step)
             if progress and task is not None:
                 progress.advance(task, step)
-        misfits = _misfits(node.query(topics.health(cell.name, "haptics")))
+        answers = node.query(topics.health(cell.name, "haptics"))
     if not any(pad.looks for pad in examination.pads.values()):
         raise bus.BusError(
             f"cell {cell.name}: expected voltages within {seconds:g} s, got none; start `penumbra up`, or `penumbra skin "
             "--device DEVICE` for a real board"
         )
-    return examination.judge(misfits)
+    return examination.judge(_misfits(answers), _touched(answers))
 
 
 def _misfits(answers: list[bytes]) -> dict[str, float]:
@@ -226,6 +229,12 @@ def _misfits(answers: list[bytes]) -> dict[str, float]:
             if name.startswith("misfit/") and value is not None:
                 out[name.removeprefix("misfit/")] = float(value)
     return out
+
+
+def _touched(answers: list[bytes]) -> frozenset[str]:
+    """The pads that something touches, as the haptics service reports them in its health."""
+    contacts = [contact for answer in answers for contact in report.read(answer).report.get("contact", {}).values()]
+    return frozenset(pad for contact in contacts for pad in contact["touched"])
 
 
 def _nearest(known: deque[Any], stamp_ns: int) -> Any:
@@ -263,6 +272,8 @@ def main(cell: cells.Cell, connection: bus.Connection, seconds: float, as_json: 
             f"[yellow]note[/] {', '.join(elsewhere)}: no limb with a known pose was within about 5 to 10 cm, or a fault is in "
             "the way: their mounting and calibration were not checked"
         )
+    if touched := [name for name, pad in found["pads"].items() if pad["touched"]]:
+        console.print(f"[yellow]note[/] {', '.join(touched)}: touched, so that electrodes may read the end of their scale")
     for note in found["notes"]:
         console.print(f"[yellow]note[/] {escape(note)}")
     return int(found["wrong"] > 0)

@@ -49,8 +49,8 @@ ROUNDING = 1e-6
 SMALL = 64
 """Largest number of entries for which Python computes a norm as fast as NumPy, and several times faster where NumPy's code is in
 no cache, as with a message every few milliseconds."""
-LONGEST_TEXT, MOST_SOURCES = 256, 32
-"""Characters of a name, and senses of a pose: more than any message needs, less than fills a memory."""
+LONGEST_TEXT, MOST_SOURCES, MOST_PADS = 256, 32, 128
+"""Characters of a name, senses of a pose and pads of a skin: more than any message needs, less than fills a memory."""
 
 
 @dataclass(frozen=True)
@@ -212,13 +212,38 @@ class VisionPose(Message, frozen=True, kw_only=True):
 
 
 HapticState = Literal["in_range", "unidentified", "object", "out_of_range"]
+ContactState = Literal["none", "touch", "grip"]
+
+
+class SurfacePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The point of the nearest surface before a pad, whatever it belongs to.
+
+    Attributes:
+        link: What carries the pad, `world` or ROBOT/LINK.
+        position: Of the point (x, y, z), in the pose's frame [m].
+        distance: From the pad's middle [m].
+        along: Standard deviation of the distance, along the line from the pad, which is the surface's normal [m].
+        across: Standard deviation of the point across this line [m].
+        gap: Of the surface to the pad's board, wherever that is nearest [m].
+    """
+
+    link: Name
+    position: tuple[Quantity, Quantity, Quantity]
+    distance: Quantity
+    along: Quantity
+    across: Quantity
+    gap: Quantity
 
 
 class HapticPose(Message, frozen=True, kw_only=True):
     """What the skin says. `information` (6 x 6, inverse covariance) is zero along directions that it does not observe.
     `stamp_ns` is the time that the pose belongs to, `sample_stamp_ns` that of the newest voltage sample in it. `state`: in_range
     (a limb), unidentified (a limb or something else: the pose is that of the limb that would feel so), object (no limb: the same,
-    without information) or out_of_range (nothing near). Use in_range alone as the target's pose."""
+    without information) or out_of_range (nothing near). Use in_range alone as the target's pose. `surface`: by pad, the nearest
+    point of whatever is there, for each pad that feels something: the `link` that carries the pad, the point's `position` in
+    `frame`, its `distance` from the pad's middle with the standard deviations `along` and `across` the line between them, and the
+    surface's `gap` to the pad's board [m]; no shape is assumed, and the points belong to no target. `contact`: none, touch (a
+    surface is within 5 mm of a pad) or grip (on opposite sides of one link), whatever the `state`, of the pads `touched`."""
 
     target: Name
     frame: Name
@@ -228,6 +253,9 @@ class HapticPose(Message, frozen=True, kw_only=True):
     information: Covariance
     gap: Quantity
     state: HapticState
+    surface: Annotated[dict[Name, SurfacePoint], msgspec.Meta(max_length=MOST_PADS)] = {}
+    contact: ContactState = "none"
+    touched: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_PADS)] = ()
 
 
 class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -306,7 +334,7 @@ class Codec(typing.Generic[M]):
             found = [each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Array)]
             self.arrays += [(name, spec) for spec in found]
             bare = getattr(hint, "__origin__", hint)
-            self.faults[name] = "array" if found else _FAULTS.get(bare, "sources")
+            self.faults[name] = "array" if found else _FAULTS.get(bare, name)
 
     def encode(self, message: M) -> bytes:
         """As the function `encode`."""

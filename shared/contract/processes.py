@@ -248,8 +248,21 @@ PROCESSES = (
         "voltages to the skin's pose",
         extra="haptics",
         needs="pads",
-        tools=(Tool("train", "train the network", "penumbra.services.haptics.train:main", extra="haptics,train"),),
+        tools=(
+            Tool("train", "train the network", "penumbra.services.haptics.train:main", extra="haptics,train"),
+            Tool("shapes", "what unknown shapes do to pads", "penumbra.services.haptics.shapes:main", extra="haptics,train"),
+        ),
         trained_by="train",
+        metrics=(
+            Metric(
+                "skin_contact",
+                "1 for what touches the pads",
+                each="target",
+                field="state",
+                within="contact",
+                values=("none", "touch", "grip"),
+            ),
+        ),
     ),
     Process(
         "fusion",

@@ -5,7 +5,7 @@
     /robot/NAME/joints          JointStates
     /target/NAME/pose/SENSE     PoseInFrame, likewise .../pose/fused and .../truth
     /tf                         FrameTransforms
-    /scene                      SceneUpdate: robots, pads and targets as meshes
+    /scene                      SceneUpdate: robots, pads and targets as meshes; points of surfaces that the pads feel, as spheres
 
 Frames of reference: the cell's own, `camera/NAME`, `ROBOT/LINK`, and a target's name at its fused pose.
 """
@@ -53,6 +53,9 @@ QUALITY = 90
 LINKS_S = 0.04
 """Robots' links are placed at most so often [s]: a viewer shows no more."""
 ROBOT, TARGET, PAD = Color(r=0.72, g=0.74, b=0.78, a=1.0), Color(r=0.2, g=0.85, b=0.35, a=0.8), Color(r=0.95, g=0.7, b=0.1, a=1.0)
+FELT, TOUCHED = Color(r=0.3, g=0.6, b=1.0, a=0.6), Color(r=0.95, g=0.2, b=0.2, a=0.9)
+LEAST_SPHERE = 0.003
+"""Smallest radius [m] of a point of a surface, as it is drawn."""
 PAD_SIZE = (0.061, 0.06, 0.002)
 """Of a pad [m], as it is drawn."""
 
@@ -93,6 +96,7 @@ class Viewers:
         self._tf, self._scene = channel("/tf", FrameTransforms), channel("/scene", SceneUpdate)
         self._joints = {name: channel(f"/robot/{name}/joints", JointStates) for name in cell.robots}
         self._poses: dict[str, Channel] = {}
+        self._felt_ns: dict[str, int] = {}
 
     def stage(self, now_ns: int) -> Iterator[Entry]:
         """What does not change, for the beginning of a file: calibrations, places of cameras and bases, and all meshes."""
@@ -180,6 +184,10 @@ class Viewers:
                 rotation=placed.orientation,
             )
             yield Entry(self._tf, taken.received_ns, pose.stamp_ns, FrameTransforms(transforms=[moved]).SerializeToString())
+        if isinstance(pose, messages.HapticPose) and pose.stamp_ns - self._felt_ns.get(name, 0) >= LINKS_S * 1e9:
+            self._felt_ns[name] = pose.stamp_ns
+            felt = SceneUpdate(entities=[_felt(name, pose, at)])
+            yield Entry(self._scene, taken.received_ns, pose.stamp_ns, felt.SerializeToString())
 
     def _transforms(self, log_ns: int, stamp_ns: int, places: Mapping[str, Array]) -> Entry:
         at = _time(stamp_ns)
@@ -236,6 +244,21 @@ def _calibration(name: str, camera: cells.Camera, at: Timestamp) -> bytes:
     )
     data: bytes = calibration.SerializeToString()
     return data
+
+
+def _felt(name: str, pose: messages.HapticPose, at: Timestamp) -> SceneEntity:
+    """The points of surfaces of a target's pads: spheres of one standard deviation of the distance, touched pads' in another
+    colour. Without points, the ones before disappear."""
+    entity = SceneEntity(timestamp=at, frame_id=pose.frame, id=f"surface {name}", frame_locked=True)
+    for pad, point in pose.surface.items():
+        x, y, z = point.position
+        side = 2.0 * max(point.along, LEAST_SPHERE)
+        entity.spheres.add(
+            pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0)),
+            size=Vector3(x=side, y=side, z=side),
+            color=TOUCHED if pad in pose.touched else FELT,
+        )
+    return entity
 
 
 def _entity(frame: str, name: str, mesh: Mesh, colour: Color, at: Timestamp) -> SceneEntity:

@@ -6,7 +6,7 @@ averaged, noise and converter as the cell says. Beside every error stands the Cr
 the broad prior that the first look at a limb has, once with a tracking prior.
 
 Then limbs that rest for ten seconds (what is published, and what the default observer makes of it, against their covariances),
-limbs that move through all gaps, and things that are no limb.
+limbs that move through all gaps, and things that are no limb. `--only-surface`: points of surfaces without a shape, and contact.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from penumbra.services.fusion.observer import ErrorStateObserver
 from penumbra.services.haptics import paper_network
 from penumbra.services.haptics.batches import Collector
 from penumbra.services.haptics.estimator import Estimator
-from penumbra.services.haptics.service import WEIGHTS
+from penumbra.services.haptics.service import WEIGHTS, shapes_of
+from penumbra.services.haptics.surface_points import SurfacePoints
 from penumbra.services.skin.model import links, mountings
 from penumbra.shared.body.anatomy import target_mesh
 from penumbra.shared.body.robot import robot_models
@@ -43,7 +44,7 @@ from penumbra.shared.skin import bound
 from penumbra.shared.skin.layout import Skin, link_names
 from penumbra.shared.skin.response import SIZE_SPREAD, Response, fingerprint
 from penumbra.sim.skin import field
-from penumbra.tests.bench.lib import results, things
+from penumbra.tests.bench.lib import results, surfaces, things
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
 ARRAYS = {"bare": "table", "hull": "arm"}
@@ -60,7 +61,6 @@ GIRTH, LENGTH = (-0.27, 0.11), (-0.1, 0.1)
 """Range of log sizes."""
 NAMES = ("axial", "lateral", "height", "roll", "pitch", "yaw")
 RATIO_GOAL, MS_GOAL = 1.2, 2.0
-TAKEN_GOAL, REFUSED_GOAL_S = 0.01, 0.1
 NEAR_M = (0.02, 0.15)
 """Gaps for which the first goal holds."""
 REST_S, SETTLED_S = 10.0, 1.0
@@ -119,13 +119,15 @@ class Rig:
             self.weights = paper_network.load(WEIGHTS / f"{self.cell.name}-{self.target}.npz", self.cell, self.target)
         except (FileNotFoundError, ValueError) as error:
             print(f"{name}: without a network: {error}", file=sys.stderr)
+        self.shapes = shapes_of(self.cell, self.target, WEIGHTS)
+        self.points = SurfacePoints(self.skin, self.response, self.surface, self.shapes)
         away = np.linalg.norm(self.pads[:, :3, 3] - self.pads[:, :3, 3].mean(axis=0), axis=1)
         order = np.argsort(away.round(6), kind="stable")
         self.chosen = {count: np.sort(order[:count]) for count in PADS}
 
     def estimator(self, home: Array, spread: Array, method: str = "solve") -> Estimator:
         """A fresh one that expects the target at home (4, 4), known to spread (6,) along the world's axes."""
-        return Estimator(self.skin, self.response, self.surface, home, spread, self.weights, method)
+        return Estimator(self.skin, self.response, self.surface, home, spread, self.weights, method, shapes=self.shapes)
 
     def samples(self, count: int) -> np.ndarray:
         """Samples (n,) in a window of each electrode when only so many pads are used."""
@@ -436,8 +438,10 @@ def measure(seed: int, plan: Plan, arrays: tuple[str, ...], paper: bool) -> dict
 def tables(result: Result) -> list[Part]:
     """Errors beside their bounds, then limbs that rest and move, and what is taken for one. The JSON has the rows of fewer pads
     and of moving limbs too: here they count as shares."""
+    if "surface" in result:
+        return surfaces.tables(result)
     if "arrays" not in result:
-        return [_objects(result)]
+        return [things.table(result)]
     shown, lines = result["arrays"], list[Part]()
     consistent = Table(
         *("array", "limbs", "of the observer's pose", "95 % band", "of the published one", "moving: observer's", "published"),
@@ -461,32 +465,7 @@ def tables(result: Result) -> list[Part]:
             moving.add_row(name, band, *(f"{each[axis]:.2f}" for axis in NAMES))
         p95 = marked(f"{part['ms']['p95']} ms", part["ms"]["p95"] <= MS_GOAL)
         lines.append(f"From sample to pose, {name}: {part['ms']['median']} ms, 95th percentile {p95} (goal {MS_GOAL:g}).")
-    return [_errors(result), _shares(result), consistent, resting, moving, _objects(result), *lines]
-
-
-def _objects(result: Result) -> Table:
-    """What a thing that passes is taken for."""
-    table = Table(
-        *("array", "thing", "passes", "called a limb later than 0.5 s", "its windows", "called an object", "longest, s"),
-        *("never decided", "decided after, s"),
-        title=f"Things that pass within 10 cm, seed {result['seed']}",
-        caption=f"Goals: at most {TAKEN_GOAL:.0%} of objects called a limb, no limb called an object for longer than "
-        f"{REFUSED_GOAL_S:g} s. Seen: a camera saw the limb until it arrived.",
-    )
-    for row in result["objects"]:
-        is_limb = row["kind"].startswith("limb")
-        taken, refused = f"{row['taken_for_limb']:.0%}", f"{row['refused_s']:.2f}"
-        after = row["decided_after_s"]
-        table.add_row(
-            *(row["mounting"], row["kind"], str(row["passes"])),
-            taken if is_limb else marked(taken, row["taken_for_limb"] <= TAKEN_GOAL),
-            f"{row['windows_as_limb']:.0%}",
-            f"{row['called_object']:.0%}",
-            marked(refused, row["refused_s"] <= REFUSED_GOAL_S) if is_limb else refused,
-            f"{row['undecided']:.0%}",
-            "" if after is None else f"{after:.2f}",
-        )
-    return table
+    return [_errors(result), _shares(result), consistent, resting, moving, things.table(result), *lines]
 
 
 def _errors(result: Result) -> Table:
@@ -573,12 +552,19 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     flags.Option("--array", choices=tuple(ARRAYS), multiple=True, help="only this one (default: all)"),
     flags.Option("--method", choices=("both", "solve"), default="both", help="the paper's beside ours"),
     flags.Option("--only-objects", is_flag=True, help="only things that pass"),
+    flags.Option("--only-surface", is_flag=True, help="only points of surfaces, and contact"),
     flags.Option("--quick", is_flag=True, help="a few of everything: whether it runs, no numbers to believe"),
     example="penumbra bench haptics --quick --json haptics.json",
 )
 def main(options: flags.Options, report: results.Report) -> None:
     plan, arrays = QUICK if options.quick else FULL, tuple(options.array or ARRAYS)
-    if options.only_objects:
+    if options.only_surface:
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            parts = [
+                surfaces.measure(Rig(name), options.seed, 1 if options.quick else surfaces.THINGS, progress) for name in arrays
+            ]
+        result: dict[str, Any] = {"seed": options.seed, "surface": parts}
+    elif options.only_objects:
         result = {"seed": options.seed, "objects": measure_objects(options.seed, plan.passes, arrays)}
     else:
         result = measure(options.seed, plan, arrays, options.method == "both")

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from typing import Any
+
+from msgspec.structs import replace
 
 from penumbra.services import flags
 from penumbra.services.replay.chain import SERVICES, Replay
@@ -12,6 +16,9 @@ from penumbra.sim.world.world import record
 from penumbra.tests.bench.lib import accuracy, results
 from penumbra.tests.bench.lib.accuracy import SENSES
 from penumbra.tests.bench.lib.results import Part, Result
+
+APART_NS = 10**12
+"""Time from the beginning of one run to that of the next: they are scored together."""
 
 
 def tables(result: Result) -> list[Part]:
@@ -25,8 +32,9 @@ def tables(result: Result) -> list[Part]:
     tables,
     flags.Option("--cell", default="table", help="built-in cell or YAML file"),
     flags.Option("--seconds", type=flags.above_zero, default=60.0, help="length of the recording"),
-    flags.Option("--seed", type=int, default=1, help="draws motion, occlusion and appearance"),
-    flags.Option("--skip", type=float, default=2.0, help="seconds at the start that are not scored"),
+    flags.Option("--runs", type=flags.positive, default=1, help="number of recordings, from as many seeds"),
+    flags.Option("--seed", type=int, default=1, help="of the first; draws motion, occlusion and appearance"),
+    flags.Option("--skip", type=float, default=2.0, help="seconds at the start of each that are not scored"),
     *(
         flags.Option(f"--{service}", default="", metavar="FLAGS", help=f"flags of {service}, such as '--method paper'")
         for service in SERVICES
@@ -34,16 +42,25 @@ def tables(result: Result) -> list[Part]:
     example="penumbra bench replay --json replay.json",
 )
 def main(options: flags.Options, report: results.Report) -> None:
-    cell = cells.load(options.cell)
+    cell, started = cells.load(options.cell), time.monotonic()
+    found: dict[str, list[Any]] = {name: [] for name in ("truth", *SENSES)}
+    for run in range(options.runs):
+        for name, message in _heard(cell, options, run):
+            found[name].append(message)
+    truths = found.pop("truth")
+    result = accuracy.summary(cell, options, truths, found, options.runs * (options.seconds - options.skip))
+    report.save({**result, "runs": options.runs, "wall_s": round(time.monotonic() - started, 1)})
+
+
+def _heard(cell: cells.Cell, options: flags.Options, run: int) -> Iterator[tuple[str, Any]]:
+    """What a run of the chain says, and the truth, by name; later than all runs before."""
     replay = Replay(cell, arguments={service: getattr(options, service).split() for service in SERVICES})
-    started = time.monotonic()
-    heard = replay.run(record(cell, options.seed, options.seconds))
+    heard = replay.run(record(cell, options.seed + run, options.seconds))
+    named = {topic: name for name, topic in {"truth": topics.TRUTH, **SENSES}.items()}
     begin_ns = heard[0].time_ns + options.skip * 1e9
-    chosen = [item for item in heard if item.time_ns >= begin_ns]
-    truths = [item.message for item in chosen if item.topic is topics.TRUTH]
-    estimates = {sense: [item.message for item in chosen if item.topic is topic] for sense, topic in SENSES.items()}
-    result = accuracy.summary(cell, options, truths, estimates, options.seconds - options.skip)
-    report.save({**result, "wall_s": round(time.monotonic() - started, 1)})
+    for item in heard:
+        if item.time_ns >= begin_ns and item.topic in named:
+            yield named[item.topic], replace(item.message, stamp_ns=item.message.stamp_ns + run * APART_NS)
 
 
 if __name__ == "__main__":

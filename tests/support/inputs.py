@@ -35,6 +35,15 @@ def covariance(draw):
 SIDES = st.integers(1, 12)
 SOURCES = st.dictionaries(NAMES, st.builds(messages.Source, age_s=FINITE, weight=SHARES), max_size=4)
 POSE = {"stamp_ns": STAMPS, "target": NAMES, "frame": NAMES, "position": vector(3), "orientation": quaternion()}
+POINTS = st.builds(
+    messages.SurfacePoint,
+    link=NAMES,
+    position=st.tuples(FINITE, FINITE, FINITE),
+    distance=FINITE,
+    along=FINITE,
+    across=FINITE,
+    gap=FINITE,
+)
 KINDS: dict[type[messages.Message], dict[str, Any]] = {
     messages.Frame: {"stamp_ns": STAMPS, "image": st.tuples(SIDES, SIDES).flatmap(lambda s: npst.arrays(np.uint8, (*s, 3)))},
     messages.Mask: {
@@ -64,6 +73,9 @@ KINDS: dict[type[messages.Message], dict[str, Any]] = {
         "information": covariance(),
         "gap": FINITE,
         "state": st.sampled_from(["in_range", "unidentified", "object", "out_of_range"]),
+        "surface": st.dictionaries(NAMES, POINTS, max_size=4),
+        "contact": st.sampled_from(["none", "touch", "grip"]),
+        "touched": st.lists(NAMES, max_size=4).map(tuple),
     },
     messages.FusedPose: {
         **POSE,

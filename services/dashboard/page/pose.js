@@ -84,7 +84,8 @@ export class PoseView {
       if (!items.some(({ sense }) => sense === name)) items.push({ name, sense: name, age, weight, state: "silent" });
     }
     for (const item of items) {
-      if (item.hidden !== undefined) item.more = `${percent(item.hidden)} hidden`;
+      if (item.contact) item.more = item.contact;
+      else if (item.hidden !== undefined) item.more = `${percent(item.hidden)} hidden`;
       else item.more = item.gap === undefined || item.gap === null ? "" : `gap ${centimetres(item.gap)}`;
     }
     this.#senses.show(items, ({ name }) => name);

@@ -1,7 +1,7 @@
 """The hypotheses about an object's pose compete by how well they explain the picture.
 
-`search` follows those of `region.hypotheses` from small to large pictures and keeps the best of each stage; `follow` has one, a
-prediction.
+`search` follows those of `region.hypotheses` from small to large pictures and keeps the best of each stage, which
+`settled` brings to their optimum; `follow` has one, a prediction.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ SAME_START = (0.012, 0.2)
 """Shifted hypotheses nearer than this [m, rad] are one."""
 SCORED_PX = 30.0
 """Length of contour whose offsets count as one in the likelihood of a pose [px]."""
+SETTLING = (4,) * 8
+"""Reaches of the last steps [px]. Distance and tilt together hardly change the contour, so each step covers only a small part of
+the way to their optimum."""
 LEAST_SUPPORT = 0.05
 """Least likelihood of an offset near none, against that of any: what hides the object makes a few lines wrong, not the pose."""
 SCORING = 7
@@ -80,7 +83,13 @@ def search(shape: Shape, window: Window, prior: Prior, reach: float) -> list[Fou
                 found.append(scored(shape, model, at, T, prior, last))
         found.sort(key=lambda one: -one.score)
         poses = distinct([one.T for one in found], basin.SAME, KEPT[min(i, len(KEPT) - 1)])
-    return [one for one in found if any(one.T is T for T in poses)]
+    return settled(shape, [one for one in found if any(one.T is T for T in poses)], prior)
+
+
+def settled(shape: Shape, found: list[Found], prior: Prior) -> list[Found]:
+    """The poses after more steps on the same picture and with the same colours, best first."""
+    poses = [(one.level, descend(shape, shape.fine, one.level, one.T, prior, SETTLING, True)) for one in found]
+    return sorted((scored(shape, shape.fine, at, T, prior, True) for at, T in poses), key=lambda one: -one.score)
 
 
 def distinct(poses: list[Array], same: tuple[float, float], most: int) -> list[Array]:

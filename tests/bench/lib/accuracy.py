@@ -5,6 +5,7 @@ Errors are taken at each estimate's own stamp against the truth there.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,12 +84,12 @@ class TruthTrack:
         return nearest, position, np.arccos(cosine.clip(-1, 1))
 
 
-def beyond_3_sigma(truths: list[messages.Truth], fused: list[messages.FusedPose]) -> float | None:
+def beyond_3_sigma(truths: list[messages.Truth], estimates: list[messages.FusedPose] | list[messages.VisionPose]) -> float | None:
     """Of the poses called tracking, the share whose squared error in units of their own covariance is beyond what 99.73 % of
     normal errors of six dimensions stay within; None where there are none."""
     order = sorted(truths, key=lambda truth: truth.stamp_ns)
     stamps, wrong = np.array([truth.stamp_ns for truth in order]), []
-    for pose in fused:
+    for pose in estimates:
         if pose.state != "tracking" or not stamps[0] <= pose.stamp_ns <= stamps[-1]:
             continue
         near = order[int(np.argmin(np.abs(stamps - pose.stamp_ns)))]
@@ -100,11 +101,11 @@ def beyond_3_sigma(truths: list[messages.Truth], fused: list[messages.FusedPose]
 
 
 def long_runs(flags: np.ndarray, stamps_ns: np.ndarray, seconds: float) -> np.ndarray:
-    """`flags`, without the runs of true that last less than `seconds`."""
+    """`flags`, without the runs of true that last less than `seconds`; where nothing is stamped for as long, one ends."""
     out = np.zeros_like(flags)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
-        if (stamps_ns[end - 1] - stamps_ns[start]) * 1e-9 >= seconds:
+    breaks = np.flatnonzero(np.diff(flags) | (np.diff(stamps_ns) > seconds * 1e9)) + 1
+    for start, end in itertools.pairwise([0, *breaks.tolist(), len(flags)]):
+        if end > start and flags[start] and (stamps_ns[end - 1] - stamps_ns[start]) * 1e-9 >= seconds:
             out[start:end] = True
     return out
 
@@ -138,7 +139,8 @@ def summary(
     result["fused_states"] = {
         state: round(states.count(state) / max(len(states), 1), 4) for state in ("tracking", "coasting", "lost")
     }
-    result["fused_beyond_3_sigma"] = beyond_3_sigma(truths, estimates["fused"])
+    for sense in ("vision", "fused"):
+        result[f"{sense}_beyond_3_sigma"] = beyond_3_sigma(truths, estimates[sense])
     result["situation_s"] = {
         sight: {skin: round(float(situations[sight, skin].mean()) * seconds, 1) for skin in ("in_range", "out_of_range")}
         for sight in ("visible", "occluded")
@@ -152,7 +154,9 @@ def table(result: Result) -> Table:
     lost, coasting = (result["fused_states"][state] for state in ("lost", "coasting"))
     caption = f"Fused poses: {lost:.1%} lost, which do not count, {coasting:.1%} coasting, which do."
     if (beyond := result.get("fused_beyond_3_sigma")) is not None:
-        caption += f" Of those tracking {marked(f'{beyond:.2%}', beyond <= BEYOND_GOAL)} are beyond three sigma."
+        caption += f" Of those tracking {marked(f'{beyond:.2%}', beyond <= BEYOND_GOAL)} are beyond three sigma"
+        vision = result.get("vision_beyond_3_sigma")
+        caption += "." if vision is None else f", of vision's {vision:.1%}."
     table = Table("situation", "s", *SENSES, "goal", title=title, caption=caption)
     for (sight, skin), goal_cm in GOALS_CM.items():
         columns = []

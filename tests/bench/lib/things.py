@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from rich.table import Table
 from scipy.interpolate import CubicSpline
 
 from penumbra.services.haptics.estimator import Estimator
@@ -22,6 +23,7 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
 from penumbra.sim.skin import field
+from penumbra.tests.bench.lib.results import Result, marked
 
 LIMBS = ("limb", "limb, hand first")
 """Kinds that are limbs: forearm and hand across the middle of the pads, and with the hand alone before them."""
@@ -77,6 +79,8 @@ WINDOW_S, SAMPLES = 0.01, 10
 """Length [s] of a window, and samples in it."""
 HOME_SPREAD = np.repeat([0.12, 0.4], 3)
 """Standard deviations [m, rad] of where the target is expected: those of the built-in cells."""
+TAKEN_GOAL, REFUSED_GOAL_S = 0.01, 0.1
+"""Goals: share of objects called a limb, and time [s] for which a limb is called an object."""
 LATE_S = 0.5
 """Time [s] after a thing is first felt from which it must not be called what it is not."""
 
@@ -210,3 +214,28 @@ def _called(rig: Pads, kind: str, seed: int, k: int) -> list[str]:
         estimate = estimator.update(round(1e9 * stamp_s), amplitude, rig.samples(8), rig.pads, rig.joints, expected)
         states.append(estimate.state)
     return states
+
+
+def table(result: Result) -> Table:
+    """What a thing that passes is taken for."""
+    table = Table(
+        *("array", "thing", "passes", "called a limb later than 0.5 s", "its windows", "called an object", "longest, s"),
+        *("never decided", "decided after, s"),
+        title=f"Things that pass within 10 cm, seed {result['seed']}",
+        caption=f"Goals: at most {TAKEN_GOAL:.0%} of objects called a limb, no limb called an object for longer than "
+        f"{REFUSED_GOAL_S:g} s. Seen: a camera saw the limb until it arrived.",
+    )
+    for row in result["objects"]:
+        is_limb = row["kind"].startswith("limb")
+        taken, refused = f"{row['taken_for_limb']:.0%}", f"{row['refused_s']:.2f}"
+        after = row["decided_after_s"]
+        table.add_row(
+            *(row["mounting"], row["kind"], str(row["passes"])),
+            taken if is_limb else marked(taken, row["taken_for_limb"] <= TAKEN_GOAL),
+            f"{row['windows_as_limb']:.0%}",
+            f"{row['called_object']:.0%}",
+            marked(refused, row["refused_s"] <= REFUSED_GOAL_S) if is_limb else refused,
+            f"{row['undecided']:.0%}",
+            "" if after is None else f"{after:.2f}",
+        )
+    return table

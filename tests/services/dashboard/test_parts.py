@@ -187,6 +187,21 @@ def test_a_lost_pose_has_a_reason_from_each_sense():
     ]
 
 
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"state": "in_range", "contact": "touch", "touched": ("p3",)}, "the limb touches p3"),
+        ({"state": "object", "contact": "grip", "touched": ("p1", "p4")}, "an object holds p1, p4"),
+        ({"state": "unidentified", "contact": "touch", "touched": ("p1",)}, "something touches p1"),
+        ({"state": "in_range", "gap": 0.05}, ""),
+    ],
+)
+def test_what_touches_is_said_before_the_gap(values, words):
+    seen = state.Seen(pose(NOW), None, {}, haptic(**values))
+    assert shown(seen, NOW)["senses"]["haptic"]["contact"] == words
+    assert state.reasons(seen, ["haptic"], [], NOW) == [f"haptic: {words or 'in range, gap 5 cm'}"]
+
+
 def test_a_silent_sense_is_explained_by_its_process():
     seen = state.Seen(pose(NOW), None, {"front": vision()}, None)
     reports = [Report("search", "a", "degraded", ["no camera/front/mask for 4.0 s"]), Report("fusion", "b", "ok")]

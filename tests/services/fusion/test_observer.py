@@ -269,6 +269,19 @@ def test_a_sense_that_disagrees_for_long_is_used_again_beside_one_that_is_accept
     assert vision.age_s < 0.2 and vision.weight > 0.01
 
 
+def test_the_skin_which_does_not_feel_a_roll_does_not_keep_vision_from_one() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    axis = np.concatenate([np.zeros(3), HOME[:3, 0]])
+    without_roll = np.eye(6) - np.outer(axis, axis)
+    felt = without_roll @ (4.0 * VISION) @ without_roll
+    for k in range(150):
+        observer.measure("haptic", ns(k * 0.01), HOME, felt)
+        if k % 5 == 0:
+            observer.measure("vision", ns(k * 0.01), perturb(HOME, 1.5 * axis) if k >= 100 else HOME, VISION)
+    error = rigid.pose_error(perturb(HOME, 1.5 * axis), observer.estimate(ns(1.5)).T)
+    assert abs(error @ axis) < 0.2
+
+
 def test_without_measurements_the_covariance_grows_and_the_state_goes_from_tracking_to_lost() -> None:
     observer = ErrorStateObserver(HOME, SPREAD)
     still(observer, HOME, 0.0, 1.0)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from penumbra.services.haptics import service
-from penumbra.services.haptics.batches import Backlog, Collector, VoltageWindow
+from penumbra.services.haptics.batches import SATURATED, Backlog, Collector, VoltageWindow
 from penumbra.services.haptics.pad_poses import PadPoses
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
@@ -86,6 +87,7 @@ def test_an_electrode_that_reads_an_end_of_its_adc_is_left_out_at_once_and_alone
             windows.append(collector.add(pad, stamp, MS, volts))
     assert windows[-1] is not None and set(windows[-1].faults) == {"p1/t"} and "saturated" in windows[-1].faults["p1/t"]
     assert np.flatnonzero(windows[-1].samples == 0).tolist() == [skin.names.index("p1/t")]
+    assert np.flatnonzero(windows[-1].pressed).tolist() == ([skin.names.index("p1/t")] if end == "full scale" else [])
 
 
 def test_an_electrode_without_any_noise_is_left_out(skin: Skin) -> None:
@@ -227,7 +229,7 @@ def test_the_service_answers_every_window_within_milliseconds_and_goes_on_withou
     # without a camera it may be anything that is as near as a limb
     assert truth.gap > 0.12 or last.state in ("in_range", "unidentified")
     assert last.gap == pytest.approx(truth.gap, abs=0.03 + 0.3 * truth.gap)
-    misfits = haptics.report().report
+    misfits = {name: value for name, value in haptics.report().report.items() if name.startswith("misfit/")}
     if any(pose.state == "in_range" for _, pose in poses):
         assert set(misfits) == {f"misfit/{pad}" for pad in table.pads} and max(misfits.values()) < 4.0
 
@@ -254,6 +256,18 @@ def test_a_fused_pose_is_looked_at_only_where_a_camera_had_a_part_in_it_lately()
     assert service.seen(camera, 1_400 * MS) is None
 
 
+def test_what_touches_is_in_the_health_and_is_no_fault(table: cells.Cell) -> None:
+    node = Node("haptics", table, bus.Connection(connect=("tcp/127.0.0.1:1",)))
+    contacts, nothing = service.Contacts(node), service.estimator(node, SimpleNamespace(**OPTIONS), table, "forearm").nothing("")
+    contacts.update("forearm", nothing)
+    assert node.report().report["contact"] == {"forearm": {"state": "none", "touched": []}}
+    touching = replace(nothing, contact="touch", touched=("p2",))
+    contacts.update("forearm", touching)
+    assert node.report().report["contact"] == {"forearm": {"state": "touch", "touched": ["p2"]}}
+    assert service.is_by_touch("p2/c", SATURATED, touching)
+    assert not service.is_by_touch("p3/c", SATURATED, touching) and not service.is_by_touch("p2", "silent", touching)
+
+
 def test_a_turned_pad_stands_out_by_its_misfit_in_the_health(table: cells.Cell, skin: Skin) -> None:
     """Its electrodes read what the ones opposite should; its estimate goes on without it."""
     node = Node("haptics", table, bus.Connection(connect=("tcp/127.0.0.1:1",)))
@@ -266,7 +280,7 @@ def test_a_turned_pad_stands_out_by_its_misfit_in_the_health(table: cells.Cell, 
     rng = np.random.default_rng(0)
     for i in range(100):
         amplitude = skin.amplitude(signals / skin.gain / skin.sensitivity) + np.sqrt(skin.noise / 10) * rng.standard_normal(40)
-        window = VoltageWindow((i + 1) * 10 * MS, (i + 1) * 10 * MS, amplitude, np.full(40, 10), {})
+        window = VoltageWindow((i + 1) * 10 * MS, (i + 1) * 10 * MS, amplitude, np.full(40, 10), {}, np.zeros(40, bool))
         estimate = which.update(window.stamp_ns, window.amplitude, window.samples, skin.T_world_pads())
         misfits.update(estimate, skin, window.samples)
     told = node.report().report

@@ -48,6 +48,15 @@ def test_a_place_is_a_rival_only_where_it_is_apart_and_possible():
     assert followed(place(0.15), SETTINGS.odds_decided).rival is None, "the windows have decided"
 
 
+def test_a_sharp_place_does_not_stand_for_a_vague_one_beside_it():
+    vague = Place(place(0.15).T, 100.0 * place(0.15).covariance)
+    sharp = followed(vague)
+    assert sharp.rival is not None, "the vague place may be where the sharp one is, and elsewhere as well"
+    sharp.place = vague
+    sharp.contest(place(0.15), 1.0)
+    assert sharp.rival is None
+
+
 def test_a_single_window_changes_the_odds_by_a_limited_step_and_several_decide():
     track = followed(place(0.15))
     assert not track.weigh(place(0.15), 100.0)

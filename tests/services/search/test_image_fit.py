@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from penumbra.services.search.rivals import RIVALS
 from penumbra.services.search.tracker import Search, Searched
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.contract.messages import Mask
@@ -109,3 +110,48 @@ def test_an_image_of_another_camera_is_refused(visible):
     shot = visible[0]
     with pytest.raises(ValueError, match=r"image: expected 640 x 480.*got 320 x 240"):
         Search(shot.cell).update(mask(shot, shot.T_world_target), shot.T_world_target, PRIOR, shot.joints, shot.image[::2, ::2])
+
+
+def turned(shot: Shot, degrees: float) -> np.ndarray:
+    T = shot.T_world_target.copy()
+    T[:3, :3] = rigid.rotation(np.radians(degrees) * T[:3, 0]) @ T[:3, :3]
+    return T
+
+
+def off(shot: Shot, estimate: Searched) -> np.ndarray:
+    return rigid.pose_error(shot.T_world_target, estimate.T)
+
+
+def looked_at(shot: Shot, mask: Mask, image: np.ndarray, T: np.ndarray) -> list[Searched]:
+    """The estimates of pictures of a limb at rest, whose prediction T stays wrong: one round of rivals, and one more."""
+    search = Search(shot.cell)
+    return [search.update(mask, T, PRIOR, shot.joints, image) for _ in range(2 * RIVALS)][RIVALS:]
+
+
+@pytest.mark.parametrize("degrees", [-140.0, -60.0, 60.0, 140.0])
+def test_a_limb_with_its_hand_in_sight_does_not_stay_turned_over(visible, degrees):
+    right = []
+    for shot in visible:
+        estimates = looked_at(shot, mask(shot, shot.T_world_target), shot.image, turned(shot, degrees))
+        rolls = [abs(np.degrees(off(shot, estimate)[3:] @ estimate.T[:3, 0])) for estimate in estimates]
+        right.append(np.median(rolls) < 10.0)
+    assert np.mean(right) > 0.8
+
+
+def test_a_roll_that_a_hidden_hand_leaves_open_is_uncertain(visible):
+    nees = []
+    for shot in visible:
+        image, seen = shot.image.copy(), mask(shot, shot.T_world_target)
+        rows, columns = np.nonzero(shot.labels == Label.HAND)
+        covered = (slice(rows.min() - 4, rows.max() + 5), slice(columns.min() - 4, columns.max() + 5))
+        image[covered] = (90, 120, 60)
+        labels = shot.labels.copy()
+        labels[covered] = Label.OCCLUDER
+        h, w = seen.labels.shape
+        behind = replace(seen, labels=labels[seen.y0 : seen.y0 + h, seen.x0 : seen.x0 + w])
+        for estimate in looked_at(shot, behind, image, turned(shot, 120.0)):
+            if estimate.state == "tracking":
+                error = off(shot, estimate)
+                nees.append(error @ np.linalg.solve(estimate.covariance, error))
+    assert len(nees) > 10
+    assert np.mean(np.array(nees) > 20.1) < 0.1  # beyond three standard deviations

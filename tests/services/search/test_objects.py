@@ -14,9 +14,9 @@ import trimesh
 
 from penumbra.services.command import cli
 from penumbra.services.search.contour import Model
-from penumbra.services.search.objects import meshes, tools
+from penumbra.services.search.objects import contest, meshes, region, tools
 from penumbra.services.search.objects.creases import Creases
-from penumbra.services.search.objects.pose import RigidObject, Tracker, find_pose
+from penumbra.services.search.objects.pose import RigidObject, Tracker, find_pose, started
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster
 from penumbra.shared.geometry.lens import Lens
@@ -212,6 +212,20 @@ def test_a_picture_alone_gives_the_pose_from_far_starts(drill, rigid):
         found = find_pose(rigid, None, K, moved(T, 20.0, 0.03, np.random.default_rng(seed)), picture=picture)
         assert errors(drill, found.T, T).add < CONVERGED / 2
         assert nees(found, T) < 22.5
+
+
+def test_the_last_steps_of_a_search_bring_a_distance_nearer_to_the_true_one(drill, rigid):
+    T, _ = scene(drill, (79, 0), EXACT)
+    true = T @ rigid.T_object_middle
+    far = true.copy()
+    far[:3, 3] *= 1.02
+    prior = started(rigid, far @ rigid.T_middle_object)
+    window = region.Window(photographed(drill, T, 0), None, None, K, rigid.shape, far, 0.0)
+    at = window.level(window.factors[-1], window.of_pose(rigid.shape.coarse, far, 0.015))
+    begin = contest.scored(rigid.shape, rigid.shape.fine, at, far, prior, True)
+    (found,) = contest.settled(rigid.shape, [begin], prior)
+    assert abs(found.T[2, 3] - true[2, 3]) < 0.5 * abs(far[2, 3] - true[2, 3])
+    assert found.score > begin.score
 
 
 def test_a_picture_without_the_object_is_not_tracked(drill, rigid):

@@ -342,3 +342,16 @@ def test_the_doctor_trusts_a_pose_that_says_nothing_is_near_more_than_a_pad_that
     pads = examination.judge({})["pads"]
     assert all(row["fault"] == "drift" for row in pads["p1"]["electrodes"].values())
     assert not any(row["fault"] for row in pads["p0"]["electrodes"].values())
+
+
+def test_a_pad_that_something_touches_is_not_called_faulty():
+    """Its electrodes read the end of their scale, as those of a pad whose amplifier is turned too high do."""
+    examination, rng = Examination(CELL), np.random.default_rng(14)
+    for i in range(60):
+        stamp_ns = 10**18 + (i + 1) * BATCH * PERIOD_NS
+        volts = rest(BATCH, rng)
+        volts[:, 0] = 1.65
+        examination.voltages(Voltages(stamp_ns=stamp_ns, period_ns=PERIOD_NS, volts=volts.astype("f4")), {"pad": "p0"})
+    alone, touched = examination.judge({})["pads"]["p0"], examination.judge({}, frozenset({"p0"}))["pads"]["p0"]
+    assert alone["electrodes"]["c"]["fault"] == "saturated" and not alone["touched"]
+    assert touched["electrodes"]["c"]["fault"] is None and touched["touched"]

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -21,6 +22,7 @@ from penumbra.shared.contract import messages, topics
 from penumbra.shared.recording import provenance, reading
 from penumbra.shared.recording.entries import as_on_the_bus
 from penumbra.shared.recording.faults import RecordingError
+from penumbra.shared.recording.foxglove import Viewers
 from penumbra.shared.recording.reading import Recording
 from penumbra.tests.support.nodes import pose
 from penumbra.tests.support.recorded import entries, new_file, on_the_bus, recorded, taken
@@ -202,6 +204,32 @@ def test_viewers_find_a_scene_of_meshes_in_the_frames_that_move(path):
     assert len(arm.triangles[0].points) == len(mesh.vertices)
     assert by_name["panda/panda_link3"].frame_id == "panda/panda_link3"
     assert {f"pad {name}" for name in ARM.pads} <= by_name.keys()
+
+
+def test_viewers_find_points_of_surfaces_as_spheres_where_they_are_and_touched_ones_apart():
+    def felt(at_ns, touched=(), **surface):
+        points = {
+            pad: messages.SurfacePoint("panda/panda_link5", (0.1, distance, 0.3), distance, 0.01, 0.02, distance)
+            for pad, distance in surface.items()
+        }
+        message = messages.HapticPose(
+            stamp_ns=10**18 + at_ns, sample_stamp_ns=10**18, target="forearm", frame="world", position=np.zeros(3),
+            orientation=np.array([0.0, 0.0, 0.0, 1.0]), information=np.eye(6), gap=0.1, state="object", surface=points,
+            contact="touch" if touched else "none", touched=touched,
+        )  # fmt: skip
+        return taken(ARM, topics.HAPTIC, {"target": "forearm"}, message)
+
+    viewers = Viewers(ARM)
+    scenes = [
+        [SceneUpdate.FromString(entry.data) for entry in viewers.of(each) if entry.channel.topic == "/scene"]
+        for each in (felt(0, ("p3",), p2=0.05, p3=0.004), felt(1_000_000, p2=0.05), felt(50_000_000))
+    ]
+    (entity,) = scenes[0][0].entities
+    assert [sphere.pose.position.y for sphere in entity.spheres] == [0.05, 0.004]
+    assert entity.frame_id == "world" and entity.spheres[0].size.x == pytest.approx(0.02)
+    assert entity.spheres[1].color.r > entity.spheres[0].color.r
+    assert not scenes[1], "no more often than a viewer shows"
+    assert [each.id for each in scenes[2][0].entities] == [entity.id] and not scenes[2][0].entities[0].spheres
 
 
 # ---- files that were not closed

@@ -1,0 +1,113 @@
+"""Other poses of a tracked limb that explain the picture as well: its roll where the hand is hidden, its tilt where it lies
+in the image plane.
+
+A forearm is nearly round: without its hand, a limb that is turned over has almost the same contour, and every fit stays with
+the turn that it began with, surely or not. So its rivals are fitted to the picture: turns about the limb's axis, and the mirror
+image of its tilt. A rival that the picture prefers takes the pose's place. One that it cannot refute makes the pose
+as uncertain as the two are apart, until it is compared again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from penumbra.services.search import detect
+from penumbra.services.search.image_fit import TYPICAL
+from penumbra.services.search.mask_fit import Fit, Limits
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+
+TURNS = tuple(math.radians(degrees) for degrees in (180.0, 60.0, -60.0, 120.0, -120.0))
+"""Turns of the rivals about the limb's axis [rad]: as far apart as `PASSES` steps of a fit reach."""
+RIVALS = len(TURNS) + 1
+"""Number of rivals: the turns, and the mirror image."""
+PASSES = 8
+"""Steps of a rival's fit, at most."""
+REFUTED = 9.0
+"""Difference of two poses' `Fit.cost` from which the worse one is refuted: three standard deviations. Where even the better one
+fits worse than noise explains, the difference counts less."""
+PREFERRED = 18.0
+"""The same from which a rival takes the pose's place. Chosen: half as much let poses that are wrong as well take it."""
+LASTS = 10.0
+"""Number of pictures in a row of which the same one of two poses may be the wrong one. An observer takes the pictures' errors for
+independent: ten that prefer the wrong turn a little would convince it."""
+APART_RAD = 0.2
+"""Poses that differ by less are one."""
+JUMPED_RAD = 0.4
+"""A pose that differs by more from that in the picture before has jumped: then that one is its rival."""
+
+
+class Rivals:
+    """The rivals of one tracked limb: all of them in its first picture, then one in each."""
+
+    def __init__(self, limits: Limits):
+        self._limits = limits
+        self._next = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, as with another limb."""
+        self._doubts: deque[Array | None] = deque(maxlen=RIVALS)
+        self._before: Array | None = None
+
+    def contested(self, best: Fit, shown: Callable[[Array, int], Fit]) -> Fit:
+        """`best`, or a rival where the picture prefers that, as uncertain as rivals make it.
+
+        shown(T, passes): the pose near T (4 x 4) after at most so many steps, of forearm and hand alike and without regard to a
+        prediction.
+        """
+        if self._before is not None and _angle(self._before, best.T) > JUMPED_RAD:
+            other = shown(self._before, PASSES)
+            if _excess(other, best, shown) < -PREFERRED:
+                best = other
+        for _ in range(1 if len(self._doubts) == RIVALS else RIVALS):
+            other = shown(self._start(best), PASSES)
+            excess = _excess(other, best, shown)
+            if excess < -PREFERRED:
+                self._doubts.clear()
+                best = other
+            else:
+                self._doubts.append(self._doubt(best, other, excess) if excess < REFUTED else None)
+        self._before = best.T
+        axes = _axes(best)
+        doubts = [axes @ doubt @ axes.T for doubt in self._doubts if doubt is not None]
+        return replace(best, covariance=sum(doubts, best.covariance))
+
+    def _start(self, best: Fit) -> Array:
+        """The pose from which to fit the next rival."""
+        turn, T = self._next, best.T_searched.copy()
+        self._next = (turn + 1) % RIVALS
+        if turn == len(TURNS):
+            return detect.mirrored(T)[0]
+        T[:3, :3] = rigid.rotation(TURNS[turn] * T[:3, 0]) @ T[:3, :3]
+        return T
+
+    def _doubt(self, best: Fit, other: Fit, excess: float) -> Array:
+        """What a rival adds to the covariance (6, 6) of a pose, along the limb's axes: as much of its own covariance, and of the
+        square of what they are apart, `LASTS` times, as it has of the probability of both."""
+        apart = rigid.pose_error(other.T, best.T)
+        apart[3:] *= min(1.0, self._limits.rotation / float(np.linalg.norm(apart[3:])))
+        axes, share = _axes(best), 1.0 / (1.0 + math.exp(0.5 * excess))
+        return np.asarray(share * axes.T @ (other.covariance + LASTS * np.outer(apart, apart)) @ axes, np.float64)
+
+
+def _excess(other: Fit, best: Fit, shown: Callable[[Array, int], Fit]) -> float:
+    """By how much a rival's cost is above that of the best pose; infinite where it is the same pose, or none."""
+    if not other.sharp or _angle(other.T, best.T) < APART_RAD:
+        return math.inf
+    here = best if best.hand == 1.0 else shown(best.T_searched, 1)
+    return (other.cost - here.cost) / max(1.0, min(other.rms, here.rms) / TYPICAL) ** 2
+
+
+def _angle(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(rigid.pose_error(a, b)[3:]))
+
+
+def _axes(fit: Fit) -> Array:
+    """From the limb's axes to the camera's, of a pose error (6, 6)."""
+    return np.asarray(np.kron(np.eye(2), fit.T[:3, :3]), np.float64)
