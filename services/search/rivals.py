@@ -36,6 +36,10 @@ PREFERRED = 18.0
 LASTS = 10.0
 """Number of pictures in a row of which the same one of two poses may be the wrong one. An observer takes the pictures' errors for
 independent: ten that prefer the wrong turn a little would convince it."""
+FIRST = 3
+"""Number of a limb's first pictures in which all rivals are compared: an observer that begins with a wrong turn keeps it."""
+REFUTED_TIMES = 2
+"""Number of pictures in a row that have to refute a rival: where the two explain a picture nearly alike, noise refutes it once."""
 APART_RAD = 0.2
 """Poses that differ by less are one."""
 JUMPED_RAD = 0.4
@@ -43,7 +47,7 @@ JUMPED_RAD = 0.4
 
 
 class Rivals:
-    """The rivals of one tracked limb: all of them in its first picture, then one in each."""
+    """The rivals of one tracked limb: all of them in its first pictures, then one in each."""
 
     def __init__(self, limits: Limits):
         self._limits = limits
@@ -52,7 +56,8 @@ class Rivals:
 
     def forget(self) -> None:
         """Begin anew, as with another limb."""
-        self._doubts: deque[Array | None] = deque(maxlen=RIVALS)
+        self._doubts: list[deque[Array | None]] = [deque(maxlen=REFUTED_TIMES) for _ in range(RIVALS)]
+        self._pictures = 0
         self._before: Array | None = None
 
     def contested(self, best: Fit, shown: Callable[[Array, int], Fit]) -> Fit:
@@ -65,27 +70,23 @@ class Rivals:
             other = shown(self._before, PASSES)
             if _excess(other, best, shown) < -PREFERRED:
                 best = other
-        for _ in range(1 if len(self._doubts) == RIVALS else RIVALS):
-            other = shown(self._start(best), PASSES)
+        for _ in range(RIVALS if self._pictures < FIRST else 1):
+            which, self._next = self._next, (self._next + 1) % RIVALS
+            other = shown(_start(best, which), PASSES)
             excess = _excess(other, best, shown)
             if excess < -PREFERRED:
-                self._doubts.clear()
+                self.forget()
                 best = other
             else:
-                self._doubts.append(self._doubt(best, other, excess) if excess < REFUTED else None)
+                self._doubts[which].append(self._doubt(best, other, excess) if excess < REFUTED else None)
+        self._pictures += 1
         self._before = best.T
-        axes = _axes(best)
-        doubts = [axes @ doubt @ axes.T for doubt in self._doubts if doubt is not None]
-        return replace(best, covariance=sum(doubts, best.covariance))
-
-    def _start(self, best: Fit) -> Array:
-        """The pose from which to fit the next rival."""
-        turn, T = self._next, best.T_searched.copy()
-        self._next = (turn + 1) % RIVALS
-        if turn == len(TURNS):
-            return detect.mirrored(T)[0]
-        T[:3, :3] = rigid.rotation(TURNS[turn] * T[:3, 0]) @ T[:3, :3]
-        return T
+        axes, covariance = _axes(best), best.covariance
+        for doubts in self._doubts:
+            left = [doubt for doubt in doubts if doubt is not None]
+            if left:
+                covariance = covariance + axes @ left[-1] @ axes.T
+        return replace(best, covariance=covariance)
 
     def _doubt(self, best: Fit, other: Fit, excess: float) -> Array:
         """What a rival adds to the covariance (6, 6) of a pose, along the limb's axes: as much of its own covariance, and of the
@@ -96,12 +97,25 @@ class Rivals:
         return np.asarray(share * axes.T @ (other.covariance + LASTS * np.outer(apart, apart)) @ axes, np.float64)
 
 
+def _start(best: Fit, which: int) -> Array:
+    """The pose from which to fit a rival."""
+    T = best.T_searched.copy()
+    if which == len(TURNS):
+        return detect.mirrored(T)[0]
+    T[:3, :3] = rigid.rotation(TURNS[which] * T[:3, 0]) @ T[:3, :3]
+    return T
+
+
 def _excess(other: Fit, best: Fit, shown: Callable[[Array, int], Fit]) -> float:
-    """By how much a rival's cost is above that of the best pose; infinite where it is the same pose, or none."""
+    """By how much a rival's cost is above that of the best pose; infinite where it is the same pose, or none. Costs are taken for
+    the longer of the two contours: a hand that is seen edge on has less of it than one that shows its fingers, and must not be
+    the cheaper for what it leaves unexplained."""
     if not other.sharp or _angle(other.T, best.T) < APART_RAD:
         return math.inf
     here = best if best.hand == 1.0 else shown(best.T_searched, 1)
-    return (other.cost - here.cost) / max(1.0, min(other.rms, here.rms) / TYPICAL) ** 2
+    longer = max(other.length, here.length)
+    excess = longer * (other.cost / other.length - here.cost / here.length)
+    return excess / max(1.0, min(other.rms, here.rms) / TYPICAL) ** 2
 
 
 def _angle(a: Array, b: Array) -> float:

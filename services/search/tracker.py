@@ -116,7 +116,8 @@ class Search:
         due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost", bool(starts))
         other = self._detect(mask, T_start, joints, starts) if due else None
         if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
-            tracked = other[0], self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
+            found = self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
+            tracked = other[0], self._among_rivals(other[0], found, image)
         if tracked is None:
             return self._lost(T_start)
         return self._judge(*tracked, image is not None, T_start if T_prior is not None else None, prior_covariance)
