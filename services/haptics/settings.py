@@ -93,13 +93,14 @@ class HapticSettings:
     apart: float = 4.0
     """Squared Mahalanobis distance above which two places are two. Below it, one of them with its covariance stands for both.
     Chosen: two standard deviations."""
-    beside_odds: float = 2.0
-    """Log odds of the track over a rival that was found beside it and explains the window as well: seven to one. Chosen: the
-    rival was searched for, and one of many places always explains a single window."""
+    beside_odds: float = 4.0
+    """Log odds of the track over a rival that was found beside it and explains the window as well: 55 to one. Chosen on recordings
+    of `arm`: the rival was searched for, one of many places always explains a single window, and a limb that is followed rarely is
+    elsewhere. With seven to one the track jumped to places up to 20 cm away, and stayed there for a quarter of a second."""
     odds_step: float = 2.0
     """Largest change of the log odds by one window, so that a burst of noise does not decide. Chosen."""
-    odds_decided: float = 5.0
-    """Log odds from which the rival is dropped: 150 to one. Chosen. Below zero the two change places."""
+    odds_decided: float = 7.0
+    """Log odds from which the rival is dropped: a thousand to one. Chosen. Below zero the two change places."""
     slides: tuple[float, ...] = (0.0, -0.08, 0.08, -0.16, 0.16, -0.24, 0.24)
     """Displacements along the limb [m] of the starts from scratch, from home. Chosen to cover a forearm: its thick and thin parts
     feel alike."""
@@ -111,6 +112,9 @@ class HapticSettings:
     error_lasts: float = 5.0
     """Number of successive windows in which the field model makes about the same error. Its variance is multiplied by it, because
     fusion takes the windows' errors for independent. Chosen by the NEES of `penumbra bench haptics`."""
+    doubt_lasts: float = 50.0
+    """The same number for the doubt about two places: a second, in which one window after the other may prefer the wrong one.
+    Chosen likewise."""
     size_lasts: float = 25.0
     """The same number for the error of the limb's size, which stays for as long as the person does. Chosen likewise."""
     links_error: float = 0.005

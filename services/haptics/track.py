@@ -122,13 +122,13 @@ class Track:
 
     def mixed(self, information: Array, gradient: Array) -> tuple[Array, Array]:
         """A likelihood at the track, as information (6, 6) and gradient (6,), widened to the mixture of the track and its
-        rival. The scatter between the two lasts as long as the model's error does."""
+        rival. The scatter between the two lasts for as long as it is not decided."""
         if self.rival is None:
             return information, gradient
         offset, share = pose_error(self.rival.T, self.place.T), 1.0 / (1.0 + np.exp(self.odds))
         mean, scatter = share * offset, share * (1.0 - share) * np.outer(offset, offset)
         if scatter.any():
-            keep = np.linalg.inv(np.eye(6) + self._settings.error_lasts * information @ scatter)
+            keep = np.linalg.inv(np.eye(6) + self._settings.doubt_lasts * information @ scatter)
             gradient = keep @ (gradient + information @ mean)
             information = keep @ information
         return information, gradient
