@@ -38,6 +38,8 @@ LASTS = 10.0
 independent: ten that prefer the wrong turn a little would convince it."""
 FIRST = 3
 """Number of a limb's first pictures in which all rivals are compared: an observer that begins with a wrong turn keeps it."""
+MOST = 2 * RIVALS
+"""Number of rivals that one picture compares, at most: where one of them takes the pose's place, all are compared with that."""
 REFUTED_TIMES = 2
 """Number of pictures in a row that have to refute a rival: where the two explain a picture nearly alike, noise refutes it once."""
 APART_RAD = 0.2
@@ -47,7 +49,7 @@ JUMPED_RAD = 0.4
 
 
 class Rivals:
-    """The rivals of one tracked limb: all of them in its first pictures, then one in each."""
+    """The rivals of one tracked limb: all of them in its first pictures and where one takes its place, otherwise one in each."""
 
     def __init__(self, limits: Limits):
         self._limits = limits
@@ -70,15 +72,18 @@ class Rivals:
             other = shown(self._before, PASSES)
             if _excess(other, best, shown) < -PREFERRED:
                 best = other
-        for _ in range(RIVALS if self._pictures < FIRST else 1):
+        due = RIVALS if self._pictures < FIRST else 1
+        for compared in range(1, MOST + 1):
             which, self._next = self._next, (self._next + 1) % RIVALS
             other = shown(_start(best, which), PASSES)
             excess = _excess(other, best, shown)
             if excess < -PREFERRED:
                 self.forget()
-                best = other
+                best, due = other, compared + RIVALS
             else:
                 self._doubts[which].append(self._doubt(best, other, excess) if excess < REFUTED else None)
+            if compared == due:
+                break
         self._pictures += 1
         self._before = best.T
         axes, covariance = _axes(best), best.covariance

@@ -61,9 +61,11 @@ def test_a_single_window_changes_the_odds_by_a_limited_step_and_several_decide()
     track = followed(place(0.15))
     assert not track.weigh(place(0.15), 100.0)
     assert track.odds == SETTINGS.odds_step and track.rival is not None
-    for _ in range(2):
+    while track.odds + SETTINGS.odds_step < SETTINGS.odds_decided:
         track.weigh(place(0.15), 100.0)
-    assert track.rival is None, "150 to one: the rival is dropped"
+        assert track.rival is not None
+    track.weigh(place(0.15), 100.0)
+    assert track.rival is None, "a thousand to one: the rival is dropped"
 
 
 def test_a_rival_that_becomes_more_probable_changes_places_with_the_track():
@@ -80,7 +82,7 @@ def test_the_mixture_of_two_places_is_less_sure_along_the_line_between_them_alon
     mixed, gradient = followed(place(0.15)).mixed(information, np.zeros(6))
     covariance = np.linalg.inv(mixed)
     between = 0.25 * 0.15**2  # two places equally probable
-    assert covariance[0, 0] == pytest.approx(1e-4 + SETTINGS.error_lasts * between)
+    assert covariance[0, 0] == pytest.approx(1e-4 + SETTINGS.doubt_lasts * between)
     np.testing.assert_allclose(np.diag(covariance)[1:], 1e-4, rtol=1e-9)
     assert np.linalg.solve(mixed, gradient)[0] == pytest.approx(0.075), "its mean lies half-way"
 
