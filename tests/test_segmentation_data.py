@@ -1,6 +1,7 @@
 """What the segmentation learns from beside the simulation's usual looks: posed hands, real cameras, photographs."""
 
 import csv
+import subprocess
 from pathlib import Path
 
 import cv2
@@ -212,8 +213,7 @@ def test_clones_become_folders_to_train_on_and_what_is_missing_is_named(sources,
     call = [str(sources), "--tables", str(sources / "tables"), "--out", str(sources / "out"), "--models", str(sources / "none")]
     assert photographs.main(call) == 0
     said = capsys.readouterr()
-    assert f"git clone https://github.com/nobody/cloned && git -C cloned checkout {'0' * 40}" in said.err
-    assert "somebody/pictures" not in said.err and not (sources / "out" / "street").exists()
+    assert "expected clones of nobody/cloned as well" in said.err and not (sources / "out" / "street").exists()
     assert "street is left out" in said.err and "penumbra segmentation models" in said.err
     close, scenes = (sources / "out" / kind for kind in ("close", "scenes"))
     assert {path.stem for path in (close / "images").iterdir()} == {"large", "white"}
@@ -227,6 +227,42 @@ def test_clones_become_folders_to_train_on_and_what_is_missing_is_named(sources,
     assert recordings.Recordings([scenes], 1).count > 0
     before = {path.name: path.read_bytes() for path in scenes.rglob("*.*")}
     assert photographs.main(call) == 0 and before == {path.name: path.read_bytes() for path in scenes.rglob("*.*")}
+
+
+def test_missing_clones_are_got_at_the_commit_of_the_table_with_nothing_but_the_pictures(sources, monkeypatch, capsys):
+    monkeypatch.setattr(photographs, "SCENE", (90, 120))
+    published = sources / "published" / "nobody" / "cloned"
+
+    def git(*words: str) -> str:
+        identity = ("-c", "user.name=nobody", "-c", "user.email=nobody")
+        return subprocess.run(
+            ["git", *identity, *words], cwd=published, check=True, capture_output=True, text=True
+        ).stdout.strip()
+
+    published.mkdir(parents=True)
+    git("init", "--quiet")
+    image = np.full((90, 120, 3), 200, np.uint8)
+    for name in ("arms [1].png", "arms 1.png"):
+        cv2.imwrite(str(published / name), image)
+    git("add", ".")
+    git("commit", "--quiet", "--message", "the one of the table")
+    commit = git("rev-parse", "HEAD")
+    cv2.imwrite(str(published / "arms [1].png"), image[:50])
+    git("commit", "--quiet", "--all", "--message", "a later one")
+    tables = sources / "tables"
+    cv2.imwrite(str(tables / "masks" / "elsewhere.png"), np.full((90, 120), Label.HAND, np.uint8))
+    pictures, repositories = tables / "pictures.csv", tables / "repositories.csv"
+    pictures.write_text(pictures.read_text().replace("nobody/cloned,1.png", "nobody/cloned,arms [1].png"))
+    call = [str(sources), "--tables", str(tables), "--out", str(sources / "out"), "--models", str(sources / "none")]
+    call += ["--get", str(sources / "published")]
+
+    assert photographs.main(call) == 0
+    assert "nobody/cloned: expected git to clone commit 000000" in capsys.readouterr().err and not (sources / "cloned").exists()
+    repositories.write_text(repositories.read_text().replace(f"nobody/cloned,{'0' * 40}", f"nobody/cloned,{commit}"))
+    assert photographs.main(call) == 0
+    assert "nobody/cloned" not in capsys.readouterr().err
+    assert {path.name for path in (sources / "cloned").iterdir()} == {".git", "arms [1].png"}
+    assert (recordings.read_mask(sources / "out" / "close" / "masks" / "elsewhere.png") == Label.HAND).all()
 
 
 def test_a_clone_of_another_commit_is_refused(sources, capsys):

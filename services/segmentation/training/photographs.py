@@ -8,6 +8,8 @@ folders are written, of what the clones have:
   close    hands and forearms at work, with the project's masks
   scenes   pictures without people, and cut-out hands in front of these
 
+With --get, `git clone` fetches the repositories first, each at its commit in the table, and only the files that are used.
+
 A larger picture is shrunk, by the mean of areas, until its longer side has 960 pixels; that is the size of the masks.
 """
 
@@ -27,13 +29,15 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from penumbra.services import flags
-from penumbra.services.segmentation.training import models, pasted, street
+from penumbra.services.segmentation.training import clones, models, pasted, street
 from penumbra.services.segmentation.training.recordings import DataError, read_mask
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.perception.landmarks import Landmarks, ModelsError
 
 STREET = "bearpaw/clothing-co-parsing"
 HANDS = "ardamavi/Sign-Language-Digits-Dataset"
+WHOLE = {STREET: street.PATHS, HANDS: ("Dataset",)}
+"""What is used of the repositories whose pictures pictures.csv does not list one by one: paths in each."""
 LONGEST = 960
 """Pixels of a picture's longer side at most."""
 QUALITY = 95
@@ -48,26 +52,6 @@ HANDS_IN_A_SCENE = 2, 4
 """Bounds of their number."""
 REPEATS = 6
 """Scenes made of each picture on white."""
-
-
-@dataclass(frozen=True)
-class Repository:
-    """A line of repositories.csv: repository "owner/name"; licence and copyright are for readers."""
-
-    repository: str
-    commit: str
-    licence: str
-    copyright: str
-
-    @property
-    def folder(self) -> str:
-        """Where `git clone` puts it."""
-        return self.repository.split("/")[1]
-
-    @property
-    def clone(self) -> str:
-        """The command that gets what the table means."""
-        return f"git clone https://github.com/{self.repository} && git -C {self.folder} checkout {self.commit}"
 
 
 @dataclass(frozen=True)
@@ -132,33 +116,44 @@ class Folder:
 class Sources:
     """The tables of a folder, and the clones in another one. Raises OSError or TypeError where a table cannot be read."""
 
-    def __init__(self, tables: Path, clones: Path):
+    def __init__(self, tables: Path, folder: Path):
         with (tables / "repositories.csv").open(newline="") as file:
-            found = [Repository(**row) for row in csv.DictReader(file)]
+            self._repositories = [clones.Repository(**row) for row in csv.DictReader(file)]
         with (tables / "pictures.csv").open(newline="") as file:
-            pictures = [Picture(**row) for row in csv.DictReader(file)]
-        self.missing = [repository for repository in found if not (clones / repository.folder).is_dir()]
-        self._there = {
-            repository.repository: clones / repository.folder for repository in found if repository not in self.missing
-        }
+            self._pictures = [Picture(**row) for row in csv.DictReader(file)]
         self._masks = tables / "masks"
-        self._pictures = [picture for picture in pictures if picture.repository in self._there]
+        self._folder = folder
+
+    @property
+    def missing(self) -> list[clones.Repository]:
+        """The repositories that there is no clone of."""
+        return [repository for repository in self._repositories if not self.clone(repository.repository)]
 
     def clone(self, repository: str) -> Path | None:
         """Where a repository's clone is, if it is."""
-        return self._there.get(repository)
+        place = self._place(repository)
+        return place if place.is_dir() else None
+
+    def get(self, repository: clones.Repository, host: str) -> None:
+        """Clones what is used of a repository. Raises CloneError."""
+        listed = (picture.path for picture in self._pictures if picture.repository == repository.repository)
+        paths = dict.fromkeys([*WHOLE.get(repository.repository, ()), *listed])
+        repository.get(self._place(repository.repository), host, paths)
 
     def pictures(self, kind: str) -> list[Picture]:
         """The pictures of a kind that the clones should have."""
-        return [picture for picture in self._pictures if picture.kind == kind]
+        return [picture for picture in self._pictures if picture.kind == kind and self.clone(picture.repository)]
 
     def read(self, picture: Picture) -> NDArray[np.uint8]:
         """A picture (h, w, 3) BGR. Raises DataError where the clone has not that one."""
-        return picture.read(self._there[picture.repository])
+        return picture.read(self._place(picture.repository))
 
     def mask(self, picture: Picture) -> NDArray[np.uint8]:
         """Classes (h, w) of a close picture. Raises DataError where there are none."""
         return read_mask(self._masks / f"{picture.name}.png")
+
+    def _place(self, repository: str) -> Path:
+        return self._folder / repository.split("/")[1]
 
 
 def write_close(sources: Sources, out: Path) -> int:
@@ -224,20 +219,31 @@ def _empty(
     "segmentation photographs",
     "Makes frames and masks for `penumbra segmentation train --data` from clones of public repositories.\n\n" + (__doc__ or ""),
     flags.Argument(
-        "clones", type=Path, help="folder with the clones; those that are not there are named, with the commands to get them"
+        "clones", type=Path, help="folder with the clones, each called as its repository; those that are not there are named"
+    ),
+    flags.Option(
+        "--get",
+        takes="maybe",
+        without=clones.HOST,
+        metavar="[URL]",
+        help=f"clone what is not there, from URL/OWNER/NAME (without a value: {clones.HOST}/OWNER/NAME)",
     ),
     models.FOLDER,
     flags.Option("--tables", type=Path, default=Path("training/photographs"), help="the project's folder with tables and masks"),
     flags.Option("--out", type=Path, default=Path("photographs"), help="folder to write street/, close/ and scenes/ to"),
-    example="penumbra segmentation photographs clones",
+    example="penumbra segmentation photographs clones --get",
 )
 def main(options: flags.Options) -> int:
-    """Writes the folders that can be made of the clones that are there."""
+    """Clones where asked to, then writes the folders that can be made of the clones that are there."""
     try:
         sources = Sources(options.tables, options.clones)
-        if sources.missing:
-            lines = "\n".join(f"  {repository.clone}" for repository in sources.missing)
-            _tell(f"{options.clones}: expected these clones as well; what needs them is left out:\n{lines}")
+        for repository in track(sources.missing if options.get else (), "clones"):
+            try:
+                sources.get(repository, options.get)
+            except clones.CloneError as error:
+                _tell(str(error))
+        if missing := ", ".join(repository.repository for repository in sources.missing):
+            _tell(f"{options.clones}: expected clones of {missing} as well; what needs them is left out (--get clones them)")
         folders = {}
         people = sources.clone(STREET)
         if people:

@@ -22,6 +22,8 @@ from rich.progress import track
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 from penumbra.shared.perception.landmarks import Landmarks, Pose
 
+PATHS = "photos", "annotations/pixel-level", "label_list.mat"
+"""What is used of the dataset's repository."""
 SLEEVED = (
     "blazer",
     "blouse",
