@@ -23,6 +23,7 @@ from penumbra.services.search.contour import DROPPED, NEAR, Model, Points
 from penumbra.services.search.evidence import COVERED, FREE, TARGET, Evidence
 from penumbra.services.search.mask_fit import Noise
 from penumbra.services.search.objects.creases import Creases
+from penumbra.services.search.objects.paint import Paint
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
@@ -58,11 +59,13 @@ MAX_STEP = np.array([0.08, 0.08, 0.15, 0.3, 0.3, 0.3])
 
 @dataclass(frozen=True)
 class Shape:
-    """An object about its own middle: with few triangles for the small picture, and with all; and its creases."""
+    """An object about its own middle: with few triangles for the small picture, and with all; its creases; and its colours for
+    both, None where it has none."""
 
     coarse: Model
     fine: Model
     creases: Creases
+    paints: tuple[Paint, Paint] | None
 
     @property
     def size(self) -> float:

@@ -56,8 +56,11 @@ def scored(shape: Shape, model: Model, at: Level, T: Array, prior: Prior, crease
     if creases:
         inside = lines(shape, model, at, T, SCORING, True)
         score += float(inside.length @ np.log(np.maximum(inside.support, LEAST_SUPPORT)))
+    score = score / SCORED_PX - 0.5 * prior.cost(T)
+    if (colours := at.compared(model, T)) is not None:
+        score += colours.score
     support = float(contour.length @ (contour.support > 1.0)) / length
-    return Found(T, score / SCORED_PX - 0.5 * prior.cost(T), support, length * at.scale, at)
+    return Found(T, score, support, length * at.scale, at)
 
 
 def search(shape: Shape, window: Window, prior: Prior, reach: float) -> list[Found]:

@@ -20,6 +20,7 @@ from penumbra.services.search.mask_fit import Limits, Noise
 from penumbra.services.search.objects import basin, contest, meshes, region
 from penumbra.services.search.objects.basin import Level, Prior, Pyramid, Score, Shape
 from penumbra.services.search.objects.creases import Creases
+from penumbra.services.search.objects.paint import Cloud, painted
 from penumbra.services.search.settings import ONE_IN_10_000
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry.rigid import Array, inverse, perturb, pose_error, transform
@@ -46,16 +47,18 @@ the boundary errs: fitted to the masks of `penumbra bench objects`."""
 
 
 class RigidObject:
-    """A mesh prepared for contours, about its own middle. Raises ObjectFileError for a mesh without a surface."""
+    """A mesh prepared for contours, about its own middle, and for pictures of its colours where there are some. Raises
+    ObjectFileError for a mesh without a surface."""
 
-    def __init__(self, mesh: Mesh):
+    def __init__(self, mesh: Mesh, colours: Cloud | None = None):
         mesh = meshes.repaired(mesh, FACES[1])
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         self.T_object_middle = transform((low + high) / 2.0)
         self.T_middle_object = inverse(self.T_object_middle)
         mesh = Mesh(mesh.vertices - (low + high) / 2.0, mesh.faces, mesh.labels)
         coarse = Model(meshes.repaired(mesh, FACES[0]))
-        self.shape = Shape(coarse, Model(mesh), Creases(coarse))
+        paints = None if colours is None else painted(mesh, replace(colours, points=colours.points - (low + high) / 2.0))
+        self.shape = Shape(coarse, Model(mesh), Creases(coarse), paints)
         self.diameter = float(np.linalg.norm(high - low))
         self._moments = mesh.vertices.T @ mesh.vertices / len(mesh.vertices)
 

@@ -27,6 +27,7 @@ from penumbra.services.search.evidence import GUARD_PX
 from penumbra.services.search.mask_fit import Limits
 from penumbra.services.search.objects import basin
 from penumbra.services.search.objects.basin import Contour, Prior, Shape
+from penumbra.services.search.objects.paint import Compared, Paint, compared, smoothed
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
@@ -80,13 +81,19 @@ ONTO = 1.0
 @dataclass(frozen=True)
 class Level:
     """A window of the picture whose pixels are `scale` image pixels wide: log-odds (h, w) of being the object's, gradient (h, w,
-    2) of the strongest colour against its typical size, and `guarded` (h, w) uint8 where something covers."""
+    2) of the strongest colour against its typical size, and `guarded` (h, w) uint8 where something covers; the mesh's `paint` and
+    the smoothed picture (h, w, 3) that it is compared with, None where the mesh has no colours."""
 
     odds: Floats
     gradient: Floats
     guarded: Bytes
     k: Intrinsics
     scale: int
+    painted: tuple[Paint, Floats] | None
+
+    def compared(self, model: Model, T: Array) -> Compared | None:
+        """The colours of mesh and picture at a pose; None where there are none to compare."""
+        return None if self.painted is None else compared(self.painted[0], model, self.painted[1], self.guarded, self.k, T)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -105,6 +112,7 @@ class _Plain:
     k: Intrinsics
     prior: Floats | None
     inside: Floats | None
+    painted: tuple[Paint, Floats] | None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -149,6 +157,7 @@ class Window:
         self._k = Intrinsics(k.fx / s, k.fy / s, (k.cx - x0 - half) / s, (k.cy - y0 - half) / s)
         self.factors = sorted({2 ** max(0, round(math.log2(max(self._extent / size, 1.0)))) for size in SIZES}, reverse=True)
         self._learning = self.factors[min(1, len(self.factors) - 1)]
+        self._paints, self._depth = shape.paints, max(T[2, 3], NEAR)
         self._plain: dict[int, _Plain] = {}
 
     def plain(self, factor: int) -> _Plain:
@@ -180,7 +189,11 @@ class Window:
             distance = cv2.distanceTransform(mask, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
             inside = half((distance / min(BAND_PX / self.scale, 0.1 * self._extent)).astype(np.float32))
             prior = np.where(np.abs(inside) < 1.0, 0.0, np.sign(inside) * MASK_ODDS).astype(np.float32)
-        return _Plain((c[..., 0] * BINS + c[..., 1]) * BINS + c[..., 2], gradient, covered, guarded, k, prior, inside)
+        painted = None
+        if self._paints is not None:
+            paint = self._paints[0 if f == self.factors[0] else 1]
+            painted = paint, smoothed(image, paint.spread * k.fx / self._depth)
+        return _Plain((c[..., 0] * BINS + c[..., 1]) * BINS + c[..., 2], gradient, covered, guarded, k, prior, inside, painted)
 
     def level(self, factor: int, table: Floats) -> Level:
         """The window made smaller by a factor, with the log-odds (BINS^3,) of the colours."""
@@ -190,7 +203,8 @@ class Window:
         odds = table[self.plain(factor // n).bins[: h * n, : w * n]]
         if n > 1:
             odds = np.asarray(cv2.resize(odds, (w, h), interpolation=cv2.INTER_AREA), np.float32)
-        return Level(odds if at.prior is None else odds + at.prior, at.gradient, at.guarded, at.k, factor * self.scale)
+        odds = odds if at.prior is None else odds + at.prior
+        return Level(odds, at.gradient, at.guarded, at.k, factor * self.scale, at.painted)
 
     def table(self, inside: Floats, outside: Floats) -> Floats:
         """Log-odds (BINS^3,) of the colours that pixels of these weights (h, w) show, in the size for learning."""
@@ -420,6 +434,9 @@ def descend(
     for reach in reaches:
         found = [(lines(shape, model, at, T, reach, inside), inside) for inside in ((False, True) if creases else (False,))]
         H, g = information(found, at, T, robust * reach)
+        if (colours := at.compared(model, T)) is not None:
+            of_colours = colours.information(T)
+            H, g = H + of_colours[0], g + of_colours[1]
         H += prior.information
         H[_DIAGONAL] *= 1.0 + basin.DAMPING
         step = np.linalg.solve(H, g + prior.information @ rigid.pose_error(prior.T, T))
