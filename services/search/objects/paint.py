@@ -25,7 +25,7 @@ from penumbra.services.search.objects.creases import BEHIND
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster
 from penumbra.shared.geometry.rigid import Array
-from penumbra.shared.native import kernel
+from penumbra.shared.native import inner, kernel
 from penumbra.shared.perception.intrinsics import Intrinsics
 
 Floats = NDArray[np.float32]
@@ -43,12 +43,14 @@ DARK = 16.0
 SIGMA = 0.15
 """Least standard deviation of the picture's colours (logarithm) from those that the mesh's explain: highlights, shadows, prints that
 differ."""
-GAIN = (0.0, 1.6)
-"""Bounds of the picture's contrast against the mesh's: textures are scanned in other light and fade, but light is never dark."""
+GAIN = 1.6
+"""Largest contrast of the picture against the mesh's, the least being none: textures are scanned in other light, and fade."""
 GRAZING = 0.2
 """Least cosine between a surface's direction and the line of sight: flatter ones show nothing."""
 EDGE = 2.0
 """Distance from the silhouette's edge within which nothing is compared, in standard deviations of the smoothing."""
+LEAST_SEEN = 1e-3
+"""Share of the points' weight that is added to the normal equations of the light: of directions that no seen surface has."""
 FEWEST = 40
 """Least number of points that are compared."""
 ROBUST = 0.4
@@ -57,7 +59,7 @@ FITS = 2
 """Number of fits of the light, each with the weights of the one before."""
 HIDDEN = 0.05
 """Least likelihood of a point's colour, against that of any: it may be hidden."""
-PATCH = 10.0
+PATCH = 20.0
 """Number of points whose colours' differences err together: smoothing joins 4 or 5 of them (4 pi SPREAD^2), and highlights, shadows
 and errors of the texture's place more."""
 
@@ -144,15 +146,73 @@ def smoothed(image: NDArray[np.uint8], sigma: float) -> Floats:
     return np.log(np.arange(256, dtype=np.float32) + np.float32(DARK))[image]
 
 
-@kernel("f8[n, 3], f8[n, 3], f4[h, w, 3], f4[h, w], u1[h, w], f8[4], f8, f8, out i8[n], out f8[n, 3], out f8[n, 3, 2] -> i8")
-def _sampled(P, N, image, depth, unknown, k, behind, grazing, index, value, gradient):
-    """Writes of the points P (n, 3) with normals N, in the camera's frame, which are seen, the picture's colours there and how they
-    change along the picture's axes; returns how many."""
+@dataclass(frozen=True)
+class Compared:
+    """The points (n,) that are seen at a pose T: `position` and `normal` (n, 3) in the camera's frame, `colours` (n, 3) of the mesh,
+    the picture's `gradient` (n, 3, 2) by the direction of the line of sight, what the mesh's colours leave of the picture's (n, 3),
+    what shading alone leaves of them (n, 3), and the `share` (n,) of an independent patch that each point is."""
+
+    T: Array
+    position: Array
+    normal: Array
+    colours: Array
+    gradient: Array
+    left: Array
+    plain: Array
+    share: Array
+
+    @property
+    def score(self) -> float:
+        """Log-likelihood of the mesh's colours against that of any others, over all patches."""
+        return float(_score(self.left, self.plain, self.share, SIGMA, ROBUST, HIDDEN))
+
+    @property
+    def information(self) -> tuple[Array, Array]:
+        """The information (6, 6) about the pose error at T [m, rad] and its right side (6,), with the light marginalised."""
+        H, g, origin = np.empty((6, 6)), np.empty(6), np.ascontiguousarray(self.T[:3, 3])
+        basis = self.position, self.normal, self.colours
+        _information(*basis, self.gradient, self.left, self.share, origin, SIGMA, ROBUST, LEAST_SEEN, H, g)
+        return H, g
+
+
+def compared(paint: Paint, model: Model, image: Floats, guarded: NDArray[np.uint8], k: Intrinsics, T: Array) -> Compared | None:
+    """The colours of the mesh and of a smoothed picture (h, w, 3) at a pose T_camera_object; None where too little is seen."""
+    P, N = paint.points @ T[:3, :3].T + T[:3, 3], paint.normals @ T[:3, :3].T
+    h, w = guarded.shape
+    surface = raster.Raster(w, h)
+    surface.draw(model.in_camera(T), model.faces, k.fx, k.fy, k.cx, k.cy, 0)
+    # near the contour the smoothed picture shows the surroundings, too
+    r = max(round(EDGE * paint.spread * k.fx / max(T[2, 3], raster.NEAR)), 1)
+    unknown = cv2.dilate((surface.ids == raster.EMPTY).view(np.uint8), np.ones((2 * r + 1, 2 * r + 1), np.uint8)) | guarded
+    n = len(P)
+    index, gradient = np.empty(n, np.int64), np.empty((n, 3, 2))
+    left, plain, share = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
+    four = np.array([k.fx, k.fy, k.cx, k.cy])
+    n = _sampled(P, N, image, surface.depth, unknown, four, BEHIND, GRAZING, PATCH, index, plain, gradient, share)
+    if n < FEWEST:
+        return None
+    index = index[:n]
+    P, N, C = P[index], N[index], paint.colours[index]
+    left, plain, gradient, share = left[:n], plain[:n], gradient[:n], share[:n]
+    _fit(N, C, share, ROBUST, FITS, GAIN, LEAST_SEEN, plain, left)
+    return Compared(T, P, N, C, gradient, left, plain, share)
+
+
+@kernel(
+    """f8[n, 3], f8[n, 3], f4[h, w, 3], f4[h, w], u1[h, w], f8[4], f8, f8, f8,
+    out i8[n], out f8[n, 3], out f8[n, 3, 2], out f8[n] -> i8"""
+)
+def _sampled(P, N, image, depth, unknown, k, behind, grazing, patch, index, value, gradient, share):
+    """Writes of the points P (n, 3) with normals N, in the camera's frame, which are seen, the picture's colours there, how they
+    change with the line of sight, and the share of a patch; returns how many."""
     h, w = depth.shape
     n = 0
     for i in range(len(P)):
         x, y, z = P[i, 0], P[i, 1], P[i, 2]
-        if z <= 0.0 or -(N[i, 0] * x + N[i, 1] * y + N[i, 2] * z) < grazing * math.sqrt(x * x + y * y + z * z):
+        if z <= 0.0:
+            continue
+        facing = -(N[i, 0] * x + N[i, 1] * y + N[i, 2] * z) / math.sqrt(x * x + y * y + z * z)
+        if facing < grazing:
             continue
         u, v = k[0] * x / z + k[2], k[1] * y / z + k[3]
         c, r = int(math.floor(u)), int(math.floor(v))
@@ -165,98 +225,141 @@ def _sampled(P, N, image, depth, unknown, k, behind, grazing, index, value, grad
         for d in range(3):
             i00, i01, i10, i11 = image[r, c, d], image[r, c + 1, d], image[r + 1, c, d], image[r + 1, c + 1, d]
             value[n, d] = (1.0 - b) * ((1.0 - a) * i00 + a * i01) + b * ((1.0 - a) * i10 + a * i11)
-            left = (1.0 - b) * image[r, c - 1, d] + b * image[r + 1, c - 1, d]
-            right = (1.0 - b) * image[r, c + 2, d] + b * image[r + 1, c + 2, d]
-            middle_left, middle_right = (1.0 - b) * i00 + b * i10, (1.0 - b) * i01 + b * i11
-            gradient[n, d, 0] = 0.5 * ((1.0 - a) * (middle_right - left) + a * (right - middle_left))
+            left, right = (1.0 - b) * i00 + b * i10, (1.0 - b) * i01 + b * i11
+            before = (1.0 - b) * image[r, c - 1, d] + b * image[r + 1, c - 1, d]
+            behind_right = (1.0 - b) * image[r, c + 2, d] + b * image[r + 1, c + 2, d]
+            gradient[n, d, 0] = 0.5 * k[0] * ((1.0 - a) * (right - before) + a * (behind_right - left))
+            top, bottom = (1.0 - a) * i00 + a * i01, (1.0 - a) * i10 + a * i11
             above = (1.0 - a) * image[r - 1, c, d] + a * image[r - 1, c + 1, d]
             below = (1.0 - a) * image[r + 2, c, d] + a * image[r + 2, c + 1, d]
-            top, bottom = (1.0 - a) * i00 + a * i01, (1.0 - a) * i10 + a * i11
-            gradient[n, d, 1] = 0.5 * ((1.0 - b) * (bottom - above) + b * (below - top))
-        index[n] = i
+            gradient[n, d, 1] = 0.5 * k[1] * ((1.0 - b) * (bottom - above) + b * (below - top))
+        index[n], share[n] = i, facing / patch
         n += 1
     return n
 
 
-@dataclass(frozen=True)
-class Compared:
-    """The points (n,) that are seen at a pose: `position` (n, 3) [m] in the camera's frame, the picture's `gradient` (n, 3, 2)
-    [1/px], what the mesh's colours leave of the picture's (n, 3), what shading alone leaves of them (n, 3), and the `share` (n,)
-    of an independent patch that each point is; `shading` (n, 4) and `colours` (n, 3): what was fitted."""
-
-    position: Array
-    gradient: Array
-    left: Array
-    plain: Array
-    share: Array
-    shading: Array
-    colours: Array
-
-    def trust(self, channel: int) -> Array:
-        """Weights (n,) of the points' offsets: those of Cauchy's distribution, for what hides a part."""
-        return np.asarray(1.0 / (1.0 + np.square(self.left[:, channel] / ROBUST)), np.float64)
-
-    @property
-    def score(self) -> float:
-        """Log-likelihood of the mesh's colours against that of any others, over all patches."""
-        usual = np.sqrt(np.average(np.square(self.plain), axis=0, weights=self.share))
-        trust = self.share[:, None] * np.stack([self.trust(c) for c in range(3)], axis=1)
-        left = np.sqrt(np.sum(trust * np.square(self.left), axis=0) / np.sum(trust, axis=0))
-        sigma = np.minimum(np.maximum(SIGMA, left), usual)
-        better = 0.5 * np.square(self.plain / usual) - 0.5 * np.square(self.left / sigma) + np.log(usual / sigma)
-        return float(self.share @ np.log((1.0 - HIDDEN) * np.exp(np.minimum(better.mean(axis=1), 30.0)) + HIDDEN))
-
-    def information(self, T: Array) -> tuple[Array, Array]:
-        """The information (6, 6) about the pose error at T [m, rad] and its right side (6,), with the light marginalised."""
-        (X, Y, Z), arm = self.position.T, self.position - T[:3, 3]
-        H, g = np.zeros((6, 6)), np.zeros(6)
-        for c in range(3):
-            J, (gx, gy) = np.empty((len(X), 6)), self.gradient[:, c].T
-            J[:, 0], J[:, 1], J[:, 2] = gx / Z, gy / Z, -(gx * X + gy * Y) / Z**2
-            J[:, 3:] = np.cross(arm, J[:, :3])  # a rotation vector w moves the point by w x (X - origin)
-            weights = self.share * self.trust(c) / (3.0 * SIGMA**2)
-            J, _ = _without(J, np.column_stack([self.shading, self.colours[:, c]]), weights)
-            H, g = H + (J * weights[:, None]).T @ J, g - (J * weights[:, None]).T @ self.left[:, c]
-        return H, g
+@inner
+def _solve(A, B):
+    """Replaces B (n, m) by A^-1 B, A (n, n) symmetric and positive; A is overwritten."""
+    n, m = B.shape
+    for i in range(n):
+        for j in range(i + 1, n):
+            f = A[j, i] / A[i, i]
+            for c in range(i, n):
+                A[j, c] -= f * A[i, c]
+            for c in range(m):
+                B[j, c] -= f * B[i, c]
+    for i in range(n - 1, -1, -1):
+        for c in range(m):
+            for j in range(i + 1, n):
+                B[i, c] -= A[i, j] * B[j, c]
+            B[i, c] /= A[i, i]
 
 
-def _without(Y: Array, X: Array, weights: Array) -> tuple[Array, Array]:
-    """What a linear fit by the columns of X (n, k) leaves of those of Y (n, m), and its coefficients (k, m)."""
-    weighted = X * weights[:, None]
-    A = weighted.T @ X
-    A[np.diag_indices_from(A)] += 1e-3 * weights.sum()  # directions that are not seen
-    fit = np.linalg.solve(A, weighted.T @ Y)
-    return Y - X @ fit, fit
+@inner
+def _trusted(left, robust):
+    """The weight of a point that is off: Cauchy's, for what hides a part."""
+    return 1.0 / (1.0 + left * left / (robust * robust))
 
 
-def compared(paint: Paint, model: Model, image: Floats, guarded: NDArray[np.uint8], k: Intrinsics, T: Array) -> Compared | None:
-    """The colours of the mesh and of a smoothed picture (h, w, 3) at a pose T_camera_object; None where too little is seen."""
-    P, N = paint.points @ T[:3, :3].T + T[:3, 3], paint.normals @ T[:3, :3].T
-    h, w = guarded.shape
-    surface = raster.Raster(w, h)
-    surface.draw(model.in_camera(T), model.faces, k.fx, k.fy, k.cx, k.cy, 0)
-    # near the contour the smoothed picture shows the surroundings, too
-    r = max(round(EDGE * paint.spread * k.fx / max(T[2, 3], raster.NEAR)), 1)
-    beside = np.isinf(surface.depth).astype(np.uint8)
-    unknown = cv2.dilate(beside, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) | guarded
-    n = len(P)
-    index, value, gradient = np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3, 2))
-    four = np.array([k.fx, k.fy, k.cx, k.cy])
-    n = _sampled(P, N, image, surface.depth, unknown, four, BEHIND, GRAZING, index, value, gradient)
-    if n < FEWEST:
-        return None
-    index, value, gradient = index[:n], value[:n], gradient[:n]
-    gradient[..., 0] *= k.fx
-    gradient[..., 1] *= k.fy
-    P, N, colours = P[index], N[index], paint.colours[index]
-    share = -np.einsum("nd,nd->n", N, P) / (P[:, 2] * PATCH)  # foreshortened
-    found = Compared(P, gradient, np.zeros((n, 3)), np.empty((n, 3)), share, np.column_stack([np.ones(n), N]), colours)
-    for c in range(3):
-        both = np.stack([value[:, c], colours[:, c]], axis=1)
-        for _ in range(FITS):
-            weights = share * found.trust(c)
-            rest, _ = _without(both, found.shading, weights)
-            own = float(weights @ np.square(rest[:, 1])) + 1e-6
-            gain = min(max(float(weights @ (rest[:, 0] * rest[:, 1])) / own, GAIN[0]), GAIN[1])
-            found.left[:, c], found.plain[:, c] = rest[:, 0] - gain * rest[:, 1], rest[:, 0]
-    return found
+@inner
+def _variance(left, share, d, robust):
+    """Of what is left of the picture in a channel d, of the points that are trusted."""
+    square, trust = 0.0, 0.0
+    for i in range(len(left)):
+        weight = share[i] * _trusted(left[i, d], robust)
+        square += weight * left[i, d] * left[i, d]
+        trust += weight
+    return square / trust
+
+
+@kernel("f8[n, 3], f8[n, 3], f8[n], f8, i8, f8, f8, out f8[n, 3], out f8[n, 3]")
+def _fit(N, C, share, robust, fits, largest, least, plain, left):
+    """Replaces the picture's colours `plain` (n, 3) by what shading leaves of them, and writes what the mesh's colours C (n, 3) leave
+    of those."""
+    A, B, x = np.empty((4, 4)), np.empty((4, 2)), np.ones(4)
+    own, weight = np.empty(len(N)), np.empty(len(N))
+    for d in range(3):
+        left[:, d] = 0.0
+        for _ in range(fits):
+            A[:], B[:], total = 0.0, 0.0, 0.0
+            for i in range(len(N)):
+                weight[i] = share[i] * _trusted(left[i, d], robust)
+                total += weight[i]
+                x[1], x[2], x[3] = N[i, 0], N[i, 1], N[i, 2]
+                for r in range(4):
+                    for c in range(4):
+                        A[r, c] += weight[i] * x[r] * x[c]
+                    B[r, 0] += weight[i] * x[r] * plain[i, d]
+                    B[r, 1] += weight[i] * x[r] * C[i, d]
+            for r in range(4):
+                A[r, r] += least * total
+            _solve(A, B)
+            both, square = 0.0, 1e-6
+            for i in range(len(N)):
+                plain[i, d] -= B[0, 0] + B[1, 0] * N[i, 0] + B[2, 0] * N[i, 1] + B[3, 0] * N[i, 2]
+                own[i] = C[i, d] - (B[0, 1] + B[1, 1] * N[i, 0] + B[2, 1] * N[i, 1] + B[3, 1] * N[i, 2])
+                both += weight[i] * plain[i, d] * own[i]
+                square += weight[i] * own[i] * own[i]
+            gain = min(max(both / square, 0.0), largest)
+            for i in range(len(N)):
+                left[i, d] = plain[i, d] - gain * own[i]
+
+
+@kernel("f8[n, 3], f8[n, 3], f8[n], f8, f8, f8 -> f8")
+def _score(left, plain, share, sigma, robust, hidden):
+    """See `Compared.score`."""
+    better = np.zeros(len(left))
+    for d in range(3):
+        usual, total = 0.0, 0.0
+        for i in range(len(left)):
+            usual += share[i] * plain[i, d] * plain[i, d]
+            total += share[i]
+        usual = usual / total + 1e-9
+        variance = min(max(_variance(left, share, d, robust), sigma * sigma), usual)
+        for i in range(len(left)):
+            of_any, of_mesh = plain[i, d] * plain[i, d] / usual, left[i, d] * left[i, d] / variance
+            better[i] += (of_any - of_mesh + math.log(usual / variance)) / 6.0  # the mean of three channels
+    total = 0.0
+    for i in range(len(left)):
+        total += share[i] * math.log((1.0 - hidden) * math.exp(min(better[i], 30.0)) + hidden)
+    return total
+
+
+@kernel("f8[n, 3], f8[n, 3], f8[n, 3], f8[n, 3, 2], f8[n, 3], f8[n], f8[3], f8, f8, f8, out f8[6, 6], out f8[6]")
+def _information(P, N, C, gradient, left, share, origin, sigma, robust, least, H, g):
+    """See `Compared.information`: least squares of the pose without (Schur complement) what shading and gain explain."""
+    H[:], g[:] = 0.0, 0.0
+    A, B, other, x, J = np.empty((5, 5)), np.empty((5, 7)), np.empty((5, 7)), np.ones(5), np.empty(7)
+    for d in range(3):
+        A[:], B[:], total = 0.0, 0.0, 0.0
+        variance = max(_variance(left, share, d, robust), sigma * sigma)
+        for i in range(len(P)):
+            weight = share[i] * _trusted(left[i, d], robust) / (3.0 * variance)
+            total += weight
+            X, Y, Z = P[i, 0], P[i, 1], P[i, 2]
+            J[0], J[1] = gradient[i, d, 0] / Z, gradient[i, d, 1] / Z
+            J[2] = -(J[0] * X + J[1] * Y) / Z
+            X, Y, Z = X - origin[0], Y - origin[1], Z - origin[2]
+            # a rotation vector w moves the point by w x (X - origin)
+            J[3], J[4], J[5] = Y * J[2] - Z * J[1], Z * J[0] - X * J[2], X * J[1] - Y * J[0]
+            J[6] = -left[i, d]
+            x[1], x[2], x[3], x[4] = N[i, 0], N[i, 1], N[i, 2], C[i, d]
+            for r in range(5):
+                for c in range(5):
+                    A[r, c] += weight * x[r] * x[c]
+                for c in range(7):
+                    B[r, c] += weight * x[r] * J[c]
+            for r in range(6):
+                for c in range(6):
+                    H[r, c] += weight * J[r] * J[c]
+                g[r] += weight * J[r] * J[6]
+        for r in range(5):
+            A[r, r] += least * total
+        other[:] = B
+        _solve(A, B)
+        for r in range(6):
+            for e in range(5):
+                for c in range(6):
+                    H[r, c] -= other[e, r] * B[e, c]
+                g[r] -= other[e, r] * B[e, 6]

@@ -435,8 +435,8 @@ def descend(
         found = [(lines(shape, model, at, T, reach, inside), inside) for inside in ((False, True) if creases else (False,))]
         H, g = information(found, at, T, robust * reach)
         if (colours := at.compared(model, T)) is not None:
-            of_colours = colours.information(T)
-            H, g = H + of_colours[0], g + of_colours[1]
+            more, towards = colours.information
+            H, g = H + more, g + towards
         H += prior.information
         H[_DIAGONAL] *= 1.0 + basin.DAMPING
         step = np.linalg.solve(H, g + prior.information @ rigid.pose_error(prior.T, T))
@@ -512,9 +512,9 @@ def _vote(points, edges, odds, step, beside, by_edge, by_colour, value):
                 value[r, c] += point.length * (by_edge * edges[a, y + dy, x + dx] + by_colour * between)
 
 
-def hypotheses(model: Model, at: Level, starts: list[Array], prior: Prior, reach: float) -> list[Array]:
+def hypotheses(model: Model, at: Level, starts: list[Array], prior: Prior, reach: float) -> list[tuple[float, Array]]:
     """The poses that result from shifting each start, up to `reach` [m], to the two places where its contour lies best on edges
-    and between the colours; best first."""
+    and between the colours, with what speaks for them; best first."""
     h, w = at.shape
     edges = np.empty((ANGLES, h, w), np.float32)
     for a in range(ANGLES):
@@ -541,4 +541,4 @@ def hypotheses(model: Model, at: Level, starts: list[Array], prior: Prior, reach
                 there[:2, 3] += (shift[x], shift[y])
                 found.append((float(value[y, x]), there))
                 value[max(y - 3, 0) : y + 4, max(x - 3, 0) : x + 4] = -np.inf
-    return [T for _, T in sorted(found, key=lambda one: -one[0])]
+    return sorted(found, key=lambda one: -one[0])

@@ -26,6 +26,8 @@ SUBDIVIDED = 0.0025
 """Largest edge [m] of a printed mesh: the colours of its corners are the print."""
 PATCHES = 40
 """Number of patches of a print."""
+MISPLACED = 0.001
+"""Standard deviation [m] of where a scan puts a print on the surface."""
 MAKERS: dict[str, Callable[[], trimesh.Trimesh]] = {
     "box": lambda: trimesh.creation.box((0.06, 0.158, 0.21)),
     "flat box": lambda: trimesh.creation.box((0.03, 0.085, 0.073)),
@@ -36,9 +38,11 @@ MAKERS: dict[str, Callable[[], trimesh.Trimesh]] = {
 
 @dataclass(frozen=True)
 class Printed:
-    """A trimesh with coloured vertices as a user has it, and what `search refine` makes of it with its colours and without."""
+    """A trimesh with coloured vertices as a user has it, the true colours (n, 3) of its vertices, and what `search refine` makes of it
+    with its colours and without."""
 
     mesh: trimesh.Trimesh
+    colours: NDArray[np.uint8]
     rigid: RigidObject
     plain: RigidObject
 
@@ -54,17 +58,20 @@ def printed(name: str, seed: int) -> Printed:
     body = MAKERS[name]()
     vertices, faces = trimesh.remesh.subdivide_to_size(body.vertices, body.faces, SUBDIVIDED, max_iter=12)
     vertices, faces = np.asarray(vertices, float), np.asarray(faces, np.int64)
-    ground, second = rng.uniform(20, 235, (2, 3))
-    side = vertices @ rng.normal(size=3) > rng.uniform(-0.02, 0.02)
-    colours = np.where(side[:, None], ground, second)
+    grounds, across, begin = rng.uniform(20, 235, (2, 3)), rng.normal(size=3), rng.uniform(-0.02, 0.02)
     middles = vertices[rng.integers(len(vertices), size=PATCHES)]
-    distance, nearest = cKDTree(middles).query(vertices)
-    shown = distance < rng.uniform(0.003, 0.02, PATCHES)[nearest]
-    colours = np.where(shown[:, None], rng.uniform(10, 245, (PATCHES, 3))[nearest], colours)
-    colours = np.clip(colours, 0, 255).astype(np.uint8)
-    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+    radii, inks = rng.uniform(0.003, 0.02, PATCHES), rng.uniform(10, 245, (PATCHES, 3))
+
+    def print_at(points: Array) -> NDArray[np.uint8]:
+        distance, nearest = cKDTree(middles).query(points)
+        ground = np.where((points @ across > begin)[:, None], *grounds)
+        return np.where((distance < radii[nearest])[:, None], inks[nearest], ground).astype(np.uint8)
+
+    waves, phases = rng.normal(0.0, 40.0, (3, 8)), rng.uniform(0.0, 2.0 * np.pi, 8)
+    off = np.sin(vertices @ waves + phases) @ rng.normal(0.0, MISPLACED / 2.0, (8, 3))
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=print_at(vertices + off), process=False)
     whole = Mesh(vertices, faces.astype(np.int32), np.zeros(len(faces), np.uint8))
-    return Printed(mesh, RigidObject(whole, paint.cloud(mesh)), RigidObject(whole))
+    return Printed(mesh, print_at(vertices), RigidObject(whole, paint.cloud(mesh)), RigidObject(whole))
 
 
 def photographed(
@@ -84,7 +91,7 @@ def photographed(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
     lamp = rng.normal(size=3) + (0.0, -1.0, -1.5)
     light = 0.45 + 0.75 * np.maximum(normal @ (lamp / np.linalg.norm(lamp)), 0.0)
-    colour = np.asarray(one.mesh.visual.vertex_colors, float)[faces, :3].mean(axis=1) / 255.0
+    colour = one.colours[faces].mean(axis=1) / 255.0
     look = light[:, None] * rng.uniform(0.7, 1.1, 3) * colour ** rng.uniform(0.7, 1.3)
     picture[seen] = 255.0 * look[surface.triangles[seen]]
     if hidden:
