@@ -235,7 +235,8 @@ class _Colours:
         """The best pose with the prior, by how exact contours are, and its covariance, with the other poses by likelihood."""
         best = found[0]
         trust = min(1.0, max(best.support, 0.1) / TYPICAL) ** 4  # what hides a part may have pulled the rest along
-        measured = region.covariance(self._shape, best.level, best.T) / trust
+        colours = best.level.compared(self._shape.fine, best.T) if best.colours > contest.CONVINCING else None
+        measured = region.covariance(self._shape, best.level, best.T, trust, colours)
         gain = measured @ np.linalg.inv(measured + np.linalg.inv(prior.information))
         T = perturb(best.T, gain @ pose_error(prior.T, best.T))
         covariance = measured - gain @ measured
@@ -277,6 +278,7 @@ class Tracker:
         self._colours = _Colours(rigid, k)
         self._table: NDArray[np.float32] | None = None  # log-odds of the colours
         self._usual_support = 0.0
+        self._convinced = False  # whether the mesh's colours have been seen: then they are expected
         self._missed = -1  # frames since the last pose; there was none before the start
 
     def update(self, mask: Bool | None, occluder: Bool | None = None, picture: NDArray[np.uint8] | None = None) -> ObjectEstimate:
@@ -319,7 +321,9 @@ class Tracker:
         if self._missed == 0 and self._table is not None:
             window = region.Window(picture, mask, occluder, self._k, shape, prior.T, 0.0)
             one = contest.follow(shape, window, self._table, prior)
-            if one.support > max(SUPPORTED[1], self._usual_support - DROP):
+            hidden = self._convinced and one.colours < contest.CONVINCING
+            if one.support > max(SUPPORTED[1], self._usual_support - DROP) and not hidden:
+                self._convinced = self._convinced or one.colours > contest.CONVINCING
                 # the errors of the contour are the same in all frames: the last pose adds nothing
                 alone = Prior(one.T, self._weak)
                 found = self._colours.judged([one], alone, mask, occluder, picture.shape[:2])

@@ -449,9 +449,10 @@ def descend(
 _DIAGONAL = np.diag_indices(6)
 
 
-def covariance(shape: Shape, at: Level, T: Array) -> Array:
-    """The covariance (6, 6) of a pose by contour and creases alone, with the errors of the whole contour (WAVES), of the mesh's
-    scale (SCALE) and of what rotations it shows (LEVER)."""
+def covariance(shape: Shape, at: Level, T: Array, trust: float, colours: Compared | None) -> Array:
+    """The covariance (6, 6) of a pose by contour and creases, whose errors are trusted by a share `trust`, and by the mesh's colours
+    where they convince, with the errors of the whole contour (WAVES), of the mesh's scale (SCALE) and of what rotations it shows
+    (LEVER)."""
     H, g, n = np.zeros((7, 7)), np.zeros((7, 4 * len(WAVES))), 2 * len(WAVES)
     turns = np.arange(1, len(WAVES) + 1)
     lever2 = 0.0
@@ -472,7 +473,11 @@ def covariance(shape: Shape, at: Level, T: Array) -> Array:
     P = np.linalg.inv(believed + weak)
     bent = P @ believed @ np.linalg.solve(H + weak, bent)
     farther = np.concatenate([SCALE * T[:3, 3], np.zeros(3)])  # a larger object further away looks the same
-    return np.asarray(P + bent @ bent.T + np.outer(farther, farther), np.float64)
+    P = P + bent @ bent.T
+    if colours is None:
+        return np.asarray((P + np.outer(farther, farther)) / trust, np.float64)
+    P = np.linalg.inv(np.linalg.inv(P / trust) + colours.information[0])
+    return np.asarray(P + np.outer(farther, farther), np.float64)
 
 
 SCALE = 0.01
