@@ -28,9 +28,13 @@ BY_PAINT = 5.0
 """Weight of the log-likelihood of the mesh's colours beside what speaks for a contour that is shifted: from 3 to 10, one in eleven
 to one in five of the first hypotheses of simulated things that are then near the truth were not without it."""
 CONVINCING = 3.0
-"""Log-likelihood of the mesh's colours, 20 to 1, below which a mesh with colours is looked for once more, from starts turned by
-AGAIN: angles [deg], and the number of axes of each."""
+"""Log-likelihood of the mesh's colours, 20 to 1, from which they prove a pose."""
 AGAIN = (9.0, 21.0, 33.0), 20
+"""Angles [deg] by which, and number of axes about which the starts are turned to look once more for a mesh with colours, where neither
+colours nor contour are convincing."""
+SUPPORTED = (0.35, 0.65)
+"""Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful: on photographs right poses
+have 0.7 to 1 where nothing hides the object, and of those far off few have more than 0.6."""
 SAME_START = (0.012, 0.2)
 """Shifted hypotheses nearer than this [m, rad] are one."""
 SCORED_PX = 30.0
@@ -69,7 +73,7 @@ def scored(shape: Shape, model: Model, at: Level, T: Array, prior: Prior, crease
         inside = lines(shape, model, at, T, SCORING, True)
         score += float(inside.length @ np.log(np.maximum(inside.support, LEAST_SUPPORT)))
     score = score / SCORED_PX - 0.5 * prior.cost(T)
-    compared = at.compared(model, T)
+    compared = at.compared(shape, T)
     colours = 0.0 if compared is None else compared.score
     support = float(contour.length @ (contour.support > 1.0)) / length
     return Found(T, score + colours, colours, support, length * at.scale, at)
@@ -84,10 +88,10 @@ def search(shape: Shape, window: Window, prior: Prior, reach: float) -> list[Fou
         shifts = rng.normal(0.0, 0.25 * reach, (len(starts), 3))
         table = window.of_poses(model, [rigid.perturb(T, [*way, 0.0, 0.0, 0.0]) for T, way in zip(starts, shifts, strict=True)])
     at = window.level(window.factors[0], table)
-    found = followed(shape, window, prior, of_mask, first(model, at, hypotheses(model, at, starts, prior, reach)))
-    if shape.paints is not None and (not found or found[0].colours < CONVINCING):
+    found = followed(shape, window, prior, of_mask, first(shape, at, hypotheses(model, at, starts, prior, reach)))
+    if shape.paints is not None and (not found or (found[0].colours < CONVINCING and found[0].support < SUPPORTED[1])):
         more = hypotheses(model, at, basin.starts(prior.T, *AGAIN), prior, reach)
-        found = sorted([*found, *followed(shape, window, prior, of_mask, first(model, at, more))], key=lambda one: -one.score)
+        found = sorted([*found, *followed(shape, window, prior, of_mask, first(shape, at, more))], key=lambda one: -one.score)
     return found
 
 
@@ -111,7 +115,7 @@ def followed(shape: Shape, window: Window, prior: Prior, of_mask: Floats | None,
     return settled(shape, [one for one in found if any(one.T is T for T in poses)], prior)
 
 
-def first(model: Model, at: Level, found: list[tuple[float, Array]]) -> list[Array]:
+def first(shape: Shape, at: Level, found: list[tuple[float, Array]]) -> list[Array]:
     """The hypotheses that are followed, of all with what speaks for their contours, best first: those of the best contours, and
     where the mesh has colours those of the best contours and colours together."""
     poses = distinct([T for _, T in found], SAME_START, FIRST)
@@ -119,7 +123,7 @@ def first(model: Model, at: Level, found: list[tuple[float, Array]]) -> list[Arr
         return poses
     votes = {id(T): vote for vote, T in found}
     many = distinct([T for _, T in found], SAME_START, COLOURED[0])
-    colours = [at.compared(model, T) for T in many]
+    colours = [at.compared(shape, T) for T in many]
     both = [votes[id(T)] + BY_PAINT * (one.score if one is not None else 0.0) for T, one in zip(many, colours, strict=True)]
     best = distinct([many[i] for i in np.argsort(both)[::-1]], SAME_START, COLOURED[1])
     return poses + [T for T in best if not any(T is other for other in poses)]

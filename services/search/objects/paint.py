@@ -92,9 +92,10 @@ def cloud(mesh: Any) -> Cloud | None:
     elif visual.kind == "face":
         colours = np.asarray(visual.face_colors, np.float64)[face, :3]
     elif visual.kind == "texture" and visual.uv is not None and (image := _image(visual.material)) is not None:
-        u, v = np.einsum("nc,ncd->nd", weights, np.asarray(visual.uv, np.float64)[faces[face]]).T
+        at = np.einsum("nc,ncd->nd", weights, np.asarray(visual.uv, np.float64)[faces[face]])
+        u, v = np.where((at < 0.0) | (at > 1.0), at % 1.0, at).T  # it repeats; v points up
         h, w = image.shape[:2]
-        colours = image[np.floor((1.0 - v % 1.0) * h).astype(int) % h, np.floor(u % 1.0 * w).astype(int) % w].astype(np.float64)
+        colours = image[np.minimum((1.0 - v) * h, h - 1).astype(int), np.minimum(u * w, w - 1).astype(int)].astype(np.float64)
     else:
         return None
     return Cloud(points, colours)
@@ -120,7 +121,7 @@ def spread_over(vertices: Array, faces: NDArray[np.int_], count: int) -> tuple[A
 
 
 def painted(mesh: Mesh, found: Cloud) -> tuple[Paint, Paint] | None:
-    """The paint of a mesh whose faces are turned outwards, for POINTS; None where it is of one colour."""
+    """The points of a mesh whose faces are turned outwards, for POINTS; None where it is of one colour."""
     tree = cKDTree(found.points)
     corners = mesh.vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -144,6 +145,17 @@ def smoothed(image: NDArray[np.uint8], sigma: float) -> Floats:
     if sigma > 0.3:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8)
     return np.log(np.arange(256, dtype=np.float32) + np.float32(DARK))[image]
+
+
+@dataclass(frozen=True)
+class Painted:
+    """The paint of a mesh, the smoothed picture (h, w, 3) with intrinsics k that it is compared with, and where something covers that
+    (h, w)."""
+
+    paint: Paint
+    picture: Floats
+    guarded: NDArray[np.uint8]
+    k: Intrinsics
 
 
 @dataclass(frozen=True)
@@ -175,20 +187,21 @@ class Compared:
         return H, g
 
 
-def compared(paint: Paint, model: Model, image: Floats, guarded: NDArray[np.uint8], k: Intrinsics, T: Array) -> Compared | None:
-    """The colours of the mesh and of a smoothed picture (h, w, 3) at a pose T_camera_object; None where too little is seen."""
+def compared(at: Painted, model: Model, T: Array) -> Compared | None:
+    """The colours of mesh and picture at a pose T_camera_object, the model saying what is seen; None where too little is."""
+    paint, k = at.paint, at.k
     P, N = paint.points @ T[:3, :3].T + T[:3, 3], paint.normals @ T[:3, :3].T
-    h, w = guarded.shape
+    h, w = at.guarded.shape
     surface = raster.Raster(w, h)
     surface.draw(model.in_camera(T), model.faces, k.fx, k.fy, k.cx, k.cy, 0)
     # near the contour the smoothed picture shows the surroundings, too
     r = max(round(EDGE * paint.spread * k.fx / max(T[2, 3], raster.NEAR)), 1)
-    unknown = cv2.dilate((surface.ids == raster.EMPTY).view(np.uint8), np.ones((2 * r + 1, 2 * r + 1), np.uint8)) | guarded
+    unknown = cv2.dilate((surface.ids == raster.EMPTY).view(np.uint8), np.ones((2 * r + 1, 2 * r + 1), np.uint8)) | at.guarded
     n = len(P)
     index, gradient = np.empty(n, np.int64), np.empty((n, 3, 2))
     left, plain, share = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
     four = np.array([k.fx, k.fy, k.cx, k.cy])
-    n = _sampled(P, N, image, surface.depth, unknown, four, BEHIND, GRAZING, PATCH, index, plain, gradient, share)
+    n = _sampled(P, N, at.picture, surface.depth, unknown, four, BEHIND, GRAZING, PATCH, index, plain, gradient, share)
     if n < FEWEST:
         return None
     index = index[:n]

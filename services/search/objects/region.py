@@ -27,7 +27,7 @@ from penumbra.services.search.evidence import GUARD_PX
 from penumbra.services.search.mask_fit import Limits
 from penumbra.services.search.objects import basin
 from penumbra.services.search.objects.basin import Contour, Prior, Shape
-from penumbra.services.search.objects.paint import Compared, Paint, compared, smoothed
+from penumbra.services.search.objects.paint import Compared, Painted, compared, smoothed
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
@@ -81,19 +81,19 @@ ONTO = 1.0
 @dataclass(frozen=True)
 class Level:
     """A window of the picture whose pixels are `scale` image pixels wide: log-odds (h, w) of being the object's, gradient (h, w,
-    2) of the strongest colour against its typical size, and `guarded` (h, w) uint8 where something covers; the mesh's `paint` and
-    the smoothed picture (h, w, 3) that it is compared with, None where the mesh has no colours."""
+    2) of the strongest colour against its typical size, and `guarded` (h, w) uint8 where something covers; what the mesh's colours
+    are compared with, None where it has none."""
 
     odds: Floats
     gradient: Floats
     guarded: Bytes
     k: Intrinsics
     scale: int
-    painted: tuple[Paint, Floats] | None
+    painted: Painted | None
 
-    def compared(self, model: Model, T: Array) -> Compared | None:
+    def compared(self, shape: Shape, T: Array) -> Compared | None:
         """The colours of mesh and picture at a pose; None where there are none to compare."""
-        return None if self.painted is None else compared(self.painted[0], model, self.painted[1], self.guarded, self.k, T)
+        return None if self.painted is None else compared(self.painted, shape.coarse, T)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -112,7 +112,7 @@ class _Plain:
     k: Intrinsics
     prior: Floats | None
     inside: Floats | None
-    painted: tuple[Paint, Floats] | None
+    painted: Painted | None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -190,9 +190,9 @@ class Window:
             inside = half((distance / min(BAND_PX / self.scale, 0.1 * self._extent)).astype(np.float32))
             prior = np.where(np.abs(inside) < 1.0, 0.0, np.sign(inside) * MASK_ODDS).astype(np.float32)
         painted = None
-        if self._paints is not None:
-            paint = self._paints[0 if f == self.factors[0] else 1]
-            painted = paint, smoothed(image, paint.spread * k.fx / self._depth)
+        if self._paints is not None and f in self.factors[:2]:
+            paint = self._paints[self.factors.index(f)]
+            painted = Painted(paint, smoothed(image, paint.spread * k.fx / self._depth), guarded, k)
         return _Plain((c[..., 0] * BINS + c[..., 1]) * BINS + c[..., 2], gradient, covered, guarded, k, prior, inside, painted)
 
     def level(self, factor: int, table: Floats) -> Level:
@@ -204,7 +204,9 @@ class Window:
         if n > 1:
             odds = np.asarray(cv2.resize(odds, (w, h), interpolation=cv2.INTER_AREA), np.float32)
         odds = odds if at.prior is None else odds + at.prior
-        return Level(odds, at.gradient, at.guarded, at.k, factor * self.scale, at.painted)
+        # the points are as far apart as a few pixels of the second size: larger pictures show no more of them
+        painted = self.plain(factor if factor in self.factors[:2] else self.factors[1]).painted
+        return Level(odds, at.gradient, at.guarded, at.k, factor * self.scale, painted)
 
     def table(self, inside: Floats, outside: Floats) -> Floats:
         """Log-odds (BINS^3,) of the colours that pixels of these weights (h, w) show, in the size for learning."""
@@ -434,7 +436,7 @@ def descend(
     for reach in reaches:
         found = [(lines(shape, model, at, T, reach, inside), inside) for inside in ((False, True) if creases else (False,))]
         H, g = information(found, at, T, robust * reach)
-        if (colours := at.compared(model, T)) is not None:
+        if (colours := at.compared(shape, T)) is not None:
             more, towards = colours.information
             H, g = H + more, g + towards
         H += prior.information
