@@ -89,7 +89,7 @@ def photographed(
     seen = surface.triangles >= 0
     normal = np.cross(V[faces[:, 1]] - V[faces[:, 0]], V[faces[:, 2]] - V[faces[:, 0]])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
-    lamp = rng.normal(size=3) + (0.0, -1.0, -1.5)
+    lamp = rng.normal(size=3) + np.array([0.0, -1.0, -1.5])
     light = 0.45 + 0.75 * np.maximum(normal @ (lamp / np.linalg.norm(lamp)), 0.0)
     colour = one.colours[faces].mean(axis=1) / 255.0
     look = light[:, None] * rng.uniform(0.7, 1.1, 3) * colour ** rng.uniform(0.7, 1.3)
