@@ -25,13 +25,13 @@ COLOURED = (60, 8)
 """Number of hypotheses whose colours are compared with the mesh's where it has some, and of those the number that is followed
 besides."""
 BY_PAINT = 5.0
-"""Weight of the log-likelihood of the mesh's colours beside what speaks for a contour that is shifted: from 3 to 10, one in eleven
-to one in five of the first hypotheses of simulated things that are then near the truth were not without it."""
+"""Weight of the log-likelihood of the mesh's colours beside what speaks for a contour that is shifted: from 3 to 10, one in
+eleven to one in five of the first hypotheses of simulated things that are then near the truth were not without it."""
 CONVINCING = 3.0
 """Log-likelihood of the mesh's colours, 20 to 1, from which they prove a pose."""
 AGAIN = (9.0, 21.0, 33.0), 20
-"""Angles [deg] by which, and number of axes about which the starts are turned to look once more for a mesh with colours, where neither
-colours nor contour are convincing."""
+"""Angles [deg] by which, and number of axes about which the starts are turned to look once more for a mesh with colours, where
+neither colours nor contour are convincing."""
 SUPPORTED = (0.35, 0.65)
 """Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful: on photographs right poses
 have 0.7 to 1 where nothing hides the object, and of those far off few have more than 0.6."""
@@ -50,9 +50,9 @@ SCORING = 7
 
 @dataclass(frozen=True)
 class Found:
-    """A pose T_camera_object; `score`: log-likelihood of its contour and colours against any others, with the start; `colours`: that of
-    the colours alone, 0 where the mesh has none; `support`: share of the
-    contour's length that lies on an edge; `length` of contour that is seen [px of the image]; `level`: where it was compared."""
+    """A pose T_camera_object; `score`: log-likelihood of its contour and colours against any others, with the start; `colours`:
+    that of the colours alone, 0 where the mesh has none; `support`: share of the contour's length that lies on an edge;
+    `length` of contour that is seen [px of the image]; `level`: where it was compared."""
 
     T: Array
     score: float
@@ -96,8 +96,8 @@ def search(shape: Shape, window: Window, prior: Prior, reach: float) -> list[Fou
 
 
 def followed(shape: Shape, window: Window, prior: Prior, of_mask: Floats | None, poses: list[Array]) -> list[Found]:
-    """Where hypotheses lead from small to large pictures, best first, with the log-odds of the mask's colours, or, None, with those
-    inside and around each pose's silhouette."""
+    """Where hypotheses lead from small to large pictures, best first, with the log-odds of the mask's colours, or, None, with
+    those inside and around each pose's silhouette."""
     factors = window.factors
     stages = [(factors[0], shape.coarse, (7, 7, 6, 6), 0.06), (factors[0], shape.coarse, (6, 5), 0.03)]
     stages += [(factor, shape.fine, (7, 6, 5), 0.02) for factor in factors[1:]]

@@ -1,12 +1,13 @@
 """The colours of a mesh against those of the picture inside its silhouette, where the mesh has a texture or coloured vertices.
 
-Points spread evenly over the surface carry the mesh's colours, smoothed as far as their neighbours (`painted`). At a pose, those that
-the camera sees are compared with the picture, which is smoothed as much. Both are logarithms, so that light is an offset: each channel
-of the picture is fitted by a multiple of the mesh's colour, the direction of the surface (shading) and an offset (`compared`).
+Points spread evenly over the surface carry the mesh's colours, smoothed as far as their neighbours (`painted`). At a pose,
+those that the camera sees are compared with the picture, which is smoothed as much. Both are logarithms, so that light is an
+offset: each channel of the picture is fitted by a multiple of the mesh's colour, the direction of the surface (shading) and an
+offset (`compared`).
 
 That says two things. How the offsets between the colours change with the pose gives least squares (`information`), as photometric
-tracking does (Lucas, Kanade 1981). How much better the mesh's colours explain the picture than shading alone is the likelihood of the
-texture's being there against that of any other (`score`); what hides a part makes it wrong only there.
+tracking does (Lucas, Kanade 1981). How much better the mesh's colours explain the picture than shading alone is the likelihood
+of the texture's being there against that of any other (`score`); what hides a part makes it wrong only there.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ LEAST_CONTRAST = 0.05
 DARK = 16.0
 """Added to a colour of 0 to 255 before the logarithm: darker ones are noise and reflections."""
 SIGMA = 0.15
-"""Least standard deviation of the picture's colours (logarithm) from those that the mesh's explain: highlights, shadows, prints that
-differ."""
+"""Least standard deviation of the picture's colours (logarithm) from those that the mesh's explain: highlights, shadows, prints
+that differ."""
 GAIN = 1.6
 """Largest contrast of the picture against the mesh's, the least being none: textures are scanned in other light, and fade."""
 GRAZING = 0.2
@@ -60,8 +61,8 @@ FITS = 2
 HIDDEN = 0.05
 """Least likelihood of a point's colour, against that of any: it may be hidden."""
 PATCH = 20.0
-"""Number of points whose colours' differences err together: smoothing joins 4 or 5 of them (4 pi SPREAD^2), and highlights, shadows
-and errors of the texture's place more."""
+"""Number of points whose colours' differences err together: smoothing joins 4 or 5 of them (4 pi SPREAD^2), and highlights,
+shadows and errors of the texture's place more."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def _image(material: Any) -> NDArray[np.uint8] | None:
     return None if image is None else np.asarray(image.convert("RGB"))
 
 
-def spread_over(vertices: Array, faces: NDArray[np.int_], count: int) -> tuple[Array, NDArray[np.int64], Array]:
+def spread_over(vertices: Array, faces: NDArray[np.integer[Any]], count: int) -> tuple[Array, NDArray[np.int64], Array]:
     """Points (count, 3) spread evenly over a mesh, the face (count,) and the weights (count, 3) of its corners for each."""
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -149,8 +150,8 @@ def smoothed(image: NDArray[np.uint8], sigma: float) -> Floats:
 
 @dataclass(frozen=True)
 class Painted:
-    """The paint of a mesh, the smoothed picture (h, w, 3) with intrinsics k that it is compared with, and where something covers that
-    (h, w)."""
+    """The paint of a mesh, the smoothed picture (h, w, 3) with intrinsics k that it is compared with, and where something
+    covers that (h, w)."""
 
     paint: Paint
     picture: Floats
@@ -160,9 +161,10 @@ class Painted:
 
 @dataclass(frozen=True)
 class Compared:
-    """The points (n,) that are seen at a pose T: `position` and `normal` (n, 3) in the camera's frame, `colours` (n, 3) of the mesh,
-    the picture's `gradient` (n, 3, 2) by the direction of the line of sight, what the mesh's colours leave of the picture's (n, 3),
-    what shading alone leaves of them (n, 3), and the `share` (n,) of an independent patch that each point is."""
+    """The points (n,) that are seen at a pose T: `position` and `normal` (n, 3) in the camera's frame, `colours` (n, 3) of the
+    mesh, the picture's `gradient` (n, 3, 2) by the direction of the line of sight, what the mesh's colours leave of the
+    picture's (n, 3), what shading alone leaves of them (n, 3), and the `share` (n,) of an independent patch that each point
+    is."""
 
     T: Array
     position: Array
@@ -196,7 +198,8 @@ def compared(at: Painted, model: Model, T: Array) -> Compared | None:
     surface.draw(model.in_camera(T), model.faces, k.fx, k.fy, k.cx, k.cy, 0)
     # near the contour the smoothed picture shows the surroundings, too
     r = max(round(EDGE * paint.spread * k.fx / max(T[2, 3], raster.NEAR)), 1)
-    unknown = cv2.dilate((surface.ids == raster.EMPTY).view(np.uint8), np.ones((2 * r + 1, 2 * r + 1), np.uint8)) | at.guarded
+    near = cv2.dilate((surface.ids == raster.EMPTY).view(np.uint8), np.ones((2 * r + 1, 2 * r + 1), np.uint8))
+    unknown = np.asarray(near, np.uint8) | at.guarded
     n = len(P)
     index, gradient = np.empty(n, np.int64), np.empty((n, 3, 2))
     left, plain, share = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
@@ -288,8 +291,8 @@ def _variance(left, share, d, robust):
 
 @kernel("f8[n, 3], f8[n, 3], f8[n], f8, i8, f8, f8, out f8[n, 3], out f8[n, 3]")
 def _fit(N, C, share, robust, fits, largest, least, plain, left):
-    """Replaces the picture's colours `plain` (n, 3) by what shading leaves of them, and writes what the mesh's colours C (n, 3) leave
-    of those."""
+    """Replaces the picture's colours `plain` (n, 3) by what shading leaves of them, and writes what the mesh's colours C (n, 3)
+    leave of those."""
     A, B, x = np.empty((4, 4)), np.empty((4, 2)), np.ones(4)
     own, weight = np.empty(len(N)), np.empty(len(N))
     for d in range(3):

@@ -81,8 +81,8 @@ ONTO = 1.0
 @dataclass(frozen=True)
 class Level:
     """A window of the picture whose pixels are `scale` image pixels wide: log-odds (h, w) of being the object's, gradient (h, w,
-    2) of the strongest colour against its typical size, and `guarded` (h, w) uint8 where something covers; what the mesh's colours
-    are compared with, None where it has none."""
+    2) of the strongest colour against its typical size, and `guarded` (h, w) uint8 where something covers; what the mesh's
+    colours are compared with, None where it has none."""
 
     odds: Floats
     gradient: Floats
@@ -452,9 +452,9 @@ _DIAGONAL = np.diag_indices(6)
 
 
 def covariance(shape: Shape, at: Level, T: Array, trust: float, colours: Compared | None) -> Array:
-    """The covariance (6, 6) of a pose by contour and creases, whose errors are trusted by a share `trust`, and by the mesh's colours
-    where they convince, with the errors of the whole contour (WAVES), of the mesh's scale (SCALE) and of what rotations it shows
-    (LEVER)."""
+    """The covariance (6, 6) of a pose by contour and creases, whose errors are trusted by a share `trust`, and by the mesh's
+    colours where they convince, with the errors of the whole contour (WAVES), of the mesh's scale (SCALE) and of what rotations
+    it shows (LEVER)."""
     H, g, n = np.zeros((7, 7)), np.zeros((7, 4 * len(WAVES))), 2 * len(WAVES)
     turns = np.arange(1, len(WAVES) + 1)
     lever2 = 0.0

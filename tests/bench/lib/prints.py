@@ -38,8 +38,8 @@ MAKERS: dict[str, Callable[[], trimesh.Trimesh]] = {
 
 @dataclass(frozen=True)
 class Printed:
-    """A trimesh with coloured vertices as a user has it, the true colours (n, 3) of its vertices, and what `search refine` makes of it
-    with its colours and without."""
+    """A trimesh with coloured vertices as a user has it, the true colours (n, 3) of its vertices, and what `search refine`
+    makes of it with its colours and without."""
 
     mesh: trimesh.Trimesh
     colours: NDArray[np.uint8]

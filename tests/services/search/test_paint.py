@@ -118,8 +118,8 @@ def test_a_mesh_of_one_colour_has_no_print_and_gives_the_same_pose(cube, tmp_pat
     rigid = RigidObject(*meshes.load(tmp_path / "grey.ply", "m"))
     assert rigid.shape.paints is None
     picture, start = photographed(cube, ABOVE, K, SHAPE, 3), moved(ABOVE, 15.0, 0.02, np.random.default_rng(1))
-    of_both = [find_pose(one, None, K, start, picture=picture).T for one in (rigid, cube.plain)]
-    np.testing.assert_allclose(*of_both, atol=1e-4)
+    grey_T, plain_T = (find_pose(one, None, K, start, picture=picture).T for one in (rigid, cube.plain))
+    np.testing.assert_allclose(grey_T, plain_T, atol=1e-4)
 
 
 def test_a_mesh_without_colours_has_no_print(tmp_path):
@@ -166,7 +166,9 @@ def test_points_are_spread_evenly_over_a_surface():
 
 def test_paint_is_about_the_points_of_the_mesh_that_is_drawn(cube):
     whole = Mesh(np.asarray(cube.mesh.vertices), np.asarray(cube.mesh.faces, np.int32), np.zeros(len(cube.mesh.faces), np.uint8))
-    found = paint.painted(whole, paint.cloud(cube.mesh))
+    colours = paint.cloud(cube.mesh)
+    assert colours is not None
+    found = paint.painted(whole, colours)
     assert found is not None
     assert [len(one.points) for one in found] == list(paint.POINTS)
     assert all((np.abs(one.points).max(axis=1) == pytest.approx(0.0425)) for one in found)
