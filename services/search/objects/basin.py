@@ -23,6 +23,7 @@ from penumbra.services.search.contour import DROPPED, NEAR, Model, Points
 from penumbra.services.search.evidence import COVERED, FREE, TARGET, Evidence
 from penumbra.services.search.mask_fit import Noise
 from penumbra.services.search.objects.creases import Creases
+from penumbra.services.search.objects.paint import Paint
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
@@ -58,11 +59,13 @@ MAX_STEP = np.array([0.08, 0.08, 0.15, 0.3, 0.3, 0.3])
 
 @dataclass(frozen=True)
 class Shape:
-    """An object about its own middle: with few triangles for the small picture, and with all; and its creases."""
+    """An object about its own middle: with few triangles for the small picture, and with all; its creases; and its colours for
+    both, None where it has none."""
 
     coarse: Model
     fine: Model
     creases: Creases
+    paints: tuple[Paint, Paint] | None
 
     @property
     def size(self) -> float:
@@ -163,13 +166,13 @@ def score(model: Model, at: Level, T: Array, prior: Prior, noise: Noise = NOISE)
     return Score(cost + prior.cost(T), both, at.evidence.seen_px + free, covered)
 
 
-def starts(T: Array) -> list[Array]:
-    """The pose T (4 x 4) turned about its origin to all sides."""
-    i = np.arange(AXES) + 0.5
-    z = 1.0 - 2.0 * i / AXES  # a Fibonacci lattice on the sphere
+def starts(T: Array, angles: tuple[float, ...] = TURNS, count: int = AXES) -> list[Array]:
+    """The pose T (4 x 4) turned about its origin to all sides, by angles [deg] about so many axes."""
+    i = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * i / count  # a Fibonacci lattice on the sphere
     angle = np.pi * (1.0 + 5.0**0.5) * i
     axes = np.stack([np.sqrt(1.0 - z * z) * np.cos(angle), np.sqrt(1.0 - z * z) * np.sin(angle), z], axis=1)
-    turns = [np.concatenate([np.zeros(3), np.radians(degrees) * axis]) for degrees in TURNS for axis in axes]
+    turns = [np.concatenate([np.zeros(3), np.radians(degrees) * axis]) for degrees in angles for axis in axes]
     return [T, *(rigid.perturb(T, turn) for turn in turns)]
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from penumbra.services.search.objects import paint
+from penumbra.services.search.objects.paint import Cloud
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.body.simplification import simplified
 from penumbra.shared.geometry.rigid import Array
@@ -31,9 +33,9 @@ class ObjectFileError(ValueError):
     """What a user gave cannot be used; the text says what was expected, what was received and what to do."""
 
 
-def load(path: Path, unit: str) -> Mesh:
-    """The triangle mesh of a file (PLY, STL, OBJ, GLB, OFF) in metres, as it is; `unit` is one of UNITS. Raises
-    ObjectFileError."""
+def load(path: Path, unit: str) -> tuple[Mesh, Cloud | None]:
+    """The triangle mesh of a file (PLY, STL, OBJ, GLB, OFF) in metres, as it is, and its colours, None where it has none; `unit`
+    is one of UNITS. Raises ObjectFileError."""
     import trimesh
 
     if not path.is_file():
@@ -55,7 +57,9 @@ def load(path: Path, unit: str) -> Mesh:
             f"{path}: expected an object of {EXTENT[0]} to {EXTENT[1]:g} m, got one of {extent * UNITS[unit]:.3g} m with "
             f"--mesh-unit {unit}; {hint}"
         )
-    return Mesh(vertices.astype(np.float64) * UNITS[unit], faces.astype(np.int32), np.zeros(len(faces), np.uint8))
+    mesh.apply_scale(UNITS[unit])
+    whole = Mesh(np.asarray(mesh.vertices, np.float64), faces.astype(np.int32), np.zeros(len(faces), np.uint8))
+    return whole, paint.cloud(mesh)
 
 
 def repaired(mesh: Mesh, most: int) -> Mesh:

@@ -20,6 +20,7 @@ from penumbra.services.search.mask_fit import Limits, Noise
 from penumbra.services.search.objects import basin, contest, meshes, region
 from penumbra.services.search.objects.basin import Level, Prior, Pyramid, Score, Shape
 from penumbra.services.search.objects.creases import Creases
+from penumbra.services.search.objects.paint import Cloud, painted
 from penumbra.services.search.settings import ONE_IN_10_000
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry.rigid import Array, inverse, perturb, pose_error, transform
@@ -46,16 +47,18 @@ the boundary errs: fitted to the masks of `penumbra bench objects`."""
 
 
 class RigidObject:
-    """A mesh prepared for contours, about its own middle. Raises ObjectFileError for a mesh without a surface."""
+    """A mesh prepared for contours, about its own middle, and for pictures of its colours where there are some. Raises
+    ObjectFileError for a mesh without a surface."""
 
-    def __init__(self, mesh: Mesh):
+    def __init__(self, mesh: Mesh, colours: Cloud | None = None):
         mesh = meshes.repaired(mesh, FACES[1])
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         self.T_object_middle = transform((low + high) / 2.0)
         self.T_middle_object = inverse(self.T_object_middle)
         mesh = Mesh(mesh.vertices - (low + high) / 2.0, mesh.faces, mesh.labels)
         coarse = Model(meshes.repaired(mesh, FACES[0]))
-        self.shape = Shape(coarse, Model(mesh), Creases(coarse))
+        paints = None if colours is None else painted(mesh, replace(colours, points=colours.points - (low + high) / 2.0))
+        self.shape = Shape(coarse, Model(mesh), Creases(coarse), paints)
         self.diameter = float(np.linalg.norm(high - low))
         self._moments = mesh.vertices.T @ mesh.vertices / len(mesh.vertices)
 
@@ -176,9 +179,6 @@ GAP = 0.015
 """Distance from a good pose's contour within which no colours are learned, as a share of the object's size."""
 MARGIN = 2.0
 """How far from the start an object is looked for in a picture, in standard deviations of its position."""
-SUPPORTED = (0.35, 0.65)
-"""Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful: on photographs right poses
-have 0.7 to 1 where nothing hides the object, and of those far off few have more than 0.6."""
 TYPICAL = 0.85
 """Share of the contour that lies on edges from which the covariance is that of the settings; below, it grows with its fourth
 power."""
@@ -204,7 +204,7 @@ class _Colours:
         found = contest.search(self._shape, window, prior, reach)
         if not found:
             return _lost(prior.T), None
-        table = window.of_pose(self._shape.coarse, found[0].T, GAP) if found[0].support > SUPPORTED[1] else None
+        table = window.of_pose(self._shape.coarse, found[0].T, GAP) if found[0].support > contest.SUPPORTED[1] else None
         return self.judged(found, prior, mask, occluder, picture.shape[:2]), table
 
     def judged(
@@ -222,9 +222,9 @@ class _Colours:
                 seen = mask if occluder is None else mask & ~occluder
                 overlap = int(np.count_nonzero(seen & free)) / max(int(np.count_nonzero(seen | free)), 1)
         T, covariance = self._posterior(found, prior)
-        if best.support < SUPPORTED[0] or (mask is not None and overlap < FITS) or best.length < basin.NOISE.correlation:
+        if best.support < contest.SUPPORTED[0] or (mask is not None and overlap < FITS) or best.length < basin.NOISE.correlation:
             return _lost(T, overlap)
-        if best.support < SUPPORTED[1] or self._rigid.error(covariance, T) > CERTAIN * self._rigid.diameter:
+        if best.support < contest.SUPPORTED[1] or self._rigid.error(covariance, T) > CERTAIN * self._rigid.diameter:
             return ObjectEstimate(T, covariance, overlap, "doubtful")
         return ObjectEstimate(T, covariance, overlap, "occluded" if covered > COVERS else "tracking")
 
@@ -232,7 +232,8 @@ class _Colours:
         """The best pose with the prior, by how exact contours are, and its covariance, with the other poses by likelihood."""
         best = found[0]
         trust = min(1.0, max(best.support, 0.1) / TYPICAL) ** 4  # what hides a part may have pulled the rest along
-        measured = region.covariance(self._shape, best.level, best.T) / trust
+        colours = best.level.compared(self._shape, best.T) if best.colours > contest.CONVINCING else None
+        measured = region.covariance(self._shape, best.level, best.T, trust, colours)
         gain = measured @ np.linalg.inv(measured + np.linalg.inv(prior.information))
         T = perturb(best.T, gain @ pose_error(prior.T, best.T))
         covariance = measured - gain @ measured
@@ -274,6 +275,7 @@ class Tracker:
         self._colours = _Colours(rigid, k)
         self._table: NDArray[np.float32] | None = None  # log-odds of the colours
         self._usual_support = 0.0
+        self._convinced = False  # whether the mesh's colours have been seen: then they are expected
         self._missed = -1  # frames since the last pose; there was none before the start
 
     def update(self, mask: Bool | None, occluder: Bool | None = None, picture: NDArray[np.uint8] | None = None) -> ObjectEstimate:
@@ -316,7 +318,10 @@ class Tracker:
         if self._missed == 0 and self._table is not None:
             window = region.Window(picture, mask, occluder, self._k, shape, prior.T, 0.0)
             one = contest.follow(shape, window, self._table, prior)
-            if one.support > max(SUPPORTED[1], self._usual_support - DROP):
+            proved = one.colours > contest.CONVINCING
+            hidden = self._convinced and not proved
+            if proved or (one.support > max(contest.SUPPORTED[1], self._usual_support - DROP) and not hidden):
+                self._convinced = self._convinced or proved
                 # the errors of the contour are the same in all frames: the last pose adds nothing
                 alone = Prior(one.T, self._weak)
                 found = self._colours.judged([one], alone, mask, occluder, picture.shape[:2])

@@ -27,6 +27,7 @@ from penumbra.services.search.evidence import GUARD_PX
 from penumbra.services.search.mask_fit import Limits
 from penumbra.services.search.objects import basin
 from penumbra.services.search.objects.basin import Contour, Prior, Shape
+from penumbra.services.search.objects.paint import Compared, Painted, compared, smoothed
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
@@ -80,13 +81,19 @@ ONTO = 1.0
 @dataclass(frozen=True)
 class Level:
     """A window of the picture whose pixels are `scale` image pixels wide: log-odds (h, w) of being the object's, gradient (h, w,
-    2) of the strongest colour against its typical size, and `guarded` (h, w) uint8 where something covers."""
+    2) of the strongest colour against its typical size, and `guarded` (h, w) uint8 where something covers; what the mesh's
+    colours are compared with, None where it has none."""
 
     odds: Floats
     gradient: Floats
     guarded: Bytes
     k: Intrinsics
     scale: int
+    painted: Painted | None
+
+    def compared(self, shape: Shape, T: Array) -> Compared | None:
+        """The colours of mesh and picture at a pose; None where there are none to compare."""
+        return None if self.painted is None else compared(self.painted, shape.coarse, T)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -105,6 +112,7 @@ class _Plain:
     k: Intrinsics
     prior: Floats | None
     inside: Floats | None
+    painted: Painted | None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -149,6 +157,7 @@ class Window:
         self._k = Intrinsics(k.fx / s, k.fy / s, (k.cx - x0 - half) / s, (k.cy - y0 - half) / s)
         self.factors = sorted({2 ** max(0, round(math.log2(max(self._extent / size, 1.0)))) for size in SIZES}, reverse=True)
         self._learning = self.factors[min(1, len(self.factors) - 1)]
+        self._paints, self._depth = shape.paints, max(T[2, 3], NEAR)
         self._plain: dict[int, _Plain] = {}
 
     def plain(self, factor: int) -> _Plain:
@@ -180,7 +189,11 @@ class Window:
             distance = cv2.distanceTransform(mask, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
             inside = half((distance / min(BAND_PX / self.scale, 0.1 * self._extent)).astype(np.float32))
             prior = np.where(np.abs(inside) < 1.0, 0.0, np.sign(inside) * MASK_ODDS).astype(np.float32)
-        return _Plain((c[..., 0] * BINS + c[..., 1]) * BINS + c[..., 2], gradient, covered, guarded, k, prior, inside)
+        painted = None
+        if self._paints is not None and f in self.factors[:2]:
+            paint = self._paints[self.factors.index(f)]
+            painted = Painted(paint, smoothed(image, paint.spread * k.fx / self._depth), guarded, k)
+        return _Plain((c[..., 0] * BINS + c[..., 1]) * BINS + c[..., 2], gradient, covered, guarded, k, prior, inside, painted)
 
     def level(self, factor: int, table: Floats) -> Level:
         """The window made smaller by a factor, with the log-odds (BINS^3,) of the colours."""
@@ -190,7 +203,10 @@ class Window:
         odds = table[self.plain(factor // n).bins[: h * n, : w * n]]
         if n > 1:
             odds = np.asarray(cv2.resize(odds, (w, h), interpolation=cv2.INTER_AREA), np.float32)
-        return Level(odds if at.prior is None else odds + at.prior, at.gradient, at.guarded, at.k, factor * self.scale)
+        odds = odds if at.prior is None else odds + at.prior
+        # the points are as far apart as a few pixels of the second size: larger pictures show no more of them
+        painted = self.plain(factor if factor in self.factors[:2] else self.factors[1]).painted
+        return Level(odds, at.gradient, at.guarded, at.k, factor * self.scale, painted)
 
     def table(self, inside: Floats, outside: Floats) -> Floats:
         """Log-odds (BINS^3,) of the colours that pixels of these weights (h, w) show, in the size for learning."""
@@ -420,6 +436,9 @@ def descend(
     for reach in reaches:
         found = [(lines(shape, model, at, T, reach, inside), inside) for inside in ((False, True) if creases else (False,))]
         H, g = information(found, at, T, robust * reach)
+        if (colours := at.compared(shape, T)) is not None:
+            more, towards = colours.information
+            H, g = H + more, g + towards
         H += prior.information
         H[_DIAGONAL] *= 1.0 + basin.DAMPING
         step = np.linalg.solve(H, g + prior.information @ rigid.pose_error(prior.T, T))
@@ -432,9 +451,10 @@ def descend(
 _DIAGONAL = np.diag_indices(6)
 
 
-def covariance(shape: Shape, at: Level, T: Array) -> Array:
-    """The covariance (6, 6) of a pose by contour and creases alone, with the errors of the whole contour (WAVES), of the mesh's
-    scale (SCALE) and of what rotations it shows (LEVER)."""
+def covariance(shape: Shape, at: Level, T: Array, trust: float, colours: Compared | None) -> Array:
+    """The covariance (6, 6) of a pose by contour and creases, whose errors are trusted by a share `trust`, and by the mesh's
+    colours where they convince, with the errors of the whole contour (WAVES), of the mesh's scale (SCALE) and of what rotations
+    it shows (LEVER)."""
     H, g, n = np.zeros((7, 7)), np.zeros((7, 4 * len(WAVES))), 2 * len(WAVES)
     turns = np.arange(1, len(WAVES) + 1)
     lever2 = 0.0
@@ -455,7 +475,11 @@ def covariance(shape: Shape, at: Level, T: Array) -> Array:
     P = np.linalg.inv(believed + weak)
     bent = P @ believed @ np.linalg.solve(H + weak, bent)
     farther = np.concatenate([SCALE * T[:3, 3], np.zeros(3)])  # a larger object further away looks the same
-    return np.asarray(P + bent @ bent.T + np.outer(farther, farther), np.float64)
+    P = P + bent @ bent.T
+    if colours is None:
+        return np.asarray((P + np.outer(farther, farther)) / trust, np.float64)
+    P = np.linalg.inv(np.linalg.inv(P / trust) + colours.information[0])
+    return np.asarray(P + np.outer(farther, farther), np.float64)
 
 
 SCALE = 0.01
@@ -495,9 +519,9 @@ def _vote(points, edges, odds, step, beside, by_edge, by_colour, value):
                 value[r, c] += point.length * (by_edge * edges[a, y + dy, x + dx] + by_colour * between)
 
 
-def hypotheses(model: Model, at: Level, starts: list[Array], prior: Prior, reach: float) -> list[Array]:
+def hypotheses(model: Model, at: Level, starts: list[Array], prior: Prior, reach: float) -> list[tuple[float, Array]]:
     """The poses that result from shifting each start, up to `reach` [m], to the two places where its contour lies best on edges
-    and between the colours; best first."""
+    and between the colours, with what speaks for them; best first."""
     h, w = at.shape
     edges = np.empty((ANGLES, h, w), np.float32)
     for a in range(ANGLES):
@@ -524,4 +548,4 @@ def hypotheses(model: Model, at: Level, starts: list[Array], prior: Prior, reach
                 there[:2, 3] += (shift[x], shift[y])
                 found.append((float(value[y, x]), there))
                 value[max(y - 3, 0) : y + 4, max(x - 3, 0) : x + 4] = -np.inf
-    return [T for _, T in sorted(found, key=lambda one: -one[0])]
+    return sorted(found, key=lambda one: -one[0])

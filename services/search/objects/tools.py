@@ -176,7 +176,7 @@ def _given(options: flags.Options) -> tuple[RigidObject, CameraFiles, Array]:
     options.spread = metres, math.radians(degrees)
     files, T = CameraFiles(read_camera(options.camera)), read_pose(options.init)
     try:
-        return RigidObject(meshes.load(options.mesh, options.mesh_unit)), files, T
+        return RigidObject(*meshes.load(options.mesh, options.mesh_unit)), files, T
     except ObjectFileError as error:
         raise ObjectFileError(str(error) if str(options.mesh) in str(error) else f"{options.mesh}: {error}") from None
 

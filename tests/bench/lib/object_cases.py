@@ -81,7 +81,7 @@ def cases(folder: Path) -> list[Case]:
 
 def read(folder: Path) -> Case:
     """The case of a folder. Raises ObjectFileError."""
-    mesh = meshes.load(folder / "mesh.ply", "m")
+    mesh, colours = meshes.load(folder / "mesh.ply", "m")
     truth = json.loads((folder / "truth.json").read_text())
     vertices = mesh.vertices[np.unique(mesh.faces)]
     corners = np.asarray(trimesh.convex.convex_hull(vertices).vertices)
@@ -89,7 +89,7 @@ def read(folder: Path) -> Case:
     frames = tuple((folder / one["file"], np.array(one["camera_from_object"], float)) for one in truth.get("frames", ()))
     files = tools.CameraFiles(tools.read_camera(folder / "camera.json"))
     pose = tools.read_pose(folder / "truth.json")
-    return Case(folder.name, folder, files, RigidObject(mesh), vertices, diameter, pose, frames)
+    return Case(folder.name, folder, files, RigidObject(mesh, colours), vertices, diameter, pose, frames)
 
 
 def timed(call: Any, *arguments: Any) -> tuple[ObjectEstimate, float]:
