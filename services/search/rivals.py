@@ -41,7 +41,7 @@ FIRST = 3
 MOST = 2 * RIVALS
 """Number of rivals that one picture compares, at most: where one of them takes the pose's place, all are compared with that."""
 REFUTED_TIMES = 2
-"""Number of pictures in a row that have to refute a rival: where the two explain a picture nearly alike, noise refutes it once."""
+"""Number of pictures in a row that have to refute a rival: where both explain a picture nearly alike, noise refutes it once."""
 APART_RAD = 0.2
 """Poses that differ by less are one."""
 JUMPED_RAD = 0.4
