@@ -94,8 +94,8 @@ class HapticSettings:
     """Squared Mahalanobis distance above which two places are two. Below it, one of them with its covariance stands for both.
     Chosen: two standard deviations."""
     beside_odds: float = 3.0
-    """Log odds of the track over a rival that was found beside it and explains the window as well: twenty to one. Chosen on replays
-    of `arm`: the rival was searched for, one of many places always explains a single window, and a limb that is followed rarely
+    """Log odds of the track over a rival that was found beside it and explains the window as well: twenty to one. Chosen with
+    replays of `arm`: the rival was searched for, one of many places always explains a single window, and a limb that is followed rarely
     is elsewhere. With seven to one the track jumped to places up to 20 cm away, and stayed there for a quarter of a second; with
     fifty to one a limb that has jumped is found too late."""
     odds_step: float = 2.0
