@@ -56,7 +56,9 @@ def test_every_message_comes_back_as_it_was_sent_ready_for_compiled_code(kind, d
 def test_whatever_stands_in_a_field_decode_answers_with_a_message_or_bad_message(kind, data):
     fields = msgpack.unpackb(encode(kind(**data.draw(st.fixed_dictionaries(KINDS[kind])))))
     for name in data.draw(st.sets(st.sampled_from(sorted(fields)), min_size=1)):
-        if isinstance(fields[name], list) and fields[name] and data.draw(st.booleans()):  # one of dtype, shape, bytes, or an entry
+        if (
+            isinstance(fields[name], list) and fields[name] and data.draw(st.booleans())
+        ):  # one of dtype, shape, bytes, or an entry
             fields[name][data.draw(st.integers(0, len(fields[name]) - 1))] = data.draw(ANYTHING)
         else:
             fields[name] = data.draw(ANYTHING)
