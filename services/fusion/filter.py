@@ -1,8 +1,9 @@
 """The default observer's filter, compiled: an error-state Kalman filter that knows that the errors of a sense last.
 
-State: position p, rotation R, linear and angular velocity and acceleration, and a bias of every sense. Errors are along fixed axes,
-the rotation's applied from the left (`shared.geometry.rigid.perturb`). A velocity is that of a damped oscillator which white jerk
-drives: a limb speeds up and slows down smoothly, as in reaches, and one that is faster over the same ways takes less time for it.
+State: position p, rotation R, linear and angular velocity and acceleration, and a bias of every sense. Errors are along fixed
+axes, the rotation's applied from the left (`shared.geometry.rigid.perturb`). A velocity is that of a damped oscillator which
+white jerk drives: a limb speeds up and slows down smoothly, as in reaches, and one that is faster over the same ways takes less
+time.
 
 A sense is wrong by nearly the same amount from one measurement to the next: a mask a pixel too large is a forearm 2 cm too near
 for as long as nobody moves. A filter that takes 100 such measurements a second for independent assumes a tenth of the error

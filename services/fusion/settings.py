@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +80,23 @@ class FusionSettings:
     weight_time: float = 0.5
     """Time constant [s] with which the information that a sense has brought decays in its published weight. Chosen, not
     measured."""
+
+
+MOTION = ("jerk", "motion_time", "damping")
+"""The fields of `FusionSettings` that `learning.py` learns from recordings."""
+
+
+def with_motion(text: str) -> FusionSettings:
+    """The settings with the motion of a file that `penumbra replay --motion` has written. Raises ValueError for any other."""
+    try:
+        found = json.loads(Path(text).read_text())
+        pairs = {name: (float(found[name][0]), float(found[name][1])) for name in MOTION[:2]}
+        damping = float(found["damping"])
+    except (OSError, ValueError, TypeError, LookupError) as error:
+        raise ValueError(f"expected a file of penumbra replay --motion, got {text!r}: {error}") from None
+    if not (all(0.0 < value < math.inf for pair in pairs.values() for value in pair) and 0.0 < damping < 1.0):
+        raise ValueError(f"{text}: expected positive numbers and a damping below one, got {pairs} and {damping}")
+    return FusionSettings(jerk=pairs["jerk"], motion_time=pairs["motion_time"], damping=damping)
 
 
 @dataclass(frozen=True)

@@ -292,7 +292,7 @@ class Smoother:
     def trajectory(self) -> Trajectory:
         """The trajectory, from the measurements so far. Raises NothingMeasuredError where none of them can be used."""
         measurements, parts, passed, used = self._gated()
-        open_filter = Filter(self._subject, self._settings, self._senses, is_gated=False)
+        open_filter = self.filter(self._settings)
         for left in range(PASSES - 1, -1, -1):
             segments, revised = [], used.copy()
             for mine in parts:
@@ -304,6 +304,16 @@ class Smoother:
             used = revised
         self.reinstated, self.dismissed = int((used & ~passed).sum()), int((passed & ~used).sum())
         return Trajectory(segments, self._subject.limits)
+
+    def segments(self) -> list[NDArray[np.void]]:
+        """The measurements of each segment that the gates pass, forwards or backwards in time. Raises NothingMeasuredError where
+        there are none."""
+        measurements, parts, _, used = self._gated()
+        return [measurements[mine[used[mine]]] for mine in parts if used[mine].any()]
+
+    def filter(self, settings: FusionSettings) -> Filter:
+        """The filter without gates of this target, with other settings."""
+        return Filter(self._subject, settings, self._senses, is_gated=False)
 
     def _gated(self) -> tuple[NDArray[np.void], list[Indices], Flags, Flags]:
         """What the filter with its gates makes of all: the measurements that it knows (m,), the indices of those of each segment,
