@@ -39,7 +39,8 @@ from penumbra.shared.native import inner
 
 REFUSED_RATE = 30.0
 """Factor on the rate at which the process noise grows while measurements are refused: all are, until the filter has caught up
-with the limb. Chosen: with 4 a hand that reaches 30 cm far within 0.3 s after a rest of a second is known again 0.1 s later."""
+with the limb. Chosen: with 4 a hand that reaches 20 to 45 cm far within 0.3 s, after a rest of a second, is known again up to a
+picture later."""
 SURPRISING = 2.0
 """Squared Mahalanobis distance per direction (1 expected) from which a measurement does not change the process noise while
 another sense agrees better with the state: a sense with a small bias would make the state follow it. Chosen, not measured."""
