@@ -218,7 +218,8 @@ def measure_all(
 )
 def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, shares):  # type: ignore[no-untyped-def]
     """`Bank.estimate`, one after the other."""
-    p, R, velocity, covariance = np.empty(3), np.empty((3, 3)), np.empty(POSE), np.empty((MOTION, MOTION))
+    p, R, covariance = np.empty(3), np.empty((3, 3)), np.empty((MOTION, MOTION))
+    velocity, acceleration = np.empty(POSE), np.empty(POSE)
     for n in range(len(out)):
         history = Entries(measurements[n], states[n], senses[n], P[n], rings[n])
         one, slot, found = models[n], find(history, stamp_ns), out[n]
@@ -238,9 +239,9 @@ def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, 
             so3.copy(now.R, R)
             so3.copy(P[n, slot], covariance)
             for i in range(POSE):
-                velocity[i] = now.velocity[i]
+                velocity[i], acceleration[i] = now.velocity[i], now.acceleration[i]
             dt = max(0.0, (stamp_ns - now.stamp_ns) * 1e-9)
-            move(one, dt, p, R, velocity, covariance, now.agility)
+            move(one, dt, p, R, velocity, acceleration, covariance, now.agility)
             if stamp_ns > now.accepted_ns:  # a guess; what is measured is believed
                 within_reach(one, p, R)
             found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)

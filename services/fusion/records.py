@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-POSE, MOTION = 6, 12  # sizes of the pose, and of the pose with its velocities, within the state
+POSE, MOTION = 6, 18  # sizes of the pose, and of the pose with its velocity and acceleration, within the state
 UNITS = (0.1, 0.1, 0.1, 1.0, 1.0, 1.0)
 """Units [m, rad] in which translations and rotations compare: a turn by 1 rad moves the ends of a forearm by about 10 cm."""
 GATES = 3
@@ -21,14 +21,14 @@ NEVER = -(1 << 62)
 
 
 def size(senses: int) -> int:
-    """Number of the state's errors: position, rotation, their velocities, and the bias of each sense."""
+    """Number of the state's errors: position, rotation, their velocities and accelerations, and the bias of each sense."""
     return MOTION + POSE * senses
 
 
 MODEL = np.dtype(
     [
-        *((name, "f8", 2) for name in ("acceleration", "velocity_spread", "agility", "learning")),  # as in FusionSettings
-        *((name, "f8") for name in ("velocity_time", "unsteadiness", "doubt", "patience", "source_patience", "refusals")),
+        *((name, "f8", 2) for name in ("jerk", "motion_time", "velocity_spread", "agility", "learning")),  # as in FusionSettings
+        *((name, "f8") for name in ("damping", "doubt", "patience", "source_patience", "refusals")),
         *((name, "f8") for name in ("unobserved", "agreement_time", "horizon", "weight_time", "lost_age")),
         ("limits", "f8", 4),  # as in Limits
         ("shoulder", "f8", 3),  # as in Arm
@@ -75,6 +75,7 @@ STATE = np.dtype(
         ("p", "f8", 3),
         ("R", "f8", (3, 3)),
         ("velocity", "f8", POSE),
+        ("acceleration", "f8", POSE),
         ("agility", "f8", 2),  # learned factors on the process noise, linear and angular
     ]
 )
@@ -119,7 +120,8 @@ class History(NamedTuple):
     """The histories of targets (t,), each a ring of c entries, with n senses; see `history.py`.
 
     measurements (t, c) : MEASUREMENT. states (t, c) : STATE. senses (t, c, n) : SENSE_STATE. P (t, c, size, size) : covariances
-    of the errors of position, rotation, their velocities, and the bias of each sense. rings (t, 2) : see `history.py`.
+    of the errors of position, rotation, their velocities and accelerations, and the bias of each sense. rings (t, 2) : see
+    `history.py`.
     """
 
     measurements: NDArray[np.void]

@@ -15,7 +15,7 @@ from penumbra.services.fusion import paper
 from penumbra.services.fusion.estimate import Estimate, RefusedMeasurement, latest, measured, stream_of
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver, PaperSettings
-from penumbra.services.fusion.settings import Subject
+from penumbra.services.fusion.settings import FusionSettings, Subject, with_motion
 from penumbra.shared.contract import messages, outline, topics
 from penumbra.shared.contract.senses import SENSES, Sense
 from penumbra.shared.geometry import rigid
@@ -36,6 +36,13 @@ FLAGS = (
         "--observer", choices=sorted(OBSERVERS), default="default", help="default: error-state filter; paper: the paper's"
     ),
     flags.Option("--target", metavar="NAME", show_default="all of the cell", help="fuse only this target"),
+    flags.Option(
+        "--motion",
+        type=with_motion,
+        metavar="FILE.json",
+        show_default="the built-in one",
+        help="how limbs move, learned by penumbra replay --smooth --motion; of the default observer",
+    ),
 )
 EXAMPLE = "penumbra fusion --cell table --observer paper"
 
@@ -51,7 +58,7 @@ def start(node: ServiceNode, options: flags.Options, senses: Sequence[Sense] = S
     if options.observer == "paper":
         senses = [sense for sense in senses if sense.name in paper.SENSES]
     subjects = [Subject.of(node.cell.targets[name], node.cell.body) for name in names]
-    group = Group(options.observer, subjects, node.now_ns, senses)
+    group = Group(options.observer, subjects, node.now_ns, senses, options.motion)
     described = outline.of(node.cell).encode(), "application/json"
     node.answer(topics.description(node.cell.name), lambda parameters, payload: described)
     fusions = [Fusion(node, name, group, observer, senses) for name, observer in zip(names, group.observers, strict=True)]
@@ -69,7 +76,14 @@ def start(node: ServiceNode, options: flags.Options, senses: Sequence[Sense] = S
 class Group:
     """The observers of the cell's targets, of which all can be asked at once, and their clock now_ns()."""
 
-    def __init__(self, kind: str, subjects: list[Subject], now_ns: Callable[[], int], senses: Sequence[Sense] = SENSES):
+    def __init__(
+        self,
+        kind: str,
+        subjects: list[Subject],
+        now_ns: Callable[[], int],
+        senses: Sequence[Sense] = SENSES,
+        settings: FusionSettings | None = None,
+    ):
         self.lock = threading.Lock()
         self._now_ns, self._last_ns = now_ns, now_ns()
         self.observers: Sequence[ErrorStateObserver | PaperObserver]
@@ -77,7 +91,7 @@ class Group:
             self.observers = [PaperObserver(each.home, each.spread, PaperSettings(limits=each.limits)) for each in subjects]
             self._bank = None
         else:
-            self._bank = Bank(subjects, senses=senses)
+            self._bank = Bank(subjects, settings, senses)
             self.observers = [ErrorStateObserver.of(self._bank, i) for i in range(len(subjects))]
 
     def now_ns(self) -> int:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,21 +30,24 @@ class FusionSettings:
 
     # ---- How a limb moves
 
-    acceleration: tuple[float, float] = (0.07, 1.5)
-    """Density of the white acceleration, linear [m^2/s^3] and angular [rad^2/s^3], before it is adapted. By the NEES."""
-    velocity_time: float = 0.35
-    """Time constant [s] with which a velocity decays: limbs reach to places and stop there. By the NEES."""
-    unsteadiness: float = 2.0
-    """Density of the white acceleration per squared speed [1/s], beside `acceleration`: a limb under way speeds up, turns and
-    stops within about half a second, while one at rest stays where it is. By the NEES."""
+    jerk: tuple[float, float] = (1.5, 20.0)
+    """Density of the white jerk, linear [m^2/s^5] and angular [rad^2/s^5], before it is adapted: of a limb that moves slowly. By
+    the NEES; the likelihood of the measurements alone is largest with a sixth of it, and then up to 1.7 % of the poses are beyond
+    three sigma."""
+    motion_time: tuple[float, float] = (0.22, 0.22)
+    """Time [s] in which such a limb changes its way: the standard deviation of its velocity over that of its acceleration,
+    linear and angular. By the NEES."""
+    damping: float = 0.7
+    """Damping ratio of the velocity, in (0, 1): below one, a limb that has set out stops and comes back, as one does that
+    reaches to and fro within a region. By the NEES."""
     velocity_spread: tuple[float, float] = (0.4, 1.0)
     """Standard deviation of an unknown velocity, linear [m/s] and angular [rad/s]. Chosen, not measured."""
 
     # ---- What is learned from the innovations
 
-    agility: tuple[float, float] = (0.3, 30.0)
-    """Bounds of the learned factors on `acceleration`: from a resting arm to a hand at 2 m/s. Chosen; the lower one by the
-    share of poses beyond three sigma: with 0.08 a limb that sets out from a rest leaves its covariance behind."""
+    agility: tuple[float, float] = (1.0, 30_000.0)
+    """Bounds of the learned factors on `jerk`: from a limb that rests to a hand at 2 m/s. By the NEES; the lower one by the share
+    of poses beyond three sigma: a limb that sets out from a rest must not leave its covariance behind."""
     doubt: float = 100.0
     """Largest learned factor on the covariance of a sense. Chosen, not measured."""
     learning: tuple[float, float] = (0.1, 5.0)
@@ -75,6 +80,23 @@ class FusionSettings:
     weight_time: float = 0.5
     """Time constant [s] with which the information that a sense has brought decays in its published weight. Chosen, not
     measured."""
+
+
+MOTION = ("jerk", "motion_time", "damping")
+"""The fields of `FusionSettings` that `learning.py` learns from recordings."""
+
+
+def with_motion(text: str) -> FusionSettings:
+    """The settings with the motion of a file that `penumbra replay --motion` has written. Raises ValueError for any other."""
+    try:
+        found = json.loads(Path(text).read_text())
+        pairs = {name: (float(found[name][0]), float(found[name][1])) for name in MOTION[:2]}
+        damping = float(found["damping"])
+    except (OSError, ValueError, TypeError, LookupError) as error:
+        raise ValueError(f"expected a file of penumbra replay --motion, got {text!r}: {error}") from None
+    if not (all(0.0 < value < math.inf for pair in pairs.values() for value in pair) and 0.0 < damping < 1.0):
+        raise ValueError(f"{text}: expected positive numbers and a damping below one, got {pairs} and {damping}")
+    return FusionSettings(jerk=pairs["jerk"], motion_time=pairs["motion_time"], damping=damping)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@
    wrong sense in both. Where the filter began anew a segment begins; nothing is carried over from one to the next.
 2. The filter runs over the used measurements of each segment, without gates: forwards and backwards in time, which shows how
    unsteady the limb is at each moment, and then forwards with the mean of both.
-3. A fixed-interval smoother goes back over the states of the filter: pose, velocities, and the biases of the senses.
+3. A fixed-interval smoother goes back over the states of the filter: pose, velocity, acceleration, and the biases of the senses.
 4. Every measurement is judged by the smoothed state, its own part in it taken out: one that was used and does not agree is left
    out, one that was refused and agrees is used. Where that changes something, it goes on with 2, at most PASSES times.
 
@@ -42,8 +42,6 @@ FOREVER_S = 1e9
 """A horizon [s] beyond all recordings."""
 BLOCK = 256
 """Number of states that are taken on at a time: it bounds the memory for their transitions."""
-LEAST = 1e-3
-"""Least factor on the process noise, where its part of the speed alone is more than there should be. Chosen, not measured."""
 OWN = 0.01
 """Share of a measurement's white noise below which what is left of it says nothing: nothing else measured that direction. Chosen,
 not measured."""
@@ -76,7 +74,8 @@ class States:
         a, b = self.now[i], of.now[j]
         so3.log(a["R"] @ b["R"].T, rotation)
         biases = self.senses["bias"][i] - of.senses["bias"][j]
-        return np.concatenate([a["p"] - b["p"], rotation, a["velocity"] - b["velocity"], biases.ravel()])
+        rates = a["velocity"] - b["velocity"], a["acceleration"] - b["acceleration"]
+        return np.concatenate([a["p"] - b["p"], rotation, *rates, biases.ravel()])
 
     def correct(self, i: int, error: Array, P: Array) -> None:
         """Moves state i by an error (size,), and gives it a covariance that belongs to the pose before, and turns with it."""
@@ -85,7 +84,8 @@ class States:
         now["p"] += error[:3]
         now["R"] = turn @ now["R"]
         so3.orthonormalise(now["R"])
-        now["velocity"] += error[POSE:MOTION]
+        now["velocity"] += error[POSE : 2 * POSE]
+        now["acceleration"] += error[2 * POSE : MOTION]
         self.senses["bias"][i] += error[MOTION:].reshape(-1, POSE)
         self.P[i] = turned(turn, P)
 
@@ -93,7 +93,7 @@ class States:
 def turned(turn: Array, P: Array) -> Array:
     """A covariance (size, size) of a pose that a rotation (3, 3) is applied to."""
     W = np.eye(len(P))
-    W[3:6, 3:6] = W[9:12, 9:12] = turn
+    W[3:6, 3:6] = W[9:12, 9:12] = W[15:18, 15:18] = turn
     out: Array = W @ P @ W.T
     return out
 
@@ -127,7 +127,7 @@ class Filter:
 
     def __init__(self, subject: Subject, settings: FusionSettings, senses: Sequence[Sense], is_gated: bool):
         self.one, self.senses = np.array([model(settings, subject)], MODEL), sense_models(senses)
-        self.one["horizon"] = FOREVER_S
+        self.one["horizon"], self._gated = FOREVER_S, self.senses.copy()
         if not is_gated:
             self.senses["threshold"] = np.inf
 
@@ -147,17 +147,18 @@ class Filter:
 
     def run(self, measurements: NDArray[np.void], agility: Array) -> States:
         """The states after measurements (k,), with the agilities (k, 2) of the motion to each: see `transitions.run`."""
-        return self._run(measurements, agility, len(measurements) + 1).of(slice(1, None))
+        return self._run(measurements, self.senses, agility, len(measurements) + 1).of(slice(1, None))
 
     def learned(self, measurements: NDArray[np.void]) -> NDArray[np.void]:
-        """The STATEs after measurements (k,), with the agilities that the filter learns; without covariances, which are large."""
-        return self._run(measurements, np.zeros((len(measurements), 2)), 2).now[1:]
+        """The STATEs after measurements (k,), with the agilities that the filter learns, which its gates make quicker to learn;
+        without covariances, which are large."""
+        return self._run(measurements, self._gated, np.zeros((len(measurements), 2)), 2).now[1:]
 
-    def _run(self, measurements: NDArray[np.void], agility: Array, kept: int) -> States:
+    def _run(self, measurements: NDArray[np.void], senses: NDArray[np.void], agility: Array, kept: int) -> States:
         k, n = len(measurements) + 1, len(self.senses)
         states = States(np.zeros(k, STATE), np.zeros((k, n), SENSE_STATE), np.zeros((kept, size(n), size(n))))
         transitions.run(
-            *(self.one, self.senses, measurements, agility),
+            *(self.one, senses, measurements, agility),
             *(states.now, states.senses, states.P, np.empty((size(n), POSE))),
         )
         return states
@@ -165,21 +166,10 @@ class Filter:
     def agility(self, measurements: NDArray[np.void]) -> Array:
         """Agilities (k, 2) of the motion to each measurement (k,) with which it is as unsteady as the filter finds it in the mean
         of both directions of time. Forwards it learns late that a limb sets out, backwards that it stops."""
-        out, dt = np.zeros((len(measurements), 2)), np.diff(measurements["stamp_ns"]) * 1e-9
+        out = np.zeros((len(measurements), 2))
         before = self.learned(measurements)[:-1]
         after = self.learned(reversed_in_time(measurements))[-2::-1]
-        mine, theirs = self._unsteadiness(before, dt), self._unsteadiness(after, dt)
-        density = self.one["acceleration"]
-        mean = 0.5 * (density * (before["agility"] + after["agility"]) + mine + theirs)
-        out[1:] = np.maximum((mean - mine) / density, LEAST)
-        return out
-
-    def _unsteadiness(self, now: NDArray[np.void], dt: Array) -> Array:
-        """The part of the densities (k, 2) of the white acceleration that is of the speeds of STATEs (k,), in the mean over the
-        time dt (k,) [s] that follows: see `filter.move`."""
-        one = self.one[0]
-        fading = -0.5 * one["velocity_time"] * np.expm1(-2.0 * dt / one["velocity_time"]) / np.maximum(dt, 1e-9)
-        out: Array = one["unsteadiness"] * fading[:, None] * np.sum(now["velocity"].reshape(-1, 2, 3) ** 2, axis=2)
+        out[1:] = np.maximum(before["agility"], after["agility"])
         return out
 
     def moved(self, states: States, stamps_ns: Indices) -> tuple[States, Array, Array]:
@@ -302,7 +292,7 @@ class Smoother:
     def trajectory(self) -> Trajectory:
         """The trajectory, from the measurements so far. Raises NothingMeasuredError where none of them can be used."""
         measurements, parts, passed, used = self._gated()
-        open_filter = Filter(self._subject, self._settings, self._senses, is_gated=False)
+        open_filter = self.filter(self._settings)
         for left in range(PASSES - 1, -1, -1):
             segments, revised = [], used.copy()
             for mine in parts:
@@ -314,6 +304,16 @@ class Smoother:
             used = revised
         self.reinstated, self.dismissed = int((used & ~passed).sum()), int((passed & ~used).sum())
         return Trajectory(segments, self._subject.limits)
+
+    def segments(self) -> list[NDArray[np.void]]:
+        """The measurements of each segment that the gates pass, forwards or backwards in time. Raises NothingMeasuredError where
+        there are none."""
+        measurements, parts, _, used = self._gated()
+        return [measurements[mine[used[mine]]] for mine in parts if used[mine].any()]
+
+    def filter(self, settings: FusionSettings) -> Filter:
+        """The filter without gates of this target, with other settings."""
+        return Filter(self._subject, settings, self._senses, is_gated=False)
 
     def _gated(self) -> tuple[NDArray[np.void], list[Indices], Flags, Flags]:
         """What the filter with its gates makes of all: the measurements that it knows (m,), the indices of those of each segment,

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from penumbra.services import flags
+from penumbra.services.fusion.settings import MOTION
 from penumbra.services.replay import in_process, live, smooth
 from penumbra.services.replay.chain import SERVICES
 from penumbra.services.replay.live import SENSORS
@@ -66,6 +67,12 @@ def _seconds(text: str) -> float:
         metavar="FILE.mcap",
         help="record what the methods make (--in-process), and the smoothed poses beside what was recorded (--smooth)",
     ),
+    flags.Option(
+        "--motion",
+        type=Path,
+        metavar="FILE.json",
+        help="with --smooth: learn how the limbs move, and write it here, for penumbra fusion --motion",
+    ),
     *(
         flags.Option(
             f"--{service}", default="", metavar="FLAGS", help=f"with --in-process: flags of {service}, such as '--log-level info'"
@@ -87,12 +94,15 @@ def _seconds(text: str) -> float:
     example="penumbra replay run.mcap --loop\n"
     "penumbra up --replicas emulator=0 & penumbra replay run.mcap --sensors\n"
     "penumbra replay run.mcap --in-process --json\n"
-    "penumbra replay run.mcap --smooth --out smooth.mcap",
+    "penumbra replay run.mcap --smooth --out smooth.mcap\n"
+    "penumbra replay run.mcap --smooth --motion motion.json",
 )
 def main(options: flags.Options) -> int:
     """Plays, and prints what was played; 1 where a file had no end."""
     if options.out is not None and not (options.in_process or options.smooth):
         flags.refuse("expected --in-process or --smooth beside --out, got --out alone")
+    if options.motion is not None and not options.smooth:
+        flags.refuse("expected --smooth beside --motion, got --motion alone")
     if options.smooth and (options.sensors or options.topics or options.loop):
         flags.refuse("expected --smooth without --sensors, --topics and --loop; --in-process smooths what the sensors said")
     if options.sensors and options.topics:
@@ -112,16 +122,21 @@ def main(options: flags.Options) -> int:
 def _here(options: flags.Options, recordings: Sequence[Recording], cell: cells.Cell) -> dict[str, Any]:
     """Without a bus: through the methods, or as smoothed poses, or both."""
     writer = _writer(options, recordings[0], cell) if options.out is not None else None
+    smoothing = smooth.Smoothing(cell) if options.smooth else None
     try:
-        if not options.in_process:
-            return smooth.smooth(cell, _messages(recordings, smooth.READ, options.from_s), recordings, writer)
-        arguments = {service: shlex.split(getattr(options, service)) for service in SERVICES}
-        smoothing = smooth.Smoothing(cell) if options.smooth else None
-        messages = _messages(recordings, topics.TOPICS, options.from_s)
-        return in_process.play(cell, messages, arguments, writer=writer, smoothing=smoothing)
+        if smoothing is not None and not options.in_process:
+            found = smooth.smooth(_messages(recordings, smooth.READ, options.from_s), recordings, writer, smoothing)
+        else:
+            arguments = {service: shlex.split(getattr(options, service)) for service in SERVICES}
+            messages = _messages(recordings, topics.TOPICS, options.from_s)
+            found = in_process.play(cell, messages, arguments, writer=writer, smoothing=smoothing)
     finally:
         if writer is not None:
             writer.close()
+    if smoothing is not None and options.motion is not None:
+        found["motion"] = smoothing.learned().described()
+        options.motion.write_text(json.dumps(found["motion"], indent=2) + "\n")
+    return found
 
 
 def _writer(options: flags.Options, recording: Recording, cell: cells.Cell) -> Writer:
@@ -183,6 +198,10 @@ def _print(found: dict[str, Any], as_json: bool) -> None:
         print(f"  {name}: the gates passed {passed}; {counts['reinstated']} others are used, {counts['dismissed']} of these not")
     for name, why in found.get("not_smoothed", {}).items():
         print(f"smoothed {name}: none: {why}")
+    if (motion := found.get("motion")) is not None:
+        print(f"motion, from {motion['measurements']} measurements, each by {motion['gain']:.3f} nats more likely:")
+        for name in MOTION:
+            print(f"  {name}: {motion[name]}")
     if "messages" in found:
         counts = ", ".join(f"{name} {count}" for name, count in found["topics"].items())
         print(f"{found['messages']} messages ({counts or 'none'}), at most {1e3 * found['late_s']:.0f} ms late")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from penumbra.services.fusion.estimate import RefusedMeasurement, measured, stream_of
+from penumbra.services.fusion.learning import Learned, learned
 from penumbra.services.fusion.settings import Subject
 from penumbra.services.fusion.smoother import NothingMeasuredError, Smoother
 from penumbra.services.replay.chain import Heard
@@ -74,6 +75,14 @@ class Smoothing:
             why = "; ".join(f"{name}: {reason}" for name, reason in self.missing.items())
             raise RecordingError(f"{why}; give --in-process to make them of what the sensors said, or record vision and haptic")
 
+    def learned(self) -> Learned:
+        """The motion of all targets. Raises RecordingError where too little was measured."""
+        measured = [smoother for name, smoother in self._smoothers.items() if name not in self.missing]
+        try:
+            return learned(measured)
+        except NothingMeasuredError as error:
+            raise RecordingError(str(error)) from None
+
     def described(self) -> dict[str, Any]:
         """By target what became of the measurements of each sense, how many of those that the gates refused were used after all,
         and how many that passed were not."""
@@ -88,10 +97,12 @@ class Smoothing:
         }
 
 
-def smooth(cell: cells.Cell, recording: Iterable[Played], copied: Iterable[Recording], writer: Writer | None) -> dict[str, Any]:
+def smooth(
+    recording: Iterable[Played], copied: Iterable[Recording], writer: Writer | None, smoothing: Smoothing
+) -> dict[str, Any]:
     """Smooths the senses' poses of a recording, and describes the smoothed ones as `in_process.play` does. writer: a new
     recording, of all that is in the copied ones and of the smoothed poses. Raises RecordingError where no sense has measured."""
-    smoothing, tracks = Smoothing(cell), Tracks()
+    tracks = Tracks()
     for each in recording:
         smoothing.take(each.topic, each.names, each.message)
         if each.topic in (topics.FUSED, topics.TRUTH):

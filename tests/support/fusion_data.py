@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import expm
 
 from penumbra.services.fusion.records import UNITS
+from penumbra.services.fusion.settings import FusionSettings
 from penumbra.shared.contract import senses
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
@@ -40,6 +42,19 @@ class Errors:
         white = self._rng.normal(size=6)
         lasting = self._errors.lasting
         return UNITS * (root @ (np.sqrt(lasting) * self._bias + np.sqrt(1 - lasting) * white))
+
+
+def motion(dt: float, settings: FusionSettings) -> tuple[Array, Array]:
+    """How position, velocity and acceleration (3,) along one axis go on for dt [s]: transition and process noise (3, 3), by
+    Van Loan, "Computing integrals involving the matrix exponential" (1978), DOI 10.1109/TAC.1978.1101743."""
+    w = 1.0 / settings.motion_time[0]
+    rates = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -(w**2), -2.0 * settings.damping * w]])
+    both = np.zeros((6, 6))
+    both[:3, :3], both[3:, 3:] = -rates, rates.T
+    both[2, 5] = settings.jerk[0]
+    powers = expm(dt * both)
+    F = powers[3:, 3:].T
+    return F, F @ powers[:3, 3:]
 
 
 def without_roll(T: Array, sigma: list[float]) -> Array:

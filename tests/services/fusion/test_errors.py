@@ -15,11 +15,11 @@ from penumbra.shared import chi_square
 from penumbra.shared.contract import senses
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array, perturb, pose_error
-from penumbra.tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, Errors, ns, without_roll
+from penumbra.tests.support.fusion_data import HOME, SKIN, SPREAD, VISION, Errors, motion, ns, without_roll
 
 ERRORS = senses.Errors(0.8, 1.0, 1e-4)
 SENSES = tuple(dataclasses.replace(sense, errors=ERRORS) for sense in senses.SENSES)
-MATCHED = FusionSettings(velocity_spread=(0.4, 0.5), acceleration=(0.3, 0.5), learning=(0.0, 0.0))
+MATCHED = FusionSettings(velocity_spread=(0.4, 0.4), jerk=(8.0, 8.0), learning=(0.0, 0.0))
 PERIOD = {"vision": 0.05, "haptic": 0.01}
 
 
@@ -31,11 +31,11 @@ def normalised_error(there: dict[str, tuple[float, float]], settings: FusionSett
     rng = np.random.default_rng(seed)
     spread = (0.05, 0.15)
     T = perturb(HOME, rng.normal(size=6) * np.repeat(spread, 3))
-    velocity = rng.normal(size=6) * np.repeat(settings.velocity_spread, 3)
+    rates = rng.normal(size=(2, 6)) * settings.velocity_spread[0] / np.array([[1.0], [settings.motion_time[0]]])
     observer = ErrorStateObserver(HOME, spread, settings, SENSES)
     h = 0.01
-    decay = np.exp(-h / settings.velocity_time)
-    kick = np.sqrt(np.repeat(settings.acceleration, 3) * 0.5 * settings.velocity_time * (1 - decay**2))
+    F, Q = motion(h, settings)
+    kick = np.linalg.cholesky(Q)
     errors = {name: Errors(ERRORS, PERIOD[name], rng) for name in there}
     for k in range(round(seconds / h) + 1):
         for name, (begin, end) in there.items():
@@ -50,8 +50,8 @@ def normalised_error(there: dict[str, tuple[float, float]], settings: FusionSett
                 measured = measured @ rigid.from_rpy([0, 0, 0], [rng.normal(), 0, 0])  # a roll that is made up
             observer.measure(name, ns(k * h), measured, seen)
         if k * h < seconds:
-            before, velocity = velocity, decay * velocity + kick * rng.normal(size=6)
-            T = perturb(T, 0.5 * h * (before + velocity))
+            way, *rates = F @ [np.zeros(6), *rates] + kick @ rng.normal(size=(3, 6))
+            T = perturb(T, way)
     estimate = observer.estimate(ns(seconds))
     e = pose_error(T, estimate.T)
     return float(e @ np.linalg.solve(estimate.covariance, e))

@@ -251,7 +251,7 @@ def test_a_guess_stays_within_the_reach_of_an_arm_whose_shoulder_is_known_and_wh
         for observer in (held, free):  # down, at 0.5 m/s
             observer.measure("vision", ns(0.05 * k), perturb(HOME, [0.0, 0.0, 0.5 * (0.95 - 0.05 * k), 0.0, 0.0, 0.0]), VISION)
     away = [np.linalg.norm(observer.estimate(ns(1.5)).T[:3, 3] - [elbow, 0.0, 0.0] - shoulder) for observer in (held, free)]
-    assert away[0] == pytest.approx(upper_arm, abs=1e-6) and away[1] > upper_arm + 0.05
+    assert away[0] == pytest.approx(upper_arm, abs=1e-6) and away[1] > upper_arm + 0.03
     for observer in (held, free):
         still(observer, perturb(HOME, [0.0, 0.0, -0.1, 0.0, 0.0, 0.0]), 1.5, 3.0)
         assert observer.estimate(ns(2.95)).T[2, 3] == pytest.approx(HOME[2, 3] - 0.1, abs=0.005)

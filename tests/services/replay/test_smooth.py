@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from penumbra.services.command import cli
+from penumbra.services.fusion.settings import with_motion
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.geometry import rigid
@@ -154,3 +155,13 @@ def test_in_words_it_says_what_was_used_and_how_far_the_poses_are_from_the_truth
     out = capsys.readouterr().out
     assert "smoothed forearm:" in out and "from truth: median" in out
     assert "forearm: the gates passed" in out
+
+
+def test_the_motion_of_a_recording_is_learned_into_a_file_that_fusion_reads(path, tmp_path, capsys) -> None:
+    out = tmp_path / "motion.json"
+    found = smoothed(path, capsys, "--motion", str(out))
+    assert found["motion"] == json.loads(out.read_text())
+    assert found["motion"]["gain"] >= 0.0
+    assert with_motion(str(out)).damping == found["motion"]["damping"]
+    assert cli.main(["replay", str(path), "--motion", str(out)]) == 2
+    assert "expected --smooth beside --motion" in capsys.readouterr().err
