@@ -95,9 +95,9 @@ class HapticSettings:
     Chosen: two standard deviations."""
     beside_odds: float = 3.0
     """Log odds of the track over a rival that was found beside it and explains the window as well: twenty to one. Chosen with
-    replays of `arm`: the rival was searched for, one of many places always explains a single window, and a limb that is followed rarely
-    is elsewhere. With seven to one the track jumped to places up to 20 cm away, and stayed there for a quarter of a second; with
-    fifty to one a limb that has jumped is found too late."""
+    replays of `arm`: the rival was searched for, one of many places always explains a single window, and a limb that is followed
+    rarely is elsewhere. With seven to one the track jumped to places up to 20 cm away, and stayed there for a quarter of a
+    second; with fifty to one a limb that has jumped is found too late."""
     odds_step: float = 2.0
     """Largest change of the log odds by one window, so that a burst of noise does not decide. Chosen."""
     odds_decided: float = 7.0
