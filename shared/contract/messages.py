@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import math
 import re
+import threading
 import types
 import typing
 from collections.abc import Callable
@@ -386,7 +387,16 @@ class Codec(typing.Generic[M]):
 
 _FAULTS = {int: "number", float: "number", str: "text", Literal: "text"}
 """The `kind` of BadMessage for a value of the wrong type."""
-codec = typing.cast(Callable[[type[M]], Codec[M]], functools.cache(Codec))
+_making = threading.Lock()
+
+
+@functools.cache
+def _made(kind: type[Message]) -> Codec[Any]:
+    with _making:  # a thread that decodes a class which msgspec is still working out for another one ends the process
+        return Codec(kind)
+
+
+codec = typing.cast(Callable[[type[M]], Codec[M]], _made)
 """The codec of a message class."""
 
 

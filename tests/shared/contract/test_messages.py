@@ -1,5 +1,6 @@
 """The wire format against everything that may come over a wire."""
 
+import threading
 import time
 import tracemalloc
 
@@ -248,3 +249,27 @@ def test_a_payload_that_is_wrong_and_cut_off_is_refused():
     cut = b"\x83\xa7versid\x00\x00\xa5image\x93\xa5uint8\x93\x02\x03\x03\xc4\x12" + bytes(18)  # a version that is no key
     with pytest.raises(messages.BadMessage):
         messages.decode(messages.Frame, cut)
+
+
+def test_threads_do_not_work_out_a_class_at_the_same_time(monkeypatch):
+    both, together = threading.Barrier(2), []
+
+    class Watched(messages.Codec):
+        def __init__(self, kind):
+            try:
+                both.wait(timeout=0.2)
+                together.append(kind)
+            except threading.BrokenBarrierError:
+                pass  # nobody else was here
+            super().__init__(kind)
+
+    class Fresh(messages.Message, frozen=True, kw_only=True):
+        pass
+
+    monkeypatch.setattr(messages, "Codec", Watched)
+    threads = [threading.Thread(target=messages.codec, args=(Fresh,)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not together
