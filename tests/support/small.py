@@ -38,7 +38,7 @@ class Small:
     def fusion(self) -> Iterator[Node]:
         """The real service."""
         node = self.node("fusion")
-        fusion.start(node, SimpleNamespace(observer="default", target=None))
+        fusion.start(node, SimpleNamespace(observer="default", target=None, motion=None))
         with node:
             yield node
 
