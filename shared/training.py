@@ -55,9 +55,10 @@ class Trainer(ABC, Generic[N, D]):
         """A step at a share of the whole training in [0, 1]; returns the parts of its loss."""
 
     def descend(self, total: torch.Tensor, rate: float, clip: float, averaging: float) -> None:
-        """A step down the gradient of a loss, its norm clipped; the average keeps a share `averaging`, less in the beginning."""
+        """A step down the gradient of a loss, its norm clipped; the average keeps a share `averaging`, less in the beginning. A
+        group of the optimiser's that has a "share" learns at that share of the rate."""
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group.get("share", 1.0)
         self.optimizer.zero_grad()
         total.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), clip)

@@ -15,6 +15,7 @@ import numpy as np
 import openvino
 from openvino import opset13 as op
 
+from penumbra.services.segmentation import encoder
 from penumbra.services.segmentation.model import FOLD, Model
 
 CHANNELS_FIRST, CHANNELS_LAST = np.array([0, 3, 1, 2]), np.array([0, 2, 3, 1])
@@ -55,6 +56,7 @@ class _Step:
         errors: list[Any] = []
         arriving = op.space_to_depth(image, "depth_first", FOLD)
         known = None if priors is None else op.space_to_depth(priors, "depth_first", FOLD)
+        context = self._context(image) if self._settings.encoder else {}
         for i in range(n):
             difference = op.subtract(arriving, self._convolution(f"predict.{i}", old[i]))
             errors.append(op.relu(op.concat([difference, op.negative(difference)], 1)))
@@ -68,11 +70,31 @@ class _Step:
             drive = self._convolution(f"drive.{i}", errors[i])
             if i == 1 and known is not None:
                 drive = op.add(drive, self._convolution("prior_drive", known))
+            if i in context:
+                drive = op.add(drive, context[i])
             if i + 1 < n:
                 down = self._convolution(f"descend.{i}", old[i + 1] if delayed else new[0])
                 drive = op.add(drive, _enlarged(down, 2, "nearest") if i > 0 else down)
             new.insert(0, getattr(self, f"_{self._settings.cell}")(f"cells.{i}", drive, old[i]))
         return self._decoded(new), [*new, *(errors if delayed else ())]
+
+    def _context(self, image: Any) -> dict[int, Any]:
+        """What the encoder adds to the drive of the layers' cells, by layer."""
+        x = op.divide(op.subtract(image, np.float32(encoder.MEAN)), np.float32(encoder.SPREAD))
+        x = op.clamp(self._filtered("encoder.stem", x, 2), 0.0, 6.0)
+        found: dict[int, Any] = {}
+        for k, form in enumerate(encoder.BLOCKS):
+            name = f"encoder.blocks.{k}"
+            inner = op.clamp(self._convolution(f"{name}.expand", x), 0.0, 6.0) if form.expansion > 1 else x
+            inner = op.clamp(self._filtered(f"{name}.filter", inner, form.stride), 0.0, 6.0)
+            out = self._convolution(f"{name}.project", inner)
+            x = op.add(x, out) if form.adds_input else out
+            if k in encoder.TAPS:
+                tap = encoder.TAPS.index(k)
+                i = self._settings.driven[tap]
+                part = _enlarged(self._convolution(f"context.{tap}", x), encoder.STRIDES[tap] // self._settings.layer_strides[i], "linear_onnx")
+                found[i] = op.add(found[i], part) if i in found else part
+        return found
 
     def _decoded(self, representations: list[Any]) -> Any:
         total = self._convolution("decode.0", representations[1])
@@ -108,6 +130,17 @@ class _Step:
         found = op.convolution(x, op.constant(kernel), [1, 1], padding, padding, [1, 1])
         return found if bias is None else op.add(found, op.constant(bias.reshape(1, -1, 1, 1)))
 
+    def _filtered(self, name: str, x: Any, stride: int) -> Any:
+        """A convolution of the encoder: its zeros around the picture, and each channel by itself where its weights say so."""
+        kernel, bias = self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
+        before, behind = encoder.padding(kernel.shape[-1], stride)
+        form = [stride] * 2, [before] * 2, [behind] * 2, [1, 1]
+        if kernel.shape[1] == 1:
+            found = op.group_convolution(x, op.constant(kernel[:, None]), *form)
+        else:
+            found = op.convolution(x, op.constant(kernel), *form)
+        return op.add(found, op.constant(bias.reshape(1, -1, 1, 1)))
+
     def _scaled(self, name: str, x: Any, gain: str, offset: str | None = None) -> Any:
         """gain * x + offset per channel."""
         scaled = op.multiply(x, self._per_channel(f"{name}.{gain}"))
@@ -124,6 +157,8 @@ def _pooled(x: Any) -> Any:
 
 def _enlarged(x: Any, factor: int, mode: str) -> Any:
     """torch's `interpolate` with corners not aligned."""
+    if factor == 1:
+        return x
     scales, axes = np.array([factor, factor], np.float32), np.array([2, 3])
     where = "asymmetric" if mode == "nearest" else "half_pixel"
     return op.interpolate(x, scales, mode, "scales", axes=axes, coordinate_transformation_mode=where, nearest_mode="floor")

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from penumbra.services.segmentation import encoder
+
 FOLD = 2
 """Width and height [px] of what one position of the first layer sees."""
 CELLS = ("hgru", "convlstm", "conv")
@@ -33,7 +35,7 @@ class Settings:
     """Size of the network. channels, kernels: of the cell of each layer. The authors have 64-128-256-512 and kernels of 5;
     kernels of 5 in the coarse layers alone (`kernels_of`) cost a tenth of the time of 5 everywhere and reach as far. `delay`:
     axonal delays. `cell`: one of CELLS, all of nearly the same number of parameters. `priors`: channels of what is known beside
-    the picture, those of PRIORS or none."""
+    the picture, those of PRIORS or none. `encoder`: whether what an encoder says of the picture drives the cells, too."""
 
     channels: tuple[int, ...] = (16, 16, 32, 64)
     kernels: tuple[int, ...] = (3, 3, 5, 5)
@@ -41,6 +43,7 @@ class Settings:
     delay: bool = False
     cell: str = "hgru"
     priors: int = 0
+    encoder: bool = False
 
     def __post_init__(self) -> None:
         if self.cell not in CELLS:
@@ -65,7 +68,12 @@ class Settings:
     @property
     def multiple(self) -> int:
         """Images have a multiple of this many pixels a side, and the state can be shifted by multiples of it."""
-        return self.layer_strides[-1]
+        return max(self.layer_strides[-1], encoder.STRIDES[-1] if self.encoder else 1)
+
+    @property
+    def driven(self) -> tuple[int, ...]:
+        """The layer that each of the encoder's results drives: the last one whose positions are no larger."""
+        return tuple(max(i for i, own in enumerate(self.layer_strides) if own <= stride) for stride in encoder.STRIDES)
 
     def state_sizes(self, height: int, width: int) -> tuple[tuple[int, int], ...]:
         """(height, width) of each tensor of the state for images of this size. Raises ValueError where the size does not fit."""

@@ -11,6 +11,9 @@ Priors, where the network has any (`model.PRIORS`), enter beside the picture and
 what the second layer receives from below, from which all layers above learn of them, and to the drive of its cell. Where nothing
 is known they are zero and add nothing.
 
+An encoder (`encoder.py`), where the network has one, looks at each picture by itself. What it says is added to the drive of the
+cells of all layers but the first, and is not predicted either.
+
 The picture enters folded: 2 x 2 pixels become 12 channels (space to depth). The first layer therefore works at half resolution
 where the authors' works at full; the pooling that would follow it is this folding, which, unlike it, throws nothing away.
 Together this halves the time of a step. The second layer keeps half resolution, each one above halves it.
@@ -29,12 +32,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from penumbra.services.segmentation import model
+from penumbra.services.segmentation import encoder, model
 from penumbra.services.segmentation.model import FOLD, Model, Settings
 from penumbra.shared.contract.labels import Label
 
 State = tuple[Tensor, ...]
 """What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""
+Context = dict[int, Tensor]
+"""What an encoder adds to the drive of layers' cells (batch, channels, h, w), by layer."""
 
 
 class HGRU(nn.Module):
@@ -104,6 +109,47 @@ CELLS: dict[str, type[nn.Module]] = {"hgru": HGRU, "convlstm": ConvLSTM, "conv":
 """What updates a layer's representation, by the name that the settings give."""
 
 
+class EncoderBlock(nn.Module):
+    """A block of the encoder, of the form that `encoder.Block` says."""
+
+    def __init__(self, form: encoder.Block):
+        super().__init__()
+        inner = form.expansion * form.inputs
+        self._form = form
+        self.expand = nn.Conv2d(form.inputs, inner, 1) if form.expansion > 1 else None
+        self.filter = nn.Conv2d(inner, inner, form.kernel, form.stride, groups=inner)
+        self.project = nn.Conv2d(inner, form.outputs, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        inner = x if self.expand is None else F.relu6(self.expand(x))
+        out: Tensor = self.project(F.relu6(self.filter(_padded(inner, self._form.kernel, self._form.stride))))
+        return x + out if self._form.adds_input else out
+
+
+class Encoder(nn.Module):
+    """The encoder of `encoder.py`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(3, encoder.STEM, encoder.STEM_KERNEL, 2)
+        self.blocks = nn.ModuleList(EncoderBlock(form) for form in encoder.BLOCKS)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """What it says of images (batch, 3, h, w) in [0, 1]: (batch, channels, h / stride, w / stride) for each of `encoder.STRIDES`."""
+        x = F.relu6(self.stem(_padded((image - encoder.MEAN) / encoder.SPREAD, encoder.STEM_KERNEL, 2)))
+        found = []
+        for i, block in enumerate(self.blocks):
+            x = block(x)
+            if i in encoder.TAPS:
+                found.append(x)
+        return found
+
+
+def _padded(x: Tensor, kernel: int, stride: int) -> Tensor:
+    before, behind = encoder.padding(kernel, stride)
+    return F.pad(x, (before, behind, before, behind))
+
+
 class PredNet(nn.Module):
     """The network of the module's description. Images are (batch, 3, h, w) in [0, 1], h and w multiples of `multiple`; priors
     (batch, priors, h, w) in [-1, 1], None where nothing is known."""
@@ -124,6 +170,9 @@ class PredNet(nn.Module):
         self.prior_input, self.prior_drive = (
             nn.Conv2d(known, c[1], 3, padding=1, bias=False) if known else None for _ in range(2)
         )
+        self.encoder = Encoder() if settings.encoder else None
+        taps = zip(encoder.CHANNELS, settings.driven, strict=True) if settings.encoder else ()
+        self.context = nn.ModuleList(nn.Conv2d(said, c[i], 1, bias=False) for said, i in taps)
         for module in self.modules():  # channels innermost: what convolutions on a CPU are fastest with
             if isinstance(module, nn.Conv2d):
                 module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)
@@ -139,8 +188,20 @@ class PredNet(nn.Module):
             for c, size in zip(channels, self.settings.state_sizes(height, width), strict=True)
         )
 
-    def forward(self, image: Tensor, state: State, priors: Tensor | None = None) -> tuple[Tensor, list[Tensor], State]:
-        """One time step: (class logits (batch, classes, h, w), mean absolute prediction error of each layer, new state).
+    def look(self, image: Tensor) -> Context:
+        """What the encoder adds to the drive of the layers' cells, by layer; nothing of a network that has none."""
+        found: Context = {}
+        if self.encoder is not None:
+            for said, stride, conv, i in zip(self.encoder(image), encoder.STRIDES, self.context, self.settings.driven, strict=True):
+                part = _enlarged(conv(said), stride // self.settings.layer_strides[i])
+                found[i] = found[i] + part if i in found else part
+        return found
+
+    def forward(
+        self, image: Tensor, state: State, priors: Tensor | None = None, context: Context | None = None
+    ) -> tuple[Tensor, list[Tensor], State]:
+        """One time step: (class logits (batch, classes, h, w), mean absolute prediction error of each layer, new state). context: what
+        `look` says of the image, where that is known already.
 
         With axonal delays a layer receives its neighbours' activity of the step before: layer l learns of a picture l steps late.
         """
@@ -151,6 +212,7 @@ class PredNet(nn.Module):
         missed: list[Tensor] = []
         arriving = F.pixel_unshuffle(image, FOLD)
         known = None if priors is None else F.pixel_unshuffle(priors, FOLD)
+        context = self.look(image) if context is None else context
         for i in range(n):
             difference = arriving - self.predict[i](old[i])
             errors.append(F.relu(torch.cat([difference, -difference], 1)))
@@ -165,6 +227,8 @@ class PredNet(nn.Module):
             drive = self.drive[i](errors[i])
             if i == 1 and known is not None and self.prior_drive is not None:
                 drive = drive + self.prior_drive(known)
+            if i in context:
+                drive = drive + context[i]
             if i + 1 < n:
                 down = self.descend[i](old[i + 1] if delayed else new[0])
                 drive = drive + (F.interpolate(down, scale_factor=2, mode="nearest") if i > 0 else down)
@@ -174,8 +238,12 @@ class PredNet(nn.Module):
     def _decode(self, representations: list[Tensor]) -> Tensor:
         total = self.decode[0](representations[1])
         for i in range(2, len(representations)):
-            total = total + F.interpolate(self.decode[i - 1](representations[i]), scale_factor=2 ** (i - 1), mode="bilinear")
+            total = total + _enlarged(self.decode[i - 1](representations[i]), 2 ** (i - 1))
         return F.pixel_shuffle(self.head(F.relu(total)), FOLD)
+
+
+def _enlarged(x: Tensor, factor: int) -> Tensor:
+    return F.interpolate(x, scale_factor=factor, mode="bilinear") if factor > 1 else x
 
 
 def stored(net: PredNet) -> Model:
@@ -184,18 +252,19 @@ def stored(net: PredNet) -> Model:
 
 
 def grown(net: PredNet, settings: Settings) -> PredNet:
-    """A network with more channels, layers or priors that gives the masks of `net`: its own channels come first and receive
-    nothing from the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641), and priors add nothing yet.
-    Raises ValueError where it would not be larger."""
+    """A network with more channels, layers or priors, or with an encoder, that gives the masks of `net`: its own channels come
+    first and receive nothing from the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641), and priors
+    and encoder add nothing yet. Raises ValueError where it would not be larger."""
     old, layers = net.settings, len(net.settings.channels)
-    same = replace(settings, channels=old.channels, kernels=settings.kernels[:layers], priors=old.priors) == old
+    same = replace(settings, channels=old.channels, kernels=settings.kernels[:layers], priors=old.priors, encoder=old.encoder) == old
     fewer = any(new < before for new, before in itertools.zip_longest(settings.channels, old.channels, fillvalue=0))
-    if not same or fewer or settings.priors < old.priors:
+    if not same or fewer or settings.priors < old.priors or settings.encoder < old.encoder:
         raise ValueError(
-            f"expected at least the channels {old.channels} and {old.priors} priors and otherwise those of {old}, got {settings}"
+            f"expected at least the channels {old.channels}, {old.priors} priors and the encoder, if any, of {old}, and otherwise the "
+            f"same, got {settings}"
         )
     larger, own = PredNet(settings), dict(net.named_parameters())
-    ignored = (f"descend.{layers - 1}.", "decode.", "prior_")  # what the old layers and the mask get of what is new
+    ignored = (f"descend.{layers - 1}.", "decode.", "prior_", "context.")  # what the old layers and the mask get of what is new
     with torch.no_grad():
         for name, value in larger.named_parameters():
             before = own.get(name)

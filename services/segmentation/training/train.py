@@ -6,14 +6,16 @@ interrupted and resumed ends with the same weights as one that was not. For days
 
   OMP_NUM_THREADS=1 nice -n 19 penumbra segmentation train --size 16 32 64 128 --steps 150000 --resume --compact FILE
 
-With --priors the network also receives what is known of the robot and of the target. One without, from --start or --resume, gets
-inputs for them, and gives the same masks until it has learned to use them.
+With --priors the network also receives what is known of the robot and of the target, with --encoder what filters that photographs
+have taught find in the picture. A network without, from --start or --resume, is given both, and gives the same masks until it
+has learned to use them.
 """
 
 from __future__ import annotations
 
 import datetime
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,21 +27,23 @@ from penumbra.services import flags
 from penumbra.services.segmentation import inference, prednet
 from penumbra.services.segmentation.model import PRIORS, kernels_of
 from penumbra.services.segmentation.prednet import PredNet, Settings, State
-from penumbra.services.segmentation.training import loss, recordings
+from penumbra.services.segmentation.training import loss, pretrained, recordings
 from penumbra.services.segmentation.training.data import Data, Mixed, Simulated, draw_batch
 from penumbra.services.segmentation.training.evaluate import calibrate, held_out
 from penumbra.shared import training
 from penumbra.shared.native import processor
+from penumbra.shared.perception.landmarks import kept
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`; `frames`:
-    that a step plays; `patches`: (from which progress on, pixels a side, sequences a batch); `error_weight`, `focal_weight`,
+    """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`;
+    `encoder_share`: of that rate, at which the encoder learns, which knows much already; `frames`: that a step plays; `patches`: (from which progress on, pixels a side, sequences a batch); `error_weight`, `focal_weight`,
     `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights that are exported; `seen`:
     (frames that the state has seen before those that are learned from, how often)."""
 
     peak_rate: float = 2e-3
+    encoder_share: float = 0.1
     warm_up: int = 100
     cool_down: float = 0.3
     frames: int = 5
@@ -74,7 +78,13 @@ class Trainer(training.Trainer[PredNet, Data]):
     def __init__(self, settings: Settings, schedule: Schedule, seed: int):
         torch.manual_seed(seed)
         net = PredNet(settings)
-        super().__init__(settings, schedule, seed, net, torch.optim.Adam(net.parameters(), betas=(0.9, 0.98)))
+        own, pretrained = [], []
+        for name, value in net.named_parameters():
+            (pretrained if name.startswith("encoder.") else own).append(value)
+        groups: list[dict[str, Any]] = [{"params": own}]
+        if pretrained:
+            groups.append({"params": pretrained, "share": schedule.encoder_share})
+        super().__init__(settings, schedule, seed, net, torch.optim.Adam(groups, betas=(0.9, 0.98)))
         self._half = processor.has_bfloat16()
 
     def train_step(self, data: Data, progress: float) -> dict[str, float]:
@@ -98,14 +108,15 @@ class Trainer(training.Trainer[PredNet, Data]):
         network that has any. `before`: frames played without learning, forth and back through the sequence, so that the network
         is also trained with a state that has seen much. Without it masks decay within seconds of use."""
         frames = images.shape[1]
+        seen = {i: part.unflatten(0, images.shape[:2]) for i, part in self.net.look(images.flatten(0, 1)).items()}
         state = self.net.initial_state(images.shape[0], *images.shape[-2:])
         with torch.no_grad():
             for n in range(before, 0, -1):  # the last one played is the second frame, from which the first is one step
                 turn, t = divmod(n, frames - 1)
-                _, _, state = self._play(images, known, t if turn % 2 == 0 else frames - 1 - t, state)
+                _, _, state = self._play(images, known, seen, t if turn % 2 == 0 else frames - 1 - t, state)
         logits, errors = [], []
         for t in range(frames):
-            out, missed, state = self._play(images, known, t, state)
+            out, missed, state = self._play(images, known, seen, t, state)
             logits.append(out.float())
             if t > 0 or before:  # nothing can be predicted from nothing
                 errors.append(loss.prediction_error([m.float() for m in missed]))
@@ -118,25 +129,19 @@ class Trainer(training.Trainer[PredNet, Data]):
         }
 
     def _play(
-        self, images: torch.Tensor, known: torch.Tensor, t: int, state: State
+        self, images: torch.Tensor, known: torch.Tensor, seen: prednet.Context, t: int, state: State
     ) -> tuple[torch.Tensor, list[torch.Tensor], State]:
-        return self.net(images[:, t], state, known[:, t] if self.settings.priors else None)
+        context = {i: part[:, t] for i, part in seen.items()}
+        return self.net(images[:, t], state, known[:, t] if self.settings.priors else None, context)
 
     @classmethod
-    def begin(
-        cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None, has_priors: bool = False
-    ) -> Trainer:
-        """A trainer that starts from weights with a card, grown to more channels or layers where channels are given, and to
-        priors where it shall have them; the card it writes says of them. Raises ValueError where they are fewer."""
+    def begin(cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None) -> Trainer:
+        """A trainer that starts from weights with a card, grown to more channels or layers where channels are given; the card it
+        writes says of them. Raises ValueError where they are fewer."""
         net, card = prednet.load(path)
-        larger = net.settings
         if channels is not None:
-            larger = replace(larger, channels=channels, kernels=kernels_of(len(channels)))
-        if has_priors:
-            larger = replace(larger, priors=len(PRIORS))
-        if larger != net.settings:
             torch.manual_seed(seed)
-            net = prednet.grown(net, larger)
+            net = prednet.grown(net, replace(net.settings, channels=channels, kernels=kernels_of(len(channels))))
         trainer = cls(net.settings, schedule, seed)
         trainer.net.load_state_dict(net.state_dict())
         trainer.average.load_state_dict(net.state_dict())
@@ -144,14 +149,21 @@ class Trainer(training.Trainer[PredNet, Data]):
         trainer.started_from |= {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
         return trainer
 
-    def with_priors(self) -> Trainer:
-        """This training with priors from its next step on, with an optimiser that gathers its moments anew; itself where it has
-        them already."""
-        if self.settings.priors:
+    def extended(self, has_priors: bool, pretrained: Mapping[str, torch.Tensor] | None) -> Trainer:
+        """This training from its next step on with priors, with an encoder that begins with these weights, or both, and with an
+        optimiser that gathers its moments anew; itself where it has them already."""
+        settings = replace(
+            self.settings,
+            priors=len(PRIORS) if has_priors else self.settings.priors,
+            encoder=self.settings.encoder or pretrained is not None,
+        )
+        if settings == self.settings:
             return self
-        trainer = Trainer(replace(self.settings, priors=len(PRIORS)), self.schedule, self.seed)
-        trainer.net.load_state_dict(prednet.grown(self.net, trainer.settings).state_dict())
-        trainer.average.load_state_dict(prednet.grown(self.average, trainer.settings).state_dict())
+        trainer = Trainer(settings, self.schedule, self.seed)
+        for own, other in ((self.net, trainer.net), (self.average, trainer.average)):
+            other.load_state_dict(prednet.grown(own, settings).state_dict())
+            if other.encoder is not None and self.net.encoder is None and pretrained is not None:
+                other.encoder.load_state_dict(pretrained)
         trainer.step, trainer.minutes, trainer.started_from = self.step, self.minutes, self.started_from
         trainer.warm_from = self.step
         return trainer
@@ -188,6 +200,14 @@ def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
     flags.Option("--recurrence", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations"),
     flags.Option("--error-weight", type=float, show_default="0.3; 0: without", help="of the prediction errors in the loss"),
     flags.Option("--priors", is_flag=True, help="the network also receives what is known of the robot and the target"),
+    flags.Option(
+        "--encoder",
+        type=Path,
+        takes="maybe",
+        without=str(kept()),
+        metavar="[FOLDER]",
+        help="the network also has the encoder of the models in this folder (without a value: those of `penumbra segmentation models`)",
+    ),
     flags.Option("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate"),
     flags.Option(
         "--start",
@@ -230,16 +250,17 @@ def main(options: flags.Options) -> int:
         schedule = replace(schedule, error_weight=options.error_weight)
     if checkpoint := training.begun(options):
         trainer = Trainer.restore(checkpoint, schedule)
-        if options.priors:
-            trainer = trainer.with_priors()
     elif options.start:
-        channels = tuple(options.size) if options.size else None
-        trainer = Trainer.begin(options.start, schedule, options.seed, channels, options.priors)
+        trainer = Trainer.begin(options.start, schedule, options.seed, tuple(options.size) if options.size else None)
     else:
         channels = tuple(options.size or Settings.channels)
-        known = len(PRIORS) if options.priors else 0
-        settings = Settings(channels, kernels_of(len(channels)), delay=options.delay, cell=options.recurrence, priors=known)
+        settings = Settings(channels, kernels_of(len(channels)), delay=options.delay, cell=options.recurrence)
         trainer = Trainer(settings, schedule, options.seed)
+    try:
+        trainer = trainer.extended(options.priors, pretrained.weights(options.encoder) if options.encoder else None)
+    except pretrained.ModelsError as error:
+        print(f"penumbra segmentation train: {error}", file=sys.stderr)
+        return 2
     simulated = Simulated(trainer.seed, options.held_out)
     data: Data = simulated
     try:
