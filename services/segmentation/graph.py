@@ -92,7 +92,9 @@ class _Step:
             if k in encoder.TAPS:
                 tap = encoder.TAPS.index(k)
                 i = self._settings.driven[tap]
-                part = _enlarged(self._convolution(f"context.{tap}", x), encoder.STRIDES[tap] // self._settings.layer_strides[i], "linear_onnx")
+                part = _enlarged(
+                    self._convolution(f"context.{tap}", x), encoder.STRIDES[tap] // self._settings.layer_strides[i], "linear_onnx"
+                )
                 found[i] = op.add(found[i], part) if i in found else part
         return found
 

