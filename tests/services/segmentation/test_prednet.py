@@ -266,7 +266,7 @@ def test_the_encoder_finds_the_same_wherever_a_thing_is_and_asks_for_pictures_of
 
 
 def test_the_encoder_begins_with_published_weights_whose_normalisations_are_folded(tmp_path, monkeypatch):
-    own, published = prednet.Encoder().state_dict(), {}
+    own, published = prednet.Encoder().state_dict(), dict[str, torch.Tensor]()
     places = {"stem": ("_conv_stem", "_bn0")}
     for k, form in enumerate(encoder.BLOCKS):
         places |= {f"blocks.{k}.expand": (f"_blocks.{k}._expand_conv", f"_blocks.{k}._bn0")} if form.expansion > 1 else {}
@@ -274,8 +274,8 @@ def test_the_encoder_begins_with_published_weights_whose_normalisations_are_fold
         places |= {f"blocks.{k}.project": (f"_blocks.{k}._project_conv", f"_blocks.{k}._bn2")}
     for ours, (convolution, normalisation) in places.items():
         weight = published[f"{convolution}.weight"] = torch.randn_like(own[f"{ours}.weight"])
-        statistics = {"running_mean": torch.randn, "running_var": torch.rand, "weight": torch.randn, "bias": torch.randn}
-        published |= {f"{normalisation}.{name}": of(len(weight)) for name, of in statistics.items()}
+        statistics = ("running_mean", "running_var", "weight", "bias")
+        published |= {f"{normalisation}.{name}": torch.rand(len(weight)) for name in statistics}
     path = tmp_path / encoder.FILE
     torch.save(published, path)
     with pytest.raises(landmarks.ModelsError, match="SHA-256"):
@@ -286,8 +286,8 @@ def test_the_encoder_begins_with_published_weights_whose_normalisations_are_fold
     picture = torch.rand(1, encoder.BLOCKS[0].inputs, 16, 16)
     name, weight = "_blocks.0._bn1", published["_blocks.0._depthwise_conv.weight"]
     plain = torch.nn.functional.conv2d(picture, weight, padding=1, groups=len(weight))
-    statistics = (published[f"{name}.{key}"] for key in ("running_mean", "running_var", "weight", "bias"))
-    wanted = torch.nn.functional.batch_norm(plain, *statistics, eps=1e-3)
+    mean, variance, scale, offset = (published[f"{name}.{key}"] for key in ("running_mean", "running_var", "weight", "bias"))
+    wanted = torch.nn.functional.batch_norm(plain, mean, variance, scale, offset, eps=1e-3)
     folded = torch.nn.functional.conv2d(
         picture, found["blocks.0.filter.weight"], found["blocks.0.filter.bias"], padding=1, groups=len(weight)
     )
@@ -311,7 +311,7 @@ def test_a_training_goes_on_with_priors_and_an_encoder_where_it_was(data, tmp_pa
         assert again.extended(has_priors=True, pretrained=begun_with) is again
         again.train_step(data, 0.1)
         assert again.net.prior_input is not None and again.net.prior_input.weight.abs().sum() > 0.0
-        assert all(context.weight.abs().sum() > 0.0 for context in again.net.context)
+        assert all(value.abs().sum() > 0.0 for value in again.net.context.parameters())
         own, of_encoder = (group["lr"] for group in again.optimizer.param_groups)
         assert of_encoder == pytest.approx(schedule.encoder_share * own)
         again.train_step(data, 0.1)
