@@ -115,7 +115,7 @@ def test_what_is_pasted_lies_in_front_with_its_labels():
 
 
 def test_recordings_and_simulated_sequences_are_mixed_by_their_share_and_both_are_scored(folder):
-    tiny = sequences.Variety(frames=5, size=data.VARIETY.size)
+    tiny = sequences.Variety(frames=data.VARIETY.frames, size=data.VARIETY.size)
 
     def learned(seed, index):
         sequence = sequences.render(seed, 0, tiny)
@@ -224,7 +224,9 @@ def test_clones_become_folders_to_train_on_and_what_is_missing_is_named(sources,
     assert not recordings.read_mask(scenes / "masks" / "desk.png").any()
     image, mask = seen(scenes / "images" / "white-0.jpg"), recordings.read_mask(scenes / "masks" / "white-0.png")
     assert (mask == Label.HAND).sum() > 600 and image.min(2).max() < 180, "no white is left"
-    assert recordings.Recordings([scenes], 1).count > 0
+    (made_of,) = recordings.Recordings([scenes], 1).origins
+    assert made_of["folder"] == "scenes" and made_of["sequences"] > 0
+    assert {one["repository"]: one["licence"] for one in made_of["sources"]}.keys() == {"somebody/pictures", photographs.HANDS}
     before = {path.name: path.read_bytes() for path in scenes.rglob("*.*")}
     assert photographs.main(call) == 0 and before == {path.name: path.read_bytes() for path in scenes.rglob("*.*")}
 

@@ -39,13 +39,15 @@ class Data(Protocol):
     """Sequences to learn from, and others for the calibration and the score. The first are red, green, blue and class
     (frames, h, w, 4), and, where more is known than what the labels say, priors beside them (frames, h, w, 6), packed.
     jitter: how much their colours are changed; side: the largest patch [px] that fits in all; sources: what a card says of the
-    calibration's and the score's."""
+    calibration's and the score's; origins: what it says of those to learn from."""
 
     jitter: float
     side: int
 
     @property
     def sources(self) -> tuple[dict[str, Any], dict[str, Any]]: ...
+    @property
+    def origins(self) -> list[dict[str, Any]]: ...
     @property
     def calibration(self) -> Iterable[Labelled]: ...
     @property
@@ -96,6 +98,11 @@ class Simulated:
         return np.concatenate([sequence.images, sequence.labels[..., None], priors.packed(known)], axis=-1)
 
     @property
+    def origins(self) -> list[dict[str, Any]]:
+        """The seed."""
+        return [{"simulated": "sim.sets.sequences", "seed": self._seed}]
+
+    @property
     def sources(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Seeds that nothing else is made of."""
         return {"seed": VALIDATION_SEED + self._seed}, {"seed": VALIDATION_SEED + self._seed + 1}
@@ -127,6 +134,7 @@ class Mixed:
         self._recorded, self._simulated, self._share, self._seed = recorded, simulated, share, seed
         calibration, scored = ({**a, **b} for a, b in zip(simulated.sources, recorded.sources, strict=True))
         self.sources = calibration, {**scored, "simulated": share}
+        self.origins = [*({**origin, "share": share} for origin in simulated.origins), *recorded.origins]
 
     @property
     def calibration(self) -> Iterator[Labelled]:

@@ -17,10 +17,11 @@ from __future__ import annotations
 
 import csv
 import itertools
+import json
 import math
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from penumbra.services import flags
-from penumbra.services.segmentation.training import clones, models, pasted, street
+from penumbra.services.segmentation.training import clones, models, pasted, recordings, street
 from penumbra.services.segmentation.training.recordings import DataError, read_mask
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.perception.landmarks import Landmarks, ModelsError
@@ -95,7 +96,7 @@ class Folder:
     """Where images/ and masks/ are written to, and what was."""
 
     def __init__(self, path: Path):
-        self._images, self._masks = path / "images", path / "masks"
+        self.path, self._images, self._masks = path, path / "images", path / "masks"
         self.written = 0
 
     def write(self, name: str, image: NDArray[np.uint8], labels: NDArray[np.uint8]) -> None:
@@ -105,6 +106,12 @@ class Folder:
         cv2.imwrite(str(self._images / f"{name}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         cv2.imwrite(str(self._masks / f"{name}.png"), labels)
         self.written += 1
+
+    def name_sources(self, repositories: Iterable[clones.Repository]) -> None:
+        """Writes down what the photographs were made of, for the cards of networks that learn from them."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        text = json.dumps([asdict(repository) for repository in repositories], indent=2)
+        (self.path / recordings.SOURCES).write_text(text + "\n")
 
     def read(self, name: str) -> NDArray[np.uint8]:
         """An image (h, w, 3) BGR that was written."""
@@ -128,6 +135,11 @@ class Sources:
     def missing(self) -> list[clones.Repository]:
         """The repositories that there is no clone of."""
         return [repository for repository in self._repositories if not self.clone(repository.repository)]
+
+    def cloned(self, names: Iterable[str]) -> list[clones.Repository]:
+        """Those of these repositories that there are clones of, each once, in the order of the table."""
+        wanted = set(names)
+        return [one for one in self._repositories if one.repository in wanted and self.clone(one.repository)]
 
     def clone(self, repository: str) -> Path | None:
         """Where a repository's clone is, if it is."""
@@ -161,6 +173,7 @@ def write_close(sources: Sources, out: Path) -> int:
     folder = Folder(out)
     for picture in track(sources.pictures("close"), "close"):
         folder.write(picture.name, sources.read(picture), sources.mask(picture))
+    folder.name_sources(sources.cloned(picture.repository for picture in sources.pictures("close")))
     return folder.written
 
 
@@ -188,6 +201,8 @@ def write_scenes(sources: Sources, out: Path) -> int:
             scene, labels = _empty(sources, folder, size, rng)
             pasted.paste(scene, labels, cutout, pasted.filling(cutout, *size, rng), rng)
             folder.write(f"{picture.name}-{index}", pasted.noisy(scene, rng), labels)
+    every = [*sources.pictures("scene"), *(picture for picture in sources.pictures("close") if picture.backdrop == "white")]
+    folder.name_sources(sources.cloned([HANDS, *(picture.repository for picture in every)]))
     return folder.written
 
 
@@ -249,6 +264,7 @@ def main(options: flags.Options) -> int:
         if people:
             try:
                 folders["street"] = street.write(people, Landmarks(options.models), options.out / "street")
+                Folder(options.out / "street").name_sources(sources.cloned([STREET]))
             except ModelsError as error:
                 _tell(f"street is left out: {error}")
         folders["close"] = write_close(sources, options.out / "close")

@@ -13,6 +13,13 @@ import torch
 from penumbra.services.segmentation import encoder
 from penumbra.shared.perception.landmarks import checked
 
+ORIGIN = {
+    "encoder": "EfficientNet-Lite0, ImageNet",
+    "package": encoder.PACKAGE,
+    "licence": "Apache-2.0",
+    "copyright": "The TensorFlow Authors (weights), 2020 ML Illustrated (package)",
+}
+"""What cards say of them."""
 SMALLEST = 1e-3
 """What is added to variances."""
 

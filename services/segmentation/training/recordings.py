@@ -38,6 +38,8 @@ UNIT = 16
 """Pictures are cut to multiples of this many pixels a side: what the network can take."""
 SMALLEST = 32
 """Pixels a side that a picture has at least."""
+SOURCES = "sources.json"
+"""What a folder's pictures come from, where it says so: a list of objects, of which cards have copies."""
 CLASSES = ", ".join(f"{label.value} {label.name.lower()}" for label in Label) + f", {UNLABELLED} unlabelled"
 
 
@@ -136,6 +138,10 @@ class Recordings:
             self._train.append([pieces[i] for i in order[2 * tenth :]])
         self.count = len(folders) * max(len(pieces) for pieces in self._train)
         self.side = min(piece.side for piece in itertools.chain(self.calibration, self.held_out, *self._train))
+        self.origins = [
+            {"folder": folder.name, "sequences": len(pieces), "sources": _sources(folder)}
+            for folder, pieces in zip(folders, self._train, strict=True)
+        ]
         names = ", ".join(folder.name for folder in folders)
         self.sources = (
             {"folder": names, "sequences": len(self.calibration)},
@@ -166,6 +172,15 @@ def _pieces(folder: Path) -> list[Recorded]:
     return pieces
 
 
+def _sources(folder: Path) -> Any:
+    try:
+        return json.loads((folder / SOURCES).read_text())
+    except FileNotFoundError:
+        return []
+    except ValueError as error:
+        raise DataError(f"{folder / SOURCES}: expected a list in JSON of what the pictures come from, got {error}") from None
+
+
 def find(folder: Path) -> list[list[Frame]]:
     """The sequences of a folder by the forms that the module's text names, in the order of their names."""
     if not folder.is_dir():
@@ -176,7 +191,7 @@ def find(folder: Path) -> list[list[Frame]]:
         pictures = {path.relative_to(folder / "images").with_suffix(""): path for path in _pictures(folder / "images")}
         masks = {path.relative_to(folder / "masks").with_suffix(""): path for path in sorted((folder / "masks").rglob("*.png"))}
         return in_sequences(folder / "images", _pairs(folder, pictures, masks))
-    described = sorted(folder.glob("*.json"))
+    described = sorted(path for path in folder.glob("*.json") if path.name != SOURCES)
     if len(described) > 1:
         raise DataError(f"{folder}: expected one .json file in COCO format, got {', '.join(path.name for path in described)}")
     if described:

@@ -184,6 +184,7 @@ def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
         },
         **({"started_from": trainer.started_from} if trainer.started_from else {}),
         "parameters": sum(p.numel() for p in trainer.net.parameters()),
+        "learned_from": [*data.origins, *([pretrained.ORIGIN] if trainer.settings.encoder else [])],
         "calibration": {**data.sources[0], "target_logit_offset": offset, **calibrated},
         "held_out": {**data.sources[1], **held_out(trainer.average, offset, data.held_out)},
     }
