@@ -11,7 +11,7 @@ Pictures may be JPEG or BMP as well. A mask is a PNG with one channel that holds
 there; in COCO, categories have these names, and what is not labelled counts as background. The files of a subfolder are the
 frames of one sequence in the order of their names (as text: write 0001.png); pictures that lie in no subfolder are single ones,
 each a sequence that stands still. A tenth of the sequences, or of their pieces of up to 40 frames, is kept for the calibration,
-another for the score.
+another for the score. A folder may say in sources.json, as a list, where its pictures come from: the weights' card repeats it.
 """
 
 from __future__ import annotations
