@@ -70,16 +70,16 @@ class _Step:
             drive = self._convolution(f"drive.{i}", errors[i])
             if i == 1 and known is not None:
                 drive = op.add(drive, self._convolution("prior_drive", known))
-            if i in context:
+            if i > 0 and i in context:
                 drive = op.add(drive, context[i])
             if i + 1 < n:
                 down = self._convolution(f"descend.{i}", old[i + 1] if delayed else new[0])
                 drive = op.add(drive, _enlarged(down, 2, "nearest") if i > 0 else down)
             new.insert(0, getattr(self, f"_{self._settings.cell}")(f"cells.{i}", drive, old[i]))
-        return self._decoded(new), [*new, *(errors if delayed else ())]
+        return self._decoded(new, context), [*new, *(errors if delayed else ())]
 
     def _context(self, image: Any) -> dict[int, Any]:
-        """What the encoder adds to the drive of the layers' cells, by layer."""
+        """What the encoder adds, as in `prednet.PredNet.look`."""
         x = op.divide(op.subtract(image, np.float32(encoder.MEAN)), np.float32(encoder.SPREAD))
         x = op.clamp(self._filtered("encoder.stem", x, 2), 0.0, 6.0)
         found: dict[int, Any] = {}
@@ -91,15 +91,16 @@ class _Step:
             x = op.add(x, out) if form.adds_input else out
             if k in encoder.TAPS:
                 tap = encoder.TAPS.index(k)
-                i = self._settings.driven[tap]
-                part = _enlarged(
-                    self._convolution(f"context.{tap}", x), encoder.STRIDES[tap] // self._settings.layer_strides[i], "linear_onnx"
-                )
-                found[i] = op.add(found[i], part) if i in found else part
+                for i, convolution in ((self._settings.driven[tap], f"context.{tap}"), (0, f"glance.{tap}")):
+                    factor = encoder.STRIDES[tap] // self._settings.layer_strides[i]
+                    part = _enlarged(self._convolution(convolution, x), factor, "linear_onnx")
+                    found[i] = op.add(found[i], part) if i in found else part
         return found
 
-    def _decoded(self, representations: list[Any]) -> Any:
+    def _decoded(self, representations: list[Any], context: dict[int, Any]) -> Any:
         total = self._convolution("decode.0", representations[1])
+        if 0 in context:
+            total = op.add(total, context[0])
         for i in range(2, len(representations)):
             part = self._convolution(f"decode.{i - 1}", representations[i])
             total = op.add(total, _enlarged(part, 2 ** (i - 1), "linear_onnx"))

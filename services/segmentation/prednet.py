@@ -12,7 +12,7 @@ what the second layer receives from below, from which all layers above learn of 
 is known they are zero and add nothing.
 
 An encoder (`encoder.py`), where the network has one, looks at each picture by itself. What it says is added to the drive of the
-cells of all layers but the first, and is not predicted either.
+cells of all layers but the first and to what the mask is decoded from, and is not predicted either.
 
 The picture enters folded: 2 x 2 pixels become 12 channels (space to depth). The first layer therefore works at half resolution
 where the authors' works at full; the pooling that would follow it is this folding, which, unlike it, throws nothing away.
@@ -39,7 +39,8 @@ from penumbra.shared.contract.labels import Label
 State = tuple[Tensor, ...]
 """What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""
 Context = dict[int, Tensor]
-"""What an encoder adds to the drive of layers' cells (batch, channels, h, w), by layer."""
+"""What an encoder adds to the drive of layers' cells (batch, channels, h, w), by layer, and, in place of the first one's, to what
+the mask is decoded from."""
 
 
 class HGRU(nn.Module):
@@ -172,8 +173,9 @@ class PredNet(nn.Module):
             nn.Conv2d(known, c[1], 3, padding=1, bias=False) if known else None for _ in range(2)
         )
         self.encoder = Encoder() if settings.encoder else None
-        taps = zip(encoder.CHANNELS, settings.driven, strict=True) if settings.encoder else ()
+        taps = list(zip(encoder.CHANNELS, settings.driven, strict=True)) if settings.encoder else []
         self.context = nn.ModuleList(nn.Conv2d(said, c[i], 1, bias=False) for said, i in taps)
+        self.glance = nn.ModuleList(nn.Conv2d(said, settings.decoder_channels, 1, bias=False) for said, _ in taps)
         for module in self.modules():  # channels innermost: what convolutions on a CPU are fastest with
             if isinstance(module, nn.Conv2d):
                 module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)
@@ -190,14 +192,13 @@ class PredNet(nn.Module):
         )
 
     def look(self, image: Tensor) -> Context:
-        """What the encoder adds to the drive of the layers' cells, by layer; nothing of a network that has none."""
+        """What the encoder of a network that has one adds."""
         found: Context = {}
         if self.encoder is not None:
-            for said, stride, conv, i in zip(
-                self.encoder(image), encoder.STRIDES, self.context, self.settings.driven, strict=True
-            ):
-                part = _enlarged(conv(said), stride // self.settings.layer_strides[i])
-                found[i] = found[i] + part if i in found else part
+            for k, said in enumerate(self.encoder(image)):
+                for i, convolution in ((self.settings.driven[k], self.context[k]), (0, self.glance[k])):
+                    part = _enlarged(convolution(said), encoder.STRIDES[k] // self.settings.layer_strides[i])
+                    found[i] = found[i] + part if i in found else part
         return found
 
     def forward(
@@ -230,16 +231,18 @@ class PredNet(nn.Module):
             drive = self.drive[i](errors[i])
             if i == 1 and known is not None and self.prior_drive is not None:
                 drive = drive + self.prior_drive(known)
-            if i in context:
+            if i > 0 and i in context:
                 drive = drive + context[i]
             if i + 1 < n:
                 down = self.descend[i](old[i + 1] if delayed else new[0])
                 drive = drive + (F.interpolate(down, scale_factor=2, mode="nearest") if i > 0 else down)
             new.insert(0, self.cells[i](drive, old[i]))
-        return self._decode(new), missed, (*new, *(errors if delayed else ()))
+        return self._decode(new, context), missed, (*new, *(errors if delayed else ()))
 
-    def _decode(self, representations: list[Tensor]) -> Tensor:
+    def _decode(self, representations: list[Tensor], context: Context) -> Tensor:
         total = self.decode[0](representations[1])
+        if 0 in context:
+            total = total + context[0]
         for i in range(2, len(representations)):
             total = total + _enlarged(self.decode[i - 1](representations[i]), 2 ** (i - 1))
         return F.pixel_shuffle(self.head(F.relu(total)), FOLD)
@@ -269,7 +272,13 @@ def grown(net: PredNet, settings: Settings) -> PredNet:
             f"otherwise the same, got {settings}"
         )
     larger, own = PredNet(settings), dict(net.named_parameters())
-    ignored = (f"descend.{layers - 1}.", "decode.", "prior_", "context.")  # what the old layers and the mask get of what is new
+    ignored = (
+        f"descend.{layers - 1}.",
+        "decode.",
+        "prior_",
+        "context.",
+        "glance.",
+    )  # what the old layers and the mask get of what is new
     with torch.no_grad():
         for name, value in larger.named_parameters():
             before = own.get(name)

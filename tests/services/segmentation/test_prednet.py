@@ -239,7 +239,9 @@ def test_a_network_given_priors_and_an_encoder_gives_the_same_masks_until_it_lea
         torch.testing.assert_close(more, logits, rtol=1e-4, atol=1e-5)
     loss.focal(more, torch.randint(0, len(Label), (1, 32, 32))).backward()
     for name, value in larger.named_parameters():
-        assert not name.startswith(("prior_", "context.")) or (value.grad is not None and value.grad.abs().sum() > 0.0), name
+        assert not name.startswith(("prior_", "context.", "glance.")) or (
+            value.grad is not None and value.grad.abs().sum() > 0.0
+        ), name
     for less in ({"priors": 0}, {"encoder": False}):
         with pytest.raises(ValueError, match="2 priors and the encoder, if any"):
             prednet.grown(larger, replace(larger.settings, **less))
@@ -311,7 +313,7 @@ def test_a_training_goes_on_with_priors_and_an_encoder_where_it_was(data, tmp_pa
         assert again.extended(has_priors=True, pretrained=begun_with) is again
         again.train_step(data, 0.1)
         assert again.net.prior_input is not None and again.net.prior_input.weight.abs().sum() > 0.0
-        assert all(value.abs().sum() > 0.0 for value in again.net.context.parameters())
+        assert all(value.abs().sum() > 0.0 for part in (again.net.context, again.net.glance) for value in part.parameters())
         own, of_encoder = (group["lr"] for group in again.optimizer.param_groups)
         assert of_encoder == pytest.approx(schedule.encoder_share * own)
         again.train_step(data, 0.1)
