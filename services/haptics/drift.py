@@ -33,8 +33,8 @@ OFFSET_SPREAD = 1e-3
 """The same of an offset [V]. Derived: 10 K at 0.1 mV/K."""
 WALK_S = 1500.0
 """Time constant [s] of these processes. Chosen: boards warm up within ten minutes, rooms within an hour."""
-CALIBRATED = (2e-3, 5e-5)
-"""Standard deviations of gain and offset [V] just after a calibration. Chosen: of the mean of some thousand samples."""
+CALIBRATED = (5e-4, 2e-5)
+"""Standard deviations of gain and offset [V] just after a calibration. Chosen: of the mean of ten thousand samples."""
 BLOCK_S = 1.0
 """Length [s] of a block of windows that is learned from as a whole."""
 QUIET_S = 3.0
@@ -113,9 +113,11 @@ class Drift:
 
     @property
     def sigma(self) -> tuple[Array, Array]:
-        """Standard deviations (n,) of gains and of offsets [V]."""
-        sigma = np.sqrt(np.diag(self._covariance))
-        return sigma[: self._n], sigma[self._n : 2 * self._n]
+        """Standard deviations (n,) of gains beside the mean of all, and of offsets [V]. What gains have in common looks like
+        another girth, whose spread between people is several times as large."""
+        n, own = self._n, self._covariance[: self._n, : self._n]
+        gains = np.diag(own) - 2.0 * own.mean(axis=1) + own.mean()
+        return np.sqrt(np.maximum(gains, 0.0)), np.sqrt(np.diag(self._covariance)[n : 2 * n])
 
     def predict(self, elapsed_s: float) -> None:
         """What was learned becomes old, in steps of a block."""

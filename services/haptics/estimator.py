@@ -121,8 +121,7 @@ class Estimator:
 
     def reset(self) -> None:
         """Forget the past."""
-        self._away_s = 0.0
-        self._stamp_ns: int | None = None
+        self._stamp_ns, self._away_s = 0, 0.0
         self._is_tracking, self._untracked = False, -1  # windows without a track since the last one with it
         self._track_misfit = SmoothedMisfit(self.settings)
         for part in (self._track, self._starts, self._pads, self.size, self.drift, self.identity, self._contact):
@@ -172,7 +171,7 @@ class Estimator:
         if self.method == "paper":
             estimate = self._by_network(reading)
         else:
-            estimate, seen = self._by_solve(reading, links, self._track.place if is_expected else None, elapsed_s)
+            estimate, seen = self._by_solve(reading, self._track.place if is_expected else None, elapsed_s)
         is_near = is_expected or estimate.state != "out_of_range"
         self.drift.take(reading.signal, links, samples, elapsed_s, seen, is_near)
         self._watch_absence(estimate.may_be_limb, elapsed_s)
@@ -182,8 +181,9 @@ class Estimator:
 
     def _predict(self, stamp_ns: int) -> float:
         """Takes everything to a window's stamp; returns the seconds since the last one."""
-        elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
-        self.drift.predict(max(elapsed_s, 0.0))
+        elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
+        if self._stamp_ns:  # not the first window of all
+            self.drift.predict(max(elapsed_s, 0.0))
         if not 0.0 <= elapsed_s < self.settings.memory_s:
             self.reset()
             elapsed_s = 0.0
@@ -198,14 +198,9 @@ class Estimator:
         """The signals: voltages less the electrodes' rests, and less the effect (n,) [V] of the robot's other links."""
         signal = np.where(samples > 0, self.drift.signal(self.skin.signal(amplitude), links), 0.0)
         variance = np.where(samples > 0, self.skin.noise / np.maximum(samples, 1), np.inf)
-        doubt, error = self._systematic(links, 1.0)
+        gain, offset = self.drift.sigma
+        doubt, error = np.hypot(self.settings.links_error * links, offset), np.hypot(self._response.error, gain)
         return Reading(signal, variance, T_world_pads, self._pads.distrust(), doubt, error, joints)
-
-    def _systematic(self, links: Array, drift_lasts: float) -> tuple[Array, Array]:
-        """Standard deviations (n,) of what is wrong for longer than a window: of the rests [V], of which links are so much (n,)
-        [V], and of the limb's signals, as shares. drift_lasts: a factor on the variances of the electrodes' drift."""
-        gain, offset = np.sqrt(drift_lasts) * np.array(self.drift.sigma)
-        return np.hypot(self.settings.links_error * links, offset), np.hypot(self._response.error, gain)
 
     def _with_surface(self, estimate: HapticEstimate, reading: Reading, pressed: NDArray[np.bool_] | None) -> HapticEstimate:
         """With the points of surfaces, and what touches."""
@@ -225,11 +220,8 @@ class Estimator:
         state: HapticState = "in_range" if self._is_felt(information, gap) else "out_of_range"
         return self._estimate(T, information, gap, state, np.zeros(len(self.skin)))
 
-    def _by_solve(
-        self, reading: Reading, links: Array, expected: Place | None, elapsed_s: float
-    ) -> tuple[HapticEstimate, Seen | None]:
-        """The estimate, and what a camera predicts of the window. links (n,) [V]: what the robot's links add; expected: where a
-        camera has just seen the limb."""
+    def _by_solve(self, reading: Reading, expected: Place | None, elapsed_s: float) -> tuple[HapticEstimate, Seen | None]:
+        """The estimate, and what a camera predicts of the window. expected: where it has just seen the limb."""
         before = self._track.place
         solution = self._solution(reading, expected is not None)
         if before.is_apart(self._track.place, self.settings):
@@ -237,7 +229,7 @@ class Estimator:
         gap = self._limb.gap(reading, solution.T, solution.size)
         self._judge(solution)
         self._learn_size(reading, solution, gap)
-        information, gradient = self._pose_likelihood(reading, links, solution)
+        information, gradient = self._pose_likelihood(reading, solution)
         information, gradient = self._home.without_roll(solution.T, information, gradient)
         information, gradient = self._track.mixed(information, gradient)
         T, information = self._peak(solution, information, gradient)
@@ -366,11 +358,9 @@ class Estimator:
         slopes = solution.signal[:, None] * solution.point.rows
         return Seen(solution.signal, slopes, toward, expected.covariance, solution.T[:3, 3])
 
-    def _pose_likelihood(self, reading: Reading, links: Array, solution: Solution) -> tuple[Array, Array]:
+    def _pose_likelihood(self, reading: Reading, solution: Solution) -> tuple[Array, Array]:
         """Information (6, 6) and gradient (6,) of the pose by the voltages alone, the size marginalised."""
-        lasts = self.settings.error_lasts
-        doubt, error = self._systematic(links, self.settings.drift_lasts / lasts)
-        likelihood = self._solver.likelihood(replace(reading, doubt=doubt, error=error), solution, lasts)
+        likelihood = self._solver.likelihood(reading, solution, self.settings.error_lasts)
         return self.size.marginalised(*likelihood, solution.size, self.settings.size_lasts)
 
     def _peak(self, solution: Solution, information: Array, gradient: Array) -> tuple[Array, Array]:

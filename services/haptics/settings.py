@@ -111,14 +111,11 @@ class HapticSettings:
     # ---- What is published
 
     error_lasts: float = 5.0
-    """Number of successive windows in which the field model makes about the same error. Its variance is multiplied by it, because
-    fusion takes the windows' errors for independent. Chosen by the NEES of `penumbra bench haptics`."""
+    """Number of successive windows in which field model and drift make about the same error. Its variance is multiplied by it,
+    because fusion takes the windows' errors for independent. Chosen by the NEES of `penumbra bench haptics`."""
     doubt_lasts: float = 50.0
     """The same number for the doubt about two places: a second, in which one window after the other may prefer the wrong one.
     Chosen likewise."""
-    drift_lasts: float = 50.0
-    """The same number for gains and offsets that have drifted, whose errors stay for minutes. Chosen by the NEES of `penumbra
-    bench haptics --only-drift`."""
     size_lasts: float = 25.0
     """The same number for the error of the limb's size, which stays for as long as the person does. Chosen likewise."""
     links_error: float = 0.005

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from penumbra.services.haptics.drift import BLOCK_S, CALIBRATED, GAIN_SHARED, GAIN_SPREAD, OFFSET_SPREAD, Drift
+from penumbra.services.haptics.drift import BLOCK_S, CALIBRATED, GAIN_SPREAD, OFFSET_SPREAD, Drift
 from penumbra.services.haptics.estimator import Estimator
 from penumbra.shared.body.anatomy import target_mesh
 from penumbra.shared.cell import description as cells
@@ -144,12 +144,12 @@ def test_uncertainty_grows_until_it_is_that_of_an_old_calibration(table: cells.C
     skin = Skin(table)
     drift = Drift(skin, response.error, 0.0, SIZE_SPREAD)
     new = drift.sigma
-    np.testing.assert_allclose(new[0], CALIBRATED[0])
+    np.testing.assert_allclose(new[0], CALIBRATED[0], rtol=0.02)
     np.testing.assert_allclose(new[1], CALIBRATED[1])
     drift.predict(10.0 * BLOCK_S)
     assert (drift.sigma[0] > new[0]).all() and (drift.sigma[1] > new[1]).all()
     drift.predict(1e6)
-    np.testing.assert_allclose(drift.sigma[0], np.hypot(GAIN_SPREAD, GAIN_SHARED))
+    np.testing.assert_allclose(drift.sigma[0], GAIN_SPREAD, rtol=0.02)  # beside the mean of all
     np.testing.assert_allclose(drift.sigma[1], OFFSET_SPREAD)
 
 
