@@ -301,7 +301,7 @@ def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dic
 @flags.command(
     "sim",
     "Steers the emulator: occlude LEVEL|auto, motion on|off, pause, resume, speed FACTOR, state, "
-    "skin PAD[/ELECTRODE] dead|saturated|drift|hum|gain|turned|mirrored|none [SIZE], "
+    "skin PAD[/ELECTRODE] dead|saturated|drift|warm|hum|gain|turned|mirrored|none [SIZE], "
     "board PAD-NUMBER error|lost|short|missing|slip.",
     flags.Argument(
         "action",

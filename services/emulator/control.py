@@ -16,7 +16,7 @@ COMMANDS = {
     "pause": "stop the simulation",
     "resume": "continue the simulation",
     "speed": "how fast target and robot move: above 0, at most 4, 1 is as in the cell file",
-    "skin": "PAD[/ELECTRODE] FAULT [SIZE] or `all none`: dead, saturated, drift, hum, gain, turned, mirrored, none",
+    "skin": "PAD[/ELECTRODE] FAULT [SIZE] or `all none`: dead, saturated, drift, warm, hum, gain, turned, mirrored, none",
     "board": "PAD-NUMBER error, lost, short, missing or slip: a fault of a board that --serial serves, such as p0-1 lost",
     "state": "print the current settings",
 }

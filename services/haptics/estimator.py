@@ -1,18 +1,18 @@
 """One pose per window of voltages, from all pads together.
 
 Each window is estimated from its own samples; what is published is its likelihood. Earlier windows enter as the point and spread
-where the solve looks, and through what changes slowly (`size_and_rest.py`). A window takes these steps:
+where the solve looks, and through what changes slowly (`size.py`, `drift.py`). A window takes these steps:
 
 1. predict: the track decays to its home (`track.py`), or moves to the fused pose where that is known well
 2. solve from there (`solve.py`), with the limb's size as far as it is known
 3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from all of `starts.py`
 4. far from the pads thick and thin parts of a limb feel alike: another place that is possible, from scratch or found beside the
    track, is kept as its rival and solved as well, until the windows have decided between the two
-5. learn how far each pad is to be believed (`trust.py`), the limb's size close to the pads, the electrodes' rests while nothing
-   is near
+5. learn how far each pad is to be believed (`trust.py`), the limb's size close to the pads, the drift of the electrodes while
+   nothing is near or a camera sees the limb
 6. add up the evidence on whether the thing that is felt is a limb (`identity.py`)
-7. publish the likelihood: size and roll marginalised, the model's error counted as nearly the same in several windows; where a
-   rival is possible, the likelihood of the two together
+7. publish the likelihood: size and roll marginalised, the errors of model and drift counted as nearly the same in several
+   windows; where a rival is possible, the likelihood of the two together
 8. beside the pose, and without it: the nearest point of whatever is before each pad (`surface_points.py`), and whether something
    touches (`contact.py`)
 
@@ -27,17 +27,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from penumbra.services.haptics.contact import Contact
+from penumbra.services.haptics.drift import Drift, Seen
 from penumbra.services.haptics.identity import Identity
 from penumbra.services.haptics.paper_network import PoseNetwork, Relative, features
 from penumbra.services.haptics.settings import HapticSettings
-from penumbra.services.haptics.size_and_rest import PERSON_S, SIZE_GAP, SIZE_LASTING, Size, Tare
+from penumbra.services.haptics.size import PERSON_S, SIZE_GAP, SIZE_LASTING, Size
 from penumbra.services.haptics.solve import LEVER, Prior, Reading, Solution, Solver, peak
 from penumbra.services.haptics.starts import Limb, Starts
 from penumbra.services.haptics.surface_points import Shapes, SurfacePoint, SurfacePoints
 from penumbra.services.haptics.track import Home, Place, Track
 from penumbra.services.haptics.trust import PadTrust, SmoothedMisfit
 from penumbra.shared.contract.messages import ContactState, HapticState
-from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.geometry.rigid import Array, pose_error
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
 from penumbra.shared.skin.response import Response
@@ -106,7 +107,8 @@ class Estimator:
             raise ValueError("method paper needs the network's weights: run `penumbra haptics train` for this cell, or use solve")
         self.skin, self.surface, self.network, self.method = skin, surface, network, method
         self.settings = settings or HapticSettings()
-        self.size, self.tare = Size(measured), Tare(skin.noise)
+        self.size = Size(measured)
+        self.drift = Drift(skin, response.error, self.settings.links_error, self.size.usual[1])
         self.identity = Identity(skin, response.error, self.settings)
         self._response, self._solver = response, Solver(skin, response)
         self._home = Home(home, spread, self.settings)
@@ -122,7 +124,7 @@ class Estimator:
         self._stamp_ns, self._away_s = 0, 0.0
         self._is_tracking, self._untracked = False, -1  # windows without a track since the last one with it
         self._track_misfit = SmoothedMisfit(self.settings)
-        for part in (self._track, self._starts, self._pads, self.size, self.tare, self.identity, self._contact):
+        for part in (self._track, self._starts, self._pads, self.size, self.drift, self.identity, self._contact):
             part.forget()
 
     def nothing(self, why: str) -> HapticEstimate:
@@ -163,12 +165,15 @@ class Estimator:
             return self.nothing("no electrode is free of faults")
         elapsed_s = self._predict(stamp_ns)
         is_expected = expected is not None and self._track.expect(*expected)
-        reading = self._reading(amplitude, samples, T_world_pads, joints)
+        links = self.skin.gain * self.skin.sensitivity * self._response.rest(joints)
+        reading = self._reading(amplitude, samples, T_world_pads, links, joints)
+        seen = None
         if self.method == "paper":
             estimate = self._by_network(reading)
         else:
-            estimate = self._by_solve(reading, self._track.place if is_expected else None, elapsed_s)
-        self.tare.update(reading.signal, samples, elapsed_s, estimate.may_be_limb)
+            estimate, seen = self._by_solve(reading, self._track.place if is_expected else None, elapsed_s)
+        is_near = is_expected or estimate.state != "out_of_range"
+        self.drift.take(reading.signal, links, samples, elapsed_s, seen, is_near)
         self._watch_absence(estimate.may_be_limb, elapsed_s)
         return estimate if self._points is None else self._with_surface(estimate, reading, pressed)
 
@@ -177,6 +182,8 @@ class Estimator:
     def _predict(self, stamp_ns: int) -> float:
         """Takes everything to a window's stamp; returns the seconds since the last one."""
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
+        if self._stamp_ns:  # not the first window of all
+            self.drift.predict(max(elapsed_s, 0.0))
         if not 0.0 <= elapsed_s < self.settings.memory_s:
             self.reset()
             elapsed_s = 0.0
@@ -185,13 +192,15 @@ class Estimator:
         self._track.decay(elapsed_s)
         return elapsed_s
 
-    def _reading(self, amplitude: Array, samples: NDArray[np.integer], T_world_pads: Array, joints: ArrayLike) -> Reading:
-        """The signals: voltages less the electrodes' rests, and less the effect of the robot's other links."""
-        links = self.skin.gain * self.skin.sensitivity * self._response.rest(joints)
-        signal = np.where(samples > 0, self.skin.signal(amplitude) - links - self.tare.offset, 0.0)
+    def _reading(
+        self, amplitude: Array, samples: NDArray[np.integer], T_world_pads: Array, links: Array, joints: ArrayLike
+    ) -> Reading:
+        """The signals: voltages less the electrodes' rests, and less the effect (n,) [V] of the robot's other links."""
+        signal = np.where(samples > 0, self.drift.signal(self.skin.signal(amplitude), links), 0.0)
         variance = np.where(samples > 0, self.skin.noise / np.maximum(samples, 1), np.inf)
-        doubt = self.settings.links_error * links
-        return Reading(signal, variance, T_world_pads, self._pads.distrust(), doubt, joints)
+        gain, offset = self.drift.sigma
+        doubt, error = np.hypot(self.settings.links_error * links, offset), np.hypot(self._response.error, gain)
+        return Reading(signal, variance, T_world_pads, self._pads.distrust(), doubt, error, joints)
 
     def _with_surface(self, estimate: HapticEstimate, reading: Reading, pressed: NDArray[np.bool_] | None) -> HapticEstimate:
         """With the points of surfaces, and what touches."""
@@ -211,8 +220,8 @@ class Estimator:
         state: HapticState = "in_range" if self._is_felt(information, gap) else "out_of_range"
         return self._estimate(T, information, gap, state, np.zeros(len(self.skin)))
 
-    def _by_solve(self, reading: Reading, expected: Place | None, elapsed_s: float) -> HapticEstimate:
-        """expected: where a camera has just seen the limb."""
+    def _by_solve(self, reading: Reading, expected: Place | None, elapsed_s: float) -> tuple[HapticEstimate, Seen | None]:
+        """The estimate, and what a camera predicts of the window. expected: where it has just seen the limb."""
         before = self._track.place
         solution = self._solution(reading, expected is not None)
         if before.is_apart(self._track.place, self.settings):
@@ -227,7 +236,8 @@ class Estimator:
         is_felt = self._is_felt(information, gap)
         state = self._identified(reading, solution, gap, expected, elapsed_s) if is_felt else self._absent(elapsed_s)
         self._pads.update(solution.residuals, np.isfinite(reading.variance))
-        return self._estimate(T, information, gap, state, solution.residuals)
+        seen = None if expected is None or state == "object" else self._seen(solution, expected)
+        return self._estimate(T, information, gap, state, solution.residuals), seen
 
     def _watch_absence(self, in_range: bool, elapsed_s: float) -> None:
         """Forgets the size of a limb that has been away: the next one may be another person's."""
@@ -339,6 +349,14 @@ class Estimator:
     def _absent(self, elapsed_s: float) -> HapticState:
         self.identity.miss(elapsed_s)
         return "out_of_range"
+
+    def _seen(self, solution: Solution, expected: Place) -> Seen | None:
+        """What a camera that saw the limb there predicts; None where the voltages say that it is elsewhere."""
+        if self._track.place.is_apart(expected, self.settings):
+            return None
+        toward = np.concatenate([pose_error(expected.T, solution.T), self.size.usual[0] - solution.size])
+        slopes = solution.signal[:, None] * solution.point.rows
+        return Seen(solution.signal, slopes, toward, expected.covariance, solution.T[:3, 3])
 
     def _pose_likelihood(self, reading: Reading, solution: Solution) -> tuple[Array, Array]:
         """Information (6, 6) and gradient (6,) of the pose by the voltages alone, the size marginalised."""

@@ -47,7 +47,7 @@ class Identity:
     of the signal."""
 
     def __init__(self, skin: Skin, error: Array, settings: HapticSettings):
-        self._pads, self._error, self._settings = skin.first[:-1], error, settings
+        self._pads, self._electrodes, self._settings = skin.first[:-1], len(error), settings
         is_sure = float(error.mean()) < SURE * SHARES[0]
         self._becomes_limb = settings.limb_odds if is_sure else np.inf
         self.forget()
@@ -60,9 +60,9 @@ class Identity:
     def _begin(self, odds: float) -> None:
         """Starts from log odds."""
         rows = len(ERRORS) + 1 + len(SHARES)  # limbs, a fault, other things
-        self._likelihood = np.zeros((rows, len(self._error)))  # log likelihoods, beside the first row's
-        self._mean, self._variance = np.zeros((rows, len(self._error))), np.ones((rows, len(self._error)))
-        self._likelihood[-len(SHARES) :] = -odds / len(self._error)
+        self._likelihood = np.zeros((rows, self._electrodes))  # log likelihoods, beside the first row's
+        self._mean, self._variance = np.zeros((rows, self._electrodes)), np.ones((rows, self._electrodes))
+        self._likelihood[-len(SHARES) :] = -odds / self._electrodes
         self.odds = odds
 
     @property
@@ -117,7 +117,7 @@ class Identity:
         others = SHARES * min(1.0, SHARES_GAP / max(gap, SHARES_GAP)) ** SHARES_POWER
         share = np.concatenate([0.0 * ERRORS, [1.0], others])[:, None]
         times = np.concatenate([ERRORS, np.ones(1 + len(others))])[:, None]
-        model = times * (self._error + NEAR_ERROR * signal / NEAR_SIGNAL)
+        model = times * (reading.error + NEAR_ERROR * signal / NEAR_SIGNAL)
         scale = np.sqrt(free * (model**2 + share**2) * signal**2 + reading.doubt**2)
         keep = np.exp(-elapsed_s / self._settings.share_memory_s)
         mean, variance = keep * self._mean, 1.0 - keep**2 * (1.0 - self._variance)

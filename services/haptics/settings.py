@@ -111,8 +111,8 @@ class HapticSettings:
     # ---- What is published
 
     error_lasts: float = 5.0
-    """Number of successive windows in which the field model makes about the same error. Its variance is multiplied by it, because
-    fusion takes the windows' errors for independent. Chosen by the NEES of `penumbra bench haptics`."""
+    """Number of successive windows in which field model and drift make about the same error. Its variance is multiplied by it,
+    because fusion takes the windows' errors for independent. Chosen by the NEES of `penumbra bench haptics`."""
     doubt_lasts: float = 50.0
     """The same number for the doubt about two places: a second, in which one window after the other may prefer the wrong one.
     Chosen likewise."""

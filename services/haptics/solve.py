@@ -76,14 +76,16 @@ class Prior:
 class Reading:
     """What is measured in one window: signal, variance (n,): mean voltage less its rest [V], positive near a person, and its
     variance, infinite for an electrode to leave out; T_world_pads (p, 4, 4); distrust (n,): a factor of at least one on all
-    variances of an electrode, whose pad has not fitted lately; doubt (n,) [V]: standard deviation of a rest that was only
-    predicted; joints (j,) [rad]: of the robots, which only the network reads."""
+    variances of an electrode, whose pad has not fitted lately; doubt (n,) [V]: standard deviation of the rest, which was only
+    predicted; error (n,): of what field model and gain get wrong, as a share of the signal; joints (j,) [rad]: of the robots,
+    which only the network reads."""
 
     signal: Array
     variance: Array
     T_world_pads: Array
     distrust: Array
     doubt: Array
+    error: Array
     joints: ArrayLike = ()
 
 
@@ -133,8 +135,8 @@ class Solver:
         return Solution(at.T, at.size, cost, _misfit(window, predicted, z), z, predicted, at)
 
     def likelihood(self, window: Reading, solution: Solution, lasting: float = 1.0) -> tuple[Array, Array]:
-        """Information (8, 8) and gradient (8,) of the voltages alone at a solution, by pose and size. lasting: the model's error
-        counts with so many times its variance."""
+        """Information (8, 8) and gradient (8,) of the voltages alone at a solution, by pose and size. lasting: what is wrong for
+        longer than a window counts with so many times its variance."""
         H, g = np.zeros((8, 8)), np.zeros(8)
         at, z = solution.point, np.zeros(len(self._scale))
         _normal_equations(*self._given(window), at.logs, at.rows, False, lasting, H, g, z)
@@ -144,14 +146,14 @@ class Solver:
         """The share (n,) of an electrode's error that a solve with this prior leaves in its residual, when noise is averaged out:
         one less its leverage. Next to nothing where few electrodes feel anything and pose and size fit them."""
         J = solution.signal[:, None] * solution.point.rows
-        weight = 1.0 / (window.variance / AVERAGED + (self.response.error * solution.signal) ** 2)
+        weight = 1.0 / (window.variance / AVERAGED + (window.error * solution.signal) ** 2)
         A = J.T @ (weight[:, None] * J)
         A[:6, :6] += prior.information
         A[6:, 6:] += prior.size_information
         return np.clip(1.0 - weight * np.einsum("ni,ni->n", J, np.linalg.solve(A, J.T).T), 0.0, 1.0)
 
     def _given(self, window: Reading) -> tuple[Array, Array, Array, Array, Array]:
-        return window.signal, window.variance, window.distrust, window.doubt, self.response.error
+        return window.signal, window.variance, window.distrust, window.doubt, window.error
 
 
 def _misfit(window: Reading, predicted: Array, z: Array) -> float:

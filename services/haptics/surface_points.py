@@ -172,7 +172,7 @@ class SurfacePoints:
         if not len(own):
             return []
         found = self._estimated(own, change[own], sigma[own], used[own], total[own])
-        return fused(self._pads, *found, T_world_pads, self._farthest)
+        return fused(self._pads, *found, T_world_pads, self._farthest) if len(found[0]) else []
 
     def _estimated(
         self, own: NDArray[np.intp], change: Array, sigma: Array, used: NDArray[np.bool_], total: Array

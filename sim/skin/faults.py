@@ -16,6 +16,7 @@ KINDS = {
     "dead": "a broken wire: no amplitude and no noise",
     "saturated": "the amplifier at its limit",
     "drift": "an offset that warms up by SIZE volts (default 0.05)",
+    "warm": "a board that is SIZE kelvin warmer after some minutes (default 10): gain and offset, other ones of every electrode",
     "hum": "mains of SIZE volts at 50 Hz (default 0.01)",
     "gain": "a calibration from another pad: signals times SIZE (default 1.5)",
     "turned": "the pad mounted turned by 180 degrees",
@@ -23,14 +24,38 @@ KINDS = {
     "none": "in order again",
 }
 """Every fault, and what it means. `turned` and `mirrored` are of a whole pad."""
-SIZES = {"drift": 0.05, "hum": 0.01, "gain": 1.5}
-LARGEST = {"drift": 1.0, "hum": 1.0, "gain": 10.0}
-"""Default and largest SIZE of a drift [V], of a hum [V], and of a gain."""
+SIZES = {"drift": 0.05, "warm": 10.0, "hum": 0.01, "gain": 1.5}
+LARGEST = {"drift": 1.0, "warm": 40.0, "hum": 1.0, "gain": 10.0}
+"""Default and largest SIZE of a drift [V], of a warming [K], of a hum [V], and of a gain."""
 ARRANGEMENTS = {"turned": "turned by 180 degrees", "mirrored": "mirrored left to right"}
 MAINS_HZ = 50.0
 """Frequency of the hum."""
 WARMS_S = 30.0
-"""Time constant of a drift."""
+"""Time constant [s] of a drift."""
+BOARD_WARMS_S = 300.0
+"""Time constant [s] with which a board becomes warm. Chosen: minutes, as of a populated board in a plastic shell."""
+GAIN_PER_K = (-0.003, -0.001)
+"""Bounds of an electrode's gain coefficient [1/K]. Chosen: of charge amplifiers with ceramic capacitors and an oscillator."""
+OFFSET_PER_K = 1e-4
+"""Standard deviation of an electrode's offset coefficient [V/K]. Chosen: a twentieth of a sample's noise."""
+
+
+@dataclass(frozen=True)
+class Warming:
+    """What n electrodes do when they get warmer: coefficients of gain (n,) [1/K] and offset (n,) [V/K]."""
+
+    gain: Array
+    offset: Array
+
+    @staticmethod
+    def draw(rng: np.random.Generator, n: int) -> Warming:
+        """Random coefficients of n electrodes."""
+        return Warming(rng.uniform(*GAIN_PER_K, n), OFFSET_PER_K * rng.standard_normal(n))
+
+    def apply(self, volts: Array, a3: Array, kelvin: ArrayLike) -> Array:
+        """What electrodes with offsets a3 (n,) [V] give instead of volts (s, n) when they are so much warmer (s,)."""
+        warmer = np.asarray(kelvin, np.float64)[..., None]
+        return np.asarray(a3 + (1.0 + self.gain * warmer) * (volts - a3) + self.offset * warmer)
 
 
 @dataclass(frozen=True)
@@ -45,6 +70,7 @@ class SkinFaults:
 
     def __init__(self, skin: Skin):
         self._skin = skin
+        self._warming = Warming.draw(np.random.default_rng(len(skin)), len(skin))
         self._electrodes: dict[int, _Fault] = {}
         self._pads: dict[int, str] = {}
 
@@ -95,6 +121,10 @@ class SkinFaults:
                     out[:, k] = skin.full_scale[own][k]
                 case "drift":
                     out[:, k] += fault.size * -np.expm1(-np.maximum(time - fault.since_s, 0.0) / WARMS_S)
+                case "warm":
+                    one = Warming(self._warming.gain[own][k : k + 1], self._warming.offset[own][k : k + 1])
+                    kelvin = fault.size * -np.expm1(-np.maximum(time - fault.since_s, 0.0) / BOARD_WARMS_S)
+                    out[:, k : k + 1] = one.apply(out[:, k : k + 1], a3, kelvin)
                 case "hum":
                     out[:, k] += fault.size * np.sin(2.0 * np.pi * MAINS_HZ * time)
                 case "gain":

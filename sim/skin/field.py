@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from scipy.spatial import ConvexHull
 
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.cell.pads import PadType
+from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
 
@@ -168,13 +170,19 @@ def _section(triangles: Array, at: float, angles: Array) -> tuple[Array, Array]:
 class PadField:
     """The field of one pad type, its board prepared for bodies at any pose.
 
-    backing: what is grounded behind it, panels in the pad's frame (the robot link that carries it). plate_pF: capacitance of all
-    its conductors together.
+    backing: what is grounded behind it, panels in the pad's frame (the robot link that carries it). beside (b, 4, 4): other
+    boards of this type in the pad's frame, whose electrodes are held at zero and whose rings too unless driven with the pad's.
+    plate_pF: capacitance of all conductors together.
     """
 
-    def __init__(self, kind: PadType, backing: Panels | None = None):
+    def __init__(
+        self, kind: PadType, backing: Panels | None = None, beside: Sequence[Array] | Array = (), is_driven: bool = False
+    ):
         self._kind = kind
-        self.panels, owner = _board(kind)
+        self.panels, owner = board, own = _board(kind)
+        held = np.where((own == BARE) | (own == RING) & is_driven, own, GROUND)
+        for T in beside:
+            self.panels, owner = self.panels + Panels(rigid.apply(T, board.corners)), np.concatenate([owner, held])
         if backing is not None:
             backing = self._outside(backing)
             self.panels = self.panels + backing

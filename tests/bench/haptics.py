@@ -7,6 +7,7 @@ the broad prior that the first look at a limb has, once with a tracking prior.
 
 Then limbs that rest for ten seconds (what is published, and what the default observer makes of it, against their covariances),
 limbs that move through all gaps, and things that are no limb. `--only-surface`: points of surfaces without a shape, and contact.
+`--only-drift`: limbs before electrodes whose gains and offsets have drifted.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from penumbra.shared.skin import bound
 from penumbra.shared.skin.layout import Skin, link_names
 from penumbra.shared.skin.response import SIZE_SPREAD, Response, fingerprint
 from penumbra.sim.skin import field
-from penumbra.tests.bench.lib import results, surfaces, things
+from penumbra.tests.bench.lib import drift, results, surfaces, things
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
 ARRAYS = {"bare": "table", "hull": "arm"}
@@ -440,6 +441,8 @@ def tables(result: Result) -> list[Part]:
     and of moving limbs too: here they count as shares."""
     if "surface" in result:
         return surfaces.tables(result)
+    if "drift" in result:
+        return [drift.table(result)]
     if "arrays" not in result:
         return [things.table(result)]
     shown, lines = result["arrays"], list[Part]()
@@ -553,6 +556,7 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     flags.Option("--method", choices=("both", "solve"), default="both", help="the paper's beside ours"),
     flags.Option("--only-objects", is_flag=True, help="only things that pass"),
     flags.Option("--only-surface", is_flag=True, help="only points of surfaces, and contact"),
+    flags.Option("--only-drift", is_flag=True, help="only limbs before electrodes that have drifted"),
     flags.Option("--quick", is_flag=True, help="a few of everything: whether it runs, no numbers to believe"),
     example="penumbra bench haptics --quick --json haptics.json",
 )
@@ -564,6 +568,11 @@ def main(options: flags.Options, report: results.Report) -> None:
                 surfaces.measure(Rig(name), options.seed, 1 if options.quick else surfaces.THINGS, progress) for name in arrays
             ]
         result: dict[str, Any] = {"seed": options.seed, "surface": parts}
+    elif options.only_drift:
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            limbs = 1 if options.quick else drift.LIMBS
+            rows = [row for name in arrays for row in drift.measure(Rig(name), options.seed, limbs, progress)]
+        result = {"seed": options.seed, "drift": rows}
     elif options.only_objects:
         result = {"seed": options.seed, "objects": measure_objects(options.seed, plan.passes, arrays)}
     else:

@@ -3,7 +3,8 @@
 What is compared: the capacitance of all conductors of the bare pad, what a forearm changes at the centre electrode, the response
 law fitted to it in log space, where its signal-to-noise ratio is 1 dB, lateral contrast, the influence of a grounded link; how a
 limb, a hand, a metal bar and a plastic block differ; and the networks that run live beside the boundary elements that they
-stand for, at poses and sizes that they were not fitted to. `--seed` draws those.
+stand for, at poses and sizes that they were not fitted to. `--seed` draws those. `--only-left-out`: what
+the rest of the person and neighbouring boards change, which the networks leave out.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 from scipy.optimize import brentq, least_squares
 
@@ -25,7 +28,7 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.response import Response, networks
 from penumbra.sim.skin.field import Body, PadField, limb, shell
-from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib import left_out, results
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
 Array = np.ndarray
@@ -170,6 +173,8 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
 
 def tables(found: Result) -> list[Part]:
     """Figures beside the real pad's, what different bodies change, and the networks that run live."""
+    if "left_out" in found:
+        return [left_out.table(found)]
     figure = Table("figure", "ours", "the real pad", title="The pad near a forearm")
     figure.add_row("all conductors at 1 V, pF", f"{found['plate_pF']:.3f}", f"{PLATE_PF}")
     for gap, value in found["centre_fF"].items():
@@ -212,10 +217,15 @@ def tables(found: Result) -> list[Part]:
     tables,
     flags.Option("--seed", type=int, default=1, help="draws the poses of the live comparison"),
     flags.Option("--poses", type=flags.positive, default=160, help="for each gap of the live comparison"),
+    flags.Option("--only-left-out", is_flag=True, help="only what the rest of the person and other boards change"),
     example="penumbra bench skin --json skin.json",
 )
 def main(options: flags.Options, report: results.Report) -> None:
     table, arm = cells.load("table"), cells.load("arm")
+    if options.only_left_out:
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            report.save({"seed": options.seed, "left_out": left_out.measure(table, options.seed, progress)})
+        return
     found = {"seed": options.seed, **figures(table), "live": live(table, options.seed, options.poses)}
     found["live_hull"] = live(arm, options.seed, options.poses)
     report.save(found)

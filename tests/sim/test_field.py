@@ -132,3 +132,16 @@ def test_finer_panels_change_little(table: cells.Cell, pad: PadField, arm: tuple
 
 def test_units_are_farads() -> None:
     assert pytest.approx(111.265, rel=1e-4) == FEMTOFARAD / 1e3  # 4 pi eps_0, in pF per metre
+
+
+def test_a_board_beside_a_pad_shades_it_adds_when_it_is_driven_too_and_does_nothing_from_afar(
+    table: cells.Cell, pad: PadField, arm: tuple
+) -> None:
+    kind, T = table.pad_types["five"], rigid.transform([0.0, 0.0, 0.10])
+    alone = pad.change(arm[1], T)
+
+    def with_board(x: float, is_driven: bool = False) -> np.ndarray:
+        return PadField(kind, beside=[rigid.transform([x, 0.0, 0.0])], is_driven=is_driven).change(arm[1], T)
+
+    assert (with_board(0.08) < 0.95 * alone).all() and (with_board(0.08, is_driven=True) > 1.05 * alone).all()
+    np.testing.assert_allclose(with_board(5.0), alone, rtol=0.01)

@@ -16,7 +16,7 @@ from penumbra.services.haptics import train
 from penumbra.services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
 from penumbra.services.haptics.paper_nearest import nearest_points
 from penumbra.services.haptics.paper_network import Relative
-from penumbra.services.haptics.size_and_rest import Size, Tare
+from penumbra.services.haptics.size import Size
 from penumbra.services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, Prior, Reading, Solver, marginal, peak
 from penumbra.shared.body.anatomy import target_mesh
 from penumbra.shared.cell import description as cells
@@ -133,7 +133,7 @@ def test_the_information_is_that_of_the_voltages_derivatives(skin: Skin, respons
     T, step = rigid.from_rpy((0.01, -0.02, 0.14), (0.1, -0.1, 0.2)), 1e-3
     solver = Solver(skin, response)
     prior = Prior(T, 1e-9 * np.eye(6), SIZES, 1e-9 * np.eye(2))
-    window = Reading(signal(skin, response, T), skin.noise / 10, pads, np.ones(len(skin)), np.zeros(len(skin)))
+    window = Reading(signal(skin, response, T), skin.noise / 10, pads, np.ones(len(skin)), np.zeros(len(skin)), response.error)
     information, gradient = solver.likelihood(window, solver.solve(window, prior, T, SIZES, 0, 0))
     moved = [
         [signal(skin, response, rigid.perturb(T, s * step * e[:6]), SIZES + s * step * e[6:]) for s in (1, -1)] for e in np.eye(8)
@@ -154,7 +154,7 @@ def test_the_solve_finds_pose_and_size_from_centimetres_away(
     solver = Solver(skin, response)
     away = rigid.perturb(T, np.array([0.02, -0.02, 0.03, 0.1, 0.1, -0.1]))
     prior = Prior(away, np.diag(np.repeat([0.02, 0.1], 3) ** -2.0), SIZE, np.diag(SIZE_SPREAD**-2))
-    window = Reading(signal(skin, response, T), skin.noise / 1000, pads, np.ones(len(skin)), np.zeros(len(skin)))
+    window = Reading(signal(skin, response, T), skin.noise / 1000, pads, np.ones(len(skin)), np.zeros(len(skin)), response.error)
     found = solver.solve(window, prior, away, SIZE)
     at_truth = solver.solve(window, prior, T, SIZES)
     assert found.cost == pytest.approx(at_truth.cost, abs=0.2)
@@ -194,22 +194,6 @@ def test_the_size_is_learnt_and_forgotten() -> None:
     size.predict(200.0)
     np.testing.assert_allclose(size.mean, SIZE, atol=1e-3)
     np.testing.assert_allclose(np.linalg.inv(size.information), np.diag(SIZE_SPREAD**2), rtol=1e-3)
-
-
-def test_rests_follow_a_slow_drift_while_nothing_is_near_and_not_a_limb(skin: Skin) -> None:
-    rng = np.random.default_rng(0)
-    tare, samples = Tare(skin.noise), np.full(len(skin), 10)
-    drift = np.where(np.arange(len(skin)) == 3, 0.004, 0.0)
-
-    def watch(seconds: float, in_range: bool) -> None:
-        for _ in range(int(seconds * 100)):
-            noise = np.sqrt(skin.noise / 10) * rng.standard_normal(len(skin))
-            tare.update(drift + noise - tare.offset, samples, 0.01, in_range)
-
-    watch(10.0, in_range=True)
-    np.testing.assert_array_equal(tare.offset, 0.0)
-    watch(60.0, in_range=False)
-    np.testing.assert_allclose(tare.offset, drift, atol=4e-4)
 
 
 # ---- the estimator

@@ -225,3 +225,10 @@ def test_a_hand_around_a_post_is_a_grip_and_its_palm_alone_a_touch(table: cells.
     assert gripped == {("grip", ("east", "west"))}
     released = list(windows(estimator, skin, T_world_pads, np.zeros(len(skin)), 3, 6))
     assert {e.contact for e in released} == {"none"}
+
+
+def test_pads_whose_electrodes_contradict_each_other_have_no_point(table: cells.Cell, finder: SurfacePoints) -> None:
+    skin = Skin(table)
+    signal = np.full(len(skin), -5e-3)
+    signal[skin.first[:-1]] = 0.1  # as no surface does: one electrode of each pad alone
+    assert finder.find(signal, skin.noise / SAMPLES, NONE, skin.T_world_pads()) == []

@@ -162,7 +162,7 @@ def limb(skin: Skin) -> Limb:
 
 def nothing_felt(skin: Skin) -> Reading:
     ones = np.ones(len(skin))
-    return Reading(0.0 * ones, ones, skin.T_world_pads(), ones, 0.0 * ones)
+    return Reading(0.0 * ones, ones, skin.T_world_pads(), ones, 0.0 * ones, 0.0 * ones)
 
 
 def test_starts_from_scratch_lie_along_the_limb_clear_of_the_pads_and_end_with_the_network_s(skin: Skin, limb: Limb):

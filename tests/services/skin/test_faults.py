@@ -15,7 +15,7 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 from penumbra.shared.skin.faults import LASTS, Watch, arrangements, likely
 from penumbra.shared.skin.layout import Skin
-from penumbra.sim.skin.faults import KINDS, SIZES, SkinFaults
+from penumbra.sim.skin.faults import BOARD_WARMS_S, GAIN_PER_K, KINDS, OFFSET_PER_K, SIZES, SkinFaults
 from penumbra.sim.skin.field import PadField, limb
 from penumbra.tests.support.live import free_port
 
@@ -185,7 +185,7 @@ def test_faults_do_what_they_say():
         faults.command(words, 0.0)
         return faults.apply(0, time, clean)
 
-    assert set(KINDS) == {"dead", "saturated", "drift", "hum", "gain", "turned", "mirrored", "none"}
+    assert set(KINDS) == {"dead", "saturated", "drift", "warm", "hum", "gain", "turned", "mirrored", "none"}
     assert not made("p0/c dead")[:, 0].any()
     assert (made("p0/c saturated")[:, 0] == 1.65).all()
     assert made("p0/c gain 2")[:, 0].mean() - SKIN.a3[0] == pytest.approx(2 * (level[0] - SKIN.a3[0]))
@@ -202,6 +202,19 @@ def test_faults_do_what_they_say():
     assert (
         drifted[0] == 0.0 and np.all(np.diff(drifted) >= 0.0) and drifted[-1] == pytest.approx(0.05 * (1 - np.exp(-0.999 / 30)))
     )
+
+
+def test_a_board_that_warms_up_changes_the_gain_and_offset_of_every_electrode_by_its_own_coefficients():
+    clean = np.array([SKIN.a3[:5], SKIN.a3[:5] + 0.1])  # nothing near, then a signal of 0.1 V
+    faults = SkinFaults(SKIN)
+    faults.command(f"{SKIN.pads[0]} warm 10", 5.0)
+    np.testing.assert_array_equal(faults.apply(0, [4.0, 5.0], clean), clean)
+    half_s = 5.0 + BOARD_WARMS_S * np.log(2.0)
+    half, whole = (faults.apply(0, [at, at], clean) - clean for at in (half_s, 5.0 + 30.0 * BOARD_WARMS_S))
+    np.testing.assert_allclose(half, 0.5 * whole, atol=1e-9)
+    gain = (whole[1] - whole[0]) / 0.1 / 10.0
+    assert (gain > GAIN_PER_K[0]).all() and (gain < GAIN_PER_K[1]).all() and np.ptp(gain) > 0.0
+    assert np.ptp(whole[0]) > 0.0 and np.abs(whole[0]).max() < 4.0 * 10.0 * OFFSET_PER_K
 
 
 # ---- what a whole pad is likely to be

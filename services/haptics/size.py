@@ -1,13 +1,12 @@
-"""What changes slowly beside the pose: the size of the limb, and the rest of every electrode.
+"""The size of the limb, which changes only with the person.
 
-Both are learnt only where they can be told from the pose: the size close to the pads, and only considered farther away (a Schmidt
-filter), where it would drift with what the model gets wrong; rests while nothing is near.
+It is learnt close to the pads, where it can be told from the pose, and only considered farther away (a Schmidt filter), where it
+would drift with what the model gets wrong.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from penumbra.services.haptics.solve import marginal
 from penumbra.shared.geometry.rigid import Array
@@ -22,17 +21,6 @@ SIZE_LASTING = 200.0
 multiplied by it."""
 PERSON_S = 5.0
 """Time [s] without a limb in range after which the next one may be another person's."""
-TARE_S = 10.0
-"""Time constant [s] with which the rests follow the voltages."""
-QUIET_S = 3.0
-"""Time [s] for which nothing may have been in range before the rests follow."""
-STEADY = 3.0
-"""Distance of a signal from its smoothed value, in standard deviations, above which the electrode counts as moved: the rests
-follow only while at most a tenth of the electrodes has moved."""
-SMOOTH_S = 1.0
-"""Time constant [s] of the smoothed signals."""
-FARTHEST_TARE = 0.02
-"""Largest correction of a rest [V]. A rest that is farther off is a fault and no drift."""
 
 
 class Size:
@@ -46,6 +34,11 @@ class Size:
     def forget(self) -> None:
         """Another person may come."""
         self.mean, self.information = self._usual.copy(), np.diag(1.0 / self._spread**2)
+
+    @property
+    def usual(self) -> tuple[Array, Array]:
+        """Mean and standard deviations (2,) between people."""
+        return self._usual, self._spread
 
     @property
     def strangeness(self) -> float:
@@ -78,37 +71,3 @@ class Size:
         gradient[6:] += self.information @ (self.mean - size) / lasting
         information, gradient = marginal(information, gradient, np.eye(8)[:, 6:])
         return information[:6, :6], gradient[:6]
-
-
-class Tare:
-    """offset (n,) [V]: what the rests of the electrodes have moved by. noise (n,) [V^2]: of one sample."""
-
-    def __init__(self, noise: Array):
-        self._noise = noise
-        self.offset = np.zeros(len(noise))
-        self.forget()
-
-    def forget(self) -> None:
-        """Start to watch again; what was learnt stays."""
-        self._quiet_s, self._smooth, self._weight = 0.0, np.zeros_like(self.offset), 0.0
-
-    def update(self, signal: Array, samples: NDArray[np.integer], elapsed_s: float, in_range: bool) -> None:
-        """Takes the signals (n,) [V] of a window, with the offset already subtracted, over so many samples (n,) each."""
-        if in_range or not 0.0 < elapsed_s < 1.0:
-            self.forget()
-            return
-        share = 1.0 - np.exp(-elapsed_s / SMOOTH_S)
-        self._weight += share * (1.0 - self._weight)
-        felt = samples > 0
-        self._smooth += share * (np.where(felt, signal, 0.0) - self._smooth)
-        mean = self._smooth / self._weight
-        sigma = np.sqrt(self._noise / np.maximum(samples, 1) * 0.5 * elapsed_s / SMOOTH_S) + 2e-4
-        if (np.abs(signal - mean) > STEADY * (sigma + np.sqrt(self._noise / np.maximum(samples, 1))) + 1e-3)[felt].mean() > 0.1:
-            self.forget()  # something moves
-            return
-        self._quiet_s += elapsed_s
-        if self._quiet_s > QUIET_S:
-            step = (1.0 - np.exp(-elapsed_s / TARE_S)) * mean
-            moved = np.where(felt & (np.abs(self.offset + step) < FARTHEST_TARE), step, 0.0)
-            self.offset += moved
-            self._smooth -= moved * self._weight
