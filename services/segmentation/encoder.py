@@ -4,6 +4,9 @@ From masks of a few hundred photographs a network of our size learns these photo
 others have taught (ImageNet; Tan and Le 2019, arXiv:1905.11946; Lite: without squeezing and with ReLU6, fast on a CPU). The
 stages up to a sixteenth of the picture's resolution are used. `prednet.py` has them in torch, `graph.py` in OpenVINO.
 
+What the blocks find is decoded upwards again, as in a U-Net (Ronneberger, Fischer, Brox 2015, arXiv:1505.04597): at each
+resolution, what comes from the coarser one and the block's own result are merged by a convolution.
+
 A block expands its input by a 1 x 1 convolution, filters each channel by itself and projects to fewer channels; where neither
 size nor number of channels change, its input is added (Sandler et al. 2018, arXiv:1801.04381).
 """
@@ -63,6 +66,8 @@ CHANNELS = tuple(BLOCKS[tap].outputs for tap in TAPS)
 """Channels of what the encoder gives."""
 STRIDES = (2, 4, 8, 16)
 """Pixels of the picture a side of one position of it."""
+WIDTHS = (16, 32, 48, 64)
+"""Channels of what is decoded at these strides."""
 
 
 def padding(kernel: int, stride: int) -> tuple[int, int]:

@@ -82,7 +82,7 @@ class _Step:
         """What the encoder adds, as in `prednet.PredNet.look`."""
         x = op.divide(op.subtract(image, np.float32(encoder.MEAN)), np.float32(encoder.SPREAD))
         x = op.clamp(self._filtered("encoder.stem", x, 2), 0.0, 6.0)
-        found: dict[int, Any] = {}
+        seen: list[Any] = []
         for k, form in enumerate(encoder.BLOCKS):
             name = f"encoder.blocks.{k}"
             inner = op.clamp(self._convolution(f"{name}.expand", x), 0.0, 6.0) if form.expansion > 1 else x
@@ -90,21 +90,28 @@ class _Step:
             out = self._convolution(f"{name}.project", inner)
             x = op.add(x, out) if form.adds_input else out
             if k in encoder.TAPS:
-                tap = encoder.TAPS.index(k)
-                for i, convolution in ((self._settings.driven[tap], f"context.{tap}"), (0, f"glance.{tap}")):
-                    factor = encoder.STRIDES[tap] // self._settings.layer_strides[i]
-                    part = _enlarged(self._convolution(convolution, x), factor, "linear_onnx")
-                    found[i] = op.add(found[i], part) if i in found else part
+                seen.append(x)
+        gathered: Any = None
+        found: dict[int, Any] = {}
+        for k in reversed(range(len(seen))):
+            if gathered is not None:
+                coarser = _enlarged(self._convolution(f"gather.narrow.{k}", gathered), 2, "linear_onnx")
+                seen[k] = op.concat([coarser, seen[k]], 1)
+            gathered = op.relu(self._convolution(f"gather.merge.{k}", seen[k]))
+            i = self._settings.driven[k]
+            factor = encoder.STRIDES[k] // self._settings.layer_strides[i]
+            part = _enlarged(self._convolution(f"context.{k}", gathered), factor, "linear_onnx")
+            found[i] = op.add(found[i], part) if i in found else part
+        found[0] = self._convolution("glance", gathered)
         return found
 
     def _decoded(self, representations: list[Any], context: dict[int, Any]) -> Any:
         total = self._convolution("decode.0", representations[1])
-        if 0 in context:
-            total = op.add(total, context[0])
         for i in range(2, len(representations)):
             part = self._convolution(f"decode.{i - 1}", representations[i])
             total = op.add(total, _enlarged(part, 2 ** (i - 1), "linear_onnx"))
-        return op.depth_to_space(self._convolution("head", op.relu(total)), "depth_first", FOLD)
+        logits = self._convolution("head", op.relu(total))
+        return op.depth_to_space(op.add(logits, context[0]) if 0 in context else logits, "depth_first", FOLD)
 
     def _hgru(self, name: str, drive: Any, state: Any) -> Any:
         inhibition = self._convolution(

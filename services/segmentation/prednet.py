@@ -12,7 +12,7 @@ what the second layer receives from below, from which all layers above learn of 
 is known they are zero and add nothing.
 
 An encoder (`encoder.py`), where the network has one, looks at each picture by itself. What it says is added to the drive of the
-cells of all layers but the first and to what the mask is decoded from, and is not predicted either.
+cells of all layers but the first, and the logits of its own mask to those of the mask; it is not predicted either.
 
 The picture enters folded: 2 x 2 pixels become 12 channels (space to depth). The first layer therefore works at half resolution
 where the authors' works at full; the pooling that would follow it is this folding, which, unlike it, throws nothing away.
@@ -39,8 +39,8 @@ from penumbra.shared.contract.labels import Label
 State = tuple[Tensor, ...]
 """What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""
 Context = dict[int, Tensor]
-"""What an encoder adds to the drive of layers' cells (batch, channels, h, w), by layer, and, in place of the first one's, to what
-the mask is decoded from."""
+"""What an encoder adds to the drive of layers' cells (batch, channels, h, w), by layer, and, in place of the first one's, to the
+logits of the mask, folded."""
 
 
 class HGRU(nn.Module):
@@ -147,6 +147,27 @@ class Encoder(nn.Module):
         return found
 
 
+class Gathering(nn.Module):
+    """What the encoder found, decoded from the coarsest resolution to the finest."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths, below = encoder.WIDTHS, (*encoder.WIDTHS[1:], 0)
+        self.narrow = nn.ModuleList(nn.Conv2d(n, width, 1) for n, width in zip(widths[1:], widths[:-1], strict=True))
+        self.merge = nn.ModuleList(
+            nn.Conv2d(found + (width if deeper else 0), width, 3, padding=1)
+            for found, width, deeper in zip(encoder.CHANNELS, widths, below, strict=True)
+        )
+
+    def forward(self, found: list[Tensor]) -> list[Tensor]:
+        """A tensor (batch, width, h / stride, w / stride) for each of `encoder.STRIDES`, of the encoder's results."""
+        gathered = [F.relu(self.merge[-1](found[-1]))]
+        for k in reversed(range(len(self.narrow))):
+            coarser = _enlarged(self.narrow[k](gathered[0]), 2)
+            gathered.insert(0, F.relu(self.merge[k](torch.cat([coarser, found[k]], 1))))
+        return gathered
+
+
 def _padded(x: Tensor, kernel: int, stride: int) -> Tensor:
     before, behind = encoder.padding(kernel, stride)
     return F.pad(x, (before, behind, before, behind))
@@ -173,9 +194,10 @@ class PredNet(nn.Module):
             nn.Conv2d(known, c[1], 3, padding=1, bias=False) if known else None for _ in range(2)
         )
         self.encoder = Encoder() if settings.encoder else None
-        taps = list(zip(encoder.CHANNELS, settings.driven, strict=True)) if settings.encoder else []
-        self.context = nn.ModuleList(nn.Conv2d(said, c[i], 1, bias=False) for said, i in taps)
-        self.glance = nn.ModuleList(nn.Conv2d(said, settings.decoder_channels, 1, bias=False) for said, _ in taps)
+        self.gather = Gathering() if settings.encoder else None
+        levels = zip(encoder.WIDTHS, settings.driven, strict=True) if settings.encoder else ()
+        self.context = nn.ModuleList(nn.Conv2d(width, c[i], 1, bias=False) for width, i in levels)
+        self.glance = nn.Conv2d(encoder.WIDTHS[0], self.head.out_channels, 3, padding=1) if settings.encoder else None
         for module in self.modules():  # channels innermost: what convolutions on a CPU are fastest with
             if isinstance(module, nn.Conv2d):
                 module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)
@@ -194,12 +216,17 @@ class PredNet(nn.Module):
     def look(self, image: Tensor) -> Context:
         """What the encoder of a network that has one adds."""
         found: Context = {}
-        if self.encoder is not None:
-            for k, said in enumerate(self.encoder(image)):
-                for i, convolution in ((self.settings.driven[k], self.context[k]), (0, self.glance[k])):
-                    part = _enlarged(convolution(said), encoder.STRIDES[k] // self.settings.layer_strides[i])
-                    found[i] = found[i] + part if i in found else part
+        if self.encoder is not None and self.gather is not None and self.glance is not None:
+            gathered = self.gather(self.encoder(image))
+            found[0] = self.glance(gathered[0])
+            for k, (i, said) in enumerate(zip(self.settings.driven, gathered, strict=True)):
+                part = _enlarged(self.context[k](said), encoder.STRIDES[k] // self.settings.layer_strides[i])
+                found[i] = found[i] + part if i in found else part
         return found
+
+    def glimpsed(self, image: Tensor) -> Tensor:
+        """Class logits (batch, classes, h, w) of the encoder alone, of a network that has one."""
+        return F.pixel_shuffle(self.look(image)[0], FOLD)
 
     def forward(
         self, image: Tensor, state: State, priors: Tensor | None = None, context: Context | None = None
@@ -241,11 +268,10 @@ class PredNet(nn.Module):
 
     def _decode(self, representations: list[Tensor], context: Context) -> Tensor:
         total = self.decode[0](representations[1])
-        if 0 in context:
-            total = total + context[0]
         for i in range(2, len(representations)):
             total = total + _enlarged(self.decode[i - 1](representations[i]), 2 ** (i - 1))
-        return F.pixel_shuffle(self.head(F.relu(total)), FOLD)
+        logits = self.head(F.relu(total))
+        return F.pixel_shuffle(logits + context[0] if 0 in context else logits, FOLD)
 
 
 def _enlarged(x: Tensor, factor: int) -> Tensor:

@@ -31,6 +31,9 @@ ARM_SHARE = 0.08
 """Width of an arm that a recording without any might show, as a share of its longer side."""
 CLOTHED = 0.35
 """Share of the sequences of recordings whose arms get other sleeves or gloves."""
+AROUND = {"target": 0.55, "rest": 0.25}
+"""Shares of the pieces of pictures that lie around a pixel of the target, and of the rest of a person (faces look like hands, and
+sleeves like what is worn above them); the others lie anywhere."""
 ENDLESS = 2**31
 """Number of sequences of a set that has no end."""
 
@@ -200,10 +203,7 @@ def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.
     if (shrink := int(1.0 / zoom)) > 1:  # no detail finer than a pixel is left to be sampled
         film = np.stack([_smaller(frame, shrink) for frame in film])
         arms, zoom = arms[::shrink, ::shrink], zoom * shrink
-    middle = rng.integers(0, film.shape[1:3])
-    target = np.argwhere(arms)
-    if len(target) and rng.random() < 0.8:
-        middle = target[rng.integers(len(target))] + rng.integers(-size // 6, size // 6 + 1, 2)
+    middle = _middle(film[frames // 2, ..., 3], size // 6, rng)
     angle = rng.normal(0.0, 20.0) if rng.random() < 0.7 else rng.uniform(-180.0, 180.0)
     speed = rng.random() ** 1.5
     shift, turn, grow = speed * rng.uniform(-8.0, 8.0, 2), speed * rng.uniform(-2.0, 2.0), 1.0 + speed * rng.uniform(-0.02, 0.02)
@@ -247,19 +247,15 @@ def draw_batch(
     chosen: Iterable[Any], frames: int, size: int, rng: np.random.Generator, amount: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Patches of so many frames of sequences (n, h, w, 4 or 6): images (batch, frames, 3, size, size) in [0, 1], labels
-    (batch, frames, size, size) and priors (batch, frames, 2, size, size), made of the labels where a sequence has none. Three of
-    five lie around a pixel of the target; mirrored, played backwards and coloured anew at random, by `amount`.
+    (batch, frames, size, size) and priors (batch, frames, 2, size, size), made of the labels where a sequence has none. They lie
+    where AROUND says; mirrored, played backwards and coloured anew at random, by `amount`.
     """
     images, labels, known = [], [], []
     for sequence in chosen:
         start = rng.integers(0, len(sequence) - frames + 1)
         sequence = sequence[start : start + frames]
         height, width = sequence.shape[1:3]
-        middle = rng.integers(0, [height, width])
-        if rng.random() < 0.6:
-            target = np.argwhere(np.isin(sequence[rng.integers(len(sequence)), ..., 3], inference.TARGET_LABELS))
-            if len(target):
-                middle = target[rng.integers(len(target))] + rng.integers(-size // 3, size // 3 + 1, size=2)
+        middle = _middle(sequence[rng.integers(len(sequence)), ..., 3], size // 3, rng)
         y, x = np.clip(middle - size // 2, 0, [height - size, width - size])
         patch = sequence[:, y : y + size, x : x + size]
         if rng.random() < 0.5:
@@ -272,3 +268,16 @@ def draw_batch(
         prior = priors.unpacked(patch[..., 4:]) if patch.shape[-1] > 4 else priors.of_labels(patch[..., 3], rng)
         known.append(torch.from_numpy(prior).movedim(-1, 1))
     return torch.stack(images), torch.stack(labels), torch.stack(known)
+
+
+def _middle(labels: NDArray[np.uint8], beside: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Row and column of the middle of a piece of a picture with these classes (h, w): up to `beside` pixels off a pixel that is
+    chosen as AROUND says, anywhere where there is none."""
+    chosen = rng.random()
+    if chosen < sum(AROUND.values()):
+        which = inference.TARGET_LABELS if chosen < AROUND["target"] else (Label.TORSO, Label.UPPER_ARM)
+        there = np.argwhere(np.isin(labels, which))
+        if len(there):
+            around: NDArray[np.int64] = there[rng.integers(len(there))] + rng.integers(-beside, beside + 1, size=2)
+            return around
+    return rng.integers(0, labels.shape)

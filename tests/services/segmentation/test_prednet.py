@@ -259,10 +259,14 @@ def test_where_nothing_is_known_priors_are_zero():
 
 def test_the_encoder_finds_the_same_wherever_a_thing_is_and_asks_for_pictures_of_its_own_multiple():
     net = PredNet(replace(SMALL, encoder=True))
-    image = torch.rand(1, 3, 64, 64)
+    image = torch.rand(1, 3, 32, 576)
     with torch.inference_mode():
-        here, there = net.look(image[..., :48]), net.look(image[..., 16:])
-    torch.testing.assert_close(here[1][..., 8:28, 12:20], there[1][..., 8:28, 4:12])  # away from the borders
+        here, there = net.look(image[..., :560]), net.look(image[..., 16:])
+    for i, stride in ((0, 2), *enumerate(net.settings.layer_strides[1:], 1)):
+        size = 16 // stride
+        middle = slice(240 // stride, 320 // stride)  # what is seen from there does not reach the borders
+        moved = slice(middle.start + size, middle.stop + size)
+        torch.testing.assert_close(here[i][..., moved], there[i][..., middle])
     with pytest.raises(ValueError, match="expected positive multiples of 16, got 24 x 32"):
         net.initial_state(1, 32, 24)
 
@@ -322,6 +326,23 @@ def test_a_training_goes_on_with_priors_and_an_encoder_where_it_was(data, tmp_pa
         later = train.Trainer.restore(tmp_path / "later", schedule)
         assert later.settings == replace(SMALL, priors=2, encoder=True)
         later.train_step(data, 0.1)
+
+
+def test_the_encoder_learns_masks_alone_before_the_network_learns_with_it(data):
+    schedule = train.Schedule(alone=2, patches=((0.0, 64, 2),), warm_up=1)
+    trainer = train.Trainer(SMALL, schedule, seed=1).extended(has_priors=False, pretrained=prednet.Encoder().state_dict())
+    own = ("encoder.", "gather.", "glance.")
+
+    def moved_by_a_step() -> set[bool]:
+        """Whether what moved, and what did not, is the encoder's."""
+        before = {name: value.clone() for name, value in trainer.net.state_dict().items()}
+        parts = trainer.train_step(data, 0.1)
+        assert ("error" in parts) == (trainer.step > schedule.alone)
+        after = trainer.net.state_dict()
+        return {name.startswith(own) for name, value in before.items() if (after[name] != value).any()}
+
+    assert moved_by_a_step() == moved_by_a_step() == {True}
+    assert moved_by_a_step() == {True, False}
 
 
 def test_training_may_start_from_weights_and_its_card_names_them(tmp_path):
