@@ -42,6 +42,7 @@ from penumbra.services.fusion.records import (
     SENSE_MODEL,
     SENSE_STATE,
     STATE,
+    UNITS,
 )
 from penumbra.shared.geometry import so3
 from penumbra.shared.native import inner, kernel
@@ -152,16 +153,30 @@ def clear_all(measurements, states, senses, P, rings):  # type: ignore[no-untype
         clear(Entries(measurements[i], states[i], senses[i], P[i], rings[i]))
 
 
+@inner
+def _calibration(sense_models, shares):  # type: ignore[no-untyped-def]
+    """The variance, in UNITS, of what a pose is off by because the senses that it is made of are: their calibration. To the
+    filter it is a part of their biases, which decay and average out; it does not."""
+    variance, total = 0.0, 0.0
+    for s in range(len(shares)):
+        variance += shares[s].weight * sense_models[s].floor ** 2
+        total += shares[s].weight
+    return variance / total if total > 0.0 else 0.0
+
+
 @kernel(
-    "MODEL[t], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], out i8[t, 2], "
-    "i8, i8, f8[4, 4], f8[6], f8[6, 6], SENSE_ESTIMATE[n]",
+    "MODEL[t], SENSE_MODEL[n], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], "
+    "out i8[t, 2], i8, i8, f8[4, 4], f8[6], f8[6, 6], SENSE_ESTIMATE[n]",
     MODEL=MODEL,
+    SENSE_MODEL=SENSE_MODEL,
     MEASUREMENT=MEASUREMENT,
     STATE=STATE,
     SENSE_STATE=SENSE_STATE,
     SENSE_ESTIMATE=SENSE_ESTIMATE,
 )
-def adopt(models, measurements, states, senses, P, rings, target, stamp_ns, T, velocity, covariance, known):  # type: ignore[no-untyped-def]
+def adopt(
+    models, sense_models, measurements, states, senses, P, rings, target, stamp_ns, T, velocity, covariance, known
+):  # type: ignore[no-untyped-def]  # fmt: skip
     """Makes a history of one entry: a pose T (4, 4) at a stamp, with velocity (6,), the pose's covariance (6, 6), and what is
     known of the senses. The velocity may be off by as much as one that is unknown."""
     history = Entries(measurements[target], states[target], senses[target], P[target], rings[target])
@@ -174,6 +189,14 @@ def adopt(models, measurements, states, senses, P, rings, target, stamp_ns, T, v
     so3.copy(T, now.R)
     so3.orthonormalise(now.R)
     spread(models[target], state, covariance)
+    scaled, vectors, calibration = np.empty((POSE, POSE)), np.empty((POSE, POSE)), _calibration(sense_models, known)
+    for i in range(POSE):
+        for j in range(POSE):
+            scaled[i, j] = state.P[i, j] / (UNITS[i] * UNITS[j])
+    so3.eigen(scaled, POSE, vectors)
+    if scaled[0, 0] > calibration:  # as it is in all that this observer publishes
+        for i in range(POSE):
+            state.P[i, i] -= calibration * UNITS[i] ** 2
     for i in range(POSE):
         now.velocity[i] = velocity[i]
     for s in range(len(known)):
@@ -208,16 +231,17 @@ def measure_all(
 
 
 @kernel(
-    "MODEL[t], MEASUREMENT[t, c], STATE[t, c], SENSE_STATE[t, c, n], f8[t, c, size, size], i8[t, 2], i8, "
+    "MODEL[t], SENSE_MODEL[n], MEASUREMENT[t, c], STATE[t, c], SENSE_STATE[t, c, n], f8[t, c, size, size], i8[t, 2], i8, "
     "out ESTIMATE[t], out SENSE_ESTIMATE[t, n]",
     MODEL=MODEL,
+    SENSE_MODEL=SENSE_MODEL,
     MEASUREMENT=MEASUREMENT,
     STATE=STATE,
     SENSE_STATE=SENSE_STATE,
     ESTIMATE=ESTIMATE,
     SENSE_ESTIMATE=SENSE_ESTIMATE,
 )
-def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, shares):  # type: ignore[no-untyped-def]
+def estimate_all(models, sense_models, measurements, states, senses, P, rings, stamp_ns, out, shares):  # type: ignore[no-untyped-def]
     """`Bank.estimate`, one after the other."""
     p, R, covariance = np.empty(3), np.empty((3, 3)), np.empty((MOTION, MOTION))
     velocity, acceleration = np.empty(POSE), np.empty(POSE)
@@ -225,6 +249,13 @@ def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, 
         history = Entries(measurements[n], states[n], senses[n], P[n], rings[n])
         one, slot, found = models[n], find(history, stamp_ns), out[n]
         now, of_senses = states[n, slot], senses[n, slot]
+        total = 0.0
+        for s in range(len(of_senses)):
+            total += of_senses[s].gain
+        for s in range(len(of_senses)):
+            share = shares[n, s]
+            share.accepted_ns = of_senses[s].accepted_ns
+            share.weight = of_senses[s].gain / total if total > 0.0 else 0.0
         if now.stamp_ns == NEVER:
             for i in range(3):
                 p[i] = one.home[i, 3]
@@ -243,6 +274,8 @@ def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, 
                 velocity[i], acceleration[i] = now.velocity[i], now.acceleration[i]
             dt = max(0.0, (stamp_ns - now.stamp_ns) * 1e-9)
             move(one, dt, p, R, velocity, acceleration, covariance, now.agility)
+            for i in range(POSE):
+                covariance[i, i] += _calibration(sense_models, shares[n]) * UNITS[i] ** 2
             if stamp_ns > now.accepted_ns:  # a guess; what is measured is believed
                 within_reach(one, p, R)
             found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)
@@ -254,12 +287,5 @@ def estimate_all(models, measurements, states, senses, P, rings, stamp_ns, out, 
             found.pose[i, 3], found.pose[3, i] = p[i], 0.0
         found.pose[3, 3] = 1.0
         so3.copy(covariance, found.covariance)
-        total = 0.0
         for i in range(POSE):
             found.velocity[i] = velocity[i]
-        for s in range(len(of_senses)):
-            total += of_senses[s].gain
-        for s in range(len(of_senses)):
-            share = shares[n, s]
-            share.accepted_ns = of_senses[s].accepted_ns
-            share.weight = of_senses[s].gain / total if total > 0.0 else 0.0

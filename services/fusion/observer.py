@@ -82,7 +82,7 @@ class Bank:
                 self.logs[target].received(name, int(record["accepted_ns"]))
         T = rigid.transform(message.position, message.orientation)
         history.adopt(
-            *(self._models, *self._history, target),
+            *(self._models, self._sense_models, *self._history, target),
             *(message.stamp_ns, T, message.velocity, message.covariance, known),
         )
 
@@ -91,7 +91,7 @@ class Bank:
         otherwise as `ErrorStateObserver.estimate`."""
         models = self._models[targets]
         out, senses = np.empty(len(models), ESTIMATE), np.empty((len(models), len(self.names)), SENSE_ESTIMATE)
-        history.estimate_all(models, *self._history.of(targets), stamp_ns, out, senses)
+        history.estimate_all(models, self._sense_models, *self._history.of(targets), stamp_ns, out, senses)
         return out, senses
 
     def earliest_ns(self, target: int) -> int:

@@ -18,11 +18,14 @@ GATES = 3
 """How many gates a sense has: see `senses.Errors`."""
 NEVER = -(1 << 62)
 """The stamp of what has not happened."""
+NOBODY = -1
+"""The row of no sense."""
 
 
 def size(senses: int) -> int:
-    """Number of the state's errors: position, rotation, their velocities and accelerations, and the bias of each sense."""
-    return MOTION + POSE * senses
+    """Number of the state's errors: position, rotation, their velocities and accelerations, the bias of each sense, and the
+    offset of the one that is wrong."""
+    return MOTION + POSE * senses + POSE
 
 
 MODEL = np.dtype(
@@ -30,6 +33,7 @@ MODEL = np.dtype(
         *((name, "f8", 2) for name in ("jerk", "motion_time", "velocity_spread", "agility", "learning")),  # as in FusionSettings
         *((name, "f8") for name in ("damping", "doubt", "patience", "source_patience", "refusals")),
         *((name, "f8") for name in ("unobserved", "agreement_time", "horizon", "weight_time", "lost_age")),
+        *((name, "f8", 2) for name in ("offset_spread", "offset_drift")),
         ("limits", "f8", 4),  # as in Limits
         ("shoulder", "f8", 3),  # as in Arm
         ("upper_arm", "f8"),
@@ -77,6 +81,8 @@ STATE = np.dtype(
         ("velocity", "f8", POSE),
         ("acceleration", "f8", POSE),
         ("agility", "f8", 2),  # learned factors on the process noise, linear and angular
+        ("wrong", "i8"),  # row of the sense that is taken for wrong by an offset; NOBODY
+        ("offset", "f8", POSE),  # by which it is, in units of its standard deviation beforehand
     ]
 )
 """The filter after one measurement, without the covariance (size, size) of all errors, which is an array of its own."""
@@ -91,6 +97,7 @@ SENSE_STATE = np.dtype(
         ("accepted_ns", "i8"),  # and of the last accepted one
         ("refused", "i8"),  # how many were refused since
         ("refused_ns", "i8"),  # stamp of the first of them
+        ("unsteady", "i8"),  # whether they are off by no offset that stays
         # information that it brought [nats], fading: by how much it made the logarithm of the volume of the pose's uncertainty
         # smaller. It counts what was new: the hundredth measurement with the same error brings next to nothing
         ("gain", "f8"),
@@ -120,8 +127,8 @@ class History(NamedTuple):
     """The histories of targets (t,), each a ring of c entries, with n senses; see `history.py`.
 
     measurements (t, c) : MEASUREMENT. states (t, c) : STATE. senses (t, c, n) : SENSE_STATE. P (t, c, size, size) : covariances
-    of the errors of position, rotation, their velocities and accelerations, and the bias of each sense. rings (t, 2) : see
-    `history.py`.
+    of the errors of position, rotation, their velocities and accelerations, the bias of each sense, and the offset of a wrong
+    one. rings (t, 2) : see `history.py`.
     """
 
     measurements: NDArray[np.void]

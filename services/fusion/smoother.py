@@ -75,7 +75,7 @@ class States:
         so3.log(a["R"] @ b["R"].T, rotation)
         biases = self.senses["bias"][i] - of.senses["bias"][j]
         rates = a["velocity"] - b["velocity"], a["acceleration"] - b["acceleration"]
-        return np.concatenate([a["p"] - b["p"], rotation, *rates, biases.ravel()])
+        return np.concatenate([a["p"] - b["p"], rotation, *rates, biases.ravel(), a["offset"] - b["offset"]])
 
     def correct(self, i: int, error: Array, P: Array) -> None:
         """Moves state i by an error (size,), and gives it a covariance that belongs to the pose before, and turns with it."""
@@ -86,7 +86,8 @@ class States:
         so3.orthonormalise(now["R"])
         now["velocity"] += error[POSE : 2 * POSE]
         now["acceleration"] += error[2 * POSE : MOTION]
-        self.senses["bias"][i] += error[MOTION:].reshape(-1, POSE)
+        self.senses["bias"][i] += error[MOTION:-POSE].reshape(-1, POSE)
+        now["offset"] += error[-POSE:]
         self.P[i] = turned(turn, P)
 
 

@@ -32,8 +32,8 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.geometry import rigid
 from penumbra.sim.world.world import World, stream
-from penumbra.tests.bench import fusion
 from penumbra.tests.bench.lib import fusion_runs as runs
+from penumbra.tests.bench.lib import fusion_scores as scores
 from penumbra.tests.bench.lib import results
 from penumbra.tests.bench.lib.accuracy import OCCLUDED, VISIBLE
 from penumbra.tests.bench.lib.results import Part, Result, marked
@@ -64,8 +64,8 @@ def trajectories(subject: Subject, measurements: Sequence[Measurement], stamps_n
 
 
 def score(truth: rigid.Array, T: rigid.Array, covariance: Array, rolls: bool = True) -> Score:
-    """Of a pose (4, 4) with its covariance (6, 6); without `rolls` as `fusion.normalised`."""
-    return float(np.linalg.norm(truth[:3, 3] - T[:3, 3])), fusion.normalised(truth, T, covariance, rolls)
+    """Of a pose (4, 4) with its covariance (6, 6); without `rolls` as `scores.normalised`."""
+    return float(np.linalg.norm(truth[:3, 3] - T[:3, 3])), scores.normalised(truth, T, covariance, rolls)
 
 
 def summary(rows: Sequence[dict[str, Score]], dof: Sequence[int], states: Sequence[str]) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def summary(rows: Sequence[dict[str, Score]], dof: Sequence[int], states: Sequen
             "median_cm": 100.0 * float(np.median(errors)),
             "p95_cm": 100.0 * float(np.percentile(errors, 95)),
             "nees": float(nees.mean()),
-            "beyond_3_sigma": float(np.mean(nees > chi2.ppf(fusion.THREE_SIGMA, dof))),
+            "beyond_3_sigma": float(np.mean(nees > chi2.ppf(scores.THREE_SIGMA, dof))),
         }
     return out
 
@@ -95,11 +95,11 @@ def of_senses(seed: int, count: int, seconds: float, console: Console) -> dict[s
         for index in track(range(count), name, console=console, transient=True):
             run = runs.drawn(name, seed, index, seconds)
             run = runs.wronged(run, seed, index) if situation.wrong else run
-            observer = ErrorStateObserver(fusion.HOME, fusion.SPREAD)
-            player = fusion.Player(run, [fusion.taking(observer)])
-            times = [t for t in fusion.instants(run) if t < max(m.stamp for m in run.messages)]
+            observer = ErrorStateObserver(scores.HOME, scores.SPREAD)
+            player = scores.Player(run, [scores.taking(observer)])
+            times = [t for t in scores.instants(run) if t < max(m.stamp for m in run.messages)]
             told = [(m.source, runs.ns(m.stamp), m.T, m.information) for m in run.messages]
-            subject = Subject(fusion.HOME, fusion.SPREAD)
+            subject = Subject(scores.HOME, scores.SPREAD)
             for t, poses in zip(times, trajectories(subject, told, [runs.ns(t) for t in times]), strict=True):
                 player.until(t)
                 poses["published"] = observer.estimate(runs.ns(t))
@@ -107,7 +107,7 @@ def of_senses(seed: int, count: int, seconds: float, console: Console) -> dict[s
                 rows.append({key: score(run.at(t), each.T, each.covariance, rolls) for key, each in poses.items()})
                 dof.append(6 if rolls else 5)
                 states.append(poses["smoothed"].state)
-        found[name] = summary(rows, dof, states) | {"band": fusion.band(np.full(count, np.mean(dof)))}
+        found[name] = summary(rows, dof, states) | {"band": scores.band(np.full(count, np.mean(dof)))}
     return found
 
 

@@ -16,6 +16,7 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import perturb
 from penumbra.tests.bench import fusion
 from penumbra.tests.bench.lib import fusion_runs as runs
+from penumbra.tests.bench.lib import fusion_scores as scores
 from penumbra.tests.bench.lib.fusion_baselines import FixedLagSmoother, Newest
 
 TILTED = rigid.from_rpy([0.02, -0.03, 0.15], [0.4, -0.3, 0.7])
@@ -29,24 +30,24 @@ def test_the_normalised_error_is_the_squared_one_in_standard_deviations() -> Non
     error = sigma * np.array([1.0, -2.0, 0.5, 0.3, -0.1, 0.2])
     T = perturb(TILTED, -error)
     expected = 1.0 + 4.0 + 0.25 + 0.09 + 0.01 + 0.04
-    assert fusion.normalised(TILTED, T, np.diag(sigma**2), rolls=True) == pytest.approx(expected, rel=1e-9)
+    assert scores.normalised(TILTED, T, np.diag(sigma**2), rolls=True) == pytest.approx(expected, rel=1e-9)
     L = np.random.default_rng(0).normal(size=(6, 6))
     said = perturb(TILTED, -1e-3 * L @ np.ones(6))
-    assert fusion.normalised(TILTED, said, 1e-6 * L @ L.T, rolls=True) == pytest.approx(6.0, rel=1e-9)
+    assert scores.normalised(TILTED, said, 1e-6 * L @ L.T, rolls=True) == pytest.approx(6.0, rel=1e-9)
 
 
 def test_without_the_roll_a_turn_about_the_limb_is_no_error_and_a_turn_across_it_is() -> None:
     rolled = TILTED @ rigid.from_rpy([0, 0, 0], [0.5, 0, 0])
     covariance = np.diag(np.square([0.01, 0.01, 0.01, 0.1, 0.1, 0.1]))
-    assert fusion.normalised(TILTED, rolled, covariance, rolls=False) == pytest.approx(0.0, abs=1e-18)
-    assert fusion.normalised(TILTED, rolled, covariance, rolls=True) == pytest.approx(25.0)
+    assert scores.normalised(TILTED, rolled, covariance, rolls=False) == pytest.approx(0.0, abs=1e-18)
+    assert scores.normalised(TILTED, rolled, covariance, rolls=True) == pytest.approx(25.0)
     across = TILTED @ rigid.from_rpy([0, 0, 0], [0, 0.2, 0])
-    assert fusion.normalised(TILTED, across, covariance, rolls=False) == pytest.approx(4.0)
+    assert scores.normalised(TILTED, across, covariance, rolls=False) == pytest.approx(4.0)
 
 
 def test_the_band_is_that_of_the_mean_of_independent_chi_square_values() -> None:
-    np.testing.assert_allclose(fusion.band([6.0] * 100), chi2.ppf([0.025, 0.975], 600) / 100)
-    np.testing.assert_allclose(fusion.band([6.0, 5.0, 5.0]), chi2.ppf([0.025, 0.975], 16) / 3)
+    np.testing.assert_allclose(scores.band([6.0] * 100), chi2.ppf([0.025, 0.975], 600) / 100)
+    np.testing.assert_allclose(scores.band([6.0, 5.0, 5.0]), chi2.ppf([0.025, 0.975], 16) / 3)
 
 
 @pytest.mark.parametrize(("factor", "inside"), [(1.0, (0.9, 1.0)), (1.5, (0.0, 0.05)), (0.7, (0.0, 0.05))])
@@ -57,7 +58,7 @@ def test_a_perfect_filter_is_inside_its_band_and_one_that_is_too_sure_or_too_shy
     rng = np.random.default_rng(0)
     times = np.tile(0.11 * np.arange(instants), count)
     dof = np.where(times < 10.0, 6, 5)
-    found = fusion.consistency(times, factor * rng.chisquare(dof), dof, count)
+    found = scores.consistency(times, factor * rng.chisquare(dof), dof, count)
     assert found["mean"] == pytest.approx(factor * dof.mean(), rel=0.02)
     np.testing.assert_allclose(found["band"], chi2.ppf([0.025, 0.975], count * dof.mean()) / count)
     assert inside[0] <= found["inside"] <= inside[1]
@@ -65,7 +66,7 @@ def test_a_perfect_filter_is_inside_its_band_and_one_that_is_too_sure_or_too_shy
 
 
 def test_nothing_to_score_is_no_score() -> None:
-    assert fusion.consistency(np.array([]), np.array([]), np.array([]), 3) == {"mean": None, "band": None, "inside": None}
+    assert scores.consistency(np.array([]), np.array([]), np.array([]), 3) == {"mean": None, "band": None, "inside": None}
 
 
 # ---- runs
@@ -145,7 +146,7 @@ def test_a_fast_hand_is_as_fast_as_hands_are_and_no_faster() -> None:
 
 
 def test_late_and_shuffled_measurements_end_in_the_same_poses() -> None:
-    found = fusion.late(3, 0, 3.0)
+    found = scores.late(3, 0, 3.0)
     assert list(found) == ["0", "50", "200", "shuffled"]
     assert all(each.difference < 1e-9 for each in found.values())
     np.testing.assert_allclose(found["50"].now.mean(), found["0"].now.mean(), rtol=0.5)
@@ -161,7 +162,7 @@ def test_an_observer_that_takes_late_for_new_is_found_out(monkeypatch: pytest.Mo
             return super().measure(source, self.newest_ns, *rest)
 
     monkeypatch.setattr(fusion, "ErrorStateObserver", Naive)
-    assert fusion.late(3, 0, 3.0)["shuffled"].difference > 1e-3
+    assert scores.late(3, 0, 3.0)["shuffled"].difference > 1e-3
 
 
 # ---- baselines
@@ -247,9 +248,9 @@ def test_a_tiny_run_writes_the_layout(
 
 
 def test_counts_and_states_are_those_of_all_runs() -> None:
-    scores = fusion.Scores(
+    one = scores.Scores(
         times=np.array([1.0, 2.0]),
-        errors={key: np.array([0.01, 0.03]) for key in ("ours", *fusion.BASELINES)},
+        errors={key: np.array([0.01, 0.03]) for key in ("ours", *scores.BASELINES)},
         nees=np.array([25.0, 6.0]),
         nees_dof=np.array([6, 6]),
         states=np.array(["tracking", "coasting"]),
@@ -259,7 +260,7 @@ def test_counts_and_states_are_those_of_all_runs() -> None:
         at_stamps={"vision": np.array([[0.02, 0.01]]), "haptic": np.zeros((0, 2))},
         gated=2,
     )
-    row = fusion.summary([scores, dataclasses.replace(scores, nees=np.array([6.0, 25.0]), gated=3)])
+    row = fusion.summary([one, dataclasses.replace(one, nees=np.array([6.0, 25.0]), gated=3)])
     assert row["refused"] == 5
     assert row["states"] == {"tracking": 0.5, "coasting": 0.5, "lost": 0.0}
     assert row["error_cm"] == pytest.approx(2.0) and row["nees"] == 15.5 and row["nis"] is None

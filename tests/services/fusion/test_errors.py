@@ -26,8 +26,13 @@ PERIOD = {"vision": 0.05, "haptic": 0.01}
 # ---- consistency: the truth moves and the senses err as the filter assumes
 
 
-def normalised_error(there: dict[str, tuple[float, float]], settings: FusionSettings, seed: int, seconds: float = 1.0) -> float:
-    """Squared error in units of the covariance (6 degrees of freedom) after a run; there: sense -> from and until when [s]."""
+def normalised_error(
+    there: dict[str, tuple[float, float]], settings: FusionSettings, seed: int, seconds: float = 1.0, wrong: float = np.inf
+) -> float:
+    """Squared error in units of the covariance (6 degrees of freedom) after a run.
+
+    there: sense -> from and until when [s]. wrong: from when on [s] the skin is off by 10 cm.
+    """
     rng = np.random.default_rng(seed)
     spread = (0.05, 0.15)
     T = perturb(HOME, rng.normal(size=6) * np.repeat(spread, 3))
@@ -48,6 +53,8 @@ def normalised_error(there: dict[str, tuple[float, float]], settings: FusionSett
             if name == "haptic":
                 seen = without_roll(measured, SKIN)
                 measured = measured @ rigid.from_rpy([0, 0, 0], [rng.normal(), 0, 0])  # a roll that is made up
+                if k * h >= wrong:
+                    measured = perturb(measured, [0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
             observer.measure(name, ns(k * h), measured, seen)
         if k * h < seconds:
             way, *rates = F @ [np.zeros(6), *rates] + kick @ rng.normal(size=(3, 6))
@@ -74,6 +81,13 @@ def test_errors_are_as_large_as_the_covariance_says(there: dict[str, tuple[float
     runs = 30
     total = sum(normalised_error(there, settings, seed) for seed in range(runs))
     # fixed seeds: the band catches a wrong filter, not bad luck
+    low, high = chi2.ppf([0.001, 0.999], 6 * runs)
+    assert low < total < high
+
+
+def test_errors_are_as_large_as_the_covariance_says_while_how_a_wrong_sense_changes_is_used() -> None:
+    runs, both = 30, {"vision": (0.0, 9.0), "haptic": (0.0, 9.0)}
+    total = sum(normalised_error(both, MATCHED, seed, wrong=0.5) for seed in range(runs))
     low, high = chi2.ppf([0.001, 0.999], 6 * runs)
     assert low < total < high
 
@@ -170,6 +184,21 @@ def test_a_limb_that_is_faster_than_expected_is_followed() -> None:
                 errors[id(observer)].append(float(np.linalg.norm(pose_error(T, observer.estimate(ns(t)).T)[:3])))
     assert np.mean(errors[id(learning)]) < 0.2 * np.mean(errors[id(stubborn)]), "it loses the limb at each reach"
     assert learning.log.counts["vision"].gated < 5
+
+
+def test_a_fast_hand_that_rests_is_expected_to_set_out_as_it_did_before() -> None:
+    observers = {speed: ErrorStateObserver(HOME, SPREAD) for speed in ("fast", "slow")}
+    for k in range(100):
+        t = 0.05 * k
+        s = min(t % 1.0 / 0.35, 1.0) if t < 4.0 else 0.0
+        way = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        moved = 0.3 * (way if int(t) % 2 == 0 else 1.0 - way) if t < 4.0 else 0.0
+        for speed, observer in observers.items():
+            T = perturb(HOME, [0.0, moved if speed == "fast" else 0.01 * moved, 0.0, 0.0, 0.0, 0.0])
+            observer.measure("vision", ns(t), T, VISION)
+    sigma = {speed: float(observer.estimate(ns(5.05)).covariance[1, 1] ** 0.5) for speed, observer in observers.items()}
+    # within 0.1 s a reach of 0.35 s has gone 5 cm
+    assert 3.0 * sigma["fast"] > 0.05 > 3.0 * sigma["slow"]
 
 
 def test_a_sense_that_is_noisier_than_it_says_is_doubted_and_not_refused() -> None:
