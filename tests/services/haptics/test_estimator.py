@@ -213,7 +213,8 @@ def test_from_a_broad_prior_a_limb_of_unknown_size_is_found(skin: Skin, response
         errors.append(rigid.pose_error(T, which.pose))
         squares.append(nees(T, last))
     lateral, height = np.sqrt(np.mean(np.square(errors), axis=0))[1:3]
-    assert lateral < 0.002 + 1.2 * gap**2 and height < 0.002 + 0.9 * gap**2
+    # boards beside leave a third of a lone pad's signal at 10 cm
+    assert lateral < 0.002 + 1.8 * gap**2 and height < 0.002 + 1.4 * gap**2
     assert np.median(squares) < 2.0
 
 
