@@ -317,8 +317,8 @@ def test_a_training_goes_on_with_priors_and_an_encoder_where_it_was(data, tmp_pa
         assert again.extended(has_priors=True, pretrained=begun_with) is again
         again.train_step(data, 0.1)
         assert again.net.prior_input is not None and again.net.prior_input.weight.abs().sum() > 0.0
-        new = {name: value for name, value in again.net.named_parameters() if name.startswith(("context.", "glance."))}
-        assert new and all(value.abs().sum() > 0.0 for value in new.values())
+        begun = {name: value for name, value in again.net.named_parameters() if name.startswith(("context.", "glance."))}
+        assert begun and all(value.abs().sum() > 0.0 for value in new.values())
         own, of_encoder = (group["lr"] for group in again.optimizer.param_groups)
         assert of_encoder == pytest.approx(schedule.encoder_share * own)
         again.train_step(data, 0.1)
