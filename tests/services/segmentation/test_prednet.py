@@ -318,7 +318,7 @@ def test_a_training_goes_on_with_priors_and_an_encoder_where_it_was(data, tmp_pa
         again.train_step(data, 0.1)
         assert again.net.prior_input is not None and again.net.prior_input.weight.abs().sum() > 0.0
         begun = {name: value for name, value in again.net.named_parameters() if name.startswith(("context.", "glance."))}
-        assert begun and all(value.abs().sum() > 0.0 for value in new.values())
+        assert begun and all(value.abs().sum() > 0.0 for value in begun.values())
         own, of_encoder = (group["lr"] for group in again.optimizer.param_groups)
         assert of_encoder == pytest.approx(schedule.encoder_share * own)
         again.train_step(data, 0.1)
