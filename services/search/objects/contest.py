@@ -14,7 +14,7 @@ import numpy as np
 from penumbra.services.search.contour import Model
 from penumbra.services.search.objects import basin
 from penumbra.services.search.objects.basin import Prior, Shape
-from penumbra.services.search.objects.region import ROBUST, Floats, Level, Window, descend, hypotheses, lines
+from penumbra.services.search.objects.region import Floats, Level, Window, descend, hypotheses, lines
 from penumbra.services.search.settings import ONE_IN_10_000
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
@@ -154,7 +154,7 @@ def distinct(poses: list[Array], same: tuple[float, float], most: int) -> list[A
 def follow(shape: Shape, window: Window, table: Floats, prior: Prior) -> Found:
     """The pose near a prediction, by the log-odds (BINS^3,) of colours that are known."""
     small, large = window.factors[max(len(window.factors) - 2, 0)], window.factors[-1]
-    T = descend(shape, shape.coarse, window.level(small, table), prior.T, prior, (7, 6), small == large, ROBUST[1])
+    T = descend(shape, shape.coarse, window.level(small, table), prior.T, prior, (7, 6), small == large, near=True)
     at = window.level(large, table)
-    T = descend(shape, shape.fine, at, T, prior, (5, 4), True, ROBUST[1])
+    T = descend(shape, shape.fine, at, T, prior, (5, 4), True, near=True)
     return scored(shape, shape.fine, at, T, prior, True)

@@ -70,6 +70,8 @@ standard deviation usually is [px of the image]: at poses fitted to 13 photograp
 _DILATION, _WAVES = 6, np.arange(7, 7 + 4 * HARMONICS)
 """Places of the contour's own errors behind the six of the pose: its dilation, and cosines and sines of the harmonics, for the
 contour and for the creases."""
+STIFF = 0.01
+"""Usual standard deviation of waves near a prediction [px of the image]: the contour has hardly changed since it was fitted."""
 ASSUMED, ESTIMATES = 1.0, 3
 """Number of waves that the usual standard deviation counts as where that of a picture is estimated, and passes of that."""
 DEPTHS = (0.95, 1.0, 1.05)
@@ -419,9 +421,11 @@ def _equations(one: Lines, inside: bool, at: Level, T: Array, width: float) -> t
     return J, J * weights[:, None]
 
 
-def information(found: list[tuple[Lines, bool]], at: Level, T: Array, width: float) -> tuple[Array, Array]:
+def information(
+    found: list[tuple[Lines, bool]], at: Level, T: Array, width: float, usual_px: float = WAVES
+) -> tuple[Array, Array]:
     """The information (6, 6) about the pose error at T and its right side (6,), of the lines of contour and creases (True), with
-    the contour's own errors marginalised (Schur complement).
+    the contour's own errors marginalised (Schur complement); `usual_px`: the waves' usual standard deviation [px of the image].
 
     How large the waves are is estimated with them (the evidence procedure: MacKay 1992, doi:10.1162/neco.1992.4.3.415): an exact
     mesh shows the pose by small differences of its shape, another one by its size and place alone.
@@ -432,7 +436,7 @@ def information(found: list[tuple[Lines, bool]], at: Level, T: Array, width: flo
         J, weighted = _equations(one, inside, at, T, width)
         H, g = H + weighted.T @ J, g + weighted.T @ one.contour.r
     H[_DILATION, _DILATION] += (DILATION / at.scale) ** -2
-    usual = (WAVES / at.scale) ** 2
+    usual = (usual_px / at.scale) ** 2
     variance = usual
     for _ in range(ESTIMATES):
         A = H.copy()
@@ -455,12 +459,14 @@ def descend(
     prior: Prior,
     reaches: tuple[int, ...],
     creases: bool,
-    robust: float = ROBUST[0],
+    near: bool = False,
 ) -> Array:
-    """Steps of least squares, one for each length of the lines in `reaches` [px], with or without creases."""
+    """Steps of least squares, one for each length of the lines in `reaches` [px], with or without creases. `near` a prediction,
+    what hides the object shall not take the pose along: offsets count less beyond a smaller width, and no waves are expected."""
+    robust, waves = (ROBUST[1], STIFF) if near else (ROBUST[0], WAVES)
     for reach in reaches:
         found = [(lines(shape, model, at, T, reach, inside), inside) for inside in ((False, True) if creases else (False,))]
-        H, g = information(found, at, T, robust * reach)
+        H, g = information(found, at, T, robust * reach, waves)
         if (colours := at.compared(shape, T)) is not None:
             more, towards = colours.information
             H, g = H + more, g + towards
