@@ -70,7 +70,7 @@ standard deviation usually is [px of the image]: at poses fitted to 13 photograp
 _DILATION, _WAVES = 6, np.arange(7, 7 + 4 * HARMONICS)
 """Places of the contour's own errors behind the six of the pose: its dilation, and cosines and sines of the harmonics, for the
 contour and for the creases."""
-STIFF = 0.01
+STIFF = 0.1
 """Usual standard deviation of waves near a prediction [px of the image]: the contour has hardly changed since it was fitted."""
 ASSUMED, ESTIMATES = 1.0, 3
 """Number of waves that the usual standard deviation counts as where that of a picture is estimated, and passes of that."""
