@@ -14,7 +14,7 @@ import numpy as np
 from penumbra.services.search.contour import Model
 from penumbra.services.search.objects import basin
 from penumbra.services.search.objects.basin import Prior, Shape
-from penumbra.services.search.objects.region import ROBUST, Floats, Level, Window, descend, hypotheses, lines
+from penumbra.services.search.objects.region import Floats, Level, Window, descend, hypotheses, lines
 from penumbra.services.search.settings import ONE_IN_10_000
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
@@ -30,8 +30,11 @@ eleven to one in five of the first hypotheses of simulated things that are then 
 CONVINCING = 3.0
 """Log-likelihood of the mesh's colours, 20 to 1, from which they prove a pose."""
 AGAIN = (9.0, 21.0, 33.0), 20
-"""Angles [deg] by which, and number of axes about which the starts are turned to look once more for a mesh with colours, where
-neither colours nor contour are convincing."""
+"""Angles [deg] by which, and number of axes about which the starts are turned to look once more where the best pose is refuted,
+and for a mesh with colours where neither colours nor contour are convincing."""
+REFUTED = 0.0
+"""Log-likelihood below which a pose explains the picture less than a contour anywhere else does: it is not the right one, however
+much of its contour happens to lie on edges."""
 SUPPORTED = (0.35, 0.65)
 """Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful: on photographs right poses
 have 0.7 to 1 where nothing hides the object, and of those far off few have more than 0.6."""
@@ -89,7 +92,8 @@ def search(shape: Shape, window: Window, prior: Prior, reach: float) -> list[Fou
         table = window.of_poses(model, [rigid.perturb(T, [*way, 0.0, 0.0, 0.0]) for T, way in zip(starts, shifts, strict=True)])
     at = window.level(window.factors[0], table)
     found = followed(shape, window, prior, of_mask, first(shape, at, hypotheses(model, at, starts, prior, reach)))
-    if shape.paints is not None and (not found or (found[0].colours < CONVINCING and found[0].support < SUPPORTED[1])):
+    unproved = not found or (found[0].colours < CONVINCING and found[0].support < SUPPORTED[1])
+    if not found or found[0].score < REFUTED or (shape.paints is not None and unproved):
         more = hypotheses(model, at, basin.starts(prior.T, *AGAIN), prior, reach)
         found = sorted([*found, *followed(shape, window, prior, of_mask, first(shape, at, more))], key=lambda one: -one.score)
     return found
@@ -150,7 +154,7 @@ def distinct(poses: list[Array], same: tuple[float, float], most: int) -> list[A
 def follow(shape: Shape, window: Window, table: Floats, prior: Prior) -> Found:
     """The pose near a prediction, by the log-odds (BINS^3,) of colours that are known."""
     small, large = window.factors[max(len(window.factors) - 2, 0)], window.factors[-1]
-    T = descend(shape, shape.coarse, window.level(small, table), prior.T, prior, (7, 6), small == large, ROBUST[1])
+    T = descend(shape, shape.coarse, window.level(small, table), prior.T, prior, (7, 6), small == large, near=True)
     at = window.level(large, table)
-    T = descend(shape, shape.fine, at, T, prior, (5, 4), True, ROBUST[1])
+    T = descend(shape, shape.fine, at, T, prior, (5, 4), True, near=True)
     return scored(shape, shape.fine, at, T, prior, True)

@@ -224,7 +224,8 @@ class _Colours:
         T, covariance = self._posterior(found, prior)
         if best.support < contest.SUPPORTED[0] or (mask is not None and overlap < FITS) or best.length < basin.NOISE.correlation:
             return _lost(T, overlap)
-        if best.support < contest.SUPPORTED[1] or self._rigid.error(covariance, T) > CERTAIN * self._rigid.diameter:
+        refuted = best.support < contest.SUPPORTED[1] or best.score < contest.REFUTED
+        if refuted or self._rigid.error(covariance, T) > CERTAIN * self._rigid.diameter:
             return ObjectEstimate(T, covariance, overlap, "doubtful")
         return ObjectEstimate(T, covariance, overlap, "occluded" if covered > COVERS else "tracking")
 

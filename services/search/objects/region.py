@@ -9,8 +9,8 @@
      offset. Without a mask every hypothesis learns the colours from its own silhouette. Creases count as edges, too.
   4. The hypotheses compete by the likelihood of the offsets (`contest.py`).
 
-How much larger the contour is than the object in the picture, by the mesh's and the picture's errors, is unknown and
-marginalised. A mask's boundary itself says nothing within BAND_PX.
+How much larger the contour is than the object in the picture, and how it errs in waves along its direction, by the errors of
+mesh, shadows and picture, is unknown and marginalised (`information`). A mask's boundary itself says nothing within BAND_PX.
 """
 
 from __future__ import annotations
@@ -62,8 +62,18 @@ which are often not seen."""
 EDGE, CORRELATION = 0.4, 6.0
 """Standard deviation that an offset has at least, and length of contour over which offsets err together [px]."""
 DILATION = 1.0
-"""Standard deviation of the contour's being too large or small [px]: meshes and poses of real objects differ from their pictures
-by this much."""
+"""Standard deviation of the contour's being too large or small [px of the image]: meshes and poses of real objects differ from
+their pictures by this much."""
+HARMONICS, WAVES = 4, 0.3
+"""Number of harmonics of the normal's direction by which the contour, and the creases, err as a whole (waves), and what their
+standard deviation usually is [px of the image]: at poses fitted to 13 photographs, their amplitudes are 0.1 to 0.7 px."""
+_DILATION, _WAVES = 6, np.arange(7, 7 + 4 * HARMONICS)
+"""Places of the contour's own errors behind the six of the pose: its dilation, and cosines and sines of the harmonics, for the
+contour and for the creases."""
+STIFF = 0.1
+"""Usual standard deviation of waves near a prediction [px of the image]: the contour has hardly changed since it was fitted."""
+ASSUMED, ESTIMATES = 1.0, 3
+"""Number of waves that the usual standard deviation counts as where that of a picture is estimated, and passes of that."""
 DEPTHS = (0.95, 1.0, 1.05)
 """Distances of the hypotheses, as shares of the start's."""
 ANGLES = 8
@@ -398,28 +408,47 @@ def _lines(points, odds, gradient, guarded, shown, inside, reach, temperature, f
 
 
 def _equations(one: Lines, inside: bool, at: Level, T: Array, width: float) -> tuple[Array, Array]:
-    """How the offsets change with the pose error and the contour's dilation (n, 7), and the same with the offsets' weights: those
-    count less and less beyond `width` [px]."""
-    J = one.contour.jacobian(T, at.k)
+    """How the offsets change with the pose error and the contour's own errors (n, m), and the same with the offsets' weights:
+    those count less and less beyond `width` [px]."""
+    normal = one.contour.points["normal"]
+    turns = np.arange(1, HARMONICS + 1) * np.arctan2(normal[:, 1], normal[:, 0])[:, None]
+    J = np.zeros((len(normal), 7 + len(_WAVES)))
+    J[:, :7] = one.contour.jacobian(T, at.k)
     if inside:
-        J[:, 6] = 0.0
+        J[:, _DILATION] = 0.0
+    J[:, np.split(_WAVES, 2)[int(inside)]] = np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
     weights = one.length * basin.robust(one.contour.r, width) / ((one.variance + EDGE**2) * CORRELATION)
     return J, J * weights[:, None]
 
 
-def _marginal(H: Array, g: Array) -> tuple[Array, Array]:
-    """The information (6, 6) and right sides (6, ...) about the pose error without the dilation (Schur complement)."""
-    gain = H[:6, 6] / (H[6, 6] + DILATION**-2)
-    return H[:6, :6] - np.outer(gain, H[6, :6]), g[:6] - np.multiply.outer(gain, g[6])
+def information(
+    found: list[tuple[Lines, bool]], at: Level, T: Array, width: float, usual_px: float = WAVES
+) -> tuple[Array, Array]:
+    """The information (6, 6) about the pose error at T and its right side (6,), of the lines of contour and creases (True), with
+    the contour's own errors marginalised (Schur complement); `usual_px`: the waves' usual standard deviation [px of the image].
 
-
-def information(found: list[tuple[Lines, bool]], at: Level, T: Array, width: float) -> tuple[Array, Array]:
-    """The information (6, 6) about the pose error at T and its right side (6,), of the lines of contour and creases (True)."""
-    H, g = np.zeros((7, 7)), np.zeros(7)
+    How large the waves are is estimated with them (the evidence procedure: MacKay 1992, doi:10.1162/neco.1992.4.3.415): an exact
+    mesh shows the pose by small differences of its shape, another one by its size and place alone.
+    """
+    n = 7 + len(_WAVES)
+    H, g = np.zeros((n, n)), np.zeros(n)
     for one, inside in found:
         J, weighted = _equations(one, inside, at, T, width)
         H, g = H + weighted.T @ J, g + weighted.T @ one.contour.r
-    return _marginal(H, g)
+    H[_DILATION, _DILATION] += (DILATION / at.scale) ** -2
+    usual = (usual_px / at.scale) ** 2
+    variance = usual
+    for _ in range(ESTIMATES):
+        A = H.copy()
+        A[:6, :6] += Limits().information
+        A[_WAVES, _WAVES] += 1.0 / variance
+        P = np.linalg.inv(A)
+        waves = P[_WAVES] @ g
+        shown = len(_WAVES) - float(P[_WAVES, _WAVES].sum()) / variance  # number of waves that the lines determine
+        variance = (float(waves @ waves) + ASSUMED * usual) / (shown + ASSUMED)
+    H[_WAVES, _WAVES] += 1.0 / variance
+    gain = np.linalg.solve(H[6:, 6:], H[6:, :6]).T
+    return H[:6, :6] - gain @ H[6:, :6], g[:6] - gain @ g[6:]
 
 
 def descend(
@@ -430,12 +459,14 @@ def descend(
     prior: Prior,
     reaches: tuple[int, ...],
     creases: bool,
-    robust: float = ROBUST[0],
+    near: bool = False,
 ) -> Array:
-    """Steps of least squares, one for each length of the lines in `reaches` [px], with or without creases."""
+    """Steps of least squares, one for each length of the lines in `reaches` [px], with or without creases. `near` a prediction,
+    what hides the object shall not take the pose along: offsets count less beyond a smaller width, and no waves are expected."""
+    robust, waves = (ROBUST[1], STIFF) if near else (ROBUST[0], WAVES)
     for reach in reaches:
         found = [(lines(shape, model, at, T, reach, inside), inside) for inside in ((False, True) if creases else (False,))]
-        H, g = information(found, at, T, robust * reach)
+        H, g = information(found, at, T, robust * reach, waves)
         if (colours := at.compared(shape, T)) is not None:
             more, towards = colours.information
             H, g = H + more, g + towards
@@ -453,29 +484,19 @@ _DIAGONAL = np.diag_indices(6)
 
 def covariance(shape: Shape, at: Level, T: Array, trust: float, colours: Compared | None) -> Array:
     """The covariance (6, 6) of a pose by contour and creases, whose errors are trusted by a share `trust`, and by the mesh's
-    colours where they convince, with the errors of the whole contour (WAVES), of the mesh's scale (SCALE) and of what rotations
-    it shows (LEVER)."""
-    H, g, n = np.zeros((7, 7)), np.zeros((7, 4 * len(WAVES))), 2 * len(WAVES)
-    turns = np.arange(1, len(WAVES) + 1)
+    colours where they convince, with the errors of the mesh's scale (SCALE) and of what rotations it shows (LEVER)."""
+    both = [(lines(shape, shape.fine, at, T, ENDING, inside), inside) for inside in (False, True)]
+    H, _ = information(both, at, T, 0.7 * ENDING)
     lever2 = 0.0
-    for i, inside in enumerate((False, True)):
-        one = lines(shape, shape.fine, at, T, ENDING, inside)
+    for one, inside in both:
         J, weighted = _equations(one, inside, at, T, 0.7 * ENDING)
-        normal = one.contour.points["normal"]
-        angle = turns * np.arctan2(normal[:, 1], normal[:, 0])[:, None]
-        waves = np.concatenate([np.cos(angle), np.sin(angle)], axis=1) * np.tile(WAVES, 2) / at.scale
-        H, g[:, i * n : (i + 1) * n] = H + weighted.T @ J, weighted.T @ waves
         lever2 += float(np.sum(np.hypot(weighted[:, 0], weighted[:, 1]) * np.hypot(J[:, 0], J[:, 1]))) * (LEVER * shape.size) ** 2
-    H, bent = _marginal(H, g)
     # a body of revolution shows nothing of its turn, but its facets and a scan's roughness seem to
     scale = np.repeat([1.0, 1.0 / shape.size], 3)
     values, vectors = np.linalg.eigh(np.outer(scale, scale) * (H - np.diag(np.repeat([0.0, lever2], 3))))
     believed = (vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scale, scale)
-    weak = Limits().information
-    P = np.linalg.inv(believed + weak)
-    bent = P @ believed @ np.linalg.solve(H + weak, bent)
+    P = np.linalg.inv(believed + Limits().information)
     farther = np.concatenate([SCALE * T[:3, 3], np.zeros(3)])  # a larger object further away looks the same
-    P = P + bent @ bent.T
     if colours is None:
         return np.asarray((P + np.outer(farther, farther)) / trust, np.float64)
     P = np.linalg.inv(np.linalg.inv(P / trust) + colours.information[0])
@@ -486,9 +507,6 @@ SCALE = 0.01
 """Standard deviation of a mesh's scale: of scans, and of objects of one kind."""
 LEVER = 0.02
 """Standard deviation of the levers by which the contour shows a rotation, as a share of the object's size."""
-WAVES = (0.8, 0.8, 0.8, 0.8)
-"""Standard deviations of errors of the contour that change slowly with its direction, as the first harmonics of that [px]:
-meshes, poses and shadows are not more exact (residuals of 15 photographs with true poses)."""
 ENDING = 4
 """Reach of the lines of the last steps [px]."""
 

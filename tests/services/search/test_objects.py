@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from penumbra.services.command import cli
 from penumbra.services.search.contour import Model
 from penumbra.services.search.objects import contest, meshes, region, tools
 from penumbra.services.search.objects.creases import Creases
-from penumbra.services.search.objects.pose import RigidObject, Tracker, find_pose, started
+from penumbra.services.search.objects.pose import RigidObject, Tracker, _Colours, find_pose, started
 from penumbra.shared.body.anatomy import Mesh
 from penumbra.shared.geometry import raster
 from penumbra.shared.geometry.lens import Lens
@@ -226,6 +227,42 @@ def test_the_last_steps_of_a_search_bring_a_distance_nearer_to_the_true_one(dril
     (found,) = contest.settled(rigid.shape, [begin], prior)
     assert abs(found.T[2, 3] - true[2, 3]) < 0.5 * abs(far[2, 3] - true[2, 3])
     assert found.score > begin.score
+
+
+def test_a_contour_that_errs_in_waves_hardly_moves_the_pose_and_a_moved_one_does(drill, rigid):
+    T, _ = scene(drill, (79, 0), EXACT)
+    true = T @ rigid.T_object_middle
+    window = region.Window(photographed(drill, T, 0), None, None, K, rigid.shape, true, 0.0)
+    at = window.level(window.factors[-1], window.of_pose(rigid.shape.coarse, true, 0.015))
+    seen = region.lines(rigid.shape, rigid.shape.fine, at, true, 4)
+    points = seen.contour.points
+
+    def distance(r: np.ndarray, level: region.Level) -> float:
+        lines = replace(seen, contour=replace(seen.contour, r=r))
+        H, g = region.information([(lines, False)], level, true, 1e3)
+        return float(np.linalg.solve(H + started(rigid, T).information, g)[2])
+
+    normal = points["normal"]
+    wave = np.cos(3.0 * np.arctan2(normal[:, 1], normal[:, 0]))
+    farther = seen.contour.jacobian(true, at.k)[:, 2] * 0.02
+    assert distance(farther, at) > 0.01
+    # where a pixel of the level is ten of the picture, waves of a pixel are not expected
+    assert abs(distance(wave, at)) < 0.5 * abs(distance(wave, replace(at, scale=10)))
+
+
+def test_a_pose_that_the_picture_speaks_against_is_doubtful_however_much_of_it_lies_on_edges(drill, rigid):
+    T, _ = scene(drill, (79, 0), EXACT)
+    true, picture = T @ rigid.T_object_middle, photographed(drill, T, 0)
+    prior = started(rigid, T)
+    window = region.Window(picture, None, None, K, rigid.shape, true, 0.0)
+    at = window.level(window.factors[-1], window.of_pose(rigid.shape.coarse, true, 0.015))
+    found = contest.scored(rigid.shape, rigid.shape.fine, at, true, prior, True)
+    states = [
+        _Colours(rigid, K).judged([one], prior, None, None, picture.shape[:2]).state
+        for one in (found, replace(found, score=-1.0))
+    ]
+    assert found.score > contest.REFUTED
+    assert states == ["tracking", "doubtful"]
 
 
 def test_a_picture_without_the_object_is_not_tracked(drill, rigid):

@@ -69,7 +69,8 @@ def test_an_object_that_a_thing_slides_over_is_followed_by_its_print(cube):
         found = with_print.update(None, None, picture)
         assert found.state == "tracking"
         assert cube.error(found.T, ABOVE) < CONVERGED
-        assert plain.update(None, None, picture).state == "doubtful"
+        by_contour = plain.update(None, None, picture)
+        assert by_contour.state == "doubtful" or cube.error(by_contour.T, ABOVE) < CONVERGED / 5
 
 
 def test_another_print_is_not_taken_for_the_objects(cube):
