@@ -156,8 +156,7 @@ def _meshes(cell: cells.Cell, document: Document) -> Iterator[Fault]:
 
 
 def _models(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
-    """Pads without a field model for a target that comes near them, or with that of a lone pad though boards are beside it; and
-    pads of one target with different electrodes."""
+    """Pads without a field model for a target that comes near them, and pads of one target with different electrodes."""
     try:
         known = response.networks(cell)
     except cells.CellError as error:
@@ -171,15 +170,7 @@ def _models(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Faul
             if size != expected:
                 what = f"expected as many electrodes as pad {first} has, {expected}, got {size}"
                 yield document.fault(f"pads.{name}.type", f"{what}; give pads near one target equally many")
-        unfitted = [pad for pad in pads if response.fingerprint(cell, pad, target) not in known]
-        among = [
-            pad for pad in unfitted if response.fingerprint(cell, pad, target, bare=True) in known and response.beside(cell, pad)
-        ]
-        if among:
-            what = f"expected a field model of the pads {', '.join(among)} among the boards beside them for target {target}, got "
-            what += f"that of a lone pad; fit it once with `penumbra skin model --cell {document.path}`, until then the skin errs"
-            yield document.fault(f"pads.{among[0]}.position", what, is_warning=True)
-        if missing := [pad for pad in unfitted if pad not in among]:
+        if missing := [pad for pad in pads if response.fingerprint(cell, pad, target) not in known]:
             what = f"expected a field model of the pads {', '.join(missing)} for target {target}, got none: their design, their "
             what += f"mounting or the limb is new; fit it once with `penumbra skin model --cell {document.path}`"
             yield document.fault(f"pads.{missing[0]}", what)

@@ -124,14 +124,11 @@ def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str
         shapes = shapes_of(cell, target, options.weights)
     except (FileNotFoundError, ValueError) as error:
         node.log.warning("no points of surfaces, and nothing touches", target=target, why=str(error))
-    mesh, response = target_mesh(cell.targets[target], cell), Response(cell, target)
-    if response.unfitted:
-        why = f"boards beside {', '.join(response.unfitted)} are not in their field model: run penumbra skin model --cell FILE"
-        node.log.warning("signals of lone pads are expected, and trusted less", target=target, why=why)
+    mesh = target_mesh(cell.targets[target], cell)
     spread = cell.targets[target].home_spread
     made = Estimator(
         Skin(cell),
-        response,
+        Response(cell, target),
         Surface(mesh.vertices, mesh.faces),
         cell.targets[target].home.transform,
         np.repeat([spread.position, spread.rotation], 3),

@@ -1,9 +1,9 @@
 """`penumbra skin model`: fits the networks of `shared.skin.response` to the boundary-element field of a cell's pads.
 
-For every mounting of a cell (a pad type, and the robot link behind a backed pad, or the boards beside another one) the field is
-solved for limbs of random size at random poses, from contact to where nothing is felt, and a network learns the logarithms.
-Mountings that already have a network are left alone. The network of a bare pad is learned from nothing; for a pad before a link
-or among others only what is missing to the bare one, which needs fewer poses.
+For every mounting of a cell (a pad type, and for a backed pad its robot link) the field is solved for limbs of random size at
+random poses, from contact to where nothing is felt, and a network learns the logarithms. Mountings that already have a network
+are left alone. The network of a bare pad is learned from nothing; for a pad before a link only what is missing to the bare one,
+which needs fewer poses.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.cell.pads import PadType
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
-from penumbra.shared.skin.response import FEATURES, FOLDER, Network, Rest, beside, features, fingerprint, networks, save
-from penumbra.sim.skin.field import Body, PadField, Panels, limb, plate, shell
+from penumbra.shared.skin.response import FEATURES, FOLDER, Network, Rest, features, fingerprint, networks, save
+from penumbra.sim.skin.field import Body, PadField, Panels, limb, shell
 
 Array = np.ndarray
 
-POSES, POSES_BACKED, POSES_BESIDE = 45_000, 3_000, 500
-"""Fields solved for a bare pad, for one before a link, and for one among others."""
+POSES, POSES_BACKED = 45_000, 3_000
+"""Fields solved for a bare pad, and for one more mounting."""
 POSTURES = 80
 """Number of the robot's postures in which the effect of its other links on a pad is computed."""
 LINK_PANELS = (8, 8)
@@ -58,12 +58,8 @@ OVERHANG = 0.05
 PIECES = (40, 18)
 """Rows and columns of the limb's pieces."""
 HIDDEN, HIDDEN_BACKED = 128, 32
-STEPS, STEPS_BACKED, STEPS_BESIDE, BATCH = 250_000, 10_000, 3_000, 512
-"""Units of the hidden layers and steps of the training, of a pad alone and of what a link behind it or boards beside it change;
-samples per step."""
-ACCURACY = 3e-3
-"""Relative change at which the charges of pad and limb agree in what is fitted: each step leaves a quarter, so that a tenth of a
-per cent is missing. Chosen for time."""
+STEPS, STEPS_BACKED, BATCH = 250_000, 10_000, 512
+"""Units of the hidden layers and steps of the training, of a pad alone and of what a link behind it changes; samples per step."""
 NEAR_GAP = 0.05
 """Gap [m] below which the networks err more."""
 FAINTEST = 1e-5
@@ -77,7 +73,7 @@ BANDS = (0.005, 0.015, 0.03, 0.06, 0.12, 0.17, 0.25, 0.5)
 @dataclass(frozen=True)
 class Mounting:
     """What a network is fitted for: a pad that has it, name of its file, its fingerprint and that of the same pad without
-    a link or others, the pad type and the link behind it or the boards beside it."""
+    a link, the pad type and the link behind it."""
 
     pad: str
     name: str
@@ -88,8 +84,7 @@ class Mounting:
 
 
 def mountings(cell: cells.Cell, target: str) -> list[Mounting]:
-    """The different mountings of a cell's pads, those without a link first. A pad among others is fitted as a change to the same
-    pad alone: see `lone`."""
+    """The different mountings of a cell's pads, those without a link first."""
     out: dict[str, Mounting] = {}
     models = robot_models(cell) if any(pad.backed for pad in cell.pads.values()) else {}
     for name, pad in sorted(cell.pads.items(), key=lambda item: item[1].backed):
@@ -97,10 +92,7 @@ def mountings(cell: cells.Cell, target: str) -> list[Mounting]:
         if own in out:
             continue
         backing, label = None, f"{pad.type}-{target}"
-        if others := beside(cell, name):
-            boards = [rigid.apply(T, plate(cell.pad_types[cell.pads[other].type]).corners) for other, T in others.items()]
-            backing, label = Panels(np.concatenate(boards)), f"{cell.name}-{name}-{target}"
-        elif pad.backed:
+        if pad.backed:
             robot, _, link = pad.link.partition("/")
             mesh = models[robot].meshes[link]
             backing, label = (
@@ -111,16 +103,8 @@ def mountings(cell: cells.Cell, target: str) -> list[Mounting]:
     return list(out.values())
 
 
-def lone(cell: cells.Cell, target: str) -> list[Mounting]:
-    """The pads of a cell that have others beside them as if they were alone, each design once."""
-    among = {pad.type: name for name, pad in cell.pads.items() if beside(cell, name)}
-    prints = {kind: fingerprint(cell, name, target, bare=True) for kind, name in among.items()}
-    return [Mounting(among[kind], f"{kind}-{target}", own, own, cell.pad_types[kind], None) for kind, own in prints.items()]
-
-
 class Poses:
-    """Random limbs before a pad: where they are, how they lie, how large they are; none that touches the board, the link or other
-    boards."""
+    """Random limbs before a pad: where they are, how they lie, how large they are; none that touches the board or the link."""
 
     def __init__(self, mesh: Mesh, backing: Panels | None, seed: int):
         self.rng = np.random.default_rng([seed, 41])
@@ -187,10 +171,8 @@ def solve(
     progress: Progress | None = None,
     gaps: Sequence[float] = (),
     limbs: dict[tuple[float, ...], Body] | None = None,
-    accuracy: float = ACCURACY,
 ) -> Solved:
-    """So many random fields, at these gaps [m] in turn or at all. limbs: those prepared so far, by size: preparing takes time.
-    accuracy: see `PadField.change`."""
+    """So many random fields, at these gaps [m] in turn or at all. limbs: those prepared so far, by size: preparing takes time."""
     field, poses = PadField(mounting.kind, mounting.backing), Poses(mesh, mounting.backing, seed)
     limbs = {} if limbs is None else limbs
     T, size, gap = np.empty((count, 4, 4)), np.empty((count, 2)), np.empty(count)
@@ -202,7 +184,7 @@ def solve(
         key = tuple(size[k].tolist())
         if key not in limbs:
             limbs[key] = limb(mesh, *np.exp(size[k]))
-        change[k] = field.change(limbs[key], T[k], accuracy)
+        change[k] = field.change(limbs[key], T[k])
         if progress and task is not None and k % 50 == 0:
             progress.update(task, completed=k)
     if progress and task is not None:
@@ -313,10 +295,10 @@ def fit(
         weights = tuple(layer.weight.numpy().astype(float) for layer in model.layers)
         biases = tuple(layer.bias.numpy().astype(float) for layer in model.layers)
         network = Network(points, mean, scale, weights, biases, model.skip.weight.numpy().astype(float))  # type: ignore[arg-type]
-    return network if start is None else added(start, network)
+    return network if start is None else beside(start, network)
 
 
-def added(one: Network, other: Network) -> Network:
+def beside(one: Network, other: Network) -> Network:
     """One network that gives the sum of the outputs of two with the same input."""
     (a0, a1, a2), (b0, b1, b2) = one.weights, other.weights
     (a3, a4, a5), (b3, b4, b5) = one.biases, other.biases
@@ -360,16 +342,8 @@ def score(network: Network, data: Solved) -> dict[str, dict[str, float]]:
     flags.CELL,
     flags.Option("--target", show_default="the cell's first", help="the limb"),
     flags.Option("--seed", type=int, default=1, help="draws poses and the network's start"),
-    flags.Option(
-        "--poses",
-        type=int,
-        help=f"fields to solve for each mounting (default: {POSES}, with a link {POSES_BACKED}, among others {POSES_BESIDE})",
-    ),
-    flags.Option(
-        "--steps",
-        type=int,
-        help=f"of the network's training (default: {STEPS}, with a link {STEPS_BACKED}, among others {STEPS_BESIDE})",
-    ),
+    flags.Option("--poses", type=int, help=f"fields to solve for each mounting (default: {POSES}, with a link {POSES_BACKED})"),
+    flags.Option("--steps", type=int, help=f"of the network's training (default: {STEPS}, with a link {STEPS_BACKED})"),
     flags.Option("--again", is_flag=True, help="also fit mountings that have a network already"),
     example="penumbra skin model --cell mine.yaml",
 )
@@ -381,23 +355,21 @@ def main(options: flags.Options) -> int:
     target = cell.one("targets", options.target)
     mesh = target_mesh(cell.targets[target].model_copy(update={"size": None}), cell)  # the networks know of sizes
     points = pieces(mesh)
-    limbs: dict[tuple[float, ...], Body] = {}
     with Progress() as progress:
-        for mounting in {each.fingerprint: each for each in [*lone(cell, target), *mountings(cell, target)]}.values():
+        for mounting in mountings(cell, target):
             known = networks(cell)
             if mounting.fingerprint in known and not options.again:
                 progress.console.print(f"{mounting.name}: has a network already, kept (--again fits it anew)")
                 continue
             began = time.monotonic()
             start = known.get(mounting.bare) if mounting.backing is not None else None
-            is_backed = cell.pads[mounting.pad].backed
-            poses = options.poses or (POSES if start is None else POSES_BACKED if is_backed else POSES_BESIDE)
-            steps = options.steps or (STEPS if start is None else STEPS_BACKED if is_backed else STEPS_BESIDE)
-            data = solve(mounting, mesh, poses, options.seed, progress, limbs=limbs)
+            poses = options.poses or (POSES if start is None else POSES_BACKED)
+            steps = options.steps or (STEPS if start is None else STEPS_BACKED)
+            data = solve(mounting, mesh, poses, options.seed, progress)
             network = fit(points, data, options.seed, steps, start, progress)
-            unseen = solve(mounting, mesh, max(poses // 12, 50), HELD_OUT_SEED, progress, limbs=limbs)
+            unseen = solve(mounting, mesh, max(poses // 12, 50), HELD_OUT_SEED, progress)
             held_out = score(network, unseen)
-            rest, rest_error = fit_rest(cell, mounting, options.seed) if is_backed else (None, None)
+            rest, rest_error = fit_rest(cell, mounting, options.seed) if mounting.backing is not None else (None, None)
             network = replace(network, rest=rest, error=error(network, unseen))
             path = cell.folder / FOLDER / f"{mounting.name}.npz"
             save(path, network, mounting.fingerprint)

@@ -1,10 +1,9 @@
 """What a limb at a pose changes at the electrodes: small networks, fitted to the boundary-element field of a cell's pads.
 
-One network serves one mounting: a pad type, by itself, before the robot's link or among other boards, and one limb. Every board
-makes the sine of its ring itself, at its pad's resonance, so the boards beside a pad are at rest at the pad's frequency: grounded
-metal that takes a part of its field. A network sees how the limb's skin lies before the pad (sums over pieces of it, weighted by
-powers of their nearness, with their first and second moments) and which part of the limb that is, and gives the logarithm of the
-change of capacitance [fF] of every electrode, whose sign is the same for every limb: what is grounded takes field lines away.
+One network serves one mounting: a pad type, with or without the robot's link behind it, and one limb. It sees how the limb's skin
+lies before the pad (sums over pieces of it, weighted by powers of their nearness, with their first and second moments) and which
+part of the limb that is, and gives the logarithm of the change of capacitance [fF] of every electrode, whose sign is the same for
+every limb: what is grounded takes field lines away.
 `penumbra skin model` fits the networks; a mounting is known by its fingerprint wherever the files come from.
 
 The limb's size is two logarithms, of the factors by which it is longer and thicker than the cell file's target in its size.
@@ -14,7 +13,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import itertools
 import json
 import math
 from collections.abc import Mapping
@@ -27,7 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from penumbra.shared.body import urdf
 from penumbra.shared.cell import description as cells
-from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
 
@@ -80,13 +77,6 @@ SIZE_SPREAD = np.array([0.06, 0.11])
 girths of -0.27 to 0.11."""
 SIZE_MEASURED = np.array([0.015, 0.03])
 """The same standard deviations for a person whose size the cell file states, around the stated size."""
-BESIDE_M = 0.3
-"""Largest distance [m] between the middles of two boards on the same link at which one is part of the other's mounting. Measured
-on `table`: the two boards at 16 and 18 cm from a pad take 1 % of what the nearer five leave of a limb some 3 cm away, and 10 % at
-25 cm."""
-UNFITTED = 0.3
-"""Error, as a share of the signal, of a network of a lone pad that stands for a pad among others. Chosen: what the others take
-varies from a third to four fifths of the signal."""
 REST = ("coefficients", "middle", "half")
 """The fields of `Rest`."""
 
@@ -140,23 +130,15 @@ class Network:
 class Response:
     """The networks of all pads of a cell for one of its targets; every pad has e electrodes, in the order of
     `shared.skin.layout.Skin`. size (2,): logs of the target's own length and girth, beside the mesh's. error (n,): standard
-    deviation of what the networks get wrong, as a share of the change. unfitted: the pads among others whose mounting has no
-    network yet; that of the lone pad stands for it, with an error of UNFITTED.
+    deviation of what the networks get wrong, as a share of the change.
 
-    known: networks by fingerprint, those of `networks` unless given. Raises CellError where neither a pad's mounting nor the lone
-    pad has a network, or pads differ in their number of electrodes.
+    known: networks by fingerprint, those of `networks` unless given. Raises CellError where a pad's mounting has no network, or
+    pads differ in their number of electrodes.
     """
 
     def __init__(self, cell: cells.Cell, target: str, known: Mapping[str, Network] | None = None):
         known = networks(cell) if known is None else known
         prints = [fingerprint(cell, pad, target) for pad in cell.pads]
-        lone = [fingerprint(cell, pad, target, bare=True) for pad in cell.pads]
-        is_unfitted = [
-            own not in known and bool(beside(cell, pad)) and by_itself in known
-            for own, by_itself, pad in zip(prints, lone, cell.pads, strict=True)
-        ]
-        self.unfitted = tuple(itertools.compress(cell.pads, is_unfitted))
-        prints = [by_itself if fall else own for own, by_itself, fall in zip(prints, lone, is_unfitted, strict=True)]
         missing = [pad for pad, own in zip(cell.pads, prints, strict=True) if own not in known]
         if missing:
             raise cells.CellError(
@@ -174,8 +156,7 @@ class Response:
         rests = {pad: rest for pad, each in enumerate(prints) if (rest := known[each].rest) is not None}
         self._moved = np.array(list(rests), np.int64)  # the pads before links
         self._rest = Rest(*(np.stack([getattr(rest, name) for rest in rests.values()]) for name in REST)) if rests else None
-        errors = np.array([known[each].error for each in prints])
-        self.error = np.repeat(np.where(is_unfitted, np.maximum(errors, UNFITTED), errors), self.electrodes)
+        self.error = np.repeat([known[each].error for each in prints], self.electrodes)
         self.index = np.array([different.index(each) for each in prints])
         points, ends = np.stack([_whole(each.points) for each in own]), np.stack([each.ends for each in own])
         mean, scale = np.stack([each.mean for each in own]), np.stack([each.scale for each in own])
@@ -208,11 +189,10 @@ class Response:
 
 
 def fingerprint(cell: cells.Cell, pad: str, target: str, bare: bool = False) -> str:
-    """What the response of a pad to a target depends on: copper and board, the limb, and unless `bare` the link behind or the
-    boards beside."""
+    """What the response of a pad to a target depends on: copper and board, the limb, and unless `bare` the link behind."""
     own, aim = cell.pads[pad], cell.targets[target]
     kind = cell.pad_types[own.type]
-    parts: dict[str, Any] = {
+    parts = {
         "board": kind.board.model_dump(),
         "ring": kind.ring.model_dump(),
         "electrodes": {name: e.model_dump(exclude={"law"}) for name, e in kind.electrodes.items()},
@@ -222,23 +202,7 @@ def fingerprint(cell: cells.Cell, pad: str, target: str, bare: bool = False) -> 
         robot, _, link = own.link.partition("/")
         shapes = urdf.read(cells.urdf_path(cell.robots[robot], cell.folder)).link(link).shapes()
         parts["behind"] = {"shapes": shapes, "at": [own.position, own.rpy]}
-    elif not bare and (others := beside(cell, pad)):
-        # to a tenth of a millimetre; adding zero makes of -0 the 0 that it equals
-        at = {name: (T[:3].round(4) + 0.0).ravel().tolist() for name, T in others.items()}
-        parts["beside"] = sorted([*cell.pad_types[cell.pads[name].type].board.size, *T] for name, T in at.items())
     return _digest(json.dumps(parts, sort_keys=True).encode())
-
-
-def beside(cell: cells.Cell, pad: str) -> dict[str, Array]:
-    """T_pad_other (4, 4) of the boards that are part of a pad's mounting, by the names of their pads: those on the same link
-    within BESIDE_M. None for a pad with grounded metal behind it, which takes most of what they would: on the built-in `arm` they
-    leave 90 to 100 % of what it leaves."""
-    own = cell.pads[pad]
-    if own.backed:
-        return {}
-    T_pad_link = rigid.inverse(own.T_link_pad)
-    others = {name: T_pad_link @ other.T_link_pad for name, other in cell.pads.items() if name != pad and other.link == own.link}
-    return {name: T for name, T in others.items() if np.linalg.norm(T[:3, 3]) <= BESIDE_M}
 
 
 def networks(cell: cells.Cell) -> dict[str, Network]:

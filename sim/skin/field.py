@@ -38,12 +38,9 @@ capacitance by 3 %."""
 NEAR = 2.5
 """Distance to the pad, in sizes of a body's panel, below which the panel counts as nine points instead of one."""
 ACCURACY = 1e-5
-"""Relative change at which the charges of pad and body agree, unless another is asked for."""
+"""Relative change at which the charges of pad and body agree."""
 RING, GROUND, BARE = -1, -2, -3
 """Owners of panels beside the electrodes, which are 0, 1, 2 …: excitation ring, ground, and dielectric without copper."""
-PLATE = 6
-"""Rows and columns of panels of a plate that stands for a board beside a pad. Measured beside three boards of `table`: what a
-limb changes at 1 to 20 cm differs by 0.1 to 0.2 % in the median, 0.4 % at most, from that beside whole boards."""
 CLEAR = 0.003
 """Distance [m] to the board's volume within which parts of the link behind are left out: the board is mounted there."""
 
@@ -129,12 +126,6 @@ def shell(vertices: Array, stations: int = 16, around: int = 14) -> Panels:
     return Panels(_loft(hull.points[hull.simplices], stations, around).corners @ axes + middle)
 
 
-def plate(kind: PadType) -> Panels:
-    """Grounded panels, in its frame, that have the effect of a board on the field of another one beside it."""
-    xs, ys = (_graded(-side / 2.0, side / 2.0, both=True, parts=PLATE) for side in kind.board.size)
-    return Panels(_grid(xs, ys, 0.0))
-
-
 def _loft(triangles: Array, stations: int, around: int) -> Panels:
     """Closed panels around what triangles (n, 3, 3) enclose along x."""
     low, high = triangles[:, :, 0].min(), triangles[:, :, 0].max()
@@ -179,9 +170,8 @@ def _section(triangles: Array, at: float, angles: Array) -> tuple[Array, Array]:
 class PadField:
     """The field of one pad type, its board prepared for bodies at any pose.
 
-    backing: what is grounded behind or beside it, panels in the pad's frame (the robot link that carries it, a `plate` for each
-    board beside it). beside (b, 4, 4): other boards of this type in the pad's frame, with all of their copper, whose electrodes
-    are held at zero and whose rings too unless driven with the pad's.
+    backing: what is grounded behind it, panels in the pad's frame (the robot link that carries it). beside (b, 4, 4): other
+    boards of this type in the pad's frame, whose electrodes are held at zero and whose rings too unless driven with the pad's.
     plate_pF: capacitance of all conductors together.
     """
 
@@ -208,9 +198,8 @@ class PadField:
         self._unit = self._inverse @ volts  # charges with the ring, or one electrode, at one volt
         self.plate_pF = float((self._inverse @ (~bare).astype(float)).sum() * FEMTOFARAD * 1e-3)
 
-    def change(self, body: Body, T_pad_body: Array, accuracy: float = ACCURACY) -> Array:
-        """Decrease [fF], by a body at T_pad_body (4, 4), of the capacitance between the ring and each electrode (e,). accuracy:
-        relative change at which the charges of pad and body agree."""
+    def change(self, body: Body, T_pad_body: Array) -> Array:
+        """Decrease [fF], by a body at T_pad_body (4, 4), of the capacitance between the ring and each electrode (e,)."""
         R, t = T_pad_body[:3, :3], T_pad_body[:3, 3]
         at_body, along_body, at_pad = self._coupling(body.points @ R.T + t, body.panels.normals @ R.T, body.size)
         seen = at_body if body.conductor else along_body
@@ -218,7 +207,7 @@ class PadField:
         for _ in range(60):  # what the body's charges induce on the pad acts back on the body
             step = body.charges(seen @ (self._inverse @ -(at_pad @ step)))
             charges = charges + step
-            if np.abs(step).sum() < accuracy * np.abs(charges).sum():
+            if np.abs(step).sum() < ACCURACY * np.abs(charges).sum():
                 break
         return self._lost(at_body, charges)
 

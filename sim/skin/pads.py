@@ -1,8 +1,8 @@
 """What the pads read: how a limb changes the capacitance of their electrodes, and the amplitudes that come of it.
 
-The changes come from the networks that stand for the boundary-element field (`shared.skin.response`) of a pad among the boards
-beside it: eight pads at 1 kHz take a few per cent of a core. What the robot's other links change is added, as if the limb did not
-shade them. The person's upper arm and torso are not felt, nor are other boards on a robot's hull.
+The changes come from the networks that stand for the boundary-element field (`shared.skin.response`): eight pads at 1 kHz take a
+few per cent of a core. What the robot's other links change is added, as if the limb did not shade them. The person's upper arm
+and torso and other pads are not felt.
 """
 
 from __future__ import annotations

@@ -7,8 +7,7 @@ the broad prior that the first look at a limb has, once with a tracking prior.
 
 Then limbs that rest for ten seconds (what is published, and what the default observer makes of it, against their covariances),
 limbs that move through all gaps, and things that are no limb. `--only-surface`: points of surfaces without a shape, and contact.
-`--only-drift`: limbs before electrodes whose gains and offsets have drifted. `--only-among`: with a field model that knows the
-boards beside a pad, and with that of lone pads.
+`--only-drift`: limbs before electrodes whose gains and offsets have drifted.
 """
 
 from __future__ import annotations
@@ -44,9 +43,9 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin import bound
 from penumbra.shared.skin.layout import Skin, link_names
-from penumbra.shared.skin.response import Response, fingerprint
+from penumbra.shared.skin.response import SIZE_SPREAD, Response, fingerprint
 from penumbra.sim.skin import field
-from penumbra.tests.bench.lib import among, drift, results, surfaces, things
+from penumbra.tests.bench.lib import drift, results, surfaces, things
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
 ARRAYS = {"bare": "table", "hull": "arm"}
@@ -235,7 +234,7 @@ def single_windows(
                 information = rig.information(middle, T, size)
                 for (prior, speed), row in table.items():
                     spread = TRACKING if prior else BROAD
-                    row.bounds.append(among.pose_bound(information, axes, spread))
+                    row.bounds.append(_bound(information, axes, spread))
                     for _ in range(plan.draws):
                         home = rigid.perturb(T, (spread * rng.standard_normal(6)) @ axes)
                         estimator = rig.estimator(home, np.sqrt(np.diag(axes.T @ np.diag(spread**2) @ axes)), method)
@@ -244,6 +243,14 @@ def single_windows(
                         row.errors.append(axes @ rigid.pose_error(T, estimator.pose))
             for (prior, speed), row in table.items():
                 yield _row(rig, gap, count, prior, speed, row)
+
+
+def _bound(information: Array, axes: Array, spread: Array) -> Array:
+    """Variances (6,) by NAMES of the bound with a prior on pose and size."""
+    total = information.copy()
+    total[:6, :6] += axes.T @ np.diag(spread**-2) @ axes
+    total[6:, 6:] += np.diag(SIZE_SPREAD**-2)
+    return np.asarray(np.diag(axes @ np.linalg.inv(total)[:6, :6] @ axes.T))
 
 
 def _row(rig: Rig, gap: float, count: int, prior: bool, speed: float, row: Row) -> dict[str, Any]:
@@ -436,8 +443,6 @@ def tables(result: Result) -> list[Part]:
         return surfaces.tables(result)
     if "drift" in result:
         return [drift.table(result)]
-    if "among" in result:
-        return [among.table(result)]
     if "arrays" not in result:
         return [things.table(result)]
     shown, lines = result["arrays"], list[Part]()
@@ -552,7 +557,6 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     flags.Option("--only-objects", is_flag=True, help="only things that pass"),
     flags.Option("--only-surface", is_flag=True, help="only points of surfaces, and contact"),
     flags.Option("--only-drift", is_flag=True, help="only limbs before electrodes that have drifted"),
-    flags.Option("--only-among", is_flag=True, help="only pads of a table top, with and without knowledge of the boards beside"),
     flags.Option("--quick", is_flag=True, help="a few of everything: whether it runs, no numbers to believe"),
     example="penumbra bench haptics --quick --json haptics.json",
 )
@@ -569,10 +573,6 @@ def main(options: flags.Options, report: results.Report) -> None:
             limbs = 1 if options.quick else drift.LIMBS
             rows = [row for name in arrays for row in drift.measure(Rig(name), options.seed, limbs, progress)]
         result = {"seed": options.seed, "drift": rows}
-    elif options.only_among:
-        with Progress(console=Console(stderr=True), transient=True) as progress:
-            rows = among.measure(Rig("bare"), options.seed, 1 if options.quick else among.POSES, progress)
-        result = {"seed": options.seed, "among": rows}
     elif options.only_objects:
         result = {"seed": options.seed, "objects": measure_objects(options.seed, plan.passes, arrays)}
     else:

@@ -4,7 +4,7 @@ What is compared: the capacitance of all conductors of the bare pad, what a fore
 law fitted to it in log space, where its signal-to-noise ratio is 1 dB, lateral contrast, the influence of a grounded link; how a
 limb, a hand, a metal bar and a plastic block differ; and the networks that run live beside the boundary elements that they
 stand for, at poses and sizes that they were not fitted to. `--seed` draws those. `--only-left-out`: what
-the rest of the person and boards beside a pad change. `--only-boards`: how near the networks come to all boards in one system.
+the rest of the person and neighbouring boards change, which the networks leave out.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from penumbra.shared.contract.labels import Label
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.response import Response, networks
-from penumbra.sim.skin.field import ACCURACY, Body, PadField, limb, shell
+from penumbra.sim.skin.field import Body, PadField, limb, shell
 from penumbra.tests.bench.lib import left_out, results
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
@@ -149,7 +149,7 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
     limbs: dict[Any, Any] = {}
     for mounting in mountings:
         count = len(GAPS_CM) * max(1, poses // len(mountings))
-        data = model.solve(mounting, mesh, count, seed, gaps=[gap / 100 for gap in GAPS_CM], limbs=limbs, accuracy=ACCURACY)
+        data = model.solve(mounting, mesh, count, seed, gaps=[gap / 100 for gap in GAPS_CM], limbs=limbs)
         relative = np.abs(model.predict(known[mounting.fingerprint], data) / data.change - 1.0)
         for k, gap in enumerate(GAPS_CM):
             errors[gap].append(relative[k :: len(GAPS_CM)].ravel())
@@ -175,8 +175,6 @@ def tables(found: Result) -> list[Part]:
     """Figures beside the real pad's, what different bodies change, and the networks that run live."""
     if "left_out" in found:
         return [left_out.table(found)]
-    if "boards" in found:
-        return [left_out.table_of_boards(found)]
     figure = Table("figure", "ours", "the real pad", title="The pad near a forearm")
     figure.add_row("all conductors at 1 V, pF", f"{found['plate_pF']:.3f}", f"{PLATE_PF}")
     for gap, value in found["centre_fF"].items():
@@ -220,7 +218,6 @@ def tables(found: Result) -> list[Part]:
     flags.Option("--seed", type=int, default=1, help="draws the poses of the live comparison"),
     flags.Option("--poses", type=flags.positive, default=160, help="for each gap of the live comparison"),
     flags.Option("--only-left-out", is_flag=True, help="only what the rest of the person and other boards change"),
-    flags.Option("--only-boards", is_flag=True, help="only a field model beside all boards in one system"),
     example="penumbra bench skin --json skin.json",
 )
 def main(options: flags.Options, report: results.Report) -> None:
@@ -228,10 +225,6 @@ def main(options: flags.Options, report: results.Report) -> None:
     if options.only_left_out:
         with Progress(console=Console(stderr=True), transient=True) as progress:
             report.save({"seed": options.seed, "left_out": left_out.measure(table, options.seed, progress)})
-        return
-    if options.only_boards:
-        with Progress(console=Console(stderr=True), transient=True) as progress:
-            report.save({"seed": options.seed, "boards": left_out.compare(table, options.seed, progress)})
         return
     found = {"seed": options.seed, **figures(table), "live": live(table, options.seed, options.poses)}
     found["live_hull"] = live(arm, options.seed, options.poses)

@@ -6,7 +6,7 @@ import trimesh
 
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
-from penumbra.sim.skin.field import FEMTOFARAD, Body, PadField, Panels, limb, plate
+from penumbra.sim.skin.field import FEMTOFARAD, Body, PadField, Panels, limb
 from penumbra.tests.bench import skin as bench
 
 
@@ -145,21 +145,3 @@ def test_a_board_beside_a_pad_shades_it_adds_when_it_is_driven_too_and_does_noth
 
     assert (with_board(0.08) < 0.95 * alone).all() and (with_board(0.08, is_driven=True) > 1.05 * alone).all()
     np.testing.assert_allclose(with_board(5.0), alone, rtol=0.01)
-
-
-def test_a_plate_takes_of_a_pads_signals_what_a_whole_board_takes(table: cells.Cell, pad: PadField, arm: tuple) -> None:
-    kind, T_pad_board = table.pad_types["five"], rigid.transform([0.08, 0.0, 0.0])
-    whole = PadField(kind, beside=[T_pad_board])
-    stands_for_it = PadField(kind, Panels(rigid.apply(T_pad_board, plate(kind).corners)))
-    for gap in (0.01, 0.05, 0.15):
-        T = bench.across(arm[0], gap)
-        expected = whole.change(arm[1], T)
-        assert (expected < pad.change(arm[1], T)).all()  # it takes a part
-        np.testing.assert_allclose(stands_for_it.change(arm[1], T), expected, rtol=0.005)
-
-
-def test_less_accuracy_costs_no_more_than_it_says(pad: PadField, arm: tuple) -> None:
-    T = bench.across(arm[0], 0.02)
-    rough, exact = pad.change(arm[1], T, 3e-3), pad.change(arm[1], T)
-    assert (rough != exact).all()
-    np.testing.assert_allclose(rough, exact, rtol=3e-3)

@@ -100,9 +100,7 @@ class FieldModels:
         """Pads with their field models; those before links are made for the limbs of these scenes."""
         cell = _with(self._cell, pads)
         gaps, before = meeting(drawing, scenes, pads)
-        known = dict(self._known) | {
-            fingerprint(cell, _name(k), self._target): self._bare for k, pad in enumerate(pads) if not pad.backed
-        }  # as if alone, the present pads too: what others beside take is not weighed
+        known = dict(self._known)
         backed = [k for k, pad in enumerate(pads) if pad.backed]
         for k in track(backed, "field models of pads before links") if backed else ():
             known[fingerprint(cell, _name(k), self._target)] = self._before_link(pads[k], scenes, gaps[:, k], before[:, k])

@@ -1,9 +1,8 @@
-"""What the runtime field model leaves out, and what it makes of the boards beside a pad.
+"""What the runtime field model leaves out: the rest of the person, and the boards beside a pad.
 
-The networks stand for a pad among other boards before the hand and forearm of a person. Here boundary elements have more in one
-system, so that everything shades everything: upper arm and torso, one conductor with the forearm, and the boards beside one of
-the table's with all of their copper, three with their rings held at zero or driven with its own, or all with their rings at zero
-as the networks have them.
+The networks stand for a pad alone before the hand and forearm of a person. Here boundary elements have more in one system, so
+that everything shades everything: upper arm and torso, one conductor with the forearm, and the three boards that surround one of
+the table's, with their rings held at zero (boards that are driven one after the other) or driven with its own.
 """
 
 from __future__ import annotations
@@ -19,10 +18,9 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
-from penumbra.shared.skin.response import Response
 from penumbra.sim.skin.field import Body, PadField, Panels, limb, shell
 from penumbra.sim.world.person import Person
-from penumbra.tests.bench.lib.results import Result, marked
+from penumbra.tests.bench.lib.results import Result
 
 GAPS = (0.02, 0.05, 0.10, 0.15, 0.20)
 POSES = 6
@@ -31,43 +29,8 @@ PAD, BESIDE = "p1", ("p2", "p5", "p6")
 """The pad in whose place the others' effect is solved, and these others."""
 SHIFT, TURN = (0.06, 0.03), (0.3, 0.12, 0.26)
 """Bounds of the forearm's displacement along and across from the pads' middle [m], and of its roll, pitch and yaw [rad]."""
-COMPARED = 12
-"""Poses at each gap, where field models of PAD are compared with all boards in one system."""
-MODELS = ("of a lone pad", "with the boards beside")
-GOAL = 0.02
-"""Of their errors, in the median."""
 PERSON = ("upper arm", "upper arm and torso")
 BOARDS = ("three boards beside, not driven", "three boards beside, driven together")
-
-
-def compare(cell: cells.Cell, seed: int, progress: Progress) -> list[dict[str, Any]]:
-    """Rows by gap and field model: median, 95th percentile and mean of what a model of PAD is off by, as shares of the joint
-    solution of all boards."""
-    target = next(iter(cell.targets))
-    assert cell.sim is not None, f"cell {cell.name}: expected a `sim` section"
-    forearm, skin = Person(cell, cell.sim, cell.targets[target]).meshes[0], Skin(cell)
-    surface, body, pads = Surface(forearm.vertices, forearm.faces), limb(forearm), skin.T_world_pads()
-    own = skin.pads.index(PAD)
-    lone = cell.model_copy(update={"pads": {PAD: cell.pads[PAD]}})
-    responses = {MODELS[0]: Response(lone, target), MODELS[1]: Response(cell, target)}
-    others = [rigid.inverse(pads[own]) @ T for k, T in enumerate(pads) if k != own]
-    field = PadField(cell.pad_types[cell.pads[PAD].type], beside=others)
-    rows = []
-    for gap in progress.track(GAPS, description="all boards"):
-        shares: dict[str, list[Array]] = {model: [] for model in MODELS}
-        for k in range(COMPARED):
-            T = _place(np.random.default_rng([seed, 10, k]), gap, surface, skin.positions(pads))
-            T_pads = np.stack([rigid.inverse(pad) for pad in pads]) @ T
-            joint = field.change(body, T_pads[own])
-            shares[MODELS[0]].append(responses[MODELS[0]].change(T_pads[own : own + 1]) / joint - 1.0)
-            shares[MODELS[1]].append(responses[MODELS[1]].change(T_pads)[skin.of(own)] / joint - 1.0)
-        for model, each in shares.items():
-            share = np.concatenate(each)
-            median, p95 = (round(float(np.percentile(np.abs(share), p)), 4) for p in (50, 95))
-            rows.append(
-                {"model": model, "gap_m": gap, "median": median, "p95": p95, "mean": round(float(share.mean()), 4)}
-            )  # fmt: skip
-    return rows
 
 
 def measure(cell: cells.Cell, seed: int, progress: Progress) -> list[dict[str, Any]]:
@@ -112,20 +75,6 @@ def _place(rng: np.random.Generator, gap: float, surface: Surface, electrodes: A
 def _row(name: str, gap: float, share: Array) -> dict[str, Any]:
     low, middle, high = (round(float(np.percentile(share, p)), 4) for p in (5, 50, 95))
     return {"left_out": name, "gap_m": gap, "p5": low, "median": middle, "p95": high}
-
-
-def table_of_boards(result: Result) -> Table:
-    """Errors of field models beside the joint solution, by gap."""
-    out = Table(
-        *("field model", *(f"{100 * gap:g} cm" for gap in GAPS)),
-        title=f"Field models of {PAD} beside all eight boards in one system: error of the signal, median (95 % below), mean",
-        caption=f"{COMPARED} random poses a gap, five electrodes; rings of other boards at rest. Goal: {GOAL:.0%} in the median.",
-    )
-    for model in MODELS:
-        rows = [row for row in result["boards"] if row["model"] == model]
-        shown = [f"{row['median']:.1%} ({row['p95']:.1%}), {row['mean']:+.1%}" for row in rows]
-        out.add_row(model, *(marked(text, row["median"] <= GOAL) for text, row in zip(shown, rows, strict=True)))
-    return out
 
 
 def table(result: Result) -> Table:

@@ -11,7 +11,6 @@ import pytest
 from penumbra.shared.geometry import rigid
 from penumbra.sim.skin import field
 from penumbra.tests.bench import haptics as bench
-from penumbra.tests.bench.lib.among import pose_bound
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def test_the_bounds_information_is_that_of_the_full_fields_derivatives(rig: benc
     full = J.T @ (J / (rig.skin.noise / bench.SAMPLES)[:, None])
     for spread in (bench.BROAD, bench.TRACKING):
         axes = rig.axes(T, 8)
-        ours, theirs = (np.sqrt(pose_bound(each, axes, spread)) for each in (rig.information(signal, T, size), full))
+        ours, theirs = (np.sqrt(bench._bound(each, axes, spread)) for each in (rig.information(signal, T, size), full))
         np.testing.assert_allclose(ours, theirs, rtol=0.08)
 
 

@@ -19,7 +19,6 @@ from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
 from penumbra.shared.skin.response import Response
 from penumbra.sim.skin import field
-from penumbra.tests.support.fields import changes
 
 SAMPLES = 20
 NONE = np.zeros(40, bool)
@@ -40,9 +39,15 @@ def finder(table: cells.Cell) -> SurfacePoints:
     return made(table)
 
 
-def signals(skin: Skin, pads: np.ndarray, body: field.Body, T: np.ndarray) -> np.ndarray:
-    """True signals (n,) [V] of the table's pads, up to the converter's end."""
-    return skin.signal(skin.amplitude(changes("table", pads, body, T)))
+@pytest.fixture(scope="module")
+def bare(table: cells.Cell) -> field.PadField:
+    return field.PadField(table.pad_types["five"])
+
+
+def signals(bare: field.PadField, skin: Skin, pads: np.ndarray, body: field.Body, T: np.ndarray) -> np.ndarray:
+    """True signals (n,) [V], up to the converter's end."""
+    change = np.concatenate([bare.change(body, rigid.inverse(pad) @ T) for pad in pads])
+    return skin.signal(skin.amplitude(change))
 
 
 def shape(mesh: trimesh.Trimesh) -> field.Body:
@@ -62,10 +67,10 @@ def at(x: float, y: float, z: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("body", "middle"), [(ball, 0.04), (plate, 0.015)])
-@pytest.mark.parametrize("gap", [0.02, 0.05, 0.07])
-def test_things_that_are_no_limb_are_at_their_distance(finder, skin, body, middle, gap) -> None:
+@pytest.mark.parametrize("gap", [0.02, 0.05, 0.1])
+def test_things_that_are_no_limb_are_at_their_distance(finder, bare, skin, body, middle, gap) -> None:
     pads = skin.T_world_pads()
-    points = finder.find(signals(skin, pads, body(), at(0.04, 0.04, gap + middle)), skin.noise / SAMPLES, NONE, pads)
+    points = finder.find(signals(bare, skin, pads, body(), at(0.04, 0.04, gap + middle)), skin.noise / SAMPLES, NONE, pads)
     nearest = min(points, key=lambda point: point.distance)
     assert nearest.distance == pytest.approx(gap, rel=0.3) and abs(nearest.distance - gap) < 3.0 * nearest.along
     assert 0.03 < nearest.along / nearest.distance < 0.3
@@ -79,21 +84,21 @@ def test_where_nothing_is_near_there_is_no_point(finder, skin) -> None:
     assert not any(found)
 
 
-def test_noise_makes_points_less_certain_and_moves_them_by_no_more_than_that(finder, skin) -> None:
+def test_noise_makes_points_less_certain_and_moves_them_by_no_more_than_that(finder, bare, skin) -> None:
     pads, rng = skin.T_world_pads(), np.random.default_rng(1)
-    clean = signals(skin, pads, ball(), at(0.04, 0.04, 0.12))
+    clean = signals(bare, skin, pads, ball(), at(0.04, 0.04, 0.12))
     (sure,) = (p for p in finder.find(clean, skin.noise / 1e6, NONE, pads) if p.pad == "p6")
     noise = skin.noise / SAMPLES
     found = [finder.find(clean + np.sqrt(noise) * rng.standard_normal(40), noise, NONE, pads) for _ in range(50)]
     own = [point for points in found for point in points if point.pad == "p6"]
-    assert len(own) > 45 and np.mean([point.along for point in own]) > sure.along
+    assert len(own) > 45 and min(point.along for point in own) > sure.along
     scatter = np.std([point.distance for point in own])
     assert 0.0 < scatter < np.mean([point.along for point in own])
 
 
-def test_an_electrode_that_is_left_out_is_not_missed(finder, skin) -> None:
+def test_an_electrode_that_is_left_out_is_not_missed(finder, bare, skin) -> None:
     pads = skin.T_world_pads()
-    clean, variance = signals(skin, pads, ball(), at(0.04, 0.04, 0.09)), skin.noise / SAMPLES
+    clean, variance = signals(bare, skin, pads, ball(), at(0.04, 0.04, 0.09)), skin.noise / SAMPLES
     (whole,) = (p for p in finder.find(clean, variance, NONE, pads) if p.pad == "p6")
     middle = skin.names.index("p6/c")
     spoiled, without = clean.copy(), variance.copy()
@@ -121,11 +126,10 @@ def test_a_pads_signals_are_compared_with_those_of_its_own_mounting() -> None:
     mesh = target_mesh(arm.targets["forearm"], arm)
     logs = forearm(Skin(arm), Response(arm, "forearm"), Surface(mesh.vertices, mesh.faces))
     table = cells.load("table")
-    lone = table.model_copy(update={"pads": {"p0": table.pads["p0"]}})
-    free = forearm(Skin(lone), Response(lone, "forearm"), Surface(mesh.vertices, mesh.faces))
+    free = forearm(Skin(table), Response(table, "forearm"), Surface(mesh.vertices, mesh.faces))
     far = int(np.searchsorted(GAPS, 0.1))
     assert (np.diff(logs, axis=0) < 0.0).all() and (np.diff(free, axis=0) < 0.0).all()
-    assert (logs[far].reshape(-1, 5) - free[far]).mean() < np.log(0.6)
+    assert (logs[far] - free[far]).mean() < np.log(0.6)
 
 
 def test_shapes_of_another_design_are_refused(table: cells.Cell, tmp_path) -> None:
@@ -133,9 +137,9 @@ def test_shapes_of_another_design_are_refused(table: cells.Cell, tmp_path) -> No
         Shapes.load(tmp_path, "0123456789abcdef")
 
 
-def test_points_leave_the_pose_as_it_is_to_the_bit(table: cells.Cell, skin: Skin) -> None:
+def test_points_leave_the_pose_as_it_is_to_the_bit(table: cells.Cell, bare: field.PadField, skin: Skin) -> None:
     pads, mesh = skin.T_world_pads(), target_mesh(table.targets["forearm"], table)
-    signal = signals(skin, pads, field.limb(mesh), rigid.from_rpy((0.02, 0.0, 0.1), (0.0, 0.0, 0.1)))
+    signal = signals(bare, skin, pads, field.limb(mesh), rigid.from_rpy((0.02, 0.0, 0.1), (0.0, 0.0, 0.1)))
     with_points, without = made(table, Estimator), made(table, Estimator)
     without._points = None
     for one, other in zip(windows(with_points, skin, pads, signal, 5), windows(without, skin, pads, signal, 5), strict=True):
@@ -173,28 +177,28 @@ def windows(estimator: Estimator, skin: Skin, pads: np.ndarray, signal: np.ndarr
 
 
 @pytest.mark.parametrize(("gap", "state"), [(0.003, "touch"), (0.012, "none"), (0.02, "none")])
-def test_a_limb_that_touches_a_pad_is_a_touch_and_one_beside_it_is_none(table, skin, gap, state) -> None:
+def test_a_limb_that_touches_a_pad_is_a_touch_and_one_beside_it_is_none(table, bare, skin, gap, state) -> None:
     estimator, pads = made(table, Estimator), skin.T_world_pads()
     mesh = target_mesh(table.targets["forearm"], table)
     T = rigid.from_rpy((0.0, 0.04, 0.1), (0.0, 0.0, 0.0))
     surface = Surface(mesh.vertices, mesh.faces)
     for _ in range(10):
         T[2, 3] += gap - float(surface.nearest((skin.positions(pads) - T[:3, 3]) @ T[:3, :3])[0].min())
-    found = list(windows(estimator, skin, pads, signals(skin, pads, field.limb(mesh), T), 3))
+    found = list(windows(estimator, skin, pads, signals(bare, skin, pads, field.limb(mesh), T), 3))
     assert {estimate.contact for estimate in found} == {state}
     assert all(bool(estimate.touched) == (state == "touch") for estimate in found)
 
 
-def test_an_electrode_that_is_stuck_at_the_end_of_its_scale_touches_nothing(table, skin) -> None:
+def test_an_electrode_that_is_stuck_at_the_end_of_its_scale_touches_nothing(table, bare, skin) -> None:
     estimator, pads = made(table, Estimator), skin.T_world_pads()
-    signal = signals(skin, pads, ball(), at(0.04, 0.04, 0.12))
+    signal = signals(bare, skin, pads, ball(), at(0.04, 0.04, 0.12))
     signal[skin.names.index("p1/c")] = 2.0
     found = list(windows(estimator, skin, pads, signal, 3))
     assert {estimate.contact for estimate in found} == {"none"}
     assert all({"p6"} <= {p.pad for p in estimate.surface} for estimate in found)
 
 
-def test_a_hand_around_a_post_is_a_grip_and_its_palm_alone_a_touch(table: cells.Cell) -> None:
+def test_a_hand_around_a_post_is_a_grip_and_its_palm_alone_a_touch(table: cells.Cell, bare: field.PadField) -> None:
     """Four pads around a square post; palm and fingers lie on opposite sides."""
     sides = {"east": 0.0, "north": 0.5 * np.pi, "west": np.pi, "south": -0.5 * np.pi}
     out = 0.032
@@ -214,12 +218,8 @@ def test_a_hand_around_a_post_is_a_grip_and_its_palm_alone_a_touch(table: cells.
     fingers.apply_translation((-out - 0.0125 - 0.003, 0.0, 0.2))
     parts = [field.shell(np.array(each.vertices), 24, 16) for each in (palm, fingers)]
     estimator = made(cell, Estimator)
-    lone = field.PadField(table.pad_types["five"])
-
-    def read(body: field.Body) -> np.ndarray:
-        return skin.signal(skin.amplitude(np.concatenate([lone.change(body, rigid.inverse(T)) for T in T_world_pads])))
-
-    alone, closed = read(field.Body(parts[0])), read(field.Body(parts[0] + parts[1]))
+    alone = signals(bare, skin, T_world_pads, field.Body(parts[0]), np.eye(4))
+    closed = signals(bare, skin, T_world_pads, field.Body(parts[0] + parts[1]), np.eye(4))
     assert {(e.contact, e.touched) for e in windows(estimator, skin, T_world_pads, alone, 3)} == {("touch", ("east",))}
     gripped = {(e.contact, e.touched) for e in windows(estimator, skin, T_world_pads, closed, 3, 3)}
     assert gripped == {("grip", ("east", "west"))}
