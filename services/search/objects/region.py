@@ -462,7 +462,7 @@ def descend(
     near: bool = False,
 ) -> Array:
     """Steps of least squares, one for each length of the lines in `reaches` [px], with or without creases. `near` a prediction,
-    what hides the object shall not take the pose along: offsets count less beyond a smaller width, and no waves are expected."""
+    what hides the object shall not take the pose along: offsets count less beyond a smaller width, and waves are smaller."""
     robust, waves = (ROBUST[1], STIFF) if near else (ROBUST[0], WAVES)
     for reach in reaches:
         found = [(lines(shape, model, at, T, reach, inside), inside) for inside in ((False, True) if creases else (False,))]
