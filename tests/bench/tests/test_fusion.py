@@ -161,7 +161,7 @@ def test_an_observer_that_takes_late_for_new_is_found_out(monkeypatch: pytest.Mo
             self.newest_ns = max(self.newest_ns + 1, stamp_ns)
             return super().measure(source, self.newest_ns, *rest)
 
-    monkeypatch.setattr(fusion, "ErrorStateObserver", Naive)
+    monkeypatch.setattr(scores, "ErrorStateObserver", Naive)
     assert scores.late(3, 0, 3.0)["shuffled"].difference > 1e-3
 
 
