@@ -40,7 +40,7 @@ class Schedule:
     """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`;
     `encoder_share`: of that rate, at which the encoder learns, which knows much already; `frames`: that a step plays, few, as
     many sequences teach more than long ones; `alone`: steps, from the first one on, in which the encoder learns masks by itself,
-    four times as fast; `patches`: (from which progress on, pixels a side, sequences a batch);
+    at half of a step's cost; `patches`: (from which progress on, pixels a side, sequences a batch);
     `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the
     weights that are exported; `seen`: (frames that the state has seen before those that are learned from, how often)."""
 
@@ -279,6 +279,12 @@ def main(options: flags.Options) -> int:
         trainer = trainer.extended(options.priors, pretrained.weights(options.encoder) if options.encoder else None)
     except ModelsError as error:
         print(f"penumbra segmentation train: {error}", file=sys.stderr)
+        return 2
+    if options.alone and not trainer.settings.encoder:
+        print(
+            "penumbra segmentation train: --alone: expected a network with an encoder, got one without; add --encoder",
+            file=sys.stderr,
+        )
         return 2
     simulated = Simulated(trainer.seed, options.held_out)
     data: Data = simulated

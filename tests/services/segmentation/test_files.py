@@ -184,6 +184,11 @@ def test_a_folder_that_does_not_fit_is_refused_with_what_was_expected(tmp_path, 
     assert "penumbra segmentation train: " in capsys.readouterr().err
 
 
+def test_only_an_encoder_can_learn_alone(tmp_path, capsys):
+    assert train.main(["--alone", "3", "--steps", "1", "--out", str(tmp_path / "net.npz")]) == 2
+    assert "expected a network with an encoder, got one without; add --encoder" in capsys.readouterr().err
+
+
 def test_training_on_one_s_own_frames_keeps_some_apart_and_says_so_in_the_card(tmp_path, scene, weights):
     data = tmp_path / "mine"
     for name in "abcd":
