@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from penumbra.services.haptics.solve import marginal
+from penumbra.shared.body.anatomy import SIZE, SIZE_MEASURED, SIZE_SPREAD
 from penumbra.shared.geometry.rigid import Array
-from penumbra.shared.skin.response import SIZE, SIZE_MEASURED, SIZE_SPREAD
 
 SIZE_GAP = 0.06
 """Largest gap [m] at which the size is learnt. Farther away the size is only considered (see above)."""

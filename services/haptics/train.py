@@ -25,14 +25,14 @@ from penumbra.services import flags
 from penumbra.services.haptics.estimator import Estimator
 from penumbra.services.haptics.paper_network import PoseNetwork, Regression, Relative, features, fingerprint
 from penumbra.shared import training
-from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.body.anatomy import SIZE, SIZE_SPREAD, target_mesh
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry.rigid import Array, from_rpy, pose_error
 from penumbra.shared.geometry.surface import Surface, nearest_points
 from penumbra.shared.native import kernel
 from penumbra.shared.skin.layout import Skin, link_names
-from penumbra.shared.skin.response import SIZE, SIZE_SPREAD, Response
+from penumbra.shared.skin.response import Response
 
 WEIGHTS = Path(__file__).parent / "weights"
 VALIDATION_SEED, REGRESSION_SEED = 1_000_000, 2_000_000

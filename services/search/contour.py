@@ -405,6 +405,28 @@ def _match(points, field, guarded, shown, state, known, reach, r, kind):
             before = value
 
 
+def slow_waves(points: Points, T: Array) -> list[Array]:
+    """Shapes (n,) that an error of the contour of a limb at T_camera_target (4, 4) may have: on either side, straight and bent
+    along it."""
+    axis = T[:3, 0]
+    along = (points["position"] - T[:3, 3]) @ axis
+    s = 2.0 * (along - along.min(initial=0.0)) / max(float(np.ptp(along)) if len(along) else 0.0, 1e-6) - 1.0
+    normal = points["normal"]
+    across = normal[:, 0] * axis[1] - normal[:, 1] * axis[0] > 0.0
+    return [np.where(across == side, shape, 0.0) for side in (False, True) for shape in (s, 1.5 * s**2 - 0.5)]
+
+
+def stretched(points: Points, T: Array, k: Intrinsics) -> tuple[Array, Array]:
+    """Offsets (n,) [px] of the contour of a limb at T_camera_target (4, 4) along its normals, per unit of its log length and of
+    its log girth."""
+    axis, from_middle = T[:3, 0], points["position"] - T[:3, 3]
+    along = np.outer(from_middle @ axis, axis)
+    x, y, z = points["position"].T
+    nx, ny = points["normal"][:, 0] * k.fx, points["normal"][:, 1] * k.fy
+    moves = np.stack([nx / z, ny / z, -(nx * x + ny * y) / z**2], axis=1)
+    return np.sum(moves * along, axis=1), np.sum(moves * (from_middle - along), axis=1)
+
+
 class Equations(NamedTuple):
     """The normal equations of a contour's offsets, of the pose error along the camera's axes and the dilation.
 

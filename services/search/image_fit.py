@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.contour import MEASURED, POINT, Equations, Model, Points, normal_equations
+from penumbra.services.search.contour import MEASURED, POINT, Equations, Model, Points, normal_equations, slow_waves
 from penumbra.services.search.evidence import Evidence
 from penumbra.services.search.mask_fit import Fit, Limits, marginal, overlap_of, with_prior
 from penumbra.shared.geometry import rigid
@@ -155,7 +155,7 @@ class _Pass:
 
     def waves(self, size: float) -> Array:
         """The right sides (7, k) of `ImageSettings.wave` of this size [px]."""
-        return np.stack([self.equations(size * wave).g for wave in _waves(self.points, self.T)], axis=1)
+        return np.stack([self.equations(size * wave).g for wave in slow_waves(self.points, self.T)], axis=1)
 
     def bends(self, covariance: Array, intrinsics: Intrinsics) -> Array:
         """The right sides (7, BENDS) of what the equations leave out: a pose that is off by one standard deviation moves the
@@ -260,16 +260,6 @@ def _through(pictures: list[_Picture], T: Array) -> _Pass:
         found = picture.descend(T, picture.settings.passes)
         T = found.T
     return found
-
-
-def _waves(points: Points, T: Array) -> list[Array]:
-    """Shapes (n,) that an error of the contour may have: on either side of the limb, straight and bent along it."""
-    axis = T[:3, 0]
-    along = (points["position"] - T[:3, 3]) @ axis
-    s = 2.0 * (along - along.min(initial=0.0)) / max(float(np.ptp(along)) if len(along) else 0.0, 1e-6) - 1.0
-    normal = points["normal"]
-    across = normal[:, 0] * axis[1] - normal[:, 1] * axis[0] > 0.0
-    return [np.where(across == side, shape, 0.0) for side in (False, True) for shape in (s, 1.5 * s**2 - 0.5)]
 
 
 def _bend(points: Points, T: Array, error: Array, intrinsics: Intrinsics) -> Array:

@@ -98,8 +98,9 @@ class Fit:
     `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
     `cost`: chi^2 of contour, dilation and prior together, or of the contour alone where the image shows it; `misfit`: that of the
     mask per measurement, 1 to 3 where the pose is right; `both`, `free`: see `evidence.compare`; `overlap`: see `overlap_of`;
-    `hand`: how many times as uncertain as the forearm's the hand's contour was taken for (`_Problem.bent`); `sharp`: whether
-    the image has edges along the contour (`image_fit.fit_image`)."""
+    `hand`: how many times as uncertain as the forearm's the hand's contour was taken for (`Problem.bent`); `sharp`: whether
+    the image has edges along the contour (`image_fit.fit_image`); `shape`: standard deviation of the limb's surface from the
+    mesh's [m], where the contour was fitted with one (`shape_fit.fit_shape`)."""
 
     T: Array
     covariance: Array
@@ -114,6 +115,7 @@ class Fit:
     overlap: float
     hand: float = 1.0
     sharp: bool = False
+    shape: float | None = None
 
 
 def overlap_of(model: Model, T: Array, evidence: Evidence, hand: float) -> tuple[int, int, float]:
@@ -133,7 +135,7 @@ def overlap_of(model: Model, T: Array, evidence: Evidence, hand: float) -> tuple
 
 
 @dataclass(frozen=True)
-class _Pass:
+class Pass:
     """The contour at one pose, which is `moved` (7,) from the prior: pose error and dilation."""
 
     T: Array
@@ -146,12 +148,12 @@ class _Pass:
     cost: float
 
 
-class _Problem:
+class Problem:
     def __init__(self, model: Model, evidence: Evidence, noise: Noise, regular: Array, converged: float):
         self.model, self.evidence, self.noise, self.regular, self.converged = model, evidence, noise, regular, converged
         self.hand = 1.0
 
-    def at(self, T: Array, moved: Array, reach: float, huber: float) -> _Pass:
+    def at(self, T: Array, moved: Array, reach: float, huber: float) -> Pass:
         evidence = self.evidence
         found = self.model.matched(T, evidence, SPACING_PX, reach, self.hand)
         r, both = found.r - moved[6], found.both
@@ -160,7 +162,7 @@ class _Problem:
         unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
         cost = equations.cost * evidence.boundary_px / max(equations.counted, 1.0) + unexplained
         cost += float(np.dot(moved, self.regular @ moved))
-        return _Pass(T, moved, found.points, r, found.kind, equations.H, equations.g, cost)
+        return Pass(T, moved, found.points, r, found.kind, equations.H, equations.g, cost)
 
     def normal_equations(
         self, T: Array, points: Points, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
@@ -169,7 +171,7 @@ class _Problem:
         weights = points["length"] / (noise.correlation * noise.edge**2)
         return normal_equations(points, r, kind, weights, T[:3, 3], T[:3, 0], k.fx, k.fy, huber, bounded)
 
-    def bent(self, here: _Pass) -> tuple[float, float]:
+    def bent(self, here: Pass) -> tuple[float, float]:
         """How many times the offsets of the hand's contour are those of the forearm's, from 1 to MOST_BENT, and how long it is
         [px]; 1 where too little of the forearm shows to say, or too little is amiss."""
         points = here.points
@@ -183,7 +185,7 @@ class _Problem:
         ratio = math.sqrt(square[beyond].sum() / hand_px) / arm
         return (1.0 if ratio < BENT else min(ratio, MOST_BENT)), hand_px
 
-    def loosened(self, here: _Pass) -> tuple[_Pass, float]:
+    def loosened(self, here: Pass) -> tuple[Pass, float]:
         """The pass that ends a fit once the hand is trusted as far as it fits, and what that costs: the logarithm of a Gaussian's
         width, so that a pose that explains the hand wins over one that does not."""
         hand_px = 0.0
@@ -205,9 +207,9 @@ class _Problem:
                 break
         return T, moved
 
-    def fine(self, here: _Pass) -> _Pass:
+    def fine(self, here: Pass, stage: tuple[float, float, int] = FINE) -> Pass:
         """The best pose near by, by Levenberg and Marquardt."""
-        (reach, huber, passes), damping = FINE, DAMPING[0]
+        (reach, huber, passes), damping = stage, DAMPING[0]
         for _ in range(passes):
             step = self.step(here, damping)
             there = self.at(rigid.perturb(here.T, step[:6]), here.moved + step, reach, huber)
@@ -219,7 +221,7 @@ class _Problem:
                 break
         return here
 
-    def step(self, here: _Pass, damping: float) -> Array:
+    def step(self, here: Pass, damping: float) -> Array:
         information = here.H + self.regular
         information[_DIAGONAL] *= 1.0 + damping
         step = np.linalg.solve(information, here.g - self.regular @ here.moved)
@@ -250,7 +252,7 @@ def fit(
     regular = np.zeros((7, 7))
     regular[:6, :6] = weak if prior is None else prior + weak
     regular[6, 6] = noise.dilation**-2
-    problem = _Problem(model, evidence, noise, regular, converged)
+    problem = Problem(model, evidence, noise, regular, converged)
 
     start = np.zeros(7)
     if T_prior is not None:

@@ -33,6 +33,9 @@ class SearchSettings:
     for the wall behind it is no reason to give up."""
     wrong_misfit: float = 6.0
     """Misfit from which a pose is wrong whatever its overlap. Chosen: twice what one right pose in a hundred exceeds."""
+    other_shape: tuple[float, float] = (0.001, 0.012)
+    """Standard deviation [m] of a limb's surface from the mesh's: the least that is no error of a mask, and the largest of a
+    pose that is right. Chosen: bodies differ by a tenth of a forearm's radius of 4 cm, and a sleeve adds a few millimetres."""
     gate: float = ONE_IN_10_000
     """Squared Mahalanobis distance between the prediction and another pose, above which the other pose is rejected."""
 

@@ -14,7 +14,8 @@ from penumbra.services.search.image_fit import ImageSettings, fit_image
 from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
 from penumbra.services.search.rivals import Rivals
 from penumbra.services.search.settings import SearchSettings
-from penumbra.services.search.verdict import Findings, explains_mask, least_overlap, verdict
+from penumbra.services.search.shape_fit import fit_shape
+from penumbra.services.search.verdict import Findings, explains_mask, is_of_other_shape, least_overlap, verdict
 from penumbra.shared.body import anatomy
 from penumbra.shared.cell.description import Cell
 from penumbra.shared.contract.messages import Mask
@@ -60,6 +61,7 @@ class Search:
         self._robots = RobotDepth(cell, self._T_camera_world)
         self._detected_ns: int | None = None
         self._rivals = Rivals(self._limits)
+        self._has_other_shape = False  # than the mesh: as the last pose that was tracked says
 
     def prepare(self) -> None:
         """Compiles what `update` needs, so that the first frame does not wait for it."""
@@ -70,7 +72,7 @@ class Search:
         mask = Mask(stamp_ns=0, labels=shown * np.uint8(self._target.label_values[0]), x0=0, y0=0, scale=1)
         image = np.repeat(mask.labels[..., None] * np.uint8(20), 3, axis=2)
         self.update(mask, T_home, 1e-4 * np.eye(6), joints, image)
-        self._detected_ns = None
+        self._detected_ns, self._has_other_shape = None, False
         self._rivals.forget()
 
     def update(
@@ -131,11 +133,16 @@ class Search:
         image: NDArray[np.uint8] | None,
     ) -> tuple[Evidence, Fit, bool]:
         """The pose near the prediction, and whether no other need be looked for. The fit to the mask is rough where an image
-        comes after it; what the image does not confirm is tried again from mirror images, and behind an unknown occluder."""
+        comes after it; what the image does not confirm is tried again from mirror images, and behind an unknown occluder. A limb
+        that was of another shape than the mesh still is."""
         seen = self._gather(mask, T_start, joints, limb=T_start)
         prior = self._regularising(prior_covariance)
         first = self._fit(seen, T_start, T_start, prior, CONVERGED if image is None else ROUGH)
         best = self._closer(seen, first, T_start, prior, image)
+        if self._has_other_shape and not best.sharp:
+            shaped = self._shaped(seen, best, T_start, prior)
+            if is_of_other_shape(shaped.overlap, shaped.shape, self.settings):
+                return seen, shaped, True
         if not best.sharp:
             first = self._settled(seen, self._with_mirror(seen, first, T_start, prior), T_start, prior)
             best = self._closer(seen, first, T_start, prior, image)
@@ -323,17 +330,30 @@ class Search:
     ) -> Searched:
         """The estimate of a fit; `with_image`: an image was there to confirm it; T_prior: T_camera_target as predicted, None
         where nothing is known."""
+        if best.shape is None and not best.sharp and best.misfit > MISFIT and seen.seen_px >= detect.SMALLEST_PX:
+            if T_prior is None:
+                T_home = self._T_camera_world @ self._target.home.transform
+                best = self._shaped(seen, best, T_home, self._home_information)
+            else:
+                best = self._shaped(seen, best, T_prior, self._regularising(prior_covariance))
         is_expected, T_probable = False, best.T_searched
         if T_prior is not None:
-            is_expected = self._is_expected(best, T_prior, prior_covariance)
+            is_known = best.shape is None or self._has_other_shape
+            is_expected = is_known and self._is_expected(best, T_prior, prior_covariance)
             if prior_covariance is not None:
                 information = np.asarray(np.linalg.inv(self._predicted(prior_covariance)[0]), np.float64)
                 T_probable = with_prior(best.T, best.covariance, T_prior, information)
         found = self._findings(seen, best, with_image, is_expected)
         state = verdict(found, self.settings).state
         if state == "tracking":
+            self._has_other_shape = best.shape is not None
             return self._estimate(best.T, best.covariance, best.overlap, found.hidden, state, T_probable)
         return self._estimate(best.T_searched, self._limits.covariance, best.overlap, found.hidden, state, best.T_searched)
+
+    def _shaped(self, seen: Evidence, found: Fit, T_prior: Array, prior: Array) -> Fit:
+        """The fit of a limb whose shape is not quite the mesh's."""
+        spread = anatomy.SIZE_SPREAD if self._target.size is None else anatomy.SIZE_MEASURED
+        return fit_shape(self._model, found, seen, T_prior, prior, spread, self._noise, self._limits)
 
     def _findings(self, seen: Evidence, best: Fit, with_image: bool, is_expected: bool) -> Findings:
         amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
@@ -341,6 +361,7 @@ class Search:
             overlap=best.overlap,
             misfit=best.misfit,
             is_sharp=best.sharp,
+            shape=best.shape,
             contour_px=best.length,
             hidden=float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0)),
             covered=1.0 - (best.both + best.free) / amodal,
@@ -378,6 +399,7 @@ class Search:
         return self._estimate(T, covariance, (value + 1.0) / 2.0, hidden, state, T)
 
     def _lost(self, T: Array) -> Searched:
+        self._has_other_shape = False
         return self._estimate(T, self._limits.covariance, 0.0, 1.0, "lost", T)
 
     def _estimate(self, T: Array, covariance: Array, share: float, hidden: float, state: State, T_searched: Array) -> Searched:

@@ -25,14 +25,15 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Findings:
-    """What is known of a fitted pose before it is judged. overlap, misfit, is_sharp: as of `mask_fit.Fit`; contour_px: contour
-    measured [px]; hidden: share of the silhouette in [0, 1] that the mask does not show; covered: share that something covers, or
-    that lies outside the window; has_image: whether an image was there to confirm the pose; is_expected: whether a sure
-    prediction says that the target is there."""
+    """What is known of a fitted pose before it is judged. overlap, misfit, is_sharp, shape: as of `mask_fit.Fit`; contour_px:
+    contour measured [px]; hidden: share of the silhouette in [0, 1] that the mask does not show; covered: share that something
+    covers, or that lies outside the window; has_image: whether an image was there to confirm the pose; is_expected: whether a
+    sure prediction says that the target is there, and it is not just now that it is of another shape than the mesh."""
 
     overlap: float
     misfit: float
     is_sharp: bool
+    shape: float | None
     contour_px: float
     hidden: float
     covered: float
@@ -48,6 +49,8 @@ def verdict(found: Findings, settings: SearchSettings) -> Verdict:
         return Verdict.COVERED if found.covered > settings.covers else Verdict.TOO_LITTLE
     if found.overlap < least_overlap(found.is_expected and found.is_sharp, settings):
         return Verdict.ELSEWHERE
+    if found.shape is not None:
+        return Verdict.RIGHT if found.shape < settings.other_shape[1] else Verdict.MISSHAPEN
     if found.has_image and not found.is_sharp:
         return Verdict.UNCONFIRMED
     if not found.has_image and found.misfit >= settings.wrong_misfit:
@@ -58,6 +61,12 @@ def verdict(found: Findings, settings: SearchSettings) -> Verdict:
 def least_overlap(is_confirmed: bool, settings: SearchSettings) -> float:
     """The least overlap of a right pose. is_confirmed: the image confirms the pose where a sure prediction expects it."""
     return settings.fits_expected if is_confirmed else settings.fits
+
+
+def is_of_other_shape(overlap: float, shape: float | None, settings: SearchSettings) -> bool:
+    """Whether a fit shows a limb that is not quite the mesh, and is right."""
+    least, most = settings.other_shape
+    return shape is not None and least < shape < most and overlap >= settings.fits
 
 
 def explains_mask(overlap: float, misfit: float, settings: SearchSettings) -> bool:

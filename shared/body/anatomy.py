@@ -17,6 +17,13 @@ EXTENT = (0.02, 3.0)
 """Smallest and largest length [m] of a limb."""
 MOST_FACES = 4000
 """Number of triangles that a mesh of a user's is simplified to: finer ones are smaller than a pixel."""
+SIZE = np.array([0.0, -0.08])
+"""Log length and log girth of an average limb, relative to the target's mesh."""
+SIZE_SPREAD = np.array([0.06, 0.11])
+"""Standard deviations of log length and log girth between people: the 5th percentile woman to the 95th man (ANSUR II) lie at log
+girths of -0.27 to 0.11."""
+SIZE_MEASURED = np.array([0.015, 0.03])
+"""The same standard deviations for a person whose size the cell file states, around the stated size."""
 
 
 @dataclass(frozen=True)

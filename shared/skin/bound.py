@@ -10,11 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from penumbra.shared.body.anatomy import SIZE_MEASURED, SIZE_SPREAD
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.skin.layout import Skin
-from penumbra.shared.skin.response import SIZE_MEASURED, SIZE_SPREAD, Response
+from penumbra.shared.skin.response import Response
 
 
 def logs(skin: Skin, response: Response, T_world_pads: Array, T_world_target: Array, size: ArrayLike) -> tuple[Array, Array]:

@@ -70,13 +70,6 @@ class Rest:
         return np.concatenate([np.ones((*z.shape[:-1], 1)), z, z[..., i] * z[..., k]], axis=-1)
 
 
-SIZE = np.array([0.0, -0.08])
-"""Log length and log girth of an average limb, relative to the target's mesh."""
-SIZE_SPREAD = np.array([0.06, 0.11])
-"""Standard deviations of log length and log girth between people: the 5th percentile woman to the 95th man (ANSUR II) lie at log
-girths of -0.27 to 0.11."""
-SIZE_MEASURED = np.array([0.015, 0.03])
-"""The same standard deviations for a person whose size the cell file states, around the stated size."""
 REST = ("coefficients", "middle", "half")
 """The fields of `Rest`."""
 

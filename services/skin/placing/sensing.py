@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from penumbra.services.progress import track
 from penumbra.services.skin.placing.scenes import GAP, Drawing, Room, Scenes
 from penumbra.services.skin.placing.shading import Shading, behind, beside
+from penumbra.shared.body.anatomy import SIZE
 from penumbra.shared.body.robot import RobotModel
 from penumbra.shared.cell import description as cells
 from penumbra.shared.cell.pads import Pad
@@ -19,7 +20,7 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.skin import bound
 from penumbra.shared.skin.layout import Skin
-from penumbra.shared.skin.response import SIZE, Network, Response, fingerprint, networks
+from penumbra.shared.skin.response import Network, Response, fingerprint, networks
 
 SAMPLES = 20
 """Number of samples of a millisecond in a window of `penumbra haptics`, whose poses the expected errors are for."""

@@ -7,13 +7,14 @@ import pytest
 from scipy.stats import chi2
 
 from penumbra.services.search.settings import ONE_IN_10, ONE_IN_10_000, ONE_IN_100, SearchSettings
-from penumbra.services.search.verdict import Findings, Verdict, explains_mask, verdict
+from penumbra.services.search.verdict import Findings, Verdict, explains_mask, is_of_other_shape, verdict
 
 SETTINGS = SearchSettings()
 GOOD = Findings(
     overlap=0.95,
     misfit=1.0,
     is_sharp=True,
+    shape=None,
     contour_px=400.0,
     hidden=0.1,
     covered=0.05,
@@ -40,6 +41,16 @@ def test_without_an_image_the_mask_s_boundary_decides():
     assert judged(has_image=False, misfit=SETTINGS.wrong_misfit) is Verdict.MISSHAPEN
     assert judged(has_image=False, misfit=0.99 * SETTINGS.wrong_misfit) is Verdict.RIGHT
     assert judged(has_image=True, misfit=SETTINGS.wrong_misfit) is Verdict.RIGHT  # the image is the better witness
+
+
+def test_a_limb_of_another_shape_needs_no_edges_where_the_mesh_has_them_but_may_not_be_just_anything():
+    least, most = SETTINGS.other_shape
+    assert judged(is_sharp=False, shape=0.99 * most) is Verdict.RIGHT
+    assert judged(is_sharp=False, shape=most) is Verdict.MISSHAPEN
+    assert judged(is_sharp=False, shape=0.5 * most, overlap=0.99 * SETTINGS.fits) is Verdict.ELSEWHERE
+    assert is_of_other_shape(SETTINGS.fits, 0.5 * most, SETTINGS)
+    assert not is_of_other_shape(SETTINGS.fits, least, SETTINGS)  # an error of the mask
+    assert not is_of_other_shape(SETTINGS.fits, None, SETTINGS)
 
 
 @pytest.mark.parametrize("overlap", [SETTINGS.fits_expected, 0.99 * SETTINGS.fits])

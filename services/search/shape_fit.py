@@ -1,0 +1,126 @@
+"""The fit of a limb that is not quite the mesh.
+
+A person's forearm has muscles, sleeves and measures of its own. Its contour lies millimetres beside the mesh's, which from nearby
+are several pixels: more than a mask errs, and more than an edge in the image may be off. So where no pose of the mesh explains
+the mask, the difference is taken for the shape's. The surface is off the mesh's by `Fit.shape`, a standard deviation that follows
+from the offsets left, and errs together over BULGE along the limb, on either side in slow waves, by a size that is not this
+person's, and by a hand that is bent as a whole. All of this is in the covariance: without a girth there is no sure distance, but
+the limb's direction and its place in the picture are known as well as ever.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from penumbra.services.search.contour import DROPPED, MEASURED, Model, slow_waves, stretched
+from penumbra.services.search.evidence import Evidence
+from penumbra.services.search.mask_fit import (
+    CONVERGED,
+    FINE,
+    LEAST_ARM_PX,
+    MOST_BENT,
+    Fit,
+    Limits,
+    Noise,
+    Pass,
+    Problem,
+    marginal,
+    overlap_of,
+)
+from penumbra.shared.geometry import rigid
+from penumbra.shared.geometry.rigid import Array
+
+REACH, HUBER = 3.0, 2.0
+"""Reach of the walk and Huber's threshold, in standard deviations of the contour."""
+FARTHEST = 24.0
+"""The longest walk [px]: beyond it lie other things."""
+BULGE = 0.04
+"""Length along a limb over which its surface errs together [m]: of a muscle's belly, of a fold of a sleeve."""
+ROUNDS = 4
+"""Number of times that shape and pose are estimated in turn."""
+
+
+def fit_shape(
+    model: Model,
+    first: Fit,
+    evidence: Evidence,
+    T_prior: Array,
+    prior: Array,
+    size_spread: Array,
+    noise: Noise | None = None,
+    limits: Limits | None = None,
+) -> Fit:
+    """The pose near `first` of a limb whose surface is not the mesh's, with the size of the difference.
+
+    `prior` (6, 6): information about T_prior (4 x 4) along the camera's axes, taken out of the result again as by `mask_fit.fit`;
+    size_spread (2,): standard deviations of log length and log girth about the mesh's.
+    """
+    noise, limits = noise or Noise(), limits or Limits()
+    px_per_m = evidence.intrinsics.fx / max(float(first.T_searched[2, 3]), 1e-3)
+    regular = np.zeros((7, 7))
+    regular[:6, :6] = prior + limits.information
+    T, moved, sigma, hand = first.T_searched, np.zeros(7), FINE[0] / REACH, first.hand
+    moved[:6] = rigid.pose_error(T, T_prior)
+    for _ in range(ROUNDS):
+        regular[6, 6] = 1.0 / (noise.dilation**2 + sigma**2)
+        problem = Problem(model, evidence, replace(noise, edge=sigma), regular, CONVERGED)
+        problem.hand = hand
+        stage = min(max(FINE[0], REACH * sigma), FARTHEST), HUBER * sigma, FINE[2]
+        here = problem.fine(problem.at(T, moved, *stage[:2]), stage)
+        T, moved = here.T, here.moved
+        sigma, hand = _spreads(here, model.wrist, problem.hand, noise.edge, stage[1])
+
+    problem.noise = replace(noise, edge=sigma, correlation=max(noise.correlation, BULGE * px_per_m))
+    measured = problem.normal_equations(T, here.points, here.r, here.kind, HUBER * sigma, False)
+    shapes = [sigma * wave for wave in slow_waves(here.points, T)]
+    sizes = [spread * off for spread, off in zip(size_spread, stretched(here.points, T, evidence.intrinsics), strict=True)]
+    _, beyond = _lengths(here, model.wrist, problem.hand)
+    bends = [np.where(beyond, problem.hand * sigma * here.points["normal"][:, i], 0.0) for i in (0, 1)]
+    errors = [problem.normal_equations(T, here.points, r, here.kind, math.inf, False).g for r in (*shapes, *sizes, *bends)]
+    both, free, overlap = overlap_of(model, T, evidence, hand)
+    T_measured, covariance = marginal(T, moved, measured.H, measured.g, regular, measured.rolls, limits, np.stack(errors, axis=1))
+    return replace(
+        first,
+        T=T_measured,
+        covariance=covariance,
+        T_searched=T,
+        length=_measured_px(here, model.wrist, problem.hand),
+        rms=math.sqrt(measured.square / measured.length) if measured.length > 0 else math.inf,
+        dilation=float(moved[6]),
+        both=both,
+        free=free,
+        overlap=overlap,
+        hand=hand,
+        shape=math.sqrt(max(sigma**2 - noise.edge**2, 0.0) + moved[6] ** 2) / px_per_m,
+    )
+
+
+def _measured_px(here: Pass, wrist: float, hand: float) -> float:
+    """The length of the contour that was measured [px], a bent hand's as well: it says little of the pose, but shows a limb."""
+    return float(np.sum(_lengths(here, wrist, hand)[0] * (here.kind == MEASURED)))
+
+
+def _lengths(here: Pass, wrist: float, hand: float) -> tuple[Array, NDArray[np.bool_]]:
+    """The length of contour that each point stands for [px], and whether it lies beyond the wrist."""
+    beyond = (here.points["position"] - here.T[:3, 3]) @ here.T[:3, 0] > wrist
+    return here.points["length"] * np.where(beyond, hand**2, 1.0), beyond
+
+
+def _spreads(here: Pass, wrist: float, hand: float, least: float, huber: float) -> tuple[float, float]:
+    """The standard deviation [px] of the offsets of the forearm's contour, at least `least`, and how many times that of the
+    hand's is; where hardly any of the forearm shows, that of both and 1. An offset beyond Huber's threshold counts by its
+    distance."""
+    length, beyond = _lengths(here, wrist, hand)
+    length = np.where(here.kind == DROPPED, 0.0, length)
+    r = np.abs(here.r)
+    square = length * np.where(r <= huber, r**2, huber * (2.0 * r - huber))
+    arm_px, hand_px = float(length[~beyond].sum()), float(length[beyond].sum())
+    if arm_px < LEAST_ARM_PX:
+        return max(least, math.sqrt(float(square.sum()) / max(arm_px + hand_px, 1e-9))), 1.0
+    arm = max(least, math.sqrt(float(square[~beyond].sum()) / arm_px))
+    bent = math.sqrt(float(square[beyond].sum()) / max(hand_px, 1e-9)) / arm
+    return arm, min(max(bent, 1.0), MOST_BENT)
