@@ -47,10 +47,12 @@ def verdict(found: Findings, settings: SearchSettings) -> Verdict:
     shortest_px = settings.shortest_px if found.is_expected else settings.recognised_px
     if found.hidden > largest_hidden or found.contour_px < shortest_px:
         return Verdict.COVERED if found.covered > settings.covers else Verdict.TOO_LITTLE
+    if found.shape is not None:
+        if found.overlap < settings.fits_shaped:
+            return Verdict.ELSEWHERE
+        return Verdict.RIGHT if found.shape < settings.other_shape[1] else Verdict.MISSHAPEN
     if found.overlap < least_overlap(found.is_expected and found.is_sharp, settings):
         return Verdict.ELSEWHERE
-    if found.shape is not None:
-        return Verdict.RIGHT if found.shape < settings.other_shape[1] else Verdict.MISSHAPEN
     if found.has_image and not found.is_sharp:
         return Verdict.UNCONFIRMED
     if not found.has_image and found.misfit >= settings.wrong_misfit:
@@ -66,7 +68,7 @@ def least_overlap(is_confirmed: bool, settings: SearchSettings) -> float:
 def is_of_other_shape(overlap: float, shape: float | None, settings: SearchSettings) -> bool:
     """Whether a fit shows a limb that is not quite the mesh, and is right."""
     least, most = settings.other_shape
-    return shape is not None and least < shape < most and overlap >= settings.fits
+    return shape is not None and least < shape < most and overlap >= settings.fits_shaped
 
 
 def explains_mask(overlap: float, misfit: float, settings: SearchSettings) -> bool:

@@ -35,7 +35,7 @@ from penumbra.services.haptics.estimator import Estimator
 from penumbra.services.haptics.service import WEIGHTS, shapes_of
 from penumbra.services.haptics.surface_points import SurfacePoints
 from penumbra.services.skin.model import links, mountings
-from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.body.anatomy import SIZE_SPREAD, target_mesh
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
@@ -43,7 +43,7 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin import bound
 from penumbra.shared.skin.layout import Skin, link_names
-from penumbra.shared.skin.response import SIZE_SPREAD, Response, fingerprint
+from penumbra.shared.skin.response import Response, fingerprint
 from penumbra.sim.skin import field
 from penumbra.tests.bench.lib import drift, results, surfaces, things
 from penumbra.tests.bench.lib.results import Part, Result, marked

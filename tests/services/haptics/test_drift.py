@@ -7,13 +7,13 @@ import pytest
 
 from penumbra.services.haptics.drift import BLOCK_S, CALIBRATED, GAIN_SPREAD, OFFSET_SPREAD, Drift
 from penumbra.services.haptics.estimator import Estimator
-from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.body.anatomy import SIZE_SPREAD, target_mesh
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
-from penumbra.shared.skin.response import SIZE_SPREAD, Response
+from penumbra.shared.skin.response import Response
 
 SAMPLES = 20
 EVERY_S = 0.1

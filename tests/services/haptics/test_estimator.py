@@ -18,12 +18,12 @@ from penumbra.services.haptics.paper_nearest import nearest_points
 from penumbra.services.haptics.paper_network import Relative
 from penumbra.services.haptics.size import Size
 from penumbra.services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, Prior, Reading, Solver, marginal, peak
-from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.body.anatomy import SIZE, SIZE_SPREAD, target_mesh
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
-from penumbra.shared.skin.response import SIZE, SIZE_SPREAD, Response
+from penumbra.shared.skin.response import Response
 from penumbra.sim.skin import field
 
 MS = 1_000_000

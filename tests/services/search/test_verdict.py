@@ -47,8 +47,8 @@ def test_a_limb_of_another_shape_needs_no_edges_where_the_mesh_has_them_but_may_
     least, most = SETTINGS.other_shape
     assert judged(is_sharp=False, shape=0.99 * most) is Verdict.RIGHT
     assert judged(is_sharp=False, shape=most) is Verdict.MISSHAPEN
-    assert judged(is_sharp=False, shape=0.5 * most, overlap=0.99 * SETTINGS.fits) is Verdict.ELSEWHERE
-    assert is_of_other_shape(SETTINGS.fits, 0.5 * most, SETTINGS)
+    assert judged(is_sharp=False, shape=0.5 * most, overlap=0.99 * SETTINGS.fits_shaped) is Verdict.ELSEWHERE
+    assert is_of_other_shape(SETTINGS.fits_shaped, 0.5 * most, SETTINGS)
     assert not is_of_other_shape(SETTINGS.fits, least, SETTINGS)  # an error of the mask
     assert not is_of_other_shape(SETTINGS.fits, None, SETTINGS)
 
