@@ -3,7 +3,8 @@
 In: masks, frames, robot joints, and the fused pose as prediction. Out: the camera's pose with covariance, overlap, hidden share,
 state. `mask_fit.py` is a least-squares fit of the mesh's occluding contour (`contour.py`) to the mask's boundary that ignores
 what is hidden (after SRT3D, Stoiber et al. 2022, doi:10.1007/s11263-022-01579-8, with mask boundaries in place of colour
-statistics); `image_fit.py` goes on from there on the image itself, by the colours on both sides of the contour;
+statistics); `image_fit.py` goes on from there on the image itself, by the colours on both sides of the contour; `shape_fit.py`
+measures a limb that is not quite the mesh;
 `paper_search.py` is the paper's gradient ascent on the overlap f_m. `evidence.py` classifies the pixels,
 `detect.py` finds the target without a prediction, `starter.py` from landmarks of hands and elbows where `refinder.py` looks for
 these, `verdict.py` judges the pose, and `tracker.py` puts them together; its numbers
