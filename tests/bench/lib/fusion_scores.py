@@ -205,7 +205,7 @@ def ways(seed: int, index: int, seconds: float) -> dict[str, Way]:
     for name, run in {**played, SILENT: runs.silenced(right, index)}.items():
         estimates = _poses(run, times)
         tracked = [(right.at(t), each) for t, each in zip(times, estimates, strict=True) if each.state == "tracking"]
-        beyond = sum(normalised(T, each.T, each.covariance, True) > chi2.ppf(THREE_SIGMA, 6) for T, each in tracked)
+        beyond = sum(bool(normalised(T, each.T, each.covariance, True) > chi2.ppf(THREE_SIGMA, 6)) for T, each in tracked)
         found[name] = Way(_apart(track, estimates), len(times), len(tracked), beyond)
     return found
 
