@@ -13,12 +13,13 @@ covariance L L' reads pose + sqrt(lasting) L bias + white noise.
 
 A measurement that the gate refuses and another sense contradicts is wrong, but how it changes may be right. From then on its
 sense reads pose + offset + bias + white noise, with an offset of which nothing is known at first and which stays but for a slow
-random walk. The first refused measurement tells the offset and nothing of the pose, and those after it how the limb moves, as
-surely as their noise lets them. The covariance is true for as long as the offset stays. It is given up where a measurement
-without it passes the gate, for the sense is right again, and where the sense or another one surprises: then the sense is not used
-until it is right again.
+random walk. While it is on trial its measurements tell the offset and nothing of the pose, and those after it how the limb
+moves, as surely as their noise lets them. How fast the offset wanders is learned: a sense whose offset runs away tells nothing
+of the limb. The offset is given up where a measurement without it passes the gate, for the sense is right again, and where the
+sense or another one surprises: then the sense is not used until it is right again.
 
-Two numbers adapt to the innovations, by whether each resembles the one before of the same sense. Innovations that resemble each
+Three numbers adapt to the innovations, by whether each resembles the one before of the same sense. Those of a wrong sense, beside
+its offset, that resemble each other mean that it runs away: the offset's walk grows. Those of others that resemble each
 other mean that the filter lags behind the limb: the process noise grows, linear and angular each on its own, because otherwise a
 limb that turns would let a sense that is wrong about its position pass. Innovations that are too large and do not resemble each
 other mean that the sense is noisier than it says: its covariance grows, and is never less than what it says.
@@ -29,7 +30,9 @@ that of the records. Functions write what they find to their last arguments.
 Sources: error-state filter on SO(3): Sola, "Quaternion kinematics for the error-state Kalman filter" (2017), arXiv:1711.02508;
 coloured measurement noise by state augmentation: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
 Navigation" (2001), sections 8.2 and 8.3, DOI 10.1002/0471221279; correlation of innovations as the sign of a wrong process
-noise: Mehra, "On the identification of variances and adaptive Kalman filtering" (1970), DOI 10.1109/TAC.1970.1099422.
+noise: Mehra, "On the identification of variances and adaptive Kalman filtering" (1970), DOI 10.1109/TAC.1970.1099422; errors that
+are considered and not corrected: Schmidt, "Application of state-space methods to navigation problems" (1966),
+DOI 10.1016/B978-1-4831-6716-9.50011-4.
 """
 
 from __future__ import annotations
@@ -79,7 +82,7 @@ def forget(state):  # type: ignore[no-untyped-def]
     now.stamp_ns = now.accepted_ns = NEVER
     now.passed = now.rank = 0
     now.distance = 0.0
-    now.agility[0] = now.agility[1] = 1.0
+    now.agility[0] = now.agility[1] = now.wander[0] = now.wander[1] = 1.0
     now.wrong = NOBODY
     for i in range(POSE):
         now.velocity[i] = now.acceleration[i] = now.offset[i] = 0.0
@@ -185,7 +188,7 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
             _follow(model, state, m, z, H, PHt, S_inverse, innovation, contradicted)
             return
         fresh = True  # as if it were the first
-    update(state, m, z, PHt, S_inverse)
+    update(state, m, z, PHt, S_inverse, 0)
     now.accepted_ns = sense.accepted_ns = m.stamp_ns
     sense.refused, sense.refused_ns, sense.unsteady = 0, NEVER, 0
     now.passed = 1
@@ -195,19 +198,33 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
 def _follow(model, state, m, z, H, PHt, S_inverse, innovation, contradicted):  # type: ignore[no-untyped-def]
     """Uses how a refused measurement changes, as one of a sense that is off by an offset which stays: from where it is
     contradicted on, and while nothing refutes that."""
-    now = state.now
+    now, sense = state.now, state.senses[m.source]
     if now.wrong == m.source:
         offset(model, state, m, z, H)
         innovated(model, state, m, z, H, PHt, S_inverse, innovation)
         if so3.dot(innovation, innovation) <= model.senses[m.source].threshold[1, m.rank]:
-            update(state, m, z, PHt, S_inverse)
+            _learn_wander(model.one, now, sense, m, innovation)
+            is_on_trial = m.stamp_ns - sense.refused_ns < model.one.offset_trial * 1e9
+            update(state, m, z, PHt, S_inverse, len(state.P) - POSE if is_on_trial else 0)
         else:
             _refute(state)
-    elif contradicted and now.wrong == NOBODY and not state.senses[m.source].unsteady:
-        now.wrong = m.source
+    elif contradicted and now.wrong == NOBODY and not sense.unsteady:
+        now.wrong, sense.has_innovation = m.source, 0
+        now.wander[0] = now.wander[1] = 1.0
         offset(model, state, m, z, H)
         innovated(model, state, m, z, H, PHt, S_inverse, innovation)
-        update(state, m, z, PHt, S_inverse)
+        update(state, m, z, PHt, S_inverse, len(state.P) - POSE)
+
+
+@inner
+def _learn_wander(one, now, sense, m, innovation):  # type: ignore[no-untyped-def]
+    """Adapts how fast the offset of a wrong sense wanders to an innovation (6,) of that sense."""
+    scale = _moderation(m, innovation)
+    if sense.has_innovation:
+        for half in range(2):
+            change = one.offset_learning * scale * _resemblance(m, innovation, sense.innovation, half)
+            now.wander[half] = min(max(now.wander[half] * math.exp(change), 1.0), one.offset_wander)
+    _keep(sense, innovation, scale)
 
 
 @inner
@@ -221,6 +238,8 @@ def _refute(state):  # type: ignore[no-untyped-def]
 def trust(state):  # type: ignore[no-untyped-def]
     """Forgets that a sense is taken for wrong by an offset."""
     now, P = state.now, state.P
+    if now.wrong != NOBODY:
+        state.senses[now.wrong].has_innovation = 0  # the last one was beside its offset
     now.wrong = NOBODY
     for i in range(len(P) - POSE, len(P)):
         now.offset[i + POSE - len(P)] = 0.0
@@ -369,7 +388,8 @@ def predict(model, state, stamp_ns):  # type: ignore[no-untyped-def]
         sense.gain *= math.exp(-dt / one.weight_time)
     if now.wrong != NOBODY:
         for i in range(POSE):
-            P[len(P) - POSE + i, len(P) - POSE + i] += dt * (one.offset_drift[i // 3] / one.offset_spread[i // 3]) ** 2
+            walk = one.offset_drift[i // 3] / one.offset_spread[i // 3]
+            P[len(P) - POSE + i, len(P) - POSE + i] += dt * now.wander[i // 3] * walk**2
     now.stamp_ns = stamp_ns
 
 
@@ -490,32 +510,51 @@ def innovated(model, state, m, z, H, PHt, S_inverse, innovation):  # type: ignor
 def learn(model, state, m, innovation, factor):  # type: ignore[no-untyped-def]
     """Adapts the agilities, `factor` times as fast as usual, and the doubt to an innovation (6,)."""
     now, sense, bounds = state.now, state.senses[m.source], model.one.agility
-    length = math.sqrt(so3.dot(innovation, innovation) / m.rank)
-    scale = min(1.0, 2.0 / max(length, 1e-9))  # an outlier counts no more than two sigma do
+    scale = _moderation(m, innovation)
     if sense.has_innovation:
         rate = min(model.one.learning[0], model.one.learning[1] * (m.stamp_ns - sense.learned_ns) * 1e-9)
         alike = scale * so3.dot(innovation, sense.innovation) / m.rank  # 0 expected
         unlike = scale * scale * so3.dot(innovation, innovation) / m.rank - alike  # 1 expected
         for half in range(2):
-            share, along = 0.0, 0.0
-            for i in range(3 * half, 3 * half + 3):
-                along += scale * innovation[i] * sense.innovation[i]
-                for k in range(m.rank):
-                    share += m.directions[k, i] ** 2
-            if share > 1e-3:
-                change = factor * rate * along / share
-                if change < 0.0 and now.agility[half] > SWIFT:
-                    change *= REMEMBERED  # it may set out again as it did before
-                now.agility[half] = min(max(now.agility[half] * math.exp(change), bounds[0]), bounds[1])
+            change = factor * rate * scale * _resemblance(m, innovation, sense.innovation, half)
+            if change < 0.0 and now.agility[half] > SWIFT:
+                change *= REMEMBERED  # it may set out again as it did before
+            now.agility[half] = min(max(now.agility[half] * math.exp(change), bounds[0]), bounds[1])
         sense.doubt = min(max(sense.doubt * math.exp(0.5 * rate * (unlike - 1.25)), 1.0), model.one.doubt)
-    sense.learned_ns, sense.has_innovation = m.stamp_ns, 1
+    sense.learned_ns = m.stamp_ns
+    _keep(sense, innovation, scale)
+
+
+@inner
+def _moderation(m, innovation):  # type: ignore[no-untyped-def]
+    """What an innovation (6,) is to be multiplied with before anything is learned from it: an outlier counts no more than two
+    sigma do."""
+    return min(1.0, 2.0 / max(math.sqrt(so3.dot(innovation, innovation) / m.rank), 1e-9))
+
+
+@inner
+def _resemblance(m, innovation, last, half):  # type: ignore[no-untyped-def]
+    """How much the translation (half 0) or rotation (1) of an innovation (6,) is as that of the last one (6,): the mean product
+    of what is observed of both, 0 expected."""
+    share, along = 0.0, 0.0
+    for i in range(3 * half, 3 * half + 3):
+        along += innovation[i] * last[i]
+        for k in range(m.rank):
+            share += m.directions[k, i] ** 2
+    return along / share if share > 1e-3 else 0.0
+
+
+@inner
+def _keep(sense, innovation, scale):  # type: ignore[no-untyped-def]
+    """Remembers an innovation (6,), times a scale, as the sense's last one."""
+    sense.has_innovation = 1
     for i in range(POSE):
         sense.innovation[i] = scale * innovation[i]
 
 
 @inner
-def update(state, m, z, PHt, S_inverse):  # type: ignore[no-untyped-def]
-    """Updates a state with a measurement."""
+def update(state, m, z, PHt, S_inverse, first):  # type: ignore[no-untyped-def]
+    """Updates the errors of a state from the `first` on with a measurement; those before it stay as they are."""
     now, sense, P = state.now, state.senses[m.source], state.P
     before = _log_volume(P)
     K, rotation, turn = np.empty(POSE), np.empty(3), np.empty((3, 3))
@@ -527,8 +566,10 @@ def update(state, m, z, PHt, S_inverse):  # type: ignore[no-untyped-def]
                 K[k] += PHt[i, j] * S_inverse[j, k]
             correction += K[k] * z[k]
         for k in range(m.rank):
-            for j in range(len(P)):
+            for j in range(0 if i >= first else first, len(P)):
                 P[i, j] -= K[k] * PHt[j, k]
+        if i < first:
+            correction = 0.0
         if i < 3:
             now.p[i] += correction
         elif i < POSE:

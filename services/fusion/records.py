@@ -34,6 +34,7 @@ MODEL = np.dtype(
         *((name, "f8") for name in ("damping", "doubt", "patience", "source_patience", "refusals")),
         *((name, "f8") for name in ("unobserved", "agreement_time", "horizon", "weight_time", "lost_age")),
         *((name, "f8", 2) for name in ("offset_spread", "offset_drift")),
+        *((name, "f8") for name in ("offset_trial", "offset_wander", "offset_learning")),
         ("limits", "f8", 4),  # as in Limits
         ("shoulder", "f8", 3),  # as in Arm
         ("upper_arm", "f8"),
@@ -82,6 +83,7 @@ STATE = np.dtype(
         ("acceleration", "f8", POSE),
         ("agility", "f8", 2),  # learned factors on the process noise, linear and angular
         ("wrong", "i8"),  # row of the sense that is taken for wrong by an offset; NOBODY
+        ("wander", "f8", 2),  # learned factors on the variance of the offset's random walk, in position and rotation
         ("offset", "f8", POSE),  # by which it is, in units of its standard deviation beforehand
     ]
 )

@@ -26,7 +26,7 @@ OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
 PERIOD_S = 1.0 / topics.FUSED.rate_hz
 SILENCE_S = 0.025
 """A replica publishes after the one before it in rank has been silent for so long [s], five periods: a frozen process counts as
-alive for another second."""
+alive for ten times as long."""
 SET_BACK_S = 0.05
 """A clock that goes back by more than this [s] was set; by less, it is being synchronised. Chosen, not measured."""
 

@@ -63,6 +63,7 @@ def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES)
     for service in services:
         own = [
             _rule(f"{service} lives", ["liveliness_token"], [topics.alive("*", service)]),
+            _rule(f"{service} beats", ["put", "declare_subscriber"], [topics.beat("*", service)]),
             _rule(f"{service} answers", ["declare_queryable", "reply"],
                   [topics.health("*", service), *ANSWERS.get(service, ())]),
         ]  # fmt: skip

@@ -134,6 +134,11 @@ def alive(cell: str, service: str = "*", instance: str = "*") -> str:
     return f"penumbra/{cell}/alive/{service}/{instance}"
 
 
+def beat(cell: str, service: str = "*", instance: str = "*") -> str:
+    """What the replicas of a service say to one another, without content: that this one gets its time."""
+    return f"penumbra/{cell}/beat/{service}/{instance}"
+
+
 def health(cell: str, service: str = "*", instance: str = "*") -> str:
     """Queryable: the health and metrics of one running instance, JSON."""
     return f"penumbra/{cell}/{service}/{instance}/health"

@@ -117,7 +117,7 @@ class Node:
         self.stopping = threading.Event()
         self._link = Link(replace(connection, service=service, pool_bytes=pool_bytes), self.stopping, self.log)
         self._is_open = False
-        self.replicas = Replicas(topics.alive(self.cell.name, service, self.instance))
+        self.replicas = Replicas(*(key(self.cell.name, service, self.instance) for key in (topics.alive, topics.beat)))
         self._fitness = Fitness(self.replicas, self.log)
         self._streams = Streams(cell, self._link, self.replicas, lambda: self.now_ns(), self._fitness.turn, self.fault, self.log)
         self._queries = Queries(service, self._link, self.fault)
@@ -154,6 +154,7 @@ class Node:
         if not self.is_warm():
             self.replicas.wait()
         self._link.spawn(lambda: self.replicas.watch(session), "replicas")
+        self._link.spawn(lambda: self.replicas.beat(session, self.stopping), "beat")
         self._announce(session)
         self._link.declare_all()
         self._come_alive()

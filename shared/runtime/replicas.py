@@ -1,12 +1,14 @@
 """The replicas of a service: which of them live, which of them owns a stream, and which are not fit to own any.
 
-Each replica that can work holds a liveliness token; all that see the same tokens find the same owner for a stream.
+Each replica that can work holds a liveliness token; all that see the same tokens find the same owner for a stream. One that
+stands still is left out before its token goes (`beats.py`).
 """
 
 from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -14,6 +16,7 @@ from typing import Protocol
 
 import zenoh
 
+from penumbra.shared.runtime.beats import BEAT_S, Beats
 from penumbra.shared.runtime.traffic import Traffic
 
 CLOCK_S = 1.0
@@ -55,16 +58,17 @@ class Share:
 
 
 class Replicas:
-    """This replica among the living ones. key: of its liveliness token, whose last chunk is the instance.
+    """This replica among the living ones. key, beat_key: of its liveliness token and its beats, with the instance as last chunk.
 
     Before it is open it is alone and owns everything. `others`: the instances that hold a token beside this one.
     """
 
-    def __init__(self, key: str):
-        self._key = key
+    def __init__(self, key: str, beat_key: str):
+        self._key, self._beat_key = key, beat_key
         self._instance = key.rpartition("/")[2]
         self._lock = threading.RLock()
         self._token: zenoh.LivelinessToken | None = None
+        self._frozen: frozenset[str] = frozenset()
         self._shares: list[Share] = []
         self._ranks: dict[str, float] = {}
         self._living = frozenset({self._instance})
@@ -103,6 +107,27 @@ class Replicas:
                     self._count()
             except zenoh.ZError:
                 return
+
+    def beat(self, session: zenoh.Session, stopping: threading.Event) -> None:
+        """Tells the other replicas that this one gets its time, and leaves out those that do not, until `stopping` is set."""
+        beats, own, expression = Beats(self._instance), self._beat_key, f"{self._beat_key.rpartition('/')[0]}/*"
+        try:
+            ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(64)
+            inbox = session.declare_subscriber(expression, ring, allowed_origin=zenoh.Locality.REMOTE)
+            while not stopping.wait(BEAT_S):
+                if self.others:
+                    session.put(own, b"")
+                heard = {str(sample.key_expr).rpartition("/")[2] for sample in iter(inbox.try_recv, None)}
+                self._leave_out(beats.judge(self.others, heard, time.monotonic()))
+        except zenoh.ZError:  # the session was closed
+            return
+
+    def _leave_out(self, frozen: frozenset[str]) -> None:
+        with self._lock:
+            if frozen != self._frozen:
+                self._frozen = frozen
+                if self._living:  # else it waits for the others' tokens
+                    self._count()
 
     def join(self, session: zenoh.Session) -> None:
         """Declares the liveliness token: from now on this replica owns streams."""
@@ -148,9 +173,11 @@ class Replicas:
         return rank
 
     def _count(self) -> None:
-        """This replica counts as soon as the others know of it, or where there are none."""
+        """This replica counts as soon as the others know of it, or where there are none. Where all stand still, as on an
+        overloaded machine, all count."""
         self._ranks = {}
-        self._living = self.others if self._token is None and self.others else self.others | {self._instance}
+        here = self.others if self._token is None and self.others else self.others | {self._instance}
+        self._living = here - self._frozen or here
         self._ranks = {}  # again: another thread may have put a rank among the old ones into the first
         for share in self._shares:
             share.follow(any(map(self.owns, share.streams)))

@@ -17,7 +17,8 @@ As of the stamp: at the stamp of every measurement, once it has arrived, the err
 measurement itself: what fusion costs. What delay costs is the rest, up to the error as of now.
 
 Wrong: a sense is off by 10 cm for a second. How far the pose is moved is taken beside the same run in which the sense is right;
-beside it stands how far it moves if the sense is silent for that second, which no gate can avoid.
+beside it stands how far it moves if the sense is silent for that second, which no gate can avoid. The same for other ways of
+being wrong, with the share of the poses called tracking that are beyond 3 sigma, in the 5 s from then on.
 
 Jump: the limb is elsewhere from one moment to the next, as where an emulator starts again: the messages of one run until then,
 and those of another one afterwards. Noticed: until the pose is right or not called tracking any more.
@@ -70,12 +71,14 @@ from penumbra.tests.bench.lib.fusion_scores import (
     Jump,
     Lateness,
     Scores,
+    Way,
     consistency,
     jump,
     late,
     scored,
     shift,
     taking,
+    ways,
 )
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
@@ -219,7 +222,24 @@ def lateness(each: list[dict[str, Lateness]]) -> dict[str, Any]:
     }
 
 
-EXTRA: dict[str, Callable[[int, int, float], Any]] = {"shift": shift, "late": late, "jump": jump}
+def by_way(each: list[dict[str, Way]]) -> list[dict[str, Any]]:
+    """A row for each way in which a sense is wrong: how far [cm] it moves the pose, and what the pose then says of itself."""
+    rows = []
+    for name in each[0]:
+        found = [one[name] for one in each]
+        tracked = sum(way.tracked for way in found)
+        rows.append(
+            {
+                "way": name,
+                **apart([way.moved for way in found]),
+                "tracking": tracked / max(1, sum(way.poses for way in found)),
+                "beyond_3_sigma": sum(way.beyond for way in found) / max(1, tracked),
+            }
+        )
+    return rows
+
+
+EXTRA: dict[str, Callable[[int, int, float], Any]] = {"shift": shift, "ways": ways, "late": late, "jump": jump}
 
 
 def part(name: str, seed: int, index: int, seconds: float) -> Any:
@@ -256,6 +276,7 @@ def measured(seed: int, count: int, seconds: float, jobs: int, console: Console)
             f"{kind}_sense_cm": apart(column)
             for kind, column in zip(("wrong", "silent"), zip(*every["shift"], strict=True), strict=True)
         },
+        "wrong_ways": by_way(every["ways"]),
         "step_ms": steps["in order"],
         "step_late_ms": steps["late pictures"],
         "targets": core_shares(seed, min(seconds, 5.0)),
@@ -327,6 +348,19 @@ def tables(found: Result) -> list[Part]:
     for row in found["targets"]:
         share = marked(f"{row['core_share']:.1%}", row["core_share"] <= CORE_GOAL)
         bank.add_row(f"{row['n']}", share, f"{row['with_messages']:.1%}")
+    by = Table(
+        *("one sense is", f"moves the pose by, median, cm (goal {WRONG_MEDIAN_GOAL_CM:g})", f"at worst (goal {WRONG_GOAL_CM:g})"),
+        *("tracking", "beyond 3 sigma"),
+        title=f"A sense that is wrong for a second, by how it is: {found['wrong_ways'][0]['runs']} runs each",
+    )
+    for row in found["wrong_ways"]:
+        by.add_row(
+            row["way"],
+            marked(f"{row['median']:.2f}", row["median"] <= WRONG_MEDIAN_GOAL_CM),
+            marked(f"{row['worst']:.2f}", row["worst"] <= WRONG_GOAL_CM),
+            f"{row['tracking']:.0%}",
+            marked(f"{row['beyond_3_sigma']:.2%}", row["beyond_3_sigma"] <= BEYOND_GOAL),
+        )
     return [
         consistent,
         errors,
@@ -335,6 +369,7 @@ def tables(found: Result) -> list[Part]:
         f"A sense that is wrong by 10 cm for a second moves the pose by at most {_goal(wrong['worst'], WRONG_GOAL_CM, 'cm')}, in "
         f"the median by {_goal(wrong['median'], WRONG_MEDIAN_GOAL_CM, 'cm')}, of {wrong['runs']} runs; one that is silent for as "
         f"long by {silent['worst']:.2f} and {silent['median']:.2f} cm.",
+        by,
         f"Nothing seen or felt: within {GUESSED_S:g} s {hidden['median']:.2f} cm off in the median, 95 % below "
         f"{hidden['p95']:.2f}, at worst {_goal(hidden['worst'], GUESSED_GOAL_CM, 'cm')}; later, "
         f"at worst, {hidden['later_worst']:.1f} cm.",

@@ -31,6 +31,8 @@ RADIUS_M, RANGE_M = 0.04, 0.15
 NEAR, FAR = (0.07, 0.17), (0.22, 0.35)
 """Heights [m] of the limb's axis above the skin: always in its range, never."""
 WRONG_S, WRONG_M = (10.0, 11.0), 0.1
+AWAY_SPEED, DRIFT_SPEED, WRONG_TURN = 0.3, 0.1, 0.8
+"""Of a sense that goes on becoming more wrong [m/s], from an offset and from nothing; and how far one is turned [rad]."""
 FAST_SPEED, FAST_ACCELERATION, FAST_TURN = 2.0, 50.0, 6.0
 """Peaks of a fast hand [m/s, m/s^2, rad/s]."""
 CAMERA = rigid.look_at([0.35, -1.15, 0.90], [0.05, 0.0, 0.15])[:3, 3]
@@ -230,11 +232,42 @@ def _is_wrong(m: Message, index: int) -> bool:
     return m.source == list(PERIOD_S)[index % 2] and WRONG_S[0] <= m.stamp < WRONG_S[1]
 
 
-def wronged(run: Run, seed: int, index: int) -> Run:
-    """The same run with one sense off by 10 cm for a second; each of the two in every other run."""
+@dataclass(frozen=True)
+class Wrong:
+    """How a sense is wrong, beside its own errors: off by so much at first [m], farther by so much [m/s], turned by so much
+    [rad], and whether it goes on saying the first pose that it was wrong with."""
+
+    offset: float = 0.0
+    speed: float = 0.0
+    turn: float = 0.0
+    stands: bool = False
+
+
+OFFSET = Wrong(offset=WRONG_M)
+WAYS = {
+    "off by 10 cm": OFFSET,
+    "off by 10 cm, running away at 30 cm/s": Wrong(offset=WRONG_M, speed=AWAY_SPEED),
+    "standing still, 10 cm away": Wrong(offset=WRONG_M, stands=True),
+    "drifting away at 10 cm/s": Wrong(speed=DRIFT_SPEED),
+    "turned by 46 degrees": Wrong(turn=WRONG_TURN),
+}
+"""The ways in which a sense is wrong."""
+
+
+def wronged(run: Run, seed: int, index: int, way: Wrong = OFFSET) -> Run:
+    """The same run with one sense wrong for a second, along and about a random direction; each of the two in every other run."""
     direction = np.random.default_rng([seed, index]).normal(size=3)
-    shift = np.concatenate([WRONG_M * direction / np.linalg.norm(direction), np.zeros(3)])
-    return replace(run, messages=[replace(m, T=rigid.perturb(m.T, shift)) if _is_wrong(m, index) else m for m in run.messages])
+    direction /= np.linalg.norm(direction)
+    first: Array | None = None
+    messages = []
+    for m in run.messages:
+        if _is_wrong(m, index):
+            far = way.offset + way.speed * (m.stamp - WRONG_S[0])
+            said = rigid.perturb(m.T, np.concatenate([far * direction, way.turn * direction]))
+            first = said if first is None else first
+            m = replace(m, T=first if way.stands else said)
+        messages.append(m)
+    return replace(run, messages=messages)
 
 
 def delayed(run: Run, delay: Callable[[], float]) -> Run:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from penumbra.services.fusion.estimate import Estimate
 from penumbra.services.fusion.observer import ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver
 from penumbra.shared.contract.senses import SENSES
@@ -174,20 +175,60 @@ def innovations(run: runs.Run) -> tuple[Array, Array, Array]:
 def shift(seed: int, index: int, seconds: float) -> tuple[float, float]:
     """How far [m] a wrong sense moves the pose at most, beside the same run in which it is right, and how far the same sense does
     that is silent for as long."""
-    begin, end = runs.WRONG_S[0], min(seconds, runs.WRONG_S[1] + 4.0)
-    right = runs.drawn("one sense wrong", seed, index, end)
+    right, times = _beside(seed, index, seconds)
     wrong, silent = runs.wronged(right, seed, index), runs.silenced(right, index)
-    tracks = []
-    for run in (right, wrong, silent):
-        observer = ErrorStateObserver(HOME, SPREAD)
-        player, track = Player(run, [taking(observer)]), []
-        for now in np.arange(begin, end, 0.02):
-            player.until(now)
-            track.append(observer.estimate(runs.ns(now)).T[:3, 3])
-        tracks.append(np.array(track).reshape(-1, 3))
-    right_track, *others = tracks
-    moved_by, missed_by = (float(np.linalg.norm(track - right_track, axis=1).max(initial=0.0)) for track in others)
-    return moved_by, missed_by
+    track, moved, missed = (_poses(run, times) for run in (right, wrong, silent))
+    return _apart(track, moved), _apart(track, missed)
+
+
+@dataclass(frozen=True)
+class Way:
+    """What a sense does that is wrong in one way: how far it moves the pose at most [m]; how many poses there were from then on,
+    how many of them were called tracking, and how many of these were beyond three sigma."""
+
+    moved: float
+    poses: int
+    tracked: int
+    beyond: int
+
+
+SILENT = "silent"
+"""The way of a sense that says nothing for as long as others are wrong."""
+
+
+def ways(seed: int, index: int, seconds: float) -> dict[str, Way]:
+    """One run for each way in which a sense is wrong, and one in which it is silent, beside that in which it is right."""
+    right, times = _beside(seed, index, seconds)
+    track = _poses(right, times)
+    played = {name: runs.wronged(right, seed, index, way) for name, way in runs.WAYS.items()}
+    found = {}
+    for name, run in {**played, SILENT: runs.silenced(right, index)}.items():
+        estimates = _poses(run, times)
+        tracked = [(right.at(t), each) for t, each in zip(times, estimates, strict=True) if each.state == "tracking"]
+        beyond = sum(bool(normalised(T, each.T, each.covariance, True) > chi2.ppf(THREE_SIGMA, 6)) for T, each in tracked)
+        found[name] = Way(_apart(track, estimates), len(times), len(tracked), beyond)
+    return found
+
+
+def _beside(seed: int, index: int, seconds: float) -> tuple[runs.Run, list[float]]:
+    """A run in which both senses are right, and the moments [s] at which a wrong one is compared with it."""
+    end = min(seconds, runs.WRONG_S[1] + 4.0)
+    return runs.drawn("one sense wrong", seed, index, end), np.arange(runs.WRONG_S[0], end, 0.02).tolist()
+
+
+def _poses(run: runs.Run, times: list[float]) -> list[Estimate]:
+    """What the observer says at some moments [s] of a run."""
+    observer = ErrorStateObserver(HOME, SPREAD)
+    player, found = Player(run, [taking(observer)]), []
+    for now in times:
+        player.until(now)
+        found.append(observer.estimate(runs.ns(now)))
+    return found
+
+
+def _apart(one: list[Estimate], other: list[Estimate]) -> float:
+    """The largest distance [m] between poses of the same moments."""
+    return max((_distance(a.T, b.T) for a, b in zip(one, other, strict=True)), default=0.0)
 
 
 @dataclass(frozen=True)

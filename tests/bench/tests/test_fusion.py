@@ -115,6 +115,47 @@ def test_a_sense_that_is_wrong_is_wrong_by_10_cm_for_a_second_and_the_other_is_n
             assert moved == pytest.approx(0.1 if right.source == source and 10.0 <= right.stamp < 11.0 else 0.0, abs=1e-12)
 
 
+def test_a_wrong_sense_runs_away_stands_still_drifts_or_is_turned() -> None:
+    right = runs.drawn("one sense wrong", 1, 1, 12.0)
+    felt = lambda run: [m for m in run.messages if m.source == "haptic" and 10.0 <= m.stamp < 11.0]  # noqa: E731
+    wrong = {name: felt(runs.wronged(right, 1, 1, way)) for name, way in runs.WAYS.items()}
+    off = {
+        name: np.array([rigid.pose_error(b.T, a.T) for a, b in zip(felt(right), found, strict=True)])
+        for name, found in wrong.items()
+    }
+    since = np.array([m.stamp - 10.0 for m in felt(right)])
+    for name, far in {
+        "off by 10 cm": 0.1 + 0.0 * since,
+        "off by 10 cm, running away at 30 cm/s": 0.1 + 0.3 * since,
+        "drifting away at 10 cm/s": 0.1 * since,
+    }.items():
+        np.testing.assert_allclose(np.linalg.norm(off[name][:, :3], axis=1), far, atol=1e-9)
+        np.testing.assert_allclose(off[name][:, 3:], 0.0, atol=1e-9)
+    still = wrong["standing still, 10 cm away"]
+    assert all(m.T is still[0].T for m in still)
+    assert np.linalg.norm(off["standing still, 10 cm away"][0, :3]) == pytest.approx(0.1)
+    turned = off["turned by 46 degrees"]
+    np.testing.assert_allclose(np.linalg.norm(turned[:, 3:], axis=1), 0.8, atol=1e-9)
+    np.testing.assert_allclose(turned[:, :3], 0.0, atol=1e-9)
+
+
+def test_a_sense_that_runs_away_moves_the_pose_no_farther_than_a_silent_one_and_a_turned_one_is_counted() -> None:
+    found = scores.ways(8704, 0, 13.5)
+    assert set(found) == {*runs.WAYS, scores.SILENT}
+    assert all(way.poses == 175 for way in found.values())
+    for way in found.values():
+        assert 0.0 < way.moved < 0.2 and 0 <= way.beyond <= way.tracked <= way.poses
+    assert found["off by 10 cm"].moved < found[scores.SILENT].moved
+    assert found["off by 10 cm, running away at 30 cm/s"].moved < 1.5 * found[scores.SILENT].moved
+
+
+def test_the_rows_of_wrong_senses_are_those_of_all_runs() -> None:
+    each = [{"off": scores.Way(0.01, 100, 50, 1)}, {"off": scores.Way(0.03, 100, 100, 2)}]
+    assert fusion.by_way(each) == [
+        {"way": "off", "runs": 2, "median": pytest.approx(2.0), "worst": 3.0, "tracking": 0.75, "beyond_3_sigma": 0.02}
+    ]
+
+
 def test_a_sense_is_silent_when_it_would_be_wrong_and_the_other_is_not() -> None:
     run = runs.drawn("one sense wrong", 5, 0, 12.0)
     wrong, silent = runs.wronged(run, 5, 0), runs.silenced(run, 0)
@@ -237,6 +278,7 @@ def test_a_tiny_run_writes_the_layout(
     assert max(found["late_difference_mm"].values()) < 1e-6
     # a jump in the middle; nothing is wrong in the first four seconds
     assert found["wrong_sense_cm"] == found["silent_sense_cm"] == {"runs": fusion.WRONG_RUNS, "median": 0.0, "worst": 0.0}
+    assert [row["way"] for row in found["wrong_ways"]] == [*runs.WAYS, scores.SILENT]
     assert 0.0 <= found["jump"]["noticed_worst_s"] <= found["jump"]["again_worst_s"] < 1.0
     assert 0.0 < found["guessed_cm"]["median"] <= found["guessed_cm"]["worst"]
     measured, fused = found["situations"]["visible"]["at_stamps_cm"]["vision"]

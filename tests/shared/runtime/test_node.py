@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 import json
 import logging
 import math
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ import zenoh
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
 from penumbra.shared.runtime import bus, logs
+from penumbra.shared.runtime.beats import BEAT_S, MISSED, STEADY, Beats
 from penumbra.shared.runtime.hang import Turn
 from penumbra.shared.runtime.node import Node
 from penumbra.shared.runtime.reader import sender_of
@@ -87,7 +90,7 @@ def test_a_replica_that_leaves_takes_nothing_over():
         opened.append(leaves)
 
     for leaves in (False, True):
-        replicas = Replicas("penumbra/table/health/x/one")
+        replicas = Replicas("penumbra/table/alive/x/one", "penumbra/table/beat/x/one")
         replicas.wait()
         replicas.share(Share(("stream",), [], functools.partial(read, leaves)))
         if leaves:
@@ -119,6 +122,47 @@ def test_the_streams_of_a_frozen_process_move_to_the_living_one(replica, process
     wait_for(lambda: all(map(node.owns, STREAMS)), 3, "its streams")
     frozen.send_signal(signal.SIGCONT)
     wait_for(lambda: not all(map(node.owns, STREAMS)), 5, "it to own some again after it thawed")
+
+
+def test_a_replica_whose_beats_are_missed_owns_nothing_though_its_token_is_there(replica, monkeypatch):
+    judge: Callable[..., frozenset[str]] = Beats.judge
+    heard: set[str] = set()
+
+    def noted(beats: Beats, others: Collection[str], names: Collection[str], now_s: float) -> frozenset[str]:
+        heard.update(names)
+        return judge(beats, others, names, now_s)
+
+    monkeypatch.setattr(Beats, "judge", noted)
+    node, silent = replica(), replica()
+    before = wait_for(lambda: owners([node, silent]), 5, "one owner for every stream")
+    wait_for(lambda: heard == {node.instance, silent.instance}, 5, "each to hear the other one")
+    with monkeypatch.context() as frozen:
+        frozen.setattr(silent.replicas, "others", frozenset())  # it beats for nobody
+        wait_for(lambda: all(map(node.owns, STREAMS)), 10, "its streams")
+        assert silent.instance in living(node)
+    wait_for(lambda: owners([node, silent]) == before, 10, "each to have its own again")
+
+
+def test_a_replica_counts_as_frozen_from_a_row_of_missed_beats_until_it_has_beaten_for_a_while() -> None:
+    beats = Beats("own")
+    now_s = itertools.count()  # in periods of beats
+    judge = lambda heard: beats.judge(("other", "old"), heard, BEAT_S * next(now_s))  # noqa: E731
+    assert judge([]) == frozenset(), "one that has never beaten is not missed"
+    assert judge(["other"]) == frozenset()
+    assert [judge([]) for _ in range(MISSED)] == [frozenset()] * (MISSED - 1) + [{"other"}]
+    assert [judge(["other"]) for _ in range(STEADY)] == [{"other"}] * (STEADY - 1) + [frozenset()]
+    assert all(judge(["other"] if k % MISSED else []) == frozenset() for k in range(3 * MISSED)), "a beat now and then is late"
+
+
+def test_a_replica_that_has_stood_still_knows_that_the_others_have_taken_over() -> None:
+    beats = Beats("own")
+    for k in range(3):
+        assert beats.judge(("other",), ["other"], BEAT_S * k) == frozenset()
+    later_s = BEAT_S * (2 + MISSED + 1)
+    assert beats.judge(("other",), [], later_s) == {"own"}, "it has missed one beat of the other, and the other many of its"
+    for k in range(1, STEADY):
+        assert beats.judge(("other",), ["other"], later_s + BEAT_S * k) == {"own"}
+    assert beats.judge(("other",), ["other"], later_s + BEAT_S * STEADY) == frozenset()
 
 
 def test_a_replica_receives_only_the_messages_of_its_own_streams(router, replica, process):
