@@ -31,9 +31,9 @@ class SearchSettings:
     fits_expected: float = 0.6
     """Least overlap of a pose that the image confirms where a sure prediction expects it. Chosen: a mask that takes an occluder
     for the wall behind it is no reason to give up."""
-    fits_shaped: float = 0.7
-    """The same of a limb that is not quite the mesh. Derived: a surface 8 mm off that of a forearm, of 4 cm radius, costs a
-    tenth."""
+    fits_shaped: float = 0.75
+    """The same of a limb that is not quite the mesh. Chosen: a surface 8 mm off that of a forearm of 4 cm radius costs a tenth;
+    with 0.7, poses of wrong limbs were tracked in a film."""
     wrong_misfit: float = 6.0
     """Misfit from which a pose is wrong whatever its overlap. Chosen: twice what one right pose in a hundred exceeds."""
     other_shape: tuple[float, float] = (0.001, 0.012)
