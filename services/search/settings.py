@@ -39,6 +39,9 @@ class SearchSettings:
     other_shape: tuple[float, float] = (0.001, 0.012)
     """Standard deviation [m] of a limb's surface from the mesh's: the least that is no error of a mask, and the largest of a
     pose that is right. Chosen: bodies differ by a tenth of a forearm's radius of 4 cm, and a sleeve adds a few millimetres."""
+    shape_known: tuple[int, int] = (5, 20)
+    """Number of pictures in which a limb was the mesh from which it is of no other shape, and the largest that is counted: a
+    person's shape stays, and a mask that is wrong for a moment is none. Pictures in which it is lost count back. Chosen."""
     gate: float = ONE_IN_10_000
     """Squared Mahalanobis distance between the prediction and another pose, above which the other pose is rejected."""
 

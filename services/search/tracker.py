@@ -62,6 +62,7 @@ class Search:
         self._detected_ns: int | None = None
         self._rivals = Rivals(self._limits)
         self._has_other_shape = False  # than the mesh: as the last pose that was tracked says
+        self._sharp = 0  # pictures that showed the mesh, less those in which the target was lost since
 
     def prepare(self) -> None:
         """Compiles what `update` needs, so that the first frame does not wait for it."""
@@ -72,7 +73,7 @@ class Search:
         mask = Mask(stamp_ns=0, labels=shown * np.uint8(self._target.label_values[0]), x0=0, y0=0, scale=1)
         image = np.repeat(mask.labels[..., None] * np.uint8(20), 3, axis=2)
         self.update(mask, T_home, 1e-4 * np.eye(6), joints, image)
-        self._detected_ns, self._has_other_shape = None, False
+        self._detected_ns, self._has_other_shape, self._sharp = None, False, 0
         self._rivals.forget()
 
     def update(
@@ -330,7 +331,8 @@ class Search:
     ) -> Searched:
         """The estimate of a fit; `with_image`: an image was there to confirm it; T_prior: T_camera_target as predicted, None
         where nothing is known."""
-        if best.shape is None and not best.sharp and best.misfit > MISFIT and seen.seen_px >= detect.SMALLEST_PX:
+        may_differ = self._sharp < self.settings.shape_known[0] and seen.seen_px >= detect.SMALLEST_PX
+        if may_differ and best.shape is None and not best.sharp and best.misfit > MISFIT:
             if T_prior is None:
                 T_home = self._T_camera_world @ self._target.home.transform
                 best = self._shaped(seen, best, T_home, self._home_information)
@@ -345,6 +347,7 @@ class Search:
                 T_probable = with_prior(best.T, best.covariance, T_prior, information)
         found = self._findings(seen, best, with_image, is_expected)
         state = verdict(found, self.settings).state
+        self._sharp = min(self._sharp + best.sharp, self.settings.shape_known[1]) if state != "lost" else max(self._sharp - 1, 0)
         if state == "tracking":
             self._has_other_shape = best.shape is not None
             return self._estimate(best.T, best.covariance, best.overlap, found.hidden, state, T_probable)

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 
+from penumbra.services.search.settings import SearchSettings
 from penumbra.services.search.tracker import Search, Searched
 from penumbra.shared.cell.description import Body
 from penumbra.shared.contract.labels import TARGET_LABELS, Label
@@ -64,3 +66,15 @@ def test_a_limb_that_is_the_mesh_is_measured_as_one():
     found = Search(shot.cell).update(exact_mask(shot, window_of(shot, T_start)), T_start, PRIOR, shot.joints)
     assert found.state == "tracking"
     assert np.sqrt(np.trace(found.covariance[:3, :3])) < 0.01
+
+
+def test_a_limb_that_was_the_mesh_is_of_no_other_shape_for_a_wrong_mask():
+    shot = shots.shot(80, 0, domain="easy")
+    right = exact_mask(shot, window_of(shot, shot.T_world_target))
+    fat = cv2.dilate(np.isin(right.labels, TARGET_LABELS).astype(np.uint8), np.ones((9, 9), np.uint8))
+    wrong = Mask(stamp_ns=1, labels=fat * np.uint8(Label.FOREARM), x0=right.x0, y0=right.y0, scale=right.scale)
+    search = Search(shot.cell)
+    assert search.update(wrong, shot.T_world_target, PRIOR, shot.joints).state == "tracking"
+    for _ in range(SearchSettings().shape_known[0]):
+        assert search.update(right, shot.T_world_target, PRIOR, shot.joints, shot.image).state == "tracking"
+    assert search.update(wrong, shot.T_world_target, PRIOR, shot.joints).state == "lost"
