@@ -12,7 +12,7 @@ from penumbra.shared.perception.vision import State
 class Verdict(Enum):
     """The cases. `state`: what is published; `reason`: in words."""
 
-    RIGHT = "tracking", "mask, and image where there is one, confirm the pose"
+    RIGHT = "tracking", "mask, and image where the limb is the mesh and there is one, confirm the pose"
     COVERED = "occluded", "too little is visible, and most of the target is covered or outside the picture"
     TOO_LITTLE = "lost", "too little is visible, and nothing covers the rest"
     ELSEWHERE = "lost", "mask and silhouette overlap too little"
