@@ -129,9 +129,7 @@ def _kill(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]
 
 
 def _memory(chain: Chain, process: psutil.Process) -> AbstractContextManager[None]:
-    camera = next(iter(chain.cell.cameras))
-    need = partial(injected.large_frame, chain.running.session, chain.running.cell, camera)
-    return injected.at_once(partial(injected.starve, process, need, STARVED_S))
+    return injected.at_once(partial(injected.starve, process, chain.running.session, chain.running.cell, STARVED_S))
 
 
 @contextmanager

@@ -5,6 +5,7 @@ everything takes, is `penumbra bench faults`."""
 import json
 import time
 from contextlib import ExitStack, contextmanager
+from functools import partial
 
 import psutil
 import pytest
@@ -90,9 +91,9 @@ def test_a_frozen_service_goes_on_with_what_is_new(struck):
 
 def test_a_process_out_of_memory_ends_and_begins_anew_and_does_not_go_on_half(struck):
     before = struck.pids()
-    need = lambda: injected.large_frame(struck.running.session, "table", "front")  # noqa: E731
     ended = []
-    struck.by(injected.at_once(lambda: ended.append(injected.starve(struck.one("segmentation"), need, BACK_S))))
+    starved = partial(injected.starve, struck.one("segmentation"), struck.running.session, "table", BACK_S)
+    struck.by(injected.at_once(lambda: ended.append(starved())))
     assert ended == [True]
     changed = {name for name, pid in struck.pids().items() if pid != before[name]}
     assert changed == {"segmentation"}, "the others have the memory for it"

@@ -17,17 +17,18 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import psutil
 import zenoh
 
-from penumbra.shared.contract import messages, topics
+from penumbra.shared.contract import topics
 from penumbra.shared.runtime.guard import Numbering
 from penumbra.tests.support.live import Running, free_port, penumbra_command, penumbra_up, service_of
 
 CLOCK_SOURCE = Path(__file__).parent / "clock_shift.c"
 PIDS = 1 << 22
 """More than Linux gives out."""
+QUESTION_BYTES = 1 << 26
+"""As much in one piece has no process at hand: malloc maps new memory for 32 MB and more."""
 
 
 @contextmanager
@@ -96,28 +97,24 @@ def _signalled(process: psutil.Process, number: signal.Signals) -> Iterator[None
             process.send_signal(number)
 
 
-def starve(process: psutil.Process, need: Callable[[], None], seconds: float) -> bool:
-    """Out of memory: the kernel refuses it every further page (RLIMIT_AS at less than it has already), until it has ended, at
-    most for so long; whether it has. It may go on for ever with what it has: need() is called again and again, so that it wants
-    more."""
+def starve(process: psutil.Process, session: zenoh.Session, cell: str, seconds: float) -> bool:
+    """Out of memory: the kernel refuses a service's process every further page (RLIMIT_AS at less than it has already), until it
+    has ended, at most for so long; whether it has. It may go on for ever with what it has: it is asked for its health again and
+    again, with a question for which it needs new memory."""
     before = resource.prlimit(process.pid, resource.RLIMIT_AS, (1 << 20, resource.RLIM_INFINITY))
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        need()
+        session.get(
+            topics.health(cell, instance=f"$*-{process.pid}-$*"),
+            payload=bytes(QUESTION_BYTES),
+            priority=zenoh.Priority.BACKGROUND,  # the others' messages pass by
+        )
         with suppress(psutil.TimeoutExpired):
             process.wait(1.0)
             return True
     with suppress(ProcessLookupError):
         resource.prlimit(process.pid, resource.RLIMIT_AS, before)
     return False
-
-
-def large_frame(session: zenoh.Session, cell: str, camera: str) -> None:
-    """A picture as large as a message may be: its reader needs new memory for it (malloc has nothing of 32 MB or more at hand),
-    though it will not use a picture of this size."""
-    frame = messages.Frame(stamp_ns=time.time_ns(), image=np.zeros((4600, 4600, 3), np.uint8))
-    key = topics.FRAME.at(cell=cell, camera=camera)
-    session.put(key, messages.encode(frame), congestion_control=zenoh.CongestionControl.BLOCK)  # else a busy link drops it
 
 
 @contextmanager
