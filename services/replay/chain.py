@@ -18,6 +18,7 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import processes, topics
 from penumbra.shared.contract.messages import Message, decode, encode
 from penumbra.shared.contract.topics import Topic
+from penumbra.shared.perception.lookout import MAX_PIXELS
 from penumbra.shared.recording.reading import Played
 from penumbra.shared.runtime import logs
 from penumbra.shared.runtime.hang import HANG_S
@@ -27,8 +28,9 @@ SERVICES = ("segmentation", "search", "haptics", "fusion")
 DELAY_NS = {topics.FRAME: 2_000_000, topics.MASK: 30_000_000, topics.VISION: 5_000_000, topics.HAPTIC: 1_000_000}
 """From the cause of a message to its arrival; what is not named arrives at once."""
 
-DEFAULTS = {"search": ["--landmarks", "off"]}
-"""Arguments of services: a replay shall say the same whether or not a machine has the landmark models."""
+DEFAULTS = {"search": ("--landmarks", "off"), "segmentation": ("--pixels", str(MAX_PIXELS))}
+"""Arguments of services, before others: a replay shall say the same on every machine, whether or not it has the landmark models
+and however fast it is."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +65,12 @@ class Replay:
         self._answers: dict[str, Callable[[dict[str, str], bytes], Any]] = {}
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._count = itertools.count()
-        chosen = {**DEFAULTS, **(arguments or {})}
+        chosen = arguments or {}
         for name in services:
             if (process := processes.find(name)) is not None and not process.is_needed(cell):
                 continue
             module = importlib.import_module(f"penumbra.services.{name}.service")
-            module.start(ReplayNode(self, name), flags.parse(module.FLAGS, list(chosen.get(name, ()))))
+            module.start(ReplayNode(self, name), flags.parse(module.FLAGS, [*DEFAULTS.get(name, ()), *chosen.get(name, ())]))
 
     def run(self, recording: Iterable[tuple[Topic, dict[str, str], Message]]) -> list[Heard]:
         """Plays messages in the order of their stamps, each delivered after the delay that its sensor has; returns `heard`."""

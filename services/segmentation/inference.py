@@ -17,12 +17,16 @@ from penumbra.services.segmentation.openvino_step import Compiled, Precision, St
 from penumbra.services.segmentation.shift import shift_state
 from penumbra.shared.contract.labels import TARGET_LABELS
 from penumbra.shared.native import processor
-from penumbra.shared.perception.lookout import Window
+from penumbra.shared.perception.lookout import MAX_PIXELS, Window
 
 WEIGHTS = Path(__file__).parent / "weights" / "prednet.npz"
 MAX_GAP_S = 0.5
 """Longest gap [s] between frames after which the recurrent state is kept: after a longer one it has little to do with the
 picture. Chosen, not measured."""
+TRIED_PX = 128
+"""Width and height [px] of the window by which a machine's speed is judged."""
+FEWEST_PIXELS = 112 * 112
+"""A machine too slow for a window of so many pixels gets it nevertheless: of a smaller one an arm fills too few."""
 
 
 class Segmenter:
@@ -134,6 +138,12 @@ def load_segmenter(path: Path = WEIGHTS, precision: Precision | None = None) -> 
 def _loaded(path: Path, changed_ns: int, precision: Precision | None) -> Segmenter:
     network, card = model.load(path)
     return Segmenter(network, float(card["calibration"]["target_logit_offset"]), precision)
+
+
+def affordable(segmenter: Segmenter, step_s: float) -> int:
+    """The pixels of a window that takes step_s of one thread of this processor, within FEWEST_PIXELS and lookout.MAX_PIXELS."""
+    pixels = TRIED_PX**2 * 1e3 * step_s / speed(segmenter, TRIED_PX, TRIED_PX, 5)["cpu_ms"]
+    return round(min(max(pixels, FEWEST_PIXELS), MAX_PIXELS))
 
 
 def speed(segmenter: Segmenter, width: int, height: int, frames: int = 30) -> dict[str, float]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from penumbra.services import flags
-from penumbra.services.segmentation.inference import WEIGHTS, Segmenter, load_segmenter
+from penumbra.services.segmentation.inference import WEIGHTS, Segmenter, affordable, load_segmenter
 from penumbra.services.segmentation.priors import Priors
 from penumbra.shared.cell.description import Camera
 from penumbra.shared.contract.labels import Label
@@ -23,6 +23,9 @@ FOLLOW_S = 0.2
 """Period [s] of the prediction of the next windows, also of those that are another replica's."""
 AHEAD_S = 0.4
 """Time [s] ahead of that prediction: in it the network is compiled for a window's size."""
+SHARE = 0.4
+"""Of a core's time, the part that the frames of all cameras may take, where `--pixels` does not say otherwise: two cores are the
+whole chain's, the emulator's with it."""
 JOINTS_NEAR_NS = 100_000_000
 """Largest distance [ns] of a frame from the joint angles with which robots are drawn into it: a frame does not wait for those of
 its stamp, and before they come the last velocity goes on. Chosen: the age after which joints are stale."""
@@ -36,6 +39,12 @@ FLAGS = (
         default=WEIGHTS,
         show_default="the built-in ones",
         help="the network, made by `penumbra segmentation train`",
+    ),
+    flags.Option(
+        "--pixels",
+        type=flags.positive,
+        show_default="as many as this machine has time for",
+        help="largest window around the targets [px]; what is larger is shown at a coarser scale",
     ),
 )
 EXAMPLE = "penumbra segmentation --cell table --camera front"
@@ -53,9 +62,12 @@ def start(node: ServiceNode, options: flags.Options) -> None:
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
 
-    lookouts = {name: Lookout(cell, name) for name in cameras}
-    looking = {name: threading.Lock() for name in cameras}  # a camera's frames and `follow` look by turns
     segmenters = {name: load_segmenter(options.weights) for name in cameras}
+    rate_hz = sum(cell.cameras[name].rate_hz for name in cameras)
+    most = options.pixels or affordable(load_segmenter(options.weights), SHARE / rate_hz)
+    node.add_report("largest_window_px", lambda: most)
+    lookouts = {name: Lookout(cell, name, most) for name in cameras}
+    looking = {name: threading.Lock() for name in cameras}  # a camera's frames and `follow` look by turns
     for name, segmenter in segmenters.items():
         segmenter.prepare(lookouts[name].window)  # while the process joins the others
 

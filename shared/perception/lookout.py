@@ -20,7 +20,7 @@ STEP = 16
 SIZE_STEP = 32
 """Sizes are rounded up to this, so that the size seldom changes while the target turns."""
 MAX_PIXELS = 224 * 224
-"""Largest window around targets: what a step has time for. A larger target is shown at a coarser scale."""
+"""Largest window around targets. A larger target is shown at a coarser scale."""
 MAX_PIXELS_WIDE = 320 * 240
 """Largest window of the whole frame, or around all targets' homes, while one of the targets is lost."""
 HOME_SIGMAS = 2.0
@@ -87,10 +87,11 @@ def whole_frame(camera: Sized) -> Window:
 
 class Lookout:
     """Where to look in the frames of one camera: around the targets of its cell as fusion predicts them, and around the homes of
-    those that are lost. targets: those that it can see, by what its picture shows of the region around their homes."""
+    those that are lost. targets: those that it can see, by what its picture shows of the region around their homes; most: pixels
+    of the largest window around those that are not."""
 
-    def __init__(self, cell: Cell, camera: str):
-        self._camera = cell.cameras[camera]
+    def __init__(self, cell: Cell, camera: str, most: int = MAX_PIXELS):
+        self._camera, self._most = cell.cameras[camera], most
         self._poses: dict[str, FusedPose] = {}
         self._boxes: dict[str, Array] = {}
         self._homes: dict[str, tuple[Array, Array]] = {}
@@ -132,7 +133,7 @@ class Lookout:
         """The window that `look` would give next, for a frame of this stamp."""
         known = self.predicted(stamp_ns)
         sure = [(T, self._boxes[name]) for name, (T, _) in known.items()]
-        found = window_around(self._camera, sure, self._window) if len(sure) == len(self._boxes) else None
+        found = window_around(self._camera, sure, self._window, self._most) if len(sure) == len(self._boxes) else None
         return found or self._wide([name for name in self._boxes if name not in known], sure)
 
     def _wide(self, lost: Iterable[str] = (), sure: Iterable[tuple[Array, Array]] = ()) -> Window:
@@ -152,8 +153,8 @@ def _is_in_picture(camera: Camera, region: Array) -> bool:
 def window_around(
     camera: Camera, targets: Iterable[tuple[Array, Array]], previous: Window | None = None, most: int = MAX_PIXELS
 ) -> Window | None:
-    """The window of at most `most` pixels that holds targets, given as (T_world_target (4, 4), corners (8, 3) of their box), with
-    a margin of MARGIN_M, arms of ARM_M at most WIDEST_ARM_PX wide.
+    """The window of at most `most` pixels, before its sides are rounded up, that holds targets, given as (T_world_target (4, 4),
+    corners (8, 3) of their box), with a margin of MARGIN_M, arms of ARM_M at most WIDEST_ARM_PX wide.
 
     The previous window is kept while it holds them and is not much too large: the less it moves, the more the recurrent state
     is worth. None where no target is in the picture, or one is too near to the camera to say.

@@ -85,6 +85,15 @@ def test_a_known_target_is_looked_at_until_its_pose_is_old(far):
     assert lookout.look(2 * S) == wide
 
 
+def test_with_fewer_pixels_a_known_target_is_seen_coarser_and_a_lost_one_as_before(far):
+    many, few = Lookout(far, "front"), Lookout(far, "front", 96 * 96)
+    assert few.window == many.window
+    for lookout in (many, few):
+        lookout.add(fused(rigid.from_rpy((0.05, 0.02, 0.25), (0.1, 0.0, 0.3))))
+    fine, coarse = many.look(S), few.look(S)
+    assert coarse.width * coarse.height < fine.width * fine.height and coarse.scale == 2 * fine.scale
+
+
 def test_what_is_foreseen_is_what_will_be_looked_at_and_changes_nothing(far):
     lookout, T = Lookout(far, "front"), rigid.from_rpy((0.05, 0.02, 0.25), (0.1, 0.0, 0.3))
     lookout.add(fused(T))

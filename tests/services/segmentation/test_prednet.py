@@ -24,7 +24,7 @@ from penumbra.shared.contract import topics
 from penumbra.shared.contract.labels import UNLABELLED, Label
 from penumbra.shared.native import processor
 from penumbra.shared.perception import landmarks
-from penumbra.shared.perception.lookout import Lookout, Window, corners_of, window_around
+from penumbra.shared.perception.lookout import MAX_PIXELS, Lookout, Window, corners_of, window_around
 from penumbra.sim.sets import sequences, shots
 from penumbra.tests.support import nodes
 from penumbra.tests.support.live import wait_for
@@ -579,7 +579,7 @@ def test_a_replica_that_waits_has_compiled_for_the_window_of_now():
     cell = cells.load("table")
     replay, segmenter = Replay(cell, services=()), inference.load_segmenter()  # which has what the service's own have
     node = Waiting(replay, "segmentation")
-    service.start(node, SimpleNamespace(camera=None, weights=inference.WEIGHTS))
+    service.start(node, SimpleNamespace(camera=None, weights=inference.WEIGHTS, pixels=MAX_PIXELS))
     assert not node.is_warm(), "nobody has said where to look"
     poses = [nodes.pose(stamp_ns, x=0.2) for stamp_ns in range(1_000_000_000, 2_000_000_000, 100_000_000)]
     replay.run((topics.FUSED, {"target": "forearm"}, pose) for pose in poses)
@@ -587,6 +587,12 @@ def test_a_replica_that_waits_has_compiled_for_the_window_of_now():
     lookout.add(poses[-1])
     wait_for(lambda: segmenter.is_prepared(lookout.look(poses[-1].stamp_ns)), 60, "the network compiled ahead")
     assert node.is_warm()
+
+
+def test_a_machine_gets_as_large_windows_as_it_has_time_for_within_bounds():
+    segmenter = inference.load_segmenter()
+    windows = [inference.affordable(segmenter, step_s) for step_s in (1e-9, 1e9)]
+    assert windows == [inference.FEWEST_PIXELS, MAX_PIXELS]
 
 
 def test_the_card_says_on_what_the_weights_were_made():
