@@ -259,12 +259,10 @@ def fit(
         start[:6] = rigid.pose_error(T_start, T_prior)
     independent = evidence.measurements(noise.correlation)
     here = problem.at(T_start, start, *FINE[:2])
-    if here.cost <= GOOD * independent:
-        here = problem.fine(here)
-    else:  # the start may be too far away for the short walk
-        there = problem.fine(problem.at(*problem.coarse(T_start, start), *FINE[:2]))
-        here = there if there.cost <= GOOD * independent else min(there, problem.fine(here), key=lambda one: one.cost)
-    here, loose = problem.loosened(here)
+    if here.cost > GOOD * independent:  # the start may be too far away for the short walk
+        there = problem.at(*problem.coarse(T_start, start), *FINE[:2])
+        here = min(here, there, key=lambda one: one.cost)
+    here, loose = problem.loosened(problem.fine(here))
     cost = here.cost + loose
 
     # the pose is final: only what was measured informs

@@ -145,8 +145,9 @@ class Search:
             if is_of_other_shape(shaped.overlap, shaped.shape, self.settings):
                 return seen, shaped, True
         if not best.sharp:
-            first = self._settled(seen, self._with_mirror(seen, first, T_start, prior), T_start, prior)
-            best = self._closer(seen, first, T_start, prior, image)
+            other = self._settled(seen, self._with_mirror(seen, first, T_start, prior), T_start, prior)
+            if other is not first:
+                first, best = other, self._closer(seen, other, T_start, prior, image)
         if image is not None and not best.sharp and seen.seen_px >= detect.SMALLEST_PX:
             seen, best = self._behind_unknown(seen, mask.labels, T_start, prior, image) or (seen, best)
         fits = best.sharp or (first.overlap >= self.settings.fits_well and first.misfit < self.settings.wrong_misfit)
