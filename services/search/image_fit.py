@@ -264,13 +264,13 @@ def _through(pictures: list[_Picture], T: Array) -> _Pass:
 
 def _bend(points: Points, T: Array, error: Array, intrinsics: Intrinsics) -> Array:
     """Second-order part (n,) [px] of the way of contour points along their normals as a pose moves by an error (6,)."""
-    focal = np.array([intrinsics.fx, intrinsics.fy])
+    from_middle = points["position"] - T[:3, 3]
 
     def pixels(moved: Array) -> Array:
-        there = (points["position"] - T[:3, 3]) @ rigid.rotation(moved[3:]).T + T[:3, 3] + moved[:3]
-        return there[:, :2] / there[:, 2:] * focal
+        there = from_middle @ rigid.rotation(moved[3:]).T + (T[:3, 3] + moved[:3])
+        return there[:, :2] / there[:, 2:] * (intrinsics.fx, intrinsics.fy) + (intrinsics.cx, intrinsics.cy)
 
-    second = 0.5 * (pixels(error) + pixels(-error)) - pixels(np.zeros(6))
+    second = 0.5 * (pixels(error) + pixels(-error)) - points["pixel"]
     return np.asarray(np.sum(second * points["normal"], axis=1))
 
 
