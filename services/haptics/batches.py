@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,36 @@ class Backlog:
         return self._lags[-1] > min(self._lags) + self.patience_ns
 
 
+class _Batch(NamedTuple):
+    """Samples (s, e), one every period_ns up to stamp_ns."""
+
+    stamp_ns: int
+    period_ns: int
+    volts: Array
+
+    @property
+    def before_ns(self) -> int:
+        """The stamp before the first one."""
+        return self.stamp_ns - self.period_ns * len(self.volts)
+
+    def after(self, stamp_ns: int) -> _Batch:
+        """The samples later than a stamp."""
+        early = (stamp_ns - self.before_ns) // self.period_ns
+        return self if early <= 0 else self._replace(volts=self.volts[early:])
+
+    def until(self, stamp_ns: int) -> _Batch:
+        """The samples up to a stamp."""
+        late = -((stamp_ns - self.stamp_ns) // self.period_ns)
+        if late <= 0:
+            return self
+        return _Batch(self.stamp_ns - late * self.period_ns, self.period_ns, self.volts[: max(len(self.volts) - late, 0)])
+
+    def total_ns(self, since_ns: int) -> int:
+        """The sum of all stamps since one."""
+        count = len(self.volts)
+        return count * (self.stamp_ns - since_ns) - self.period_ns * (count * (count - 1) // 2)
+
+
 class Collector:
     """Gathers batches and hands out a window when every living pad has filled it.
 
@@ -65,11 +96,10 @@ class Collector:
             raise ValueError(f"expected a window longer than nothing, got {length_ns} ns: give --window-ms above zero")
         self.skin, self.length_ns, self.patience_ns = skin, length_ns, patience_ns
         self._index = {name: k for k, name in enumerate(skin.pads)}
-        self._stamps: list[NDArray[np.int64]] = [np.empty(0, np.int64) for _ in skin.pads]
-        self._volts: list[Array] = [np.empty((0, skin.of(k).stop - skin.of(k).start)) for k in range(len(skin.pads))]
+        self._own = [skin.of(k) for k in range(len(skin.pads))]
         self._watches = [Watch(skin, k) for k in range(len(skin.pads))]
-        self._newest = np.full(len(skin.pads), NEVER, dtype=np.int64)
-        self._done_ns = self._born_ns = NEVER
+        self._top, self._bottom = skin.full_scale - 0.5 * skin.lsb, 0.5 * skin.lsb
+        self._forget()
 
     def add(self, pad: str, stamp_ns: int, period_ns: int, volts: Array) -> VoltageWindow | None:
         """Take a batch (samples, electrodes) whose last row has stamp_ns; returns a window when one is complete.
@@ -79,8 +109,9 @@ class Collector:
         if pad not in self._index:
             raise ValueError(f"expected a pad of {', '.join(self._index)}, got {pad!r}: compare the cell files")
         k = self._index[pad]
-        if volts.ndim != 2 or volts.shape[1] != self._volts[k].shape[1]:
-            raise ValueError(f"pad {pad}: expected rows of {self._volts[k].shape[1]} electrodes, got shape {volts.shape}")
+        electrodes = self._own[k].stop - self._own[k].start
+        if volts.ndim != 2 or volts.shape[1] != electrodes:
+            raise ValueError(f"pad {pad}: expected rows of {electrodes} electrodes, got shape {volts.shape}")
         if period_ns <= 0:
             raise ValueError(f"pad {pad}: expected a positive period_ns, got {period_ns}")
         if stamp_ns <= self._newest[k]:
@@ -90,53 +121,51 @@ class Collector:
         if self._born_ns == NEVER:
             self._born_ns = stamp_ns
         self._watches[k].add(stamp_ns, period_ns, volts)
-        stamps = stamp_ns - period_ns * np.arange(len(volts) - 1, -1, -1, dtype=np.int64)
-        fresh = stamps > max(self._newest[k], stamp_ns - 4 * self.length_ns)
-        self._stamps[k] = np.concatenate([self._stamps[k], stamps[fresh]])
-        self._volts[k] = np.concatenate([self._volts[k], volts[fresh]])
+        batch = _Batch(stamp_ns, period_ns, volts)
+        self._waiting[k].append(batch.after(max(self._newest[k], stamp_ns - 4 * self.length_ns)))
         self._newest[k] = stamp_ns
-        return self._window(period_ns)
+        return self._window()
 
-    def _window(self, period_ns: int) -> VoltageWindow | None:
-        newest_ns = int(self._newest.max())
-        if (self._newest == NEVER).any() and newest_ns - self._born_ns < self.patience_ns:
+    def _window(self) -> VoltageWindow | None:
+        newest_ns = max(self._newest)
+        if min(self._newest) == NEVER and newest_ns - self._born_ns < self.patience_ns:
             return None  # at the start every pad has a chance to be heard
-        heard = self._newest >= newest_ns - self.patience_ns
-        end_ns = int(self._newest[heard].min())
+        heard = [k for k, stamp_ns in enumerate(self._newest) if stamp_ns >= newest_ns - self.patience_ns]
+        end_ns = min(self._newest[k] for k in heard)
         if self._done_ns == NEVER:  # the first window begins where the slowest living pad begins
-            self._done_ns = max(int(s[0]) for s, ok in zip(self._stamps, heard, strict=True) if ok) - period_ns
+            self._done_ns = max(self._waiting[k][0].before_ns for k in heard)
         if end_ns - self._done_ns < self.length_ns:
             return None
         # After a cut only the newest stretch is used: an old one would say little about now.
         begin_ns = max(self._done_ns, end_ns - self.length_ns)
-        skin = self.skin
-        amplitude, samples, pressed = skin.a3.copy(), np.zeros(len(skin), np.int64), np.zeros(len(skin), np.bool_)
-        faults: dict[str, str] = {}
-        middles = []
-        for k, name in enumerate(skin.pads):
-            inside = (self._stamps[k] > begin_ns) & (self._stamps[k] <= end_ns)
-            rows, stamps = self._volts[k][inside], self._stamps[k][inside]
-            keep = self._stamps[k] > end_ns
-            self._volts[k], self._stamps[k] = self._volts[k][keep], self._stamps[k][keep]
-            if not len(rows):
-                faults[name] = "silent"
-                continue
-            own = skin.of(k)
-            high, low = rows >= skin.full_scale[own] - 0.5 * skin.lsb[own], rows <= 0.5 * skin.lsb[own]
-            pressed[own] = np.where(skin.polarity[own] > 0.0, high, low).mean(axis=0) > 0.5
-            ended = high.any(axis=0) | low.any(axis=0)
-            reasons = dict.fromkeys(np.flatnonzero(ended).tolist(), SATURATED)
-            reasons |= {self._watches[k].names.index(e): fault.text for e, fault in self._watches[k].faults.items()}
-            faults |= {skin.names[own.start + e]: reason for e, reason in reasons.items()}
-            amplitude[own] = rows.mean(axis=0)
-            samples[own] = np.where(np.isin(np.arange(rows.shape[1]), list(reasons)), 0, len(rows))
-            middles.append(float((stamps - begin_ns).mean()))
         self._done_ns = end_ns
-        middle = int(np.mean(middles)) if middles else self.length_ns // 2
+        taken = [[batch.until(end_ns).after(begin_ns) for batch in waiting] for waiting in self._waiting]
+        self._waiting = [[batch.after(end_ns) for batch in waiting if batch.stamp_ns > end_ns] for waiting in self._waiting]
+        return self._means(taken, begin_ns, end_ns)
+
+    def _means(self, taken: list[list[_Batch]], begin_ns: int, end_ns: int) -> VoltageWindow:
+        """The window of the samples of each pad, of all pads at once."""
+        skin = self.skin
+        counts = [sum(len(batch.volts) for batch in batches) for batches in taken]
+        volts = np.full((max(counts), len(skin)), np.nan)  # for the rows that a pad has not
+        for own, count, batches in zip(self._own, counts, taken, strict=True):
+            if count:
+                np.concatenate([batch.volts for batch in batches], out=volts[:count, own])
+        samples = np.array(counts)[skin.pad_of]
+        amplitude = np.where(samples > 0, np.nansum(volts, axis=0) / np.maximum(samples, 1), skin.a3)
+        high, low = volts >= self._top, volts <= self._bottom
+        pressed = np.where(skin.polarity > 0.0, high, low).sum(axis=0) > 0.5 * samples
+        faults = {skin.names[e]: SATURATED for e in np.flatnonzero((high | low).any(axis=0))}
+        for name, count, watch in zip(skin.pads, counts, self._watches, strict=True):
+            faults |= {f"{name}/{e}": fault.text for e, fault in watch.faults.items()} if count else {name: "silent"}
+        if faults:
+            samples[[name in faults for name in skin.names]] = 0
+        totals = [sum(batch.total_ns(begin_ns) for batch in batches) for batches in taken]
+        middles = [total / count for total, count in zip(totals, counts, strict=True) if count]
+        middle = int(sum(middles) / len(middles)) if middles else self.length_ns // 2
         return VoltageWindow(begin_ns + middle, end_ns, amplitude, samples, faults, pressed)
 
     def _forget(self) -> None:
-        for k in range(len(self.skin.pads)):
-            self._stamps[k], self._volts[k] = self._stamps[k][:0], self._volts[k][:0]
-        self._newest[:] = NEVER
+        self._waiting: list[list[_Batch]] = [[] for _ in self.skin.pads]  # what no window has had
+        self._newest = [NEVER] * len(self.skin.pads)
         self._done_ns = self._born_ns = NEVER

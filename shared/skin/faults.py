@@ -90,7 +90,9 @@ class Watch:
         own = skin.of(pad)
         self.names = tuple(name.partition("/")[2] for name in skin.names[own])
         self._a3, self._polarity, self._noise = skin.a3[own], skin.polarity[own], skin.noise[own]
-        self._lsb, self._end = skin.lsb[own], skin.full_scale[own]
+        self._end, self._top = skin.full_scale[own], skin.full_scale[own] - 0.5 * skin.lsb[own]
+        # a range that is no noise; an electrode whose own noise is below a step of the converter may have none
+        self._still = np.where(self._noise > skin.lsb[own] ** 2, 1.01 * skin.lsb[own], -np.inf)
         reach = skin.peak[own] / skin.a2[own]
         self._even: Array = reach.mean() / reach
         self.look: Look | None = None
@@ -108,7 +110,7 @@ class Watch:
         self._due_ns = stamp_ns + period_ns
         self._rows.append(volts)
         self._count += len(volts)
-        self._tail = np.concatenate([self._tail, volts])[-BLOCK:]
+        self._tail = volts[-BLOCK:] if len(volts) >= BLOCK else np.concatenate([self._tail, volts])[-BLOCK:]
         if len(self._tail) == BLOCK:
             self._see_ends()
         if self._count >= max(LEAST_SAMPLES, LOOK_S * 1e9 / period_ns):
@@ -131,13 +133,10 @@ class Watch:
 
     def _see_ends(self) -> None:
         """Electrodes at an end of the converter, or without any noise, in the last BLOCK samples."""
-        high, low = self._tail.max(axis=0), self._tail.min(axis=0)
-        ended = high >= self._end - 0.5 * self._lsb
-        still = (high - low <= 1.01 * self._lsb) & (self._noise > self._lsb**2)
+        high, low = np.maximum.reduce(self._tail), np.minimum.reduce(self._tail)
+        ended = high >= self._top
         self._quick = {}
-        if not (ended.any() or still.any()):
-            return
-        for k in np.flatnonzero(ended | still):
+        for k in np.flatnonzero(ended | (high - low <= self._still)):
             if ended[k]:
                 text = f"saturated: it reads {high[k]:.3f} V, amplitudes end at {self._end[k]:.3f} V"
                 self._quick[int(k)] = Fault("saturated", text)
