@@ -147,15 +147,15 @@ class Collector:
         """The window of the samples of each pad, of all pads at once."""
         skin = self.skin
         counts = [sum(len(batch.volts) for batch in batches) for batches in taken]
-        volts = np.full((max(counts), len(skin)), np.nan)  # for the rows that a pad has not
+        samples = np.array(counts)[skin.pad_of]
+        volts, is_there = np.zeros((max(counts), len(skin))), np.arange(max(counts))[:, None] < samples
         for own, count, batches in zip(self._own, counts, taken, strict=True):
             if count:
                 np.concatenate([batch.volts for batch in batches], out=volts[:count, own])
-        samples = np.array(counts)[skin.pad_of]
-        amplitude = np.where(samples > 0, np.nansum(volts, axis=0) / np.maximum(samples, 1), skin.a3)
-        high, low = volts >= self._top, volts <= self._bottom
+        amplitude = np.where(samples > 0, volts.sum(axis=0) / np.maximum(samples, 1), skin.a3)
+        high, low = is_there & (volts >= self._top), is_there & (volts <= self._bottom)
         pressed = np.where(skin.polarity > 0.0, high, low).sum(axis=0) > 0.5 * samples
-        faults = {skin.names[e]: SATURATED for e in np.flatnonzero((high | low).any(axis=0))}
+        faults = {skin.names[e]: SATURATED for e in (high | low).any(axis=0).nonzero()[0]}
         for name, count, watch in zip(skin.pads, counts, self._watches, strict=True):
             faults |= {f"{name}/{e}": fault.text for e, fault in watch.faults.items()} if count else {name: "silent"}
         if faults:

@@ -80,6 +80,9 @@ class Drift:
     """error (n,), links_error: standard deviations of the field model's signals and of the links', as shares; size_spread (2,):
     of log sizes between people.
 
+    sigma: standard deviations (n,) of gains beside the mean of all, and of offsets [V]. What gains have in common looks like
+    another girth, whose spread between people is several times as large.
+
     The state is what gains (n,) and offsets (n,) [V] have moved by, and the bias (8,) of camera and size.
     """
 
@@ -92,6 +95,7 @@ class Drift:
         self._times = np.concatenate([np.full(2 * n, WALK_S), np.full(len(spread) - 2 * n, BIAS_S)])
         self._mean, self._covariance = np.zeros(len(spread)), self._old.copy()
         self._covariance[: 2 * n, : 2 * n] = np.diag(np.repeat(np.square(CALIBRATED), n))
+        self.sigma = self._deviations()
         self._unlearned_s, self._refused = 0.0, 0
         self.forget()
 
@@ -111,10 +115,8 @@ class Drift:
         """What each offset has moved by (n,) [V]."""
         return self._mean[self._n : 2 * self._n]
 
-    @property
-    def sigma(self) -> tuple[Array, Array]:
-        """Standard deviations (n,) of gains beside the mean of all, and of offsets [V]. What gains have in common looks like
-        another girth, whose spread between people is several times as large."""
+    def _deviations(self) -> tuple[Array, Array]:
+        """What is `sigma` until something is learned or becomes old."""
         n, own = self._n, self._covariance[: self._n, : self._n]
         gains = np.diag(own) - 2.0 * own.mean(axis=1) + own.mean()
         return np.sqrt(np.maximum(gains, 0.0)), np.sqrt(np.diag(self._covariance)[n : 2 * n])
@@ -128,6 +130,7 @@ class Drift:
         self._mean *= keep
         self._covariance = self._old + np.outer(keep, keep) * (self._covariance - self._old)
         self._unlearned_s = 0.0
+        self.sigma = self._deviations()
 
     def signal(self, raw: Array, links: Array) -> Array:
         """The limb's signals (n,) [V] in readings (n,) beside the calibrated offsets, of which links are so much (n,)."""
@@ -153,6 +156,7 @@ class Drift:
             self._learn_seen(block)
         elif self._quiet_s > QUIET_S:
             self._learn_rest(block)
+        self.sigma = self._deviations()
 
     def _learn_rest(self, block: _Block) -> None:
         """From a block in which nothing is near. An electrode whose rest has jumped is learned anew."""

@@ -32,7 +32,7 @@ from penumbra.services.haptics.identity import Identity
 from penumbra.services.haptics.paper_network import PoseNetwork, Relative, features
 from penumbra.services.haptics.settings import HapticSettings
 from penumbra.services.haptics.size import PERSON_S, SIZE_GAP, SIZE_LASTING, Size
-from penumbra.services.haptics.solve import LEVER, Prior, Reading, Solution, Solver, peak
+from penumbra.services.haptics.solve import SCALES, Prior, Reading, Solution, Solver, peak
 from penumbra.services.haptics.starts import Limb, Starts
 from penumbra.services.haptics.surface_points import Shapes, SurfacePoint, SurfacePoints
 from penumbra.services.haptics.track import Home, Place, Track
@@ -300,7 +300,7 @@ class Estimator:
         return self._solver.solve(reading, prior, start, self.size.mean, coarse=coarse)
 
     def _prior(self, place: Place) -> Prior:
-        return Prior(place.T, np.asarray(np.linalg.inv(place.covariance), np.float64), self.size.mean, self.size.information)
+        return Prior(place.T, place.information, self.size.mean, self.size.information)
 
     def _place(self, reading: Reading, solution: Solution, prior: Prior) -> Place:
         """Where the limb is by a window's solution from a prior."""
@@ -328,7 +328,7 @@ class Estimator:
         """Learns the size where it can be told from the pose: close to the pads, with one place possible."""
         if gap < SIZE_GAP and self._is_tracking and self._track.rival is None:
             likelihood = self._solver.likelihood(reading, solution, SIZE_LASTING)
-            self.size.learn(solution.size, *likelihood, self._home.information)
+            self.size.learn(solution.size, *likelihood, self._home.place.information)
 
     def _identified(
         self, reading: Reading, solution: Solution, gap: float, expected: Place | None, elapsed_s: float
@@ -368,17 +368,16 @@ class Estimator:
         explained badly say less than their noise promises."""
         trust = 1.0 / max(1.0, solution.misfit)
         best, known = peak(solution.T, trust * information, trust * gradient)
-        turn = np.eye(6)
-        turn[3:, 3:] = best[:3, :3] @ solution.T[:3, :3].T  # what is unknown about T's axis is so about the published one
-        known = turn @ known @ turn.T
+        turn = best[:3, :3] @ solution.T[:3, :3].T  # what is unknown about T's axis is so about the published one
+        known[3:] = turn @ known[3:]
+        known[:, 3:] = known[:, 3:] @ turn.T
         return best, 0.5 * (known + known.T)
 
     def _is_felt(self, information: Array, gap: float) -> bool:
         """Whether something is near: within range, and known well enough along one direction at least."""
-        scale = np.array([1.0, 1.0, 1.0, 1.0 / LEVER, 1.0 / LEVER, 1.0 / LEVER])
-        strongest = float(np.linalg.eigvalsh(information * np.outer(scale, scale))[-1])
-        is_near = gap < self.settings.range_share * float(self.skin.range.max())
-        return is_near and strongest > 1.0 / self.settings.worst_sigma**2
+        if gap >= self.settings.range_share * float(self.skin.range.max()):
+            return False
+        return float(np.linalg.eigvalsh(information * SCALES)[-1]) > 1.0 / self.settings.worst_sigma**2
 
     def _estimate(self, T: Array, information: Array, gap: float, state: HapticState, residuals: Array) -> HapticEstimate:
         known = information if state in ("in_range", "unidentified") else np.zeros((6, 6))

@@ -11,6 +11,7 @@ yet stays unidentified. A camera that has just seen the limb where it is felt de
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -32,6 +33,8 @@ ERRORS = np.array([1.0, 2.5, 5.0])
 """The field model's error at a limb, in standard deviations of all its errors, and ERRORS_ODDS: their probabilities. Measured: at
 pads that feel little, and at odd poses, the model errs more."""
 ERRORS_ODDS = np.log([0.75, 0.2, 0.05])
+TIMES = np.concatenate([ERRORS, np.ones(1 + len(SHARES))])[:, None]
+"""The field model's error at a limb, a fault and other things, likewise."""
 FAULTY = 0.01
 """Probability that an electrode is faulty, whatever is felt, and that a pad beside a limb is: their shares are then one."""
 
@@ -95,11 +98,13 @@ class Identity:
         settings = self._settings
         self._absent_s = 0.0
         added = self._innovation(reading, solution, free, gap, elapsed_s)
-        before = self._likelihood * np.exp(-elapsed_s / settings.odds_memory_s)
+        before = self._likelihood * math.exp(-elapsed_s / settings.odds_memory_s)
         odds, most = self._odds(before), settings.odds_rate * elapsed_s
-        step = self._odds(before + added) - odds
-        self._likelihood = before + added * min(1.0, most / max(abs(step), 1e-9))
+        self._likelihood = before + added
         self.odds = self._odds(self._likelihood)
+        if abs(step := self.odds - odds) > most:
+            self._likelihood = before + added * (most / abs(step))
+            self.odds = self._odds(self._likelihood)
         self._likelihood *= min(1.0, settings.most_odds / max(abs(self.odds), 1e-9))
         self._is_limb = self.odds >= (0.0 if self._is_limb else self._becomes_limb)
 
@@ -116,10 +121,9 @@ class Identity:
         noise = np.where(used, reading.variance, 1.0)
         others = SHARES * min(1.0, SHARES_GAP / max(gap, SHARES_GAP)) ** SHARES_POWER
         share = np.concatenate([0.0 * ERRORS, [1.0], others])[:, None]
-        times = np.concatenate([ERRORS, np.ones(1 + len(others))])[:, None]
-        model = times * (reading.error + NEAR_ERROR * signal / NEAR_SIGNAL)
+        model = TIMES * (reading.error + NEAR_ERROR * signal / NEAR_SIGNAL)
         scale = np.sqrt(free * (model**2 + share**2) * signal**2 + reading.doubt**2)
-        keep = np.exp(-elapsed_s / self._settings.share_memory_s)
+        keep = math.exp(-elapsed_s / self._settings.share_memory_s)
         mean, variance = keep * self._mean, 1.0 - keep**2 * (1.0 - self._variance)
         total = scale**2 * variance + noise
         innovation = reading.signal - solution.signal - scale * mean
@@ -130,10 +134,10 @@ class Identity:
 
     def _odds(self, likelihood: Array) -> float:
         n = len(ERRORS)
-        well, ill = np.log(1.0 - FAULTY), np.log(FAULTY)
+        well, ill = math.log(1.0 - FAULTY), math.log(FAULTY)
         by_electrode = np.logaddexp(well + likelihood, ill + likelihood[n])
         by_pad = np.add.reduceat(by_electrode[:n], self._pads, axis=1)
         faulty = np.add.reduceat(likelihood[n], self._pads)
         limb = np.logaddexp.reduce(ERRORS_ODDS + np.logaddexp(well + by_pad, ill + faulty).sum(axis=1))
-        other = np.logaddexp.reduce(by_electrode[n + 1 :].sum(axis=1)) - np.log(len(SHARES))
+        other = np.logaddexp.reduce(by_electrode[n + 1 :].sum(axis=1)) - math.log(len(SHARES))
         return float(limb - other)

@@ -186,12 +186,12 @@ class Misfits:
         """Takes the residuals (n,) of a window on a skin, with so many samples (n,) each."""
         if not estimate.may_be_limb:
             return
-        squares = np.minimum(estimate.residuals**2, WORST**2)
-        for k, pad in enumerate(skin.pads):
-            own = skin.of(k)
-            used = samples[own] > 0
-            if used.any():
-                now = float(squares[own][used].mean())
+        used = (samples > 0).astype(np.float64)
+        squares = np.minimum(estimate.residuals**2, WORST**2) * used
+        sums = (np.add.reduceat(each, skin.first[:-1]).tolist() for each in (squares, used))
+        for pad, total, count in zip(skin.pads, *sums, strict=True):
+            if count:
+                now = total / count
                 before = self._means.get(pad, now)
                 self._means[pad] = before + SHARE * (now - before)
                 self._node.add_report(f"misfit/{pad}", partial(self._told, pad))

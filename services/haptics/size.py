@@ -6,9 +6,10 @@ would drift with what the model gets wrong.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from penumbra.services.haptics.solve import marginal
 from penumbra.shared.body.anatomy import SIZE, SIZE_MEASURED, SIZE_SPREAD
 from penumbra.shared.geometry.rigid import Array
 
@@ -47,27 +48,32 @@ class Size:
 
     def predict(self, elapsed_s: float) -> None:
         """What was learnt fades."""
-        keep = np.exp(-elapsed_s / SIZE_MEMORY_S)
-        covariance = keep**2 * np.linalg.inv(self.information) + (1.0 - keep**2) * np.diag(self._spread**2)
+        keep = math.exp(-elapsed_s / SIZE_MEMORY_S)
+        covariance = keep**2 * _inverse(self.information) + (1.0 - keep**2) * np.diag(self._spread**2)
         self.mean = self._usual + keep * (self.mean - self._usual)
-        self.information = np.linalg.inv(covariance)
+        self.information = _inverse(covariance)
 
     def learn(self, size: Array, information: Array, gradient: Array, pose_information: Array) -> None:
         """Takes a window's likelihood (8, 8), (8,) by pose and size at a solution of this size (2,); pose_information (6, 6):
         what is known of the pose without it."""
-        information = information.copy()
-        information[:6, :6] += pose_information
-        left, pull = marginal(information, gradient, np.eye(8)[:, :6])
-        total = self.information + left[6:, 6:]
-        self.mean = size + np.linalg.solve(total, self.information @ (self.mean - size) + pull[6:])
+        across = information[6:, :6]
+        share = across @ np.linalg.inv(information[:6, :6] + pose_information)
+        total = self.information + information[6:, 6:] - share @ across.T
+        pull = gradient[6:] - share @ gradient[:6]
+        self.mean = size + _inverse(total) @ (self.information @ (self.mean - size) + pull)
         self.information = total
 
     def marginalised(self, information: Array, gradient: Array, size: Array, lasting: float = 1.0) -> tuple[Array, Array]:
         """Information (6, 6) and gradient (6,) of the pose, from a likelihood (8, 8), (8,) by pose and size at a solution of this
         size (2,), after the size was marginalised. lasting: the factor on the covariance of what is known of the size, whose
         error is the same in many windows."""
-        information, gradient = information.copy(), gradient.copy()
-        information[6:, 6:] += self.information / lasting
-        gradient[6:] += self.information @ (self.mean - size) / lasting
-        information, gradient = marginal(information, gradient, np.eye(8)[:, 6:])
-        return information[:6, :6], gradient[:6]
+        known, across = self.information / lasting, information[:6, 6:]
+        share = across @ _inverse(information[6:, 6:] + known)
+        pull = gradient[6:] + known @ (self.mean - size)
+        return information[:6, :6] - share @ across.T, gradient[:6] - share @ pull
+
+
+def _inverse(matrix: Array) -> Array:
+    """Of a symmetric positive definite one (2, 2)."""
+    (a, b), (_, c) = matrix.tolist()
+    return np.array([[c, -b], [-b, a]]) / (a * c - b * b)

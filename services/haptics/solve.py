@@ -49,6 +49,9 @@ KNOWN = 4
 """Unknowns that the voltages usually decide on."""
 LEVER = 0.1
 """Distance [m] at which a rotation counts like a displacement, where the two are compared."""
+SCALE = np.repeat([1.0, 1.0 / LEVER], 3)
+SCALES = np.outer(SCALE, SCALE)
+"""Factors on a pose error's gradient (6,) and information (6, 6) that make them comparable."""
 WORTHLESS = 0.15
 """A direction known no better than this [m, or rad times LEVER] is published as unknown: beyond, the linearisation that a
 covariance stands for has no meaning."""
@@ -150,7 +153,7 @@ class Solver:
         A = J.T @ (weight[:, None] * J)
         A[:6, :6] += prior.information
         A[6:, 6:] += prior.size_information
-        return np.clip(1.0 - weight * np.einsum("ni,ni->n", J, np.linalg.solve(A, J.T).T), 0.0, 1.0)
+        return np.minimum(np.maximum(1.0 - weight * np.einsum("ni,in->n", J, np.linalg.solve(A, J.T)), 0.0), 1.0)
 
     def _given(self, window: Reading) -> tuple[Array, Array, Array, Array, Array]:
         return window.signal, window.variance, window.distrust, window.doubt, window.error
@@ -161,9 +164,10 @@ def _misfit(window: Reading, predicted: Array, z: Array) -> float:
     than OUTLIER."""
     used = np.isfinite(window.variance)
     felt = used & (np.maximum(window.signal, predicted) > FELT * np.sqrt(window.variance))
-    if felt.sum() < 2 * KNOWN:
+    if np.count_nonzero(felt) < 2 * KNOWN:
         felt = used
-    return float(np.minimum(z[felt] ** 2, OUTLIER**2).sum()) / max(int(felt.sum()) - KNOWN, 1)
+    squares = np.minimum(z[felt] ** 2, OUTLIER**2)
+    return float(squares.sum()) / max(len(squares) - KNOWN, 1)
 
 
 @kernel(
@@ -366,23 +370,20 @@ def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coar
 
 
 def marginal(information: Array, gradient: Array, nuisance: Array) -> tuple[Array, Array]:
-    """Information and gradient of a quadratic likelihood after a parameter's directions (m, k) were marginalised: zero along
-    them. Directions that it says nothing about change nothing."""
+    """Information and gradient of a quadratic likelihood after a direction (m,) was marginalised: zero along it. One that it says
+    nothing about changes nothing."""
     along = information @ nuisance
-    strength = nuisance.T @ along
-    strength += (1e-9 + 1e-12 * np.trace(strength)) * np.eye(len(strength))
-    share = along @ np.linalg.inv(strength)
-    return information - share @ along.T, gradient - share @ (nuisance.T @ gradient)
+    share = along / (float(nuisance @ along) + 1e-9)
+    return information - share[:, None] * along, gradient - share * float(nuisance @ gradient)
 
 
 def peak(T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
     """The pose where a quadratic log-likelihood with this information (6, 6) and gradient (6,) at T is largest, and its
     information; negative and worthless directions (see WORTHLESS, TOO_FAR) carry none and are left as they are in T."""
-    scale = np.array([1.0, 1.0, 1.0, 1.0 / LEVER, 1.0 / LEVER, 1.0 / LEVER])
-    eigenvalues, directions = np.linalg.eigh(information * np.outer(scale, scale))
-    steps = (directions.T @ (scale * gradient)) / np.maximum(eigenvalues, 1e-12)
+    eigenvalues, directions = np.linalg.eigh(information * SCALES)
+    steps = (directions.T @ (SCALE * gradient)) / np.maximum(eigenvalues, 1e-12)
     known = (eigenvalues > 1.0 / WORTHLESS**2) & (np.abs(steps) < TOO_FAR)
     directions = directions[:, known]
-    step = scale * (directions @ steps[known])
-    kept = (directions * eigenvalues[known]) @ directions.T / np.outer(scale, scale)
+    step = SCALE * (directions @ steps[known])
+    kept = (directions * eigenvalues[known]) @ directions.T / SCALES
     return perturb(T, step), kept

@@ -6,6 +6,8 @@ solved in every window; the evidence of the windows adds up in the odds until it
 
 from __future__ import annotations
 
+import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +25,11 @@ class Place:
     T: Array
     covariance: Array
 
+    @functools.cached_property
+    def information(self) -> Array:
+        """The inverse (6, 6) of the covariance."""
+        return np.asarray(np.linalg.inv(self.covariance), np.float64)
+
     def is_apart(self, other: Place, settings: HapticSettings) -> bool:
         """Whether the distance of two places is more than their covariances explain."""
         offset = self.T[:3, 3] - other.T[:3, 3]
@@ -38,39 +45,37 @@ class Place:
 
 class Home:
     """Where the limb is expected while nothing is felt, and how a place decays towards it. T (4, 4): T_world_target; spread (6,):
-    standard deviations [m, rad] of the pose about it; place: both together; information (6, 6): the inverse of its covariance."""
+    standard deviations [m, rad] of the pose about it; place: both together."""
 
     def __init__(self, T: Array, spread: ArrayLike, settings: HapticSettings):
         self.T = T
         self.place = Place(T, np.diag(np.asarray(spread, dtype=float) ** 2))
-        self.information: Array = np.asarray(np.linalg.inv(self.place.covariance), np.float64)
         self._settings = settings
 
     def decayed(self, place: Place, elapsed_s: float) -> Place:
         """A place after so many seconds in which nothing was felt: an Ornstein-Uhlenbeck process about home, whose spread never
         exceeds home's. The roll about the limb's axis decays with a time constant of its own."""
-        keep = np.exp(-elapsed_s / self._settings.memory_s)
+        keep = math.exp(-elapsed_s / self._settings.memory_s)
         T = perturb(self.T, keep * pose_error(place.T, self.T))
         covariance = keep**2 * place.covariance + (1.0 - keep**2) * self.place.covariance
-        forgotten = 1.0 - np.exp(-elapsed_s / self._settings.roll_memory_s)
-        T = perturb(T, -forgotten * self._roll(T) * roll_axis(T))
-        axis = roll_axis(T)
-        spread = float(axis @ self.place.covariance @ axis) - float(axis @ covariance @ axis)
-        return Place(T, covariance + max(0.0, (1.0 - (1.0 - forgotten) ** 2) * spread) * np.outer(axis, axis))
+        kept, axis = math.exp(-elapsed_s / self._settings.roll_memory_s), roll_axis(T)
+        T = perturb(T, (kept - 1.0) * self._roll(T) * axis)  # about the axis, which stays
+        spread = float(axis @ (self.place.covariance - covariance) @ axis)
+        return Place(T, covariance + max(0.0, (1.0 - kept**2) * spread) * (axis[:, None] * axis))
 
     def without_roll(self, T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
         """Information (6, 6) and gradient (6,) at a pose T (4, 4) after the roll about the limb's axis was marginalised, which is
         known as well as at home. The voltages would decide on it by the flatness of wrist and hand alone, with several solutions
         that look equally certain."""
         axis = roll_axis(T)
-        known = float(axis @ self.information @ axis)
+        known = float(axis @ self.place.information @ axis)
         gradient = gradient + axis * (known * float(axis @ pose_error(self.T, T)))
-        return marginal(information + known * np.outer(axis, axis), gradient, axis[:, None])
+        return marginal(information + known * (axis[:, None] * axis), gradient, axis)
 
     def _roll(self, T: Array) -> float:
         """The turn about the limb's axis [rad] from home: the twist of the rotation between them."""
-        R = self.T[:3, :3].T @ T[:3, :3]
-        return float(2.0 * np.arctan2(R[2, 1] - R[1, 2], 1.0 + np.trace(R)))
+        (a, _, _), (_, e, f), (_, h, i) = (self.T[:3, :3].T @ T[:3, :3]).tolist()
+        return 2.0 * math.atan2(h - f, 1.0 + a + e + i)
 
 
 class Track:
@@ -79,6 +84,7 @@ class Track:
 
     def __init__(self, home: Home, settings: HapticSettings):
         self._home, self._settings = home, settings
+        self._floor = np.diag(np.repeat(np.square(settings.expected_floor), 3))
         self.forget()
 
     def forget(self) -> None:
@@ -97,8 +103,7 @@ class Track:
         settings = self._settings
         known = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < settings.expected_sigma**2
         if known:
-            floor = np.diag(np.repeat(np.square(settings.expected_floor), 3))
-            self.place, self.rival = Place(T, settings.expected_inflation**2 * covariance + floor), None
+            self.place, self.rival = Place(T, settings.expected_inflation**2 * covariance + self._floor), None
         return known
 
     def contest(self, rival: Place, odds: float) -> None:
@@ -118,7 +123,7 @@ class Track:
 
     def limited(self, evidence: float) -> float:
         """The evidence of one window, limited to what one window may change."""
-        return float(np.clip(evidence, -self._settings.odds_step, self._settings.odds_step))
+        return min(max(evidence, -self._settings.odds_step), self._settings.odds_step)
 
     def mixed(self, information: Array, gradient: Array) -> tuple[Array, Array]:
         """A likelihood at the track, as information (6, 6) and gradient (6,), widened to the mixture of the track and its
@@ -136,4 +141,4 @@ class Track:
 
 def roll_axis(T: Array) -> Array:
     """The pose error (6,) of a turn by one radian about the limb's axis."""
-    return np.concatenate([np.zeros(3), T[:3, 0]])
+    return np.array([0.0, 0.0, 0.0, *T[:3, 0].tolist()])

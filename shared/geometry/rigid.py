@@ -34,7 +34,7 @@ def from_rpy(position: ArrayLike, rpy: ArrayLike) -> Array:
 
 def position_orientation(T: Array) -> tuple[Array, Array]:
     """Position [m] (3,) and unit quaternion (4,) with w >= 0 of a transform."""
-    return T[:3, 3].copy(), _quaternion(T[:3, :3])
+    return T[:3, 3].copy(), np.array(_quaternion(T[:3, :3]))
 
 
 def rpy(orientation: ArrayLike) -> Array:
@@ -73,7 +73,8 @@ def perturb(T: Array, error: ArrayLike) -> Array:
 
 def pose_error(T_true: Array, T: Array) -> Array:
     """The error (6,) with `perturb(T, error) == T_true`."""
-    return np.concatenate([T_true[:3, 3] - T[:3, 3], _rotation_vector(T_true[:3, :3] @ T[:3, :3].T)])
+    offset = T_true[:3, 3] - T[:3, 3]
+    return np.array([*offset.tolist(), *_rotation_vector(T_true[:3, :3] @ T[:3, :3].T)])
 
 
 def rotation(vector: ArrayLike) -> Array:
@@ -93,12 +94,12 @@ def rotation(vector: ArrayLike) -> Array:
     )
 
 
-def _rotation_vector(R: Array) -> Array:
-    """The rotation vector (3,) [rad] of a rotation matrix (3, 3)."""
-    x, y, z, w = _quaternion(R).tolist()
+def _rotation_vector(R: Array) -> tuple[float, float, float]:
+    """The rotation vector [rad] of a rotation matrix (3, 3)."""
+    x, y, z, w = _quaternion(R)
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-9 else 2.0
-    return np.array([scale * x, scale * y, scale * z])
+    return scale * x, scale * y, scale * z
 
 
 def _from_quaternion(orientation: ArrayLike) -> Array:
@@ -117,21 +118,22 @@ def _from_quaternion(orientation: ArrayLike) -> Array:
     )
 
 
-def _quaternion(R: Array) -> Array:
-    """The unit quaternion (4,) with w >= 0 of a rotation matrix (3, 3), from its greatest component, by which the others are
+def _quaternion(R: Array) -> tuple[float, float, float, float]:
+    """The unit quaternion with w >= 0 of a rotation matrix (3, 3), from its greatest component, by which the others are
     divided (Shepperd 1978, doi:10.2514/3.55767b)."""
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     w = a + e + i
     greatest = max(a, e, i, w)
     if greatest == w:
-        q = np.array([h - f, c - g, d - b, 1.0 + w])
+        x, y, z, w = h - f, c - g, d - b, 1.0 + w
     elif greatest == a:
-        q = np.array([1.0 + a - e - i, b + d, c + g, h - f])
+        x, y, z, w = 1.0 + a - e - i, b + d, c + g, h - f
     elif greatest == e:
-        q = np.array([b + d, 1.0 - a + e - i, f + h, c - g])
+        x, y, z, w = b + d, 1.0 - a + e - i, f + h, c - g
     else:
-        q = np.array([c + g, f + h, 1.0 - a - e + i, d - b])
-    return q / math.copysign(math.sqrt(q @ q), q[3])
+        x, y, z, w = c + g, f + h, 1.0 - a - e + i, d - b
+    length = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), w)
+    return x / length, y / length, z / length, w / length
 
 
 def axis_angle_error(T_true: Array, T: Array, axis: int = 0) -> float:

@@ -136,12 +136,12 @@ class Watch:
         high, low = np.maximum.reduce(self._tail), np.minimum.reduce(self._tail)
         ended = high >= self._top
         self._quick = {}
-        for k in np.flatnonzero(ended | (high - low <= self._still)):
+        for k in (ended | (high - low <= self._still)).nonzero()[0].tolist():
             if ended[k]:
                 text = f"saturated: it reads {high[k]:.3f} V, amplitudes end at {self._end[k]:.3f} V"
-                self._quick[int(k)] = Fault("saturated", text)
+                self._quick[k] = Fault("saturated", text)
             else:
-                self._quick[int(k)] = Fault("dead", f"dead: {BLOCK} samples at {high[k]:.3f} V without noise")
+                self._quick[k] = Fault("dead", f"dead: {BLOCK} samples at {high[k]:.3f} V without noise")
 
     def _see(self, volts: Array, period_s: float) -> Look:
         level = volts.mean(axis=0)
