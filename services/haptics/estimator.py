@@ -224,7 +224,7 @@ class Estimator:
         """The estimate, and what a camera predicts of the window. expected: where it has just seen the limb."""
         before = self._track.place
         solution = self._solution(reading, expected is not None)
-        if before.is_apart(self._track.place, self.settings):
+        if self.identity.odds < 0.0 and before.is_apart(self._track.place, self.settings):
             self.identity.doubt()
         gap = self._limb.gap(reading, solution.T, solution.size)
         self._judge(solution)

@@ -89,8 +89,7 @@ class Identity:
 
     def doubt(self) -> None:
         """The limb is at another place than was thought: what spoke against a limb there says nothing."""
-        if self.odds < 0.0:
-            self._begin(0.0)
+        self._begin(0.0)
 
     def take(self, reading: Reading, solution: Solution, free: Array, gap: float, elapsed_s: float) -> None:
         """Takes a window, the limb that explains it best, the share (n,) of errors that this leaves in the residuals (see

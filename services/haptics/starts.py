@@ -24,7 +24,8 @@ class Limb:
         scale = np.exp(size[[0, 1, 1]])
         local = (self._skin.positions(reading.T_world_pads)[np.isfinite(reading.variance)] - T[:3, 3]) @ T[:3, :3] / scale
         distance, _, gradient = self._surface.nearest(local)
-        return float((distance / np.linalg.norm(gradient / scale, axis=1)).min())
+        stretch = gradient / scale
+        return float((distance / np.sqrt(np.einsum("ni,ni->n", stretch, stretch))).min())
 
 
 class Starts:

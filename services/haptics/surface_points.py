@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +57,7 @@ PRESSED_SHARE = 0.05
 gives it at NEAREST. Measured: a rod of 3 cm that touches the middle gives 15 %; an electrode that is stuck there gives none."""
 
 
-@dataclass(frozen=True)
-class SurfacePoint:
+class SurfacePoint(NamedTuple):
     """The point of the nearest surface before a pad: its position (3,) in the world and distance from the pad's middle [m];
     toward (3,): unit vector from there to it, against the surface's normal; along, across: standard deviations in this direction
     and in each one across it [m]; gap: of the surface to the pad's board [m]."""
@@ -168,7 +168,7 @@ class SurfacePoints:
         if not used.all():
             change, sigma = np.where(used, change, 0.0), np.where(used, sigma, 0.0)
         total = change.sum(axis=1)
-        own = np.flatnonzero(total > FELT * np.sqrt((sigma * sigma).sum(axis=1)))
+        own = (total > FELT * np.sqrt((sigma * sigma).sum(axis=1))).nonzero()[0]
         if not len(own):
             return []
         found = self._estimated(own, change[own], sigma[own], used[own], total[own])
@@ -256,7 +256,7 @@ def fused(
     nearer = factor * distance
     points = middles + nearer[:, None] * toward
     gaps = np.minimum(factor * np.exp(x[:, 3]), nearer)
-    numbers = np.stack([nearer, narrower * np.sqrt(along2), np.sqrt(across2), gaps], axis=1).tolist()
+    numbers = np.array([nearer, narrower * np.sqrt(along2), np.sqrt(across2), gaps]).T.tolist()
     return [
         SurfacePoint(pads[k], points[i], toward[i], *numbers[i]) for i, k in enumerate(own.tolist()) if numbers[i][0] < farthest
     ]
