@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 import time
@@ -27,6 +28,8 @@ PERIOD_S = 1.0 / topics.FUSED.rate_hz
 SILENCE_S = 0.025
 """A replica publishes after the one before it in rank has been silent for so long [s], five periods: a frozen process counts as
 alive for ten times as long."""
+WAITING = 5
+"""A replica that publishes nothing looks at its own pose in every so many periods: it only has to know whether it has one."""
 SET_BACK_S = 0.05
 """A clock that goes back by more than this [s] was set; by less, it is being synchronised. Chosen, not measured."""
 
@@ -63,10 +66,14 @@ def start(node: ServiceNode, options: flags.Options, senses: Sequence[Sense] = S
     node.answer(topics.description(node.cell.name), lambda parameters, payload: described)
     fusions = [Fusion(node, name, group, observer, senses) for name, observer in zip(names, group.observers, strict=True)]
 
+    turns = itertools.count()
+
     def publish() -> None:
-        stamp_ns, estimates = group.estimates()
-        for fusion, estimate in zip(fusions, estimates, strict=True):
-            fusion.publish(stamp_ns, estimate)
+        due = [fusion.is_due() for fusion in fusions]
+        if any(due) or next(turns) % WAITING == 0:
+            stamp_ns, estimates = group.estimates()
+            for fusion, estimate, is_due in zip(fusions, estimates, due, strict=True):
+                fusion.take(stamp_ns, estimate, is_due)
 
     node.every(PERIOD_S, publish)
     # a replica that takes over goes on with the pose: it does not begin with "lost" while the other one knows it
@@ -202,11 +209,15 @@ class Fusion:
         """For the health report: the state, and what became of the measurements of each source."""
         return {"state": self.state, **{source: asdict(counts) for source, counts in self.observer.log.counts.items()}}
 
-    def publish(self, stamp_ns: int, estimate: Estimate) -> None:
-        """Publishes an estimate, where it is this replica's turn."""
+    def is_due(self) -> bool:
+        """Whether it is this replica's turn to publish."""
         self._follow_others()
+        return time.monotonic() - self._others_s >= self.node.rank(self.target) * SILENCE_S
+
+    def take(self, stamp_ns: int, estimate: Estimate, is_due: bool) -> None:
+        """Notes an estimate's state, and publishes it where that is due."""
         changed, self.state = (estimate.state == "lost") != (self.state == "lost"), estimate.state
-        if time.monotonic() - self._others_s < self.node.rank(self.target) * SILENCE_S:
+        if not is_due:
             return
         self.node.publish(topics.FUSED, estimate.message(stamp_ns, self.target, self.node.cell.frame), target=self.target)
         if changed:
