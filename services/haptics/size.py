@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from penumbra.services.haptics.solve import marginal
 from penumbra.shared.body.anatomy import SIZE, SIZE_MEASURED, SIZE_SPREAD
 from penumbra.shared.geometry.rigid import Array
 
@@ -56,11 +57,11 @@ class Size:
     def learn(self, size: Array, information: Array, gradient: Array, pose_information: Array) -> None:
         """Takes a window's likelihood (8, 8), (8,) by pose and size at a solution of this size (2,); pose_information (6, 6):
         what is known of the pose without it."""
-        across = information[6:, :6]
-        share = across @ np.linalg.inv(information[:6, :6] + pose_information)
-        total = self.information + information[6:, 6:] - share @ across.T
-        pull = gradient[6:] - share @ gradient[:6]
-        self.mean = size + _inverse(total) @ (self.information @ (self.mean - size) + pull)
+        information = information.copy()
+        information[:6, :6] += pose_information
+        left, pull = marginal(information, gradient, np.eye(8)[:, :6])
+        total = self.information + left[6:, 6:]
+        self.mean = size + _inverse(total) @ (self.information @ (self.mean - size) + pull[6:])
         self.information = total
 
     def marginalised(self, information: Array, gradient: Array, size: Array, lasting: float = 1.0) -> tuple[Array, Array]:

@@ -370,11 +370,13 @@ def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coar
 
 
 def marginal(information: Array, gradient: Array, nuisance: Array) -> tuple[Array, Array]:
-    """Information and gradient of a quadratic likelihood after a direction (m,) was marginalised: zero along it. One that it says
-    nothing about changes nothing."""
+    """Information and gradient of a quadratic likelihood after a parameter's directions (m, k) were marginalised: zero along
+    them. Directions that it says nothing about change nothing."""
     along = information @ nuisance
-    share = along / (float(nuisance @ along) + 1e-9)
-    return information - share[:, None] * along, gradient - share * float(nuisance @ gradient)
+    strength = nuisance.T @ along
+    strength += (1e-9 + 1e-12 * np.trace(strength)) * np.eye(len(strength))
+    share = along @ np.linalg.inv(strength)
+    return information - share @ along.T, gradient - share @ (nuisance.T @ gradient)
 
 
 def peak(T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:

@@ -70,7 +70,7 @@ class Home:
         axis = roll_axis(T)
         known = float(axis @ self.place.information @ axis)
         gradient = gradient + axis * (known * float(axis @ pose_error(self.T, T)))
-        return marginal(information + known * (axis[:, None] * axis), gradient, axis)
+        return marginal(information + known * (axis[:, None] * axis), gradient, axis[:, None])
 
     def _roll(self, T: Array) -> float:
         """The turn about the limb's axis [rad] from home: the twist of the rotation between them."""
