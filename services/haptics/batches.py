@@ -99,6 +99,9 @@ class Collector:
         self._own = [skin.of(k) for k in range(len(skin.pads))]
         self._watches = [Watch(skin, k) for k in range(len(skin.pads))]
         self._top, self._bottom = skin.full_scale - 0.5 * skin.lsb, 0.5 * skin.lsb
+        self._waiting: list[list[_Batch]]  # what no window has had, by pad
+        self._newest: list[int]
+        self._done_ns = self._born_ns = NEVER
         self._forget()
 
     def add(self, pad: str, stamp_ns: int, period_ns: int, volts: Array) -> VoltageWindow | None:
@@ -155,7 +158,7 @@ class Collector:
         amplitude = np.where(samples > 0, volts.sum(axis=0) / np.maximum(samples, 1), skin.a3)
         high, low = is_there & (volts >= self._top), is_there & (volts <= self._bottom)
         pressed = np.where(skin.polarity > 0.0, high, low).sum(axis=0) > 0.5 * samples
-        faults = {skin.names[e]: SATURATED for e in (high | low).any(axis=0).nonzero()[0]}
+        faults = {skin.names[e]: SATURATED for e in np.flatnonzero((high | low).any(axis=0))}
         for name, count, watch in zip(skin.pads, counts, self._watches, strict=True):
             faults |= {f"{name}/{e}": fault.text for e, fault in watch.faults.items()} if count else {name: "silent"}
         if faults:
@@ -166,6 +169,6 @@ class Collector:
         return VoltageWindow(begin_ns + middle, end_ns, amplitude, samples, faults, pressed)
 
     def _forget(self) -> None:
-        self._waiting: list[list[_Batch]] = [[] for _ in self.skin.pads]  # what no window has had
+        self._waiting = [[] for _ in self.skin.pads]
         self._newest = [NEVER] * len(self.skin.pads)
         self._done_ns = self._born_ns = NEVER
