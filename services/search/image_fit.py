@@ -59,7 +59,7 @@ class ImageSettings:
     edge: float = 0.2
     correlation: float = 9.0
     dilation: float = 0.12
-    wave: float = 0.1
+    wave: float = 0.3
 
 
 def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uint8], Evidence]:
