@@ -4,7 +4,8 @@ in the image plane.
 A forearm is nearly round: without its hand, a limb that is turned over has almost the same contour, and every fit stays with
 the turn that it began with, surely or not. So its rivals are fitted to the picture: turns about the limb's axis, and the mirror
 image of its tilt. A rival that the picture prefers takes the pose's place. One that it cannot refute makes the pose
-as uncertain as the two are apart, until it is compared again.
+as uncertain as the two are apart, until it is compared again; so does one that was not compared yet. One is compared in each
+picture: six times as many in the first ones would have a limb that was just found wait, and it would be elsewhere by then.
 """
 
 from __future__ import annotations
@@ -36,8 +37,6 @@ PREFERRED = 18.0
 LASTS = 10.0
 """Number of pictures in a row of which the same one of two poses may be the wrong one. An observer takes the pictures' errors for
 independent: ten that prefer the wrong turn a little would convince it."""
-FIRST = 3
-"""Number of a limb's first pictures in which all rivals are compared: an observer that begins with a wrong turn keeps it."""
 MOST = 2 * RIVALS
 """Number of rivals that one picture compares, at most: where one of them takes the pose's place, all are compared with that."""
 REFUTED_TIMES = 2
@@ -49,7 +48,7 @@ JUMPED_RAD = 0.4
 
 
 class Rivals:
-    """The rivals of one tracked limb: all of them in its first pictures and where one takes its place, otherwise one in each."""
+    """The rivals of one tracked limb: all of them where one takes its place, otherwise one in each picture."""
 
     def __init__(self, limits: Limits):
         self._limits = limits
@@ -59,7 +58,6 @@ class Rivals:
     def forget(self) -> None:
         """Begin anew, as with another limb."""
         self._doubts: list[deque[Array | None]] = [deque(maxlen=REFUTED_TIMES) for _ in range(RIVALS)]
-        self._pictures = 0
         self._before: Array | None = None
 
     def contested(self, best: Fit, shown: Callable[[Array, int], Fit]) -> Fit:
@@ -72,7 +70,7 @@ class Rivals:
             other = shown(self._before, PASSES)
             if _excess(other, best, shown) < -PREFERRED:
                 best = other
-        due = RIVALS if self._pictures < FIRST else 1
+        due = 1
         for compared in range(1, MOST + 1):
             which, self._next = self._next, (self._next + 1) % RIVALS
             other = shown(_start(best, which), PASSES)
@@ -84,10 +82,11 @@ class Rivals:
                 self._doubts[which].append(self._doubt(best, other, excess) if excess < REFUTED else None)
             if compared == due:
                 break
-        self._pictures += 1
         self._before = best.T
         axes, covariance = _axes(best), best.covariance
-        for doubts in self._doubts:
+        for which, doubts in enumerate(self._doubts):
+            if not doubts:  # not compared yet
+                doubts = [self._doubt(best, replace(best, T=_start(best, which)), 0.0)]
             left = [doubt for doubt in doubts if doubt is not None]
             if left:
                 covariance = covariance + axes @ left[-1] @ axes.T

@@ -74,13 +74,25 @@ def test_the_image_takes_out_what_a_mask_is_too_large(visible):
 def test_the_covariance_of_the_refined_pose_is_that_of_its_errors(visible, half_hidden):
     nees = []
     for seed, shot in enumerate([*visible, *half_hidden]):
-        T = start(shot, seed)
-        estimate = Search(shot.cell).update(mask(shot, T, 0.4, seed), T, PRIOR, shot.joints, shot.image)
+        T, search = start(shot, seed), Search(shot.cell)
+        for _ in range(RIVALS):  # until all are compared, a pose is less certain
+            estimate = search.update(mask(shot, T, 0.4, seed), T, PRIOR, shot.joints, shot.image)
         if estimate.state == "tracking":
             error = rigid.pose_error(shot.T_world_target, estimate.T)
             nees.append(error @ np.linalg.solve(estimate.covariance, error))
     assert len(nees) > 10
     assert 0.5 < np.median(nees) < 9.0  # chi^2 with six degrees of freedom: 5.3
+
+
+def test_the_roll_of_a_limb_that_was_just_found_is_open_until_its_rivals_are_compared(visible):
+    for seed, shot in enumerate(visible):
+        T, search = start(shot, seed), Search(shot.cell)
+        estimates = [search.update(mask(shot, T), T, PRIOR, shot.joints, shot.image) for _ in range(RIVALS)]
+        rolls = [float(np.sqrt(each.T[:3, 0] @ each.covariance[3:, 3:] @ each.T[:3, 0])) for each in estimates]
+        assert rolls[0] > 1.0
+        assert rolls[-1] < 0.5 * rolls[0]
+        places = [np.sqrt(np.trace(each.covariance[:3, :3])) for each in estimates]
+        assert places[0] < 2.0 * places[-1]  # the place is known at once
 
 
 def test_an_occluder_that_the_mask_takes_for_background_is_not_accepted(half_hidden):
