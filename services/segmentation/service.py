@@ -69,7 +69,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
     lookouts = {name: Lookout(cell, name, most) for name in cameras}
     looking = {name: threading.Lock() for name in cameras}  # a camera's frames and `follow` look by turns
     for name, segmenter in segmenters.items():
-        segmenter.prepare(lookouts[name].window)  # while the process joins the others
+        segmenter.prepare(lookouts[name].window, lookouts[name].at_home)  # while the process joins the others
 
     joints = RobotJoints({name: len(robot.joints) for name, robot in cell.robots.items()}, JOINTS_NEAR_NS, is_carried_on=True)
     priors = {name: Priors(cell, name, lookouts[name].targets) for name in cameras if segmenters[name].has_priors}

@@ -95,6 +95,7 @@ class Lookout:
         self._poses: dict[str, FusedPose] = {}
         self._boxes: dict[str, Array] = {}
         self._homes: dict[str, tuple[Array, Array]] = {}
+        self._at_home: list[tuple[Array, Array]] = []
         for name, target in cell.targets.items():
             corners = corners_of(anatomy.target_mesh(target, cell).vertices)
             home, spread = rigid.apply(target.home.transform, corners), target.home_spread
@@ -102,6 +103,7 @@ class Lookout:
             region = corners_of(np.vstack([home - room, home + room]))
             if _is_in_picture(self._camera, region):
                 self._boxes[name], self._homes[name] = corners, (np.eye(4), region)
+                self._at_home.append((target.home.transform, corners))
         self.targets = tuple(self._boxes)
         self._window = self._wide()
 
@@ -114,6 +116,11 @@ class Lookout:
     def window(self) -> Window:
         """The window last looked at, at first that around all homes."""
         return self._window
+
+    @property
+    def at_home(self) -> Window:
+        """The window if all targets were found at their homes: one of its size is likely the next after that around all homes."""
+        return window_around(self._camera, self._at_home, None, self._most) or self._wide()
 
     def look(self, stamp_ns: int) -> Window:
         """The window for a frame exposed at a stamp: kept where it was while it does (`window_around`)."""
