@@ -85,9 +85,9 @@ class Rivals:
         self._before = best.T
         axes, covariance = _axes(best), best.covariance
         for which, doubts in enumerate(self._doubts):
-            if not doubts:  # not compared yet
-                doubts = [self._doubt(best, replace(best, T=_start(best, which)), 0.0)]
             left = [doubt for doubt in doubts if doubt is not None]
+            if not doubts:  # not compared yet
+                left.append(self._doubt(best, replace(best, T=_start(best, which)), 0.0))
             if left:
                 covariance = covariance + axes @ left[-1] @ axes.T
         return replace(best, covariance=covariance)
