@@ -103,6 +103,15 @@ def test_what_is_foreseen_is_what_will_be_looked_at_and_changes_nothing(far):
     assert lookout.look(2 * S) == wide
 
 
+def test_the_window_at_home_is_that_of_a_target_that_is_found_there():
+    table = description.load("table")
+    lookout = Lookout(table, "front")
+    at_home, wide = lookout.at_home, lookout.window
+    assert lookout.window == wide  # asking changes nothing
+    lookout.add(fused(table.targets["forearm"].home.transform))
+    assert lookout.look(S) == at_home != wide
+
+
 def test_a_home_out_of_the_picture_is_looked_for_everywhere(far):
     away = far.targets["forearm"].model_copy(update={"home": description.Placement(position=(0.0, -20.0, 0.2))})
     lookout = Lookout(far.model_copy(update={"targets": {"forearm": away}}), "front")
