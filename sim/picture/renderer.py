@@ -71,7 +71,8 @@ class Renderer:
     """Renders scenes for one camera, or for a window of its image at a coarser scale (for training on crops). The image is the
     pinhole's, or with `distortion`, whose window is rendered then, that of the camera's lens; labels are always the pinhole's.
 
-    One picture after another: what a picture has in common with the last one (background, meshes, memory) is kept.
+    One picture after another: what a picture has in common with the last one (background, meshes, memory, and the surfaces of
+    bodies that stand still, but for the shadows on them) is kept.
     """
 
     def __init__(
@@ -96,6 +97,7 @@ class Renderer:
         self._image = np.empty((*self._raster.ids.shape, 3), np.float32)
         self._blurred = np.empty((camera.height, camera.width, 3), np.float32) if distortion else np.empty_like(self._image)
         self._shadow = raster.Raster(SHADOW_PX, SHADOW_PX)
+        self._surfaces = _Surfaces(*self._raster.ids.shape)
 
     def render(self, bodies: list[Body], look: Look, rng: np.random.Generator) -> Picture:
         """The picture of `bodies` (at most 254) under the light and sensor of `look`; `rng` draws the noise."""
@@ -105,6 +107,8 @@ class Renderer:
         for index, body in enumerate(bodies):
             vertices = rigid.apply(self._T_camera_world @ body.T_world_body, body.shape.mesh.vertices)
             view.draw(vertices, body.shape.mesh.faces, *self._k, index)
+        textures = np.array([body.appearance.row() for body in bodies], np.float32).reshape(-1, TEXTURE_FIELDS)
+        placed = np.array([rigid.inverse(body.T_world_body) for body in bodies]).reshape(-1, 4, 4)
         lamp = np.asarray(look.lamp, float)
         T_lamp_world, lamp_f = self._cast_shadow(bodies, lamp)
         T_world_camera = rigid.inverse(self._T_camera_world)
@@ -116,11 +120,11 @@ class Renderer:
             view.triangles,
             np.array(self._k),
             T_world_camera,
-            np.array([rigid.inverse(body.T_world_body) for body in bodies]).reshape(-1, 4, 4),
+            placed,
             faces.corners,
             faces.normals,
             faces.labels,
-            np.array([body.appearance.row() for body in bodies], np.float32).reshape(-1, TEXTURE_FIELDS),
+            textures,
             noise_volume(),
             lamp,
             np.asarray(look.lamp_colour, np.float32),
@@ -128,6 +132,8 @@ class Renderer:
             T_lamp_world,
             lamp_f,
             self._shadow.depth,
+            self._surfaces.states(faces, placed, textures, lamp),
+            *self._surfaces.arrays,
             image,
             labels,
         )
@@ -184,6 +190,35 @@ class _Faces:
         self.corners = np.concatenate([shape.corners for shape in shapes] or [np.zeros((0, 3, 3), np.float32)])
         self.normals = np.concatenate([shape.normals for shape in shapes] or [np.zeros((0, 3, 3), np.float32)])
         self.labels = np.concatenate([shape.mesh.labels for shape in shapes] or [np.zeros(0, np.uint8)])
+
+
+class _Surfaces:
+    """What the shading pass found in earlier pictures, for pixels that show the same again. `arrays`: of each pixel, which body's
+    state it shows (a number of `states`, 0 for none) and which triangle, its albedo, and its surface in the lamp's light (cosine
+    to the lamp, what it mirrors, z of its normal)."""
+
+    def __init__(self, height: int, width: int):
+        self.arrays = (
+            np.zeros((height, width), np.int32),
+            np.empty((height, width), np.int32),
+            np.empty((height, width, 3), np.float32),
+            np.empty((height, width, 3)),
+        )
+        self._count = 0
+        self._states = np.zeros(0, np.int32)
+        self._last: tuple[_Faces, Array, NDArray[np.float32], Array] | None = None
+
+    def states(self, faces: _Faces, T_body_world: Array, textures: NDArray[np.float32], lamp: Array) -> NDArray[np.int32]:
+        """A number for each body, another one whenever it looks otherwise: all do in another light or among other bodies."""
+        last, self._last = self._last, (faces, T_body_world, textures, lamp)
+        if last is None or last[0] is not faces or not np.array_equal(last[3], lamp):
+            changed = np.ones(len(textures), np.bool_)
+        else:
+            changed = (last[1] != T_body_world).any((1, 2)) | (last[2] != textures).any(1)
+        fresh = np.arange(self._count + 1, self._count + 1 + len(changed), dtype=np.int32)
+        self._states = np.where(changed, fresh, self._states) if len(self._states) == len(changed) else fresh
+        self._count += len(changed)
+        return self._states
 
 
 def _quantile(x: Array, share: float) -> float:
@@ -342,17 +377,40 @@ def _paint_background(k, R, textures, volume, out):
             _texture(textures, 0, x, y, z, volume, out[row, column])
 
 
+@inner
+def _normal(corners, normals, x, y, z):
+    """The normal of a triangle at a point of it, smooth between those of its corners (3, 3); all in the body's frame."""
+    ax, ay, az = corners[0, 0], corners[0, 1], corners[0, 2]
+    ux, uy, uz = corners[1, 0] - ax, corners[1, 1] - ay, corners[1, 2] - az
+    vx, vy, vz = corners[2, 0] - ax, corners[2, 1] - ay, corners[2, 2] - az
+    wx, wy, wz = x - ax, y - ay, z - az
+    uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
+    wu, wv = wx * ux + wy * uy + wz * uz, wx * vx + wy * vy + wz * vz
+    det = uu * vv - uv * uv
+    if det < 1e-14:
+        s1, s2 = 0.0, 0.0
+    else:  # barycentric weights
+        s1, s2 = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
+    s0 = 1.0 - s1 - s2
+    return (
+        s0 * normals[0, 0] + s1 * normals[1, 0] + s2 * normals[2, 0],
+        s0 * normals[0, 1] + s1 * normals[1, 1] + s2 * normals[2, 1],
+        s0 * normals[0, 2] + s1 * normals[1, 2] + s2 * normals[2, 2],
+    )
+
+
 @kernel(
     """f4[h, w], u1[h, w], i4[h, w], f8[4], f8[4, 4], f8[b, 4, 4], f4[m, 3, 3], f4[m, 3, 3], u1[m], f4[b, 20], f4[s, s, s],
-    f8[3], f4[3], f4[3], f8[4, 4], f8, f4[l, l], out f4[h, w, 3], out u1[h, w]"""
+    f8[3], f4[3], f4[3], f8[4, 4], f8, f4[l, l], i4[b], out i4[h, w], out i4[h, w], out f4[h, w, 3], out f8[h, w, 3],
+    out f4[h, w, 3], out u1[h, w]"""
 )
 def _shade(
     depth, ids, triangles, k, R, T, corners, normals, face_labels, textures, volume,
-    lamp, lamp_colour, ambient, T_lamp_world, lamp_f, shadow, image, labels,
+    lamp, lamp_colour, ambient, T_lamp_world, lamp_f, shadow, states, seen, seen_triangles, albedo, light, image, labels,
 ):  # fmt: skip
-    """Image and labels where there is a body; elsewhere they stay."""
+    """Image and labels where there is a body; elsewhere they stay. `states` to `light` are those of `_Surfaces`, read where it
+    knows the surface that a pixel shows, elsewhere written."""
     h, w = ids.shape
-    albedo = np.empty(3, np.float32)
     size = shadow.shape[0]
     centre = size / 2 - 0.5
     ex, ey, ez = R[0, 3], R[1, 3], R[2, 3]
@@ -369,37 +427,37 @@ def _shade(
             rz = R[2, 0] * dx + R[2, 1] * dy + R[2, 2]
             z = depth[row, column]
             px, py, pz = ex + z * rx, ey + z * ry, ez + z * rz
-            x = T[body, 0, 0] * px + T[body, 0, 1] * py + T[body, 0, 2] * pz + T[body, 0, 3]
-            y = T[body, 1, 0] * px + T[body, 1, 1] * py + T[body, 1, 2] * pz + T[body, 1, 3]
-            q = T[body, 2, 0] * px + T[body, 2, 1] * py + T[body, 2, 2] * pz + T[body, 2, 3]
             t = triangles[row, column]
             labels[row, column] = face_labels[t]
-            # barycentric weights of the point in its triangle
-            ax, ay, az = corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]
-            ux, uy, uz = corners[t, 1, 0] - ax, corners[t, 1, 1] - ay, corners[t, 1, 2] - az
-            vx, vy, vz = corners[t, 2, 0] - ax, corners[t, 2, 1] - ay, corners[t, 2, 2] - az
-            wx, wy, wz = x - ax, y - ay, q - az
-            uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
-            wu, wv = wx * ux + wy * uy + wz * uz, wx * vx + wy * vy + wz * vz
-            det = uu * vv - uv * uv
-            if det < 1e-14:
-                s1, s2 = 0.0, 0.0
-            else:
-                s1, s2 = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
-            s0 = 1.0 - s1 - s2
-            mx = s0 * normals[t, 0, 0] + s1 * normals[t, 1, 0] + s2 * normals[t, 2, 0]
-            my = s0 * normals[t, 0, 1] + s1 * normals[t, 1, 1] + s2 * normals[t, 2, 1]
-            mz = s0 * normals[t, 0, 2] + s1 * normals[t, 1, 2] + s2 * normals[t, 2, 2]
-            # its normal in the world: the transpose of T's rotation
-            nx = T[body, 0, 0] * mx + T[body, 1, 0] * my + T[body, 2, 0] * mz
-            ny = T[body, 0, 1] * mx + T[body, 1, 1] * my + T[body, 2, 1] * mz
-            nz = T[body, 0, 2] * mx + T[body, 1, 2] * my + T[body, 2, 2] * mz
-            length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
-            nx, ny, nz = nx / length, ny / length, nz / length
-            lx, ly, lz = lamp[0] - px, lamp[1] - py, lamp[2] - pz
-            length = math.sqrt(lx * lx + ly * ly + lz * lz)
-            lx, ly, lz = lx / length, ly / length, lz / length
-            diffuse = nx * lx + ny * ly + nz * lz
+            if seen[row, column] != states[body] or seen_triangles[row, column] != t:
+                seen[row, column], seen_triangles[row, column] = states[body], t
+                x = T[body, 0, 0] * px + T[body, 0, 1] * py + T[body, 0, 2] * pz + T[body, 0, 3]
+                y = T[body, 1, 0] * px + T[body, 1, 1] * py + T[body, 1, 2] * pz + T[body, 1, 3]
+                q = T[body, 2, 0] * px + T[body, 2, 1] * py + T[body, 2, 2] * pz + T[body, 2, 3]
+                _texture(textures, body, x, y, q, volume, albedo[row, column])
+                mx, my, mz = _normal(corners[t], normals[t], x, y, q)
+                # its normal in the world: the transpose of T's rotation
+                nx = T[body, 0, 0] * mx + T[body, 1, 0] * my + T[body, 2, 0] * mz
+                ny = T[body, 0, 1] * mx + T[body, 1, 1] * my + T[body, 2, 1] * mz
+                nz = T[body, 0, 2] * mx + T[body, 1, 2] * my + T[body, 2, 2] * mz
+                length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
+                nx, ny, nz = nx / length, ny / length, nz / length
+                lx, ly, lz = lamp[0] - px, lamp[1] - py, lamp[2] - pz
+                length = math.sqrt(lx * lx + ly * ly + lz * lz)
+                lx, ly, lz = lx / length, ly / length, lz / length
+                diffuse = nx * lx + ny * ly + nz * lz
+                shine = 0.0
+                if textures[body, GLOSS] > 0.0 and diffuse > 0.0:
+                    length = math.sqrt(rx * rx + ry * ry + rz * rz)
+                    hx, hy, hz = lx - rx / length, ly - ry / length, lz - rz / length
+                    length = math.sqrt(hx * hx + hy * hy + hz * hz) + 1e-9
+                    cosine = max((nx * hx + ny * hy + nz * hz) / length, 0.0)
+                    cosine *= cosine
+                    cosine *= cosine
+                    cosine *= cosine
+                    shine = textures[body, GLOSS] * cosine * cosine
+                light[row, column, 0], light[row, column, 1], light[row, column, 2] = diffuse, shine, nz
+            diffuse, shine, nz = light[row, column, 0], light[row, column, 1], light[row, column, 2]
             lit = 0.0
             if diffuse > 0.0:
                 sx = T_lamp_world[0, 0] * px + T_lamp_world[0, 1] * py + T_lamp_world[0, 2] * pz + T_lamp_world[0, 3]
@@ -415,20 +473,10 @@ def _shade(
                         lit = ((1 - fu) * (shadow[j, i] > edge) + fu * (shadow[j, i + 1] > edge)) * (1 - fv) + (
                             (1 - fu) * (shadow[j + 1, i] > edge) + fu * (shadow[j + 1, i + 1] > edge)
                         ) * fv
-                diffuse *= lit
-            else:
-                diffuse = 0.0
-            _texture(textures, body, x, y, q, volume, albedo)
-            shine = 0.0
-            if textures[body, GLOSS] > 0.0 and lit > 0.0:
-                length = math.sqrt(rx * rx + ry * ry + rz * rz)
-                hx, hy, hz = lx - rx / length, ly - ry / length, lz - rz / length
-                length = math.sqrt(hx * hx + hy * hy + hz * hz) + 1e-9
-                cosine = max((nx * hx + ny * hy + nz * hz) / length, 0.0)
-                cosine *= cosine
-                cosine *= cosine
-                cosine *= cosine
-                shine = textures[body, GLOSS] * lit * cosine * cosine
+            diffuse *= lit
+            shine *= lit
             sky = 0.75 + 0.25 * nz
             for c in range(3):
-                image[row, column, c] = albedo[c] * (ambient[c] * sky + lamp_colour[c] * diffuse) + lamp_colour[c] * shine
+                image[row, column, c] = (
+                    albedo[row, column, c] * (ambient[c] * sky + lamp_colour[c] * diffuse) + lamp_colour[c] * shine
+                )

@@ -63,6 +63,33 @@ def test_a_crop_is_the_same_picture_as_that_part_of_the_whole(table):
     assert np.abs(crop.image.astype(int) - whole.image[152:272, 208:368]).max() <= 1
 
 
+def test_what_is_kept_of_earlier_pictures_is_not_seen_in_later_ones(table):
+    camera, red = table.cameras["front"], appearance.Appearance(appearance.Texture((0.8, 0.1, 0.1), (0.8, 0.1, 0.1)), gloss=0.4)
+    top = renderer.Body(box((1.2, 0.8, 0.02), Label.BACKGROUND), rigid.transform((0, 0, -0.01)), GREY)
+    arm = scene(table)[0]
+    wall = box((2.0, 0.01, 2.0), Label.OCCLUDER)
+    away, before = (renderer.Body(wall, rigid.transform((0, y, 0.3)), GREY) for y in (-5.0, -0.6))
+    painted = renderer.Body(arm.shape, arm.T_world_body, red)
+    turned = renderer.Body(arm.shape, arm.T_world_body @ rigid.from_rpy((0, 0, 0), (1.0, 0, 0)), red)
+    one, other = look(), look(lamp=(1.0, -1.0, 2.0))
+    pictures = [
+        ([arm, top, away], one),
+        ([arm, top, away], one),
+        ([painted, top, before], one),  # it changes while it cannot be seen
+        ([painted, top, away], one),
+        ([turned, top, away], one),
+        ([turned, top, away], other),
+        ([top, turned, away], other),
+        ([top], other),
+        ([arm, top, away], one),
+    ]
+    view = renderer.Renderer(camera)
+    for bodies, light in pictures:
+        image = view.render(bodies, light, np.random.default_rng(0)).image
+        fresh = renderer.Renderer(camera).render(bodies, light, np.random.default_rng(0)).image
+        np.testing.assert_array_equal(image, fresh)
+
+
 def test_the_table_is_darker_in_the_arm_s_shadow(table):
     ground = appearance.Appearance(GREY.texture, casts_shadow=False)
     top = renderer.Body(box((1.2, 0.8, 0.02), Label.BACKGROUND), rigid.transform((0, 0, -0.01)), ground)
