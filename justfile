@@ -13,13 +13,16 @@ lint:
 types:
     mypy
 
-# the tests of the default run
-test *arguments:
-    pytest {{arguments}}
+# the tests of the default run: side by side, then those that want the machine for themselves
+test: (side-by-side "not slow and not containers and not network")
 
 # what takes long: other instruction sets, faults, trainings, benchmarks
-test-slow *arguments:
-    pytest -m slow {{arguments}}
+test-slow: (side-by-side "slow")
+
+[private]
+side-by-side which:
+    pytest -n {{num_cpus()}} --dist loadfile -m "{{which}} and not alone"
+    pytest -m "{{which}} and alone"
 
 # what asks the package index
 test-network:

@@ -5,12 +5,14 @@ import logging
 import signal
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from penumbra.shared.runtime import bus
 from penumbra.tests.support.live import Running, free_port, hold_in_reach, penumbra_up
 
+HERE = Path(__file__).parent
 collect_ignore = [] if importlib.util.find_spec("pybullet") else ["test_pybullet.py", "test_dynamics.py"]
 """What only pybullet can answer; it has wheels up to CPython 3.11."""
 
@@ -23,7 +25,11 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of the running chain come last: it would take the cores from all others until the session ends."""
+    """Marks what runs whole chains as `alone`. Tests of the running chain come last: it would take the cores from all others until
+    the session ends."""
+    for item in items:
+        if item.path.is_relative_to(HERE / "chain") or item.path.is_relative_to(HERE / "examples"):
+            item.add_marker("alone")
     items.sort(key=lambda item: "running" in getattr(item, "fixturenames", ()))
 
 

@@ -234,14 +234,14 @@ def test_a_mesh_with_too_many_triangles_is_simplified_and_one_with_holes_is_repo
     assert mesh.vertices.max(axis=0) == pytest.approx(turned.max(axis=0), abs=1e-3)
 
 
-def test_the_check_takes_less_processor_time_than_people_notice():
-    """2 s for a built-in cell; 0.9 s of processor time where it was written, most of it imports."""
+def test_the_check_takes_no_longer_than_a_few_of_its_imports():
+    """1.7 times as long where it was written; a grid over all poses would be minutes."""
     code = (
-        "import resource; from penumbra.services.command import cli; cli.main(['check', 'arm']);"
-        "u = resource.getrusage(resource.RUSAGE_SELF); print(u.ru_utime + u.ru_stime)"
+        "import time; from penumbra.services.command import check, cli; imported = time.process_time();"
+        "cli.main(['check', 'arm']); print((time.process_time() - imported) / imported)"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert float(out.splitlines()[-1]) < 2.0
+    assert float(out.splitlines()[-1]) < 4.0
 
 
 def test_up_starts_nothing_with_a_broken_cell(folder):
