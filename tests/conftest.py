@@ -25,8 +25,8 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks what runs whole chains as `alone`. Tests of the running chain come last: it would take the cores from all others until
-    the session ends."""
+    """Marks what runs whole chains as `alone`. Tests of the running chain come last: it would take the cores from all others
+    until the session ends."""
     for item in items:
         if item.path.is_relative_to(HERE / "chain") or item.path.is_relative_to(HERE / "examples"):
             item.add_marker("alone")
