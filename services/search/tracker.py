@@ -307,7 +307,7 @@ class Search:
             return share - self.settings.home_weight * float(np.hypot(distance / spread.position, angle / spread.rotation))
 
         def fitted(T: Array) -> tuple[float, Fit]:
-            found = self._fit(seen, T, T_home, information)
+            found = self._fit(seen, T, T_home, information, ROUGH)
             return score(found.overlap, found.T_searched), found
 
         starts = detect.hypotheses(self._model, seen, T_home)
