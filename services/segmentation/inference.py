@@ -23,8 +23,6 @@ WEIGHTS = Path(__file__).parent / "weights" / "prednet.npz"
 MAX_GAP_S = 0.5
 """Longest gap [s] between frames after which the recurrent state is kept: after a longer one it has little to do with the
 picture. Chosen, not measured."""
-TRIED_PX = 128
-"""Width and height [px] of the window by which a machine's speed is judged."""
 FEWEST_PIXELS = 112 * 112
 """A machine too slow for a window of so many pixels gets it nevertheless: of a smaller one an arm fills too few."""
 
@@ -140,21 +138,23 @@ def _loaded(path: Path, changed_ns: int, precision: Precision | None) -> Segment
     return Segmenter(network, float(card["calibration"]["target_logit_offset"]), precision)
 
 
-def affordable(segmenter: Segmenter, step_s: float) -> int:
-    """The pixels of a window that takes step_s of one thread of this processor, within FEWEST_PIXELS and lookout.MAX_PIXELS."""
-    pixels = TRIED_PX**2 * 1e3 * step_s / speed(segmenter, TRIED_PX, TRIED_PX, 5)["cpu_ms"]
+def affordable(segmenter: Segmenter, tried: Window, step_s: float) -> int:
+    """The pixels of a window that takes step_s of one thread of this processor, within FEWEST_PIXELS and lookout.MAX_PIXELS.
+    tried: the window by which that is judged, best one that will be looked at first, since it is compiled here."""
+    ms = speed(segmenter, tried.width, tried.height, frames=3, unused=1)["cpu_ms"]
+    pixels = tried.width * tried.height * 1e3 * step_s / ms
     return round(min(max(pixels, FEWEST_PIXELS), MAX_PIXELS))
 
 
-def speed(segmenter: Segmenter, width: int, height: int, frames: int = 30) -> dict[str, float]:
+def speed(segmenter: Segmenter, width: int, height: int, frames: int = 30, unused: int = 5) -> dict[str, float]:
     """Milliseconds a frame of a window of this size on random pixels, on one thread: median of the processor's time and of the
-    clock's, which is longer where others want the processor too."""
+    clock's, which is longer where others want the processor too. unused: frames before these, of which the first one compiles."""
     image = np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8)
     window = Window(0, 0, width, height)
     times = []
-    for i in range(frames + 5):  # the first frames compile, choose kernels and fill caches
+    for i in range(unused + frames):
         begin = time.process_time(), time.perf_counter()
         segmenter(image, window, (i + 1) * 50_000_000)
         times.append((time.process_time() - begin[0], time.perf_counter() - begin[1]))
-    cpu, wall = 1e3 * np.median(times[5:], axis=0)
+    cpu, wall = 1e3 * np.median(times[unused:], axis=0)
     return {"cpu_ms": round(float(cpu), 2), "wall_ms": round(float(wall), 2)}

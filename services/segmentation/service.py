@@ -64,7 +64,8 @@ def start(node: ServiceNode, options: flags.Options) -> None:
 
     segmenters = {name: load_segmenter(options.weights) for name in cameras}
     rate_hz = sum(cell.cameras[name].rate_hz for name in cameras)
-    most = options.pixels or affordable(load_segmenter(options.weights), SHARE / rate_hz)
+    first = Lookout(cell, cameras[0]).window
+    most = options.pixels or affordable(load_segmenter(options.weights), first, SHARE / rate_hz)
     node.add_report("largest_window_px", lambda: most)
     lookouts = {name: Lookout(cell, name, most) for name in cameras}
     looking = {name: threading.Lock() for name in cameras}  # a camera's frames and `follow` look by turns
