@@ -4,8 +4,9 @@ in the image plane.
 A forearm is nearly round: without its hand, a limb that is turned over has almost the same contour, and every fit stays with
 the turn that it began with, surely or not. So its rivals are fitted to the picture: turns about the limb's axis, and the mirror
 image of its tilt. A rival that the picture prefers takes the pose's place. One that it cannot refute makes the pose
-as uncertain as the two are apart, until it is compared again; so does one that was not compared yet. One is compared in each
-picture: six times as many in the first ones would have a limb that was just found wait, and it would be elsewhere by then.
+as uncertain as the two are apart, until it is compared again; so does one that was not compared yet. One is compared in a
+picture: six times as many in the first ones would have a limb that was just found wait, and it would be elsewhere by then. Where
+all are refuted, pictures go by without: a comparison costs as much as the pose itself.
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ LASTS = 10.0
 independent: ten that prefer the wrong turn a little would convince it."""
 MOST = 2 * RIVALS
 """Number of rivals that one picture compares, at most: where one of them takes the pose's place, all are compared with that."""
+REST_NS = 140_000_000
+"""Time [ns] between two comparisons while all rivals are refuted: each is compared every 0.8 s, or in each sixth picture where
+pictures are rarer."""
 REFUTED_TIMES = 2
 """Number of pictures in a row that have to refute a rival: where both explain a picture nearly alike, noise refutes it once."""
 APART_RAD = 0.2
@@ -48,7 +52,7 @@ JUMPED_RAD = 0.4
 
 
 class Rivals:
-    """The rivals of one tracked limb: all of them where one takes its place, otherwise one in each picture."""
+    """The rivals of one tracked limb: all of them where one takes its place, otherwise one in a picture, or none."""
 
     def __init__(self, limits: Limits):
         self._limits = limits
@@ -59,9 +63,10 @@ class Rivals:
         """Begin anew, as with another limb."""
         self._doubts: list[deque[Array | None]] = [deque(maxlen=REFUTED_TIMES) for _ in range(RIVALS)]
         self._before: Array | None = None
+        self._compared_ns = 0
 
-    def contested(self, best: Fit, shown: Callable[[Array, int], Fit]) -> Fit:
-        """`best`, or a rival where the picture prefers that, as uncertain as rivals make it.
+    def contested(self, best: Fit, stamp_ns: int, shown: Callable[[Array, int], Fit]) -> Fit:
+        """`best`, or a rival where the picture of this stamp prefers that, as uncertain as rivals make it.
 
         shown(T, passes): the pose near T (4 x 4) after at most so many steps, of forearm and hand alike and without regard to a
         prediction.
@@ -70,8 +75,9 @@ class Rivals:
             other = shown(self._before, PASSES)
             if _excess(other, best, shown) < -PREFERRED:
                 best = other
-        due = 1
-        for compared in range(1, MOST + 1):
+        compared, due = 0, self._due(stamp_ns)
+        while compared < min(due, MOST):
+            compared += 1
             which, self._next = self._next, (self._next + 1) % RIVALS
             other = shown(_start(best, which), PASSES)
             excess = _excess(other, best, shown)
@@ -80,8 +86,6 @@ class Rivals:
                 best, due = other, compared + RIVALS
             else:
                 self._doubts[which].append(self._doubt(best, other, excess) if excess < REFUTED else None)
-            if compared == due:
-                break
         self._before = best.T
         axes, covariance = _axes(best), best.covariance
         for which, doubts in enumerate(self._doubts):
@@ -91,6 +95,14 @@ class Rivals:
             if left:
                 covariance = covariance + axes @ left[-1] @ axes.T
         return replace(best, covariance=covariance)
+
+    def _due(self, stamp_ns: int) -> int:
+        """Number of rivals to compare in the picture of this stamp."""
+        are_refuted = all(doubts and not any(doubt is not None for doubt in doubts) for doubts in self._doubts)
+        if are_refuted and 0 <= stamp_ns - self._compared_ns < REST_NS:
+            return 0
+        self._compared_ns = stamp_ns
+        return 1
 
     def _doubt(self, best: Fit, other: Fit, excess: float) -> Array:
         """What a rival adds to the covariance (6, 6) of a pose, along the limb's axes: as much of its own covariance, and of the

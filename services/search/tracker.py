@@ -112,7 +112,7 @@ class Search:
             seen, best, certain = self._track(mask, T_start, prior_covariance, joints, image)
             tracked = seen, best
             if certain:
-                tracked = seen, self._among_rivals(seen, best, image)
+                tracked = seen, self._among_rivals(seen, best, mask.stamp_ns, image)
                 return self._judge(*tracked, image is not None, T_start, prior_covariance)
         self._rivals.forget()
         usable = tracked is not None and explains_mask(tracked[1].overlap, tracked[1].misfit, self.settings)
@@ -120,7 +120,7 @@ class Search:
         other = self._detect(mask, T_start, joints, starts) if due else None
         if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
             found = self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
-            tracked = other[0], self._among_rivals(other[0], found, image)
+            tracked = other[0], self._among_rivals(other[0], found, mask.stamp_ns, image)
         if tracked is None:
             return self._lost(T_start)
         return self._judge(*tracked, image is not None, T_start if T_prior is not None else None, prior_covariance)
@@ -153,7 +153,7 @@ class Search:
         fits = best.sharp or (first.overlap >= self.settings.fits_well and first.misfit < self.settings.wrong_misfit)
         return seen, best, fits or seen.seen_px < detect.SMALLEST_PX
 
-    def _among_rivals(self, seen: Evidence, best: Fit, image: NDArray[np.uint8] | None) -> Fit:
+    def _among_rivals(self, seen: Evidence, best: Fit, stamp_ns: int, image: NDArray[np.uint8] | None) -> Fit:
         """The pose that the image shows, or its rival's."""
         if image is None or not best.sharp:
             self._rivals.forget()
@@ -163,7 +163,7 @@ class Search:
             start = replace(best, T=T, T_searched=T, hand=1.0)
             return fit_image(self._model, start, image, seen, T, np.zeros((6, 6)), ImageSettings(passes=passes))
 
-        return self._rivals.contested(best, shown)
+        return self._rivals.contested(best, stamp_ns, shown)
 
     def _behind_unknown(
         self, seen: Evidence, labels: NDArray[np.uint8], T_start: Array, prior: Array, image: NDArray[np.uint8]
