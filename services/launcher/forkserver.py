@@ -46,6 +46,9 @@ COMMON = ("penumbra.shared.runtime.node", "penumbra.services.flags", "penumbra.s
 ANSWER_S = 2.0
 """A fork takes some milliseconds, on a machine that is far too busy a second. A fork server that takes longer is ended, and the
 service is started plainly."""
+CALM_S = 20.0
+"""How long nothing has to be starting before it imports the services: that takes a second, which a limb that is being looked for
+needs more."""
 AGAIN_S = 10.0
 """After which a fork server that ended is started again."""
 MAX_BYTES = 1 << 17
@@ -106,6 +109,7 @@ class ForkServer:
         self._channel: socket.socket | None = None
         self._is_ready = self._has_modules = False
         self._due = 0.0
+        self._busy_at = time.monotonic()
 
     @property
     def pid(self) -> int | None:
@@ -145,14 +149,16 @@ class ForkServer:
         return self._is_ready
 
     def watch(self, is_calm: bool) -> None:
-        """Has it import the services as soon as nothing else is starting (`is_calm`), and starts it again where it has ended. To
-        be called from the main thread."""
+        """Has it import the services once nothing else has been starting for CALM_S (`is_calm`: nothing is now), and starts it
+        again where it has ended. To be called from the main thread."""
+        now = time.monotonic()
+        self._busy_at = self._busy_at if is_calm else now
         if self._popen is None:
-            if is_calm and time.monotonic() >= self._due:
+            if is_calm and now >= self._due:
                 self.start()
         elif self._popen.poll() is not None:
             self.stop()
-        elif is_calm and self.is_ready and not self._has_modules and self._channel is not None:
+        elif now - self._busy_at >= CALM_S and self.is_ready and not self._has_modules and self._channel is not None:
             self._has_modules, self._is_ready = True, False
             with contextlib.suppress(OSError):
                 self._channel.send(b"\n".join([IMPORT, *(module.encode() for module in self.modules)]))

@@ -51,6 +51,7 @@ def make(tmp_path, monkeypatch):
     started = []
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), str(Path(__file__).parents[3])]))
     monkeypatch.setattr(supervised, "STABLE_S", 0.0)
+    monkeypatch.setattr(forkserver, "CALM_S", 0.0)
 
     def make(*modules, is_ready=True, **texts):
         for name, text in texts.items():
@@ -161,6 +162,22 @@ def test_a_fork_server_with_a_second_thread_is_none(make, supervise, capfd):
     process = supervise(server, "tells", WHERE="there")
     kill(process)
     assert isinstance(process.popen, subprocess.Popen)
+
+
+def test_it_imports_the_services_when_nothing_has_been_starting_for_a_while(make, monkeypatch):
+    monkeypatch.setattr(forkserver, "CALM_S", 0.5)
+    server = make("json", is_ready=False)
+    wait_for(lambda: server.is_ready, 60, "a fork server")
+    calm = []
+
+    def watched():
+        is_calm = len(calm) != 3  # the fourth time something is starting
+        calm.append((time.monotonic(), is_calm))
+        server.watch(is_calm)
+        return server.has_modules
+
+    wait_for(watched, 30, "its imports", 0.1)
+    assert calm[-1][0] - max(at for at, is_calm in calm if not is_calm) >= 0.5
 
 
 def test_every_service_can_be_forked(make):
