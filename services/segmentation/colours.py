@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from penumbra.services.segmentation.classes import classes
 from penumbra.shared.contract.labels import TARGET_LABELS, Label
 
 SHAPE = (16, 16, 16)
@@ -57,8 +58,8 @@ class Colours:
         """Start anew, as before another scene."""
         self._seen = np.zeros((len(GROUPS), *SHAPE), np.float32)
 
-    def weighed(self, picture: NDArray[np.uint8], logits: NDArray[np.float32], elapsed_s: float) -> NDArray[np.float32]:
-        """The network's logits (classes, h, w) with what the colours say.
+    def classes(self, picture: NDArray[np.uint8], logits: NDArray[np.float32], elapsed_s: float) -> NDArray[np.uint8]:
+        """The class of each pixel (h, w), of the network's logits (classes, h, w) with what the colours say.
 
         picture: RGB (h, w, 3). elapsed_s: since the frame before.
         """
@@ -71,10 +72,8 @@ class Colours:
         first = _with(some, _evidence(_histograms(of_some, probability), of_some), weight)
         self._seen *= np.float32(0.5 ** (elapsed_s / HALF_LIFE_S))
         self._seen += _histograms(of_some, _probability(first))
-        found = _with(logits, _evidence(self._seen, index), weight)
-        strays = _strays(_is_target(found), _is_target(logits))
-        np.copyto(found, logits, where=strays)
-        return found
+        found, own = classes(_with(logits, _evidence(self._seen, index), weight)), classes(logits)
+        return np.where(_strays(_is_target(found), _is_target(own)), own, found)
 
 
 def _bins(picture: NDArray[np.uint8]) -> NDArray[np.intp]:
@@ -131,9 +130,9 @@ def _with(logits: NDArray[np.float32], evidence: list[NDArray[np.float32]], weig
     return out
 
 
-def _is_target(logits: NDArray[np.float32]) -> NDArray[np.bool_]:
-    inside, outside = list(GROUPS[0]), [label for group in GROUPS[1:] for label in group]
-    return logits[inside].max(0) > logits[outside].max(0)
+def _is_target(index: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    found: NDArray[np.bool_] = np.isin(index, GROUPS[0])
+    return found
 
 
 def _strays(target: NDArray[np.bool_], own: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from penumbra.services.segmentation import model
+from penumbra.services.segmentation.classes import classes
 from penumbra.services.segmentation.colours import Colours
 from penumbra.services.segmentation.model import Model
 from penumbra.services.segmentation.openvino_step import Compiled, Precision, State
@@ -66,9 +67,9 @@ class Segmenter:
         self._window, self._stamp_ns = window, stamp_ns
         for label in TARGET_LABELS:
             logits[label] += self._offset
-        if self._colours is not None:
-            logits = self._colours.weighed(np.rint(255.0 * picture).astype(np.uint8), logits, elapsed_s)
-        return classes(logits)
+        if self._colours is None:
+            return classes(logits)
+        return self._colours.classes(np.rint(255.0 * picture).astype(np.uint8), logits, elapsed_s)
 
     def twin(self) -> Segmenter:
         """Another one of the same network, for another camera: what one has compiled the other need not."""
@@ -97,16 +98,6 @@ class Segmenter:
         if self._window == window:
             return self._state
         return shift_state(self._state, self._strides, self._window, window)
-
-
-def classes(logits: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """The index (h, w) of the greatest of logits (classes, h, w), of equal ones the first; in a tenth of the time of argmax,
-    which does not like to count across planes."""
-    greatest, index = logits[0].copy(), np.zeros(logits.shape[1:], np.uint8)
-    for k in range(1, len(logits)):
-        np.copyto(index, k, where=logits[k] > greatest)
-        np.maximum(greatest, logits[k], out=greatest)
-    return index
 
 
 def cut(image: NDArray[np.uint8], window: Window) -> NDArray[np.float32]:

@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from penumbra.services.segmentation.inference import TARGET_LABELS, classes
+from penumbra.services.segmentation.classes import classes
+from penumbra.services.segmentation.inference import TARGET_LABELS
 from penumbra.services.segmentation.prednet import PredNet
 from penumbra.services.segmentation.training import priors
 from penumbra.shared.contract.labels import UNLABELLED, Label
