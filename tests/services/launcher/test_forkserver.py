@@ -168,7 +168,7 @@ def test_it_imports_the_services_when_nothing_has_been_starting_for_a_while(make
     monkeypatch.setattr(forkserver, "CALM_S", 0.5)
     server = make("json", is_ready=False)
     wait_for(lambda: server.is_ready, 60, "a fork server")
-    calm = []
+    calm: list[tuple[float, bool]] = []
 
     def watched():
         is_calm = len(calm) != 3  # the fourth time something is starting
