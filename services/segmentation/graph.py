@@ -16,7 +16,7 @@ import openvino
 from openvino import opset13 as op
 
 from penumbra.services.segmentation import encoder
-from penumbra.services.segmentation.model import FOLD, Model
+from penumbra.services.segmentation.model import FOLD, SHRINK, Model
 
 CHANNELS_FIRST, CHANNELS_LAST = np.array([0, 3, 1, 2]), np.array([0, 2, 3, 1])
 
@@ -54,8 +54,8 @@ class _Step:
         n = len(self._settings.channels)
         old, delayed = state[:n], state[n:]  # with delays: E_l of the step before
         errors: list[Any] = []
-        arriving = op.space_to_depth(image, "depth_first", FOLD)
-        known = None if priors is None else op.space_to_depth(priors, "depth_first", FOLD)
+        arriving = _shrunk(image)
+        known = None if priors is None else _shrunk(priors)
         context = self._context(image) if self._settings.encoder else {}
         for i in range(n):
             difference = op.subtract(arriving, self._convolution(f"predict.{i}", old[i]))
@@ -76,7 +76,7 @@ class _Step:
                 down = self._convolution(f"descend.{i}", old[i + 1] if delayed else new[0])
                 drive = op.add(drive, _enlarged(down, 2, "nearest") if i > 0 else down)
             new.insert(0, getattr(self, f"_{self._settings.cell}")(f"cells.{i}", drive, old[i]))
-        return self._decoded(new, context), [*new, *(errors if delayed else ())]
+        return self._decoded(image, new, context), [*new, *(errors if delayed else ())]
 
     def _context(self, image: Any) -> dict[int, Any]:
         """What the encoder adds, as in `prednet.PredNet.look`."""
@@ -98,20 +98,21 @@ class _Step:
                 coarser = _enlarged(self._convolution(f"gather.narrow.{k}", gathered), 2, "linear_onnx")
                 seen[k] = op.concat([coarser, seen[k]], 1)
             gathered = op.relu(self._convolution(f"gather.merge.{k}", seen[k]))
-            i = self._settings.driven[k]
-            factor = encoder.STRIDES[k] // self._settings.layer_strides[i]
+            i = self._settings.driven[k - 1] if k > 0 else 0  # in place of the first layer, the mask
+            factor = encoder.STRIDES[k] // self._settings.layer_strides[i] if k > 0 else 1
             part = _enlarged(self._convolution(f"context.{k}", gathered), factor, "linear_onnx")
             found[i] = op.add(found[i], part) if i in found else part
-        found[0] = self._convolution("glance", gathered)
         return found
 
-    def _decoded(self, representations: list[Any], context: dict[int, Any]) -> Any:
+    def _decoded(self, image: Any, representations: list[Any], context: dict[int, Any]) -> Any:
         total = self._convolution("decode.0", representations[1])
         for i in range(2, len(representations)):
             part = self._convolution(f"decode.{i - 1}", representations[i])
             total = op.add(total, _enlarged(part, 2 ** (i - 1), "linear_onnx"))
-        logits = self._convolution("head", op.relu(total))
-        return op.depth_to_space(op.add(logits, context[0]) if 0 in context else logits, "depth_first", FOLD)
+        outline = self._convolution("outline", op.space_to_depth(image, "depth_first", FOLD))
+        total = op.add(_enlarged(total, SHRINK, "linear_onnx"), outline)
+        total = op.relu(op.add(total, context[0]) if 0 in context else total)
+        return op.depth_to_space(self._convolution("head", total), "depth_first", FOLD)
 
     def _hgru(self, name: str, drive: Any, state: Any) -> Any:
         inhibition = self._convolution(
@@ -158,6 +159,12 @@ class _Step:
 
     def _per_channel(self, name: str) -> Any:
         return op.constant(self._weights[name].reshape(1, -1, 1, 1))
+
+
+def _shrunk(x: Any) -> Any:
+    """What the first layer sees of a picture, or of priors."""
+    side = [SHRINK, SHRINK]
+    return op.space_to_depth(op.avg_pool(x, side, [0, 0], [0, 0], side, False), "depth_first", FOLD)
 
 
 def _pooled(x: Any) -> Any:

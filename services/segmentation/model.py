@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from penumbra.services.segmentation import encoder
 
+SHRINK = 2
+"""The layers see means of so many pixels a side of the picture."""
 FOLD = 2
-"""Width and height [px] of what one position of the first layer sees."""
+"""Width and height of what one position sees: the first layer's of these means, and that of the mask's decoder of the picture."""
 CELLS = ("hgru", "convlstm", "conv")
 """What may update a layer's representation; `prednet.py` describes them."""
 PRIORS = ("robot", "target")
@@ -26,7 +28,7 @@ known."""
 
 
 def kernels_of(layers: int) -> tuple[int, ...]:
-    """The width of the cell's kernel in each of so many layers: 3 where they have half the picture's resolution, 5 above."""
+    """The width of the cell's kernel in each of so many layers: 3 where they are finest, 5 above."""
     return tuple(3 if i < 2 else 5 for i in range(layers))
 
 
@@ -58,7 +60,7 @@ class Settings:
     @property
     def layer_strides(self) -> tuple[int, ...]:
         """Image pixels a side of one position of each layer."""
-        return tuple(FOLD * 2 ** max(i - 1, 0) for i in range(len(self.channels)))
+        return tuple(SHRINK * FOLD * 2 ** max(i - 1, 0) for i in range(len(self.channels)))
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -72,8 +74,8 @@ class Settings:
 
     @property
     def driven(self) -> tuple[int, ...]:
-        """The layer that each of the encoder's results drives: the last one whose positions are no larger."""
-        return tuple(max(i for i, own in enumerate(self.layer_strides) if own <= stride) for stride in encoder.STRIDES)
+        """The layer that each of the encoder's results but the first drives: the last one whose positions are no larger."""
+        return tuple(max(i for i, own in enumerate(self.layer_strides) if own <= stride) for stride in encoder.STRIDES[1:])
 
     def state_sizes(self, height: int, width: int) -> tuple[tuple[int, int], ...]:
         """(height, width) of each tensor of the state for images of this size. Raises ValueError where the size does not fit."""

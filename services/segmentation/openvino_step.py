@@ -42,7 +42,8 @@ class Compiled:
             graph.step(model, model.settings.multiple, model.settings.multiple, precision)
         except (KeyError, RuntimeError) as error:
             raise ValueError(
-                f"expected weights of {model.settings}, got others ({error}); use the weights that belong to the card"
+                f"expected weights of {model.settings}, got others ({error}); use the weights that belong to the card, "
+                "and train again what an earlier release has trained"
             ) from None
         self._core, self._type = openvino.Core(), getattr(openvino.Type, precision)
         self._model, self._precision = model, precision

@@ -5,18 +5,19 @@ One time step (section "PredNet Model"):
 1. Bottom-up. Layer l predicts its input A_l from its representation R_l of the last step. What the prediction missed is the
    error E_l, split into what was too little and what too much; convolved and pooled it is the input A_{l+1} of the next layer.
 2. Top-down. From the last layer to the first, R_l is updated by a cell (hGRU; others for comparison) driven by E_l and R_{l+1}.
-3. The mask is decoded from all R_l but the first: brought to one resolution, summed, convolved.
+3. The mask is decoded from all R_l but the first and from the picture: brought to one resolution, summed, convolved.
 
 Priors, where the network has any (`model.PRIORS`), enter beside the picture and are not predicted: convolved they are added to
 what the second layer receives from below, from which all layers above learn of them, and to the drive of its cell. Where nothing
 is known they are zero and add nothing.
 
 An encoder (`encoder.py`), where the network has one, looks at each picture by itself. What it says is added to the drive of the
-cells of all layers but the first, and the logits of its own mask to those of the mask; it is not predicted either.
+cells of all layers but the first and, at its finest resolution, to the sum that the mask is read from; it is not predicted.
 
-The picture enters folded: 2 x 2 pixels become 12 channels (space to depth). The first layer therefore works at half resolution
-where the authors' works at full; the pooling that would follow it is this folding, which, unlike it, throws nothing away.
-Together this halves the time of a step. The second layer keeps half resolution, each one above halves it.
+The layers see the picture at half its resolution and folded: 2 x 2 means become 12 channels (space to depth). The first layer
+therefore works at a quarter of the picture's resolution where the authors' works at full; the pooling that would follow it is
+this folding, which, unlike it, throws nothing away. The second layer keeps that resolution, each one above halves it. The mask's
+decoder works at half resolution, where contours come from the picture, folded likewise, and from the encoder.
 
 References: Lotter, Kreiman, Cox 2017 (arXiv:1605.08104); Linsley, Kim, Veerabadran, Windolf, Serre 2018 (arXiv:1805.08315).
 """
@@ -33,14 +34,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from penumbra.services.segmentation import encoder, model
-from penumbra.services.segmentation.model import FOLD, Model, Settings
+from penumbra.services.segmentation.model import FOLD, SHRINK, Model, Settings
 from penumbra.shared.contract.labels import Label
 
 State = tuple[Tensor, ...]
 """What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""
 Context = dict[int, Tensor]
-"""What an encoder adds to the drive of layers' cells (batch, channels, h, w), by layer, and, in place of the first one's, to the
-logits of the mask, folded."""
+"""What an encoder adds to the drive of layers' cells (batch, channels, h, w), by layer, and, in place of the first one's, to what
+the mask is read from."""
 
 
 class HGRU(nn.Module):
@@ -188,6 +189,7 @@ class PredNet(nn.Module):
         self.descend = nn.ModuleList(nn.Conv2d(c[i + 1], c[i], 1) for i in range(n - 1))
         self.cells = nn.ModuleList(CELLS[settings.cell](c[i], settings.kernels[i]) for i in range(n))
         self.decode = nn.ModuleList(nn.Conv2d(c[i], settings.decoder_channels, 1) for i in range(1, n))
+        self.outline = nn.Conv2d(3 * FOLD * FOLD, settings.decoder_channels, 3, padding=1, bias=False)
         self.head = nn.Conv2d(settings.decoder_channels, len(Label) * FOLD * FOLD, 3, padding=1)
         known = settings.priors * FOLD * FOLD
         self.prior_input, self.prior_drive = (
@@ -195,9 +197,9 @@ class PredNet(nn.Module):
         )
         self.encoder = Encoder() if settings.encoder else None
         self.gather = Gathering() if settings.encoder else None
-        levels = zip(encoder.WIDTHS, settings.driven, strict=True) if settings.encoder else ()
-        self.context = nn.ModuleList(nn.Conv2d(width, c[i], 1, bias=False) for width, i in levels)
-        self.glance = nn.Conv2d(encoder.WIDTHS[0], self.head.out_channels, 3, padding=1) if settings.encoder else None
+        receiving = (settings.decoder_channels, *(c[i] for i in settings.driven))
+        levels = zip(encoder.WIDTHS, receiving, strict=True) if settings.encoder else ()
+        self.context = nn.ModuleList(nn.Conv2d(width, channels, 1, bias=False) for width, channels in levels)
         for module in self.modules():  # channels innermost: what convolutions on a CPU are fastest with
             if isinstance(module, nn.Conv2d):
                 module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)
@@ -216,17 +218,17 @@ class PredNet(nn.Module):
     def look(self, image: Tensor) -> Context:
         """What the encoder of a network that has one adds."""
         found: Context = {}
-        if self.encoder is not None and self.gather is not None and self.glance is not None:
+        if self.encoder is not None and self.gather is not None:
             gathered = self.gather(self.encoder(image))
-            found[0] = self.glance(gathered[0])
-            for k, (i, said) in enumerate(zip(self.settings.driven, gathered, strict=True)):
-                part = _enlarged(self.context[k](said), encoder.STRIDES[k] // self.settings.layer_strides[i])
+            found[0] = self.context[0](gathered[0])
+            for k, i in enumerate(self.settings.driven, 1):
+                part = _enlarged(self.context[k](gathered[k]), encoder.STRIDES[k] // self.settings.layer_strides[i])
                 found[i] = found[i] + part if i in found else part
         return found
 
     def glimpsed(self, image: Tensor) -> Tensor:
-        """Class logits (batch, classes, h, w) of the encoder alone, of a network that has one."""
-        return F.pixel_shuffle(self.look(image)[0], FOLD)
+        """Class logits (batch, classes, h, w) without the layers, of a network that has an encoder."""
+        return self._mask(self.outline(F.pixel_unshuffle(image, FOLD)), self.look(image))
 
     def forward(
         self, image: Tensor, state: State, priors: Tensor | None = None, context: Context | None = None
@@ -241,8 +243,8 @@ class PredNet(nn.Module):
         delayed = state[n:]  # with delays: E_l of the step before
         errors: list[Tensor] = []
         missed: list[Tensor] = []
-        arriving = F.pixel_unshuffle(image, FOLD)
-        known = None if priors is None else F.pixel_unshuffle(priors, FOLD)
+        arriving = _shrunk(image)
+        known = None if priors is None else _shrunk(priors)
         context = self.look(image) if context is None else context
         for i in range(n):
             difference = arriving - self.predict[i](old[i])
@@ -264,14 +266,19 @@ class PredNet(nn.Module):
                 down = self.descend[i](old[i + 1] if delayed else new[0])
                 drive = drive + (F.interpolate(down, scale_factor=2, mode="nearest") if i > 0 else down)
             new.insert(0, self.cells[i](drive, old[i]))
-        return self._decode(new, context), missed, (*new, *(errors if delayed else ()))
+        total = self.decode[0](new[1])
+        for i in range(2, n):
+            total = total + _enlarged(self.decode[i - 1](new[i]), 2 ** (i - 1))
+        total = _enlarged(total, SHRINK) + self.outline(F.pixel_unshuffle(image, FOLD))
+        return self._mask(total, context), missed, (*new, *(errors if delayed else ()))
 
-    def _decode(self, representations: list[Tensor], context: Context) -> Tensor:
-        total = self.decode[0](representations[1])
-        for i in range(2, len(representations)):
-            total = total + _enlarged(self.decode[i - 1](representations[i]), 2 ** (i - 1))
-        logits = self.head(F.relu(total))
-        return F.pixel_shuffle(logits + context[0] if 0 in context else logits, FOLD)
+    def _mask(self, total: Tensor, context: Context) -> Tensor:
+        return F.pixel_shuffle(self.head(F.relu(total + context[0] if 0 in context else total)), FOLD)
+
+
+def _shrunk(x: Tensor) -> Tensor:
+    """What the first layer sees of a picture, or of priors."""
+    return F.pixel_unshuffle(F.avg_pool2d(x, SHRINK), FOLD)
 
 
 def _enlarged(x: Tensor, factor: int) -> Tensor:
@@ -298,13 +305,7 @@ def grown(net: PredNet, settings: Settings) -> PredNet:
             f"otherwise the same, got {settings}"
         )
     larger, own = PredNet(settings), dict(net.named_parameters())
-    ignored = (
-        f"descend.{layers - 1}.",
-        "decode.",
-        "prior_",
-        "context.",
-        "glance.",
-    )  # what the old layers and the mask get of what is new
+    ignored = (f"descend.{layers - 1}.", "decode.", "prior_", "context.")  # what the old layers and the mask get of what is new
     with torch.no_grad():
         for name, value in larger.named_parameters():
             before = own.get(name)
@@ -337,5 +338,5 @@ def load(path: Path) -> tuple[PredNet, dict[str, Any]]:
     try:
         net.load_state_dict({name: torch.from_numpy(value) for name, value in network.weights.items()})
     except RuntimeError as error:
-        raise ValueError(f"{path}: expected weights of {network.settings}, as its card says: {error}") from None
+        raise ValueError(f"{path}: expected this release's weights of {network.settings}: {error}") from None
     return net.eval(), card

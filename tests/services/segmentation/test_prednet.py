@@ -68,7 +68,7 @@ def test_a_step_gives_a_logit_per_class_and_pixel_an_error_per_layer_and_a_state
     logits, errors, state = step(net, torch.rand(2, 3, 32, 48))
     assert logits.shape == (2, len(Label), 32, 48)
     assert len(errors) == 3
-    assert [tuple(s.shape[-2:]) for s in state[:3]] == [(16, 24), (16, 24), (8, 12)]
+    assert [tuple(s.shape[-2:]) for s in state[:3]] == [(8, 12), (8, 12), (4, 6)]
     assert len(state) == (6 if delay else 3)
 
 
@@ -93,7 +93,7 @@ def test_without_delay_the_mask_depends_on_a_picture_at_once_and_with_it_layers_
 
 
 def test_an_image_of_a_size_that_does_not_fit_is_refused_with_the_sizes_that_do():
-    with pytest.raises(ValueError, match="expected positive multiples of 4, got 30 x 32"):
+    with pytest.raises(ValueError, match="expected positive multiples of 8, got 30 x 32"):
         PredNet(SMALL).initial_state(1, 32, 30)
 
 
@@ -138,15 +138,15 @@ def test_what_is_unlabelled_is_neither_learned_nor_scored():
 
 def test_state_shifted_with_the_window_is_the_state_of_the_shifted_window():
     net = PredNet(SMALL).eval()
-    image = torch.rand(1, 3, 96, 96)
-    old, new = Window(0, 0, 64, 64), Window(16, 24, 64, 64)
+    image = torch.rand(1, 3, 160, 160)
+    old, new = Window(0, 0, 128, 128), Window(16, 24, 128, 128)
     cut = lambda w: image[:, :, w.y0 : w.y0 + w.height, w.x0 : w.x0 + w.width]  # noqa: E731
     with torch.inference_mode():
         _, _, moved = step(net, cut(old))
         _, _, wanted = step(net, cut(new))
     moved = shift_state(tuple(as_rows(tensor) for tensor in moved), net.settings.strides, old, new)
     for got, tensor, stride in zip(moved, wanted, net.settings.strides, strict=True):
-        inner = slice(16 // stride, 24 // stride)  # seen by both windows, away from both borders
+        inner = slice(48 // stride, 72 // stride)  # seen by both windows, away from both borders
         np.testing.assert_allclose(got[:, inner, inner], as_rows(tensor)[:, inner, inner], rtol=1e-4, atol=1e-5)
         assert not got[:, -8 // stride :].any()  # what the old window did not see is unknown
 
@@ -239,9 +239,7 @@ def test_a_network_given_priors_and_an_encoder_gives_the_same_masks_until_it_lea
         torch.testing.assert_close(more, logits, rtol=1e-4, atol=1e-5)
     loss.focal(more, torch.randint(0, len(Label), (1, 32, 32))).backward()
     for name, value in larger.named_parameters():
-        assert not name.startswith(("prior_", "context.", "glance.")) or (
-            value.grad is not None and value.grad.abs().sum() > 0.0
-        ), name
+        assert not name.startswith(("prior_", "context.")) or (value.grad is not None and value.grad.abs().sum() > 0.0), name
     for less in ({"priors": 0}, {"encoder": False}):
         with pytest.raises(ValueError, match="2 priors and the encoder, if any"):
             prednet.grown(larger, replace(larger.settings, **less))
@@ -317,7 +315,7 @@ def test_a_training_goes_on_with_priors_and_an_encoder_where_it_was(data, tmp_pa
         assert again.extended(has_priors=True, pretrained=begun_with) is again
         again.train_step(data, 0.1)
         assert again.net.prior_input is not None and again.net.prior_input.weight.abs().sum() > 0.0
-        begun = {name: value for name, value in again.net.named_parameters() if name.startswith(("context.", "glance."))}
+        begun = {name: value for name, value in again.net.named_parameters() if name.startswith("context.")}
         assert begun and all(value.abs().sum() > 0.0 for value in begun.values())
         own, of_encoder = (group["lr"] for group in again.optimizer.param_groups)
         assert of_encoder == pytest.approx(schedule.encoder_share * own)
@@ -332,7 +330,7 @@ def test_a_training_goes_on_with_priors_and_an_encoder_where_it_was(data, tmp_pa
 def test_the_encoder_learns_masks_alone_before_the_network_learns_with_it(data):
     schedule = train.Schedule(alone=2, patches=((0.0, 64, 2),), warm_up=1)
     trainer = train.Trainer(SMALL, schedule, seed=1).extended(has_priors=False, pretrained=prednet.Encoder().state_dict())
-    own = ("encoder.", "gather.", "glance.")
+    own = ("encoder.", "gather.", "context.0.", "head.", "outline.")
 
     def moved_by_a_step() -> set[bool]:
         """Whether what moved, and what did not, is the encoder's."""
@@ -483,8 +481,8 @@ def test_a_network_of_other_channels_and_more_inputs_runs_with_nothing_but_its_w
     for name in ("predict.0.weight", "predict.0.bias"):
         shape = (5 * model.FOLD**2, *weights[name].shape[1:])
         weights[name] = rng.normal(0.0, 0.1, shape).astype(np.float32)
-    for name in ("ascend.0.weight", "drive.0.weight"):
-        shape = (weights[name].shape[0], 2 * 5 * model.FOLD**2, 3, 3)
+    for name, count in (("ascend.0.weight", 2), ("drive.0.weight", 2), ("outline.weight", 1)):
+        shape = (weights[name].shape[0], count * 5 * model.FOLD**2, 3, 3)
         weights[name] = rng.normal(0.0, 0.1, shape).astype(np.float32)
     network = openvino_step.Compiled(model.Model(settings, weights), "f32")
     logits, _ = network(rng.random((32, 48, 5), np.float32), network.initial_state(32, 48))
