@@ -171,13 +171,13 @@ def test_it_imports_the_services_when_nothing_has_been_starting_for_a_while(make
     calm: list[tuple[float, bool]] = []
 
     def watched():
-        is_calm = len(calm) != 3  # the fourth time something is starting
+        is_calm = len(calm) > 3  # the first four times something is starting
         calm.append((time.monotonic(), is_calm))
         server.watch(is_calm)
         return server.has_modules
 
     wait_for(watched, 30, "its imports", 0.1)
-    assert calm[-1][0] - max(at for at, is_calm in calm if not is_calm) >= 0.5
+    assert calm[-1][0] - max(at for at, is_calm in calm if not is_calm) > 0.4  # looked at every 0.1 s
 
 
 def test_every_service_can_be_forked(make):
