@@ -241,7 +241,7 @@ def test_the_check_takes_no_longer_than_a_few_of_its_imports():
         "cli.main(['check', 'arm']); print((time.process_time() - imported) / imported)"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert float(out.splitlines()[-1]) < 4.0
+    assert float(out.splitlines()[-1]) < 2.5
 
 
 def test_up_starts_nothing_with_a_broken_cell(folder):

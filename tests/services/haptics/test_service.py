@@ -182,6 +182,7 @@ def test_fixed_pads_need_no_joint_angles(table: cells.Cell, skin: Skin) -> None:
 # ---- the service
 
 
+@pytest.mark.alone
 def test_the_service_keeps_up_with_the_pads_and_goes_on_without_a_silent_one(table: cells.Cell) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     world = World(table, seed=3)
@@ -223,7 +224,7 @@ def test_the_service_keeps_up_with_the_pads_and_goes_on_without_a_silent_one(tab
         played(60)
     ages_ns = [came_ns - pose.sample_stamp_ns for came_ns, pose in poses]
     periods_ns = np.diff([pose.sample_stamp_ns for _, pose in poses])
-    assert np.min(ages_ns) < np.median(periods_ns)  # all are on an idle machine; here other tests share two cores
+    assert np.min(ages_ns) < 0.5 * np.median(periods_ns)  # the median too on an idle machine
     assert np.diff([pose.stamp_ns for _, pose in poses]).min() > 0
     last = poses[-1][1]
     truth = truths[last.sample_stamp_ns]
