@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -34,9 +33,6 @@ APART = 0.01
 """Two points of the contour whose depths differ by more than this [m] belong to two parts."""
 SHAPE = 0.006
 """Error of the mesh's cross-section [m]: levers shorter than this say nothing about the roll."""
-SECTION = 0.25
-"""Angle [rad] by which the mesh's cross-section may be turned against the limb's. Chosen: with none, a picture of a distant arm
-whose roll is off by 11 degrees says 3, and the roll runs away; with 0.2 and 0.6 it does not."""
 MOST = 4096
 """Maximum number of points of a contour: more than fit in an image."""
 CREASE = 0.8
@@ -420,19 +416,6 @@ def slow_waves(points: Points, T: Array) -> list[Array]:
     return [np.where(across == side, shape, 0.0) for side in (False, True) for shape in (s, 1.5 * s**2 - 0.5)]
 
 
-def turned(points: Points, T: Array, k: Intrinsics, regular: Array) -> Array:
-    """Error (n,) [px] at one standard deviation of the contour of a limb at T_camera_target (4, 4) because its cross-section is
-    turned against the mesh's: by SECTION, or by as much as a prior's information leaves of the roll. `regular` (6, 6) or more. It
-    is what a roll moves the contour by on levers up to SHAPE, which `normal_equations` leaves out."""
-    roll = max(float(T[:3, 0] @ np.linalg.solve(regular[3:6, 3:6], T[:3, 0])) ** 0.5, SECTION)
-    X, normal = points["position"], points["normal"]
-    moved = np.cross(T[:3, 0], X - T[:3, 3])
-    u = k.fx * (moved[:, 0] - moved[:, 2] * X[:, 0] / X[:, 2])
-    v = k.fy * (moved[:, 1] - moved[:, 2] * X[:, 1] / X[:, 2])
-    short = SHAPE * k.fx
-    return np.asarray(roll * np.clip(normal[:, 0] * u + normal[:, 1] * v, -short, short) / X[:, 2], np.float64)
-
-
 def stretched(points: Points, T: Array, k: Intrinsics) -> tuple[Array, Array]:
     """Offsets (n,) [px] of the contour of a limb at T_camera_target (4, 4) along its normals, per unit of its log length and of
     its log girth."""
@@ -445,12 +428,11 @@ def stretched(points: Points, T: Array, k: Intrinsics) -> tuple[Array, Array]:
 
 
 class Equations(NamedTuple):
-    """The normal equations of a contour's offsets, of the pose error along the camera's axes, the dilation and k errors that
-    the offsets share.
+    """The normal equations of a contour's offsets, of the pose error along the camera's axes and the dilation.
 
-    H (7 + k, 7 + k) : information. g (7 + k,) : its right side. length : of the contour that was measured [px]. square : sum of
-    length times Huber-limited squared offset [px^3]. counted : length that costs [px]. cost : Huber's (chi^2 where all is within
-    `huber`).
+    H (7, 7) : information. g (7,) : its right side. length : of the contour that was measured [px]. square : sum of length times
+    Huber-limited squared offset [px^3]. counted : length that costs [px]. cost : Huber's (chi^2 where all is within `huber`).
+    rolls : share of the information about the roll that comes from levers longer than SHAPE.
     """
 
     H: Array
@@ -459,6 +441,7 @@ class Equations(NamedTuple):
     square: float
     counted: float
     cost: float
+    rolls: float
 
 
 def normal_equations(
@@ -471,29 +454,25 @@ def normal_equations(
     fx: float,
     fy: float,
     huber: float,
-    solving: bool,
-    shared: Sequence[Array] = (),
+    bounded: bool,
 ) -> Equations:
     """The normal equations of the offsets r (n,) [px] of contour points (n,), of a `kind` (n,) each (`_match`).
 
-    `weights` (n,) [1/px^2] of the points; `origin` (3,) [m] and `axis` (3,) of the target; `solving`: whether they serve to find
-    the pose, and BOUNDED points inform, beside that they cost; otherwise only what was measured does, and levers shorter than
-    SHAPE say nothing about the roll; `shared` (n,) each [px]: errors that the offsets share, at one standard deviation.
+    `weights` (n,) [1/px^2] of the points; `origin` (3,) [m] and `axis` (3,) of the target; `bounded`: whether BOUNDED points
+    inform, beside that they cost.
     """
-    size = 7 + len(shared)
-    H, g, sums = np.zeros((size, size)), np.zeros(size), np.empty(4)
-    errors = np.array(shared).reshape(len(shared), len(points))
+    H, g, sums = np.zeros((7, 7)), np.zeros(7), np.empty(5)
     origin, axis = np.ascontiguousarray(origin), np.ascontiguousarray(axis)
-    _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, solving, errors, H, g, sums)
+    _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bounded, H, g, sums)
     return Equations(H, g, *sums.tolist())
 
 
-@kernel("POINT[n], f8[n], u1[n], f8[n], f8[3], f8[3], f8, f8, f8, b1, f8[k, n], out f8[m, m], out f8[m], out f8[4]", POINT=POINT)
-def _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, solving, shared, H, g, sums):
-    """Adds to H and g, and writes the four numbers after them: see `normal_equations`."""
-    size = len(g)
-    J = np.empty(size)
+@kernel("POINT[n], f8[n], u1[n], f8[n], f8[3], f8[3], f8, f8, f8, b1, out f8[7, 7], out f8[7], out f8[5]", POINT=POINT)
+def _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, bounded, H, g, sums):
+    """Adds to H and g, and writes the five numbers after them: see `normal_equations`."""
+    J = np.empty(7)
     length, square, counted, cost = 0.0, 0.0, 0.0, 0.0
+    rolls, long_rolls = 1e-12, 0.0
     for i in range(len(points)):
         if kind[i] == DROPPED:
             continue
@@ -508,8 +487,6 @@ def _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, sol
         J[4] = J[0] * z - J[2] * x
         J[5] = J[1] * x - J[0] * y
         J[6] = 1.0
-        for a in range(7, size):
-            J[a] = shared[a - 7, i]
         if kind[i] == MEASURED:
             length += point.length
             square += point.length * min(r[i] * r[i], huber * huber)
@@ -520,14 +497,13 @@ def _normal_equations(points, r, kind, weights, origin, axis, fx, fy, huber, sol
         else:
             cost += weight * huber * (2.0 * abs(r[i]) - huber)
             weight *= huber / abs(r[i])
-        if kind[i] == BOUNDED and not solving:
+        if kind[i] == BOUNDED and not bounded:
             continue
-        if not solving:
-            roll, short = J[3] * axis[0] + J[4] * axis[1] + J[5] * axis[2], SHAPE * fx / Z
-            for a in range(3):
-                J[3 + a] -= min(max(roll, -short), short) * axis[a]
-        for a in range(size):
+        roll = abs(J[3] * axis[0] + J[4] * axis[1] + J[5] * axis[2])
+        rolls += weight * roll * roll
+        long_rolls += weight * max(roll - SHAPE * fx / Z, 0.0) ** 2
+        for a in range(7):
             g[a] += weight * J[a] * r[i]
-            for b in range(size):
+            for b in range(7):
                 H[a, b] += weight * J[a] * J[b]
-    sums[0], sums[1], sums[2], sums[3] = length, square, counted, cost
+    sums[0], sums[1], sums[2], sums[3], sums[4] = length, square, counted, cost, long_rolls / rolls

@@ -12,14 +12,15 @@ What covers the target ends the lines, as it guards the mask's boundary.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.contour import MEASURED, POINT, Equations, Model, Points, normal_equations, slow_waves, turned
+from penumbra.services.search.contour import MEASURED, POINT, Equations, Model, Points, normal_equations, slow_waves
 from penumbra.services.search.evidence import Evidence
 from penumbra.services.search.mask_fit import Fit, Limits, marginal, overlap_of, with_prior
 from penumbra.shared.geometry import rigid
@@ -58,7 +59,7 @@ class ImageSettings:
     edge: float = 0.2
     correlation: float = 9.0
     dilation: float = 0.12
-    wave: float = 0.15
+    wave: float = 0.3
 
 
 def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uint8], Evidence]:
@@ -116,15 +117,10 @@ def fit_image(
         if best.rms >= enough:
             best = min(best, _through(way, start), key=lambda one: one.rms)
     trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
-    k = pictures[-1].evidence.intrinsics
-    shapes = [*(settings.wave * wave for wave in slow_waves(best.points, best.T)), turned(best.points, best.T, k, regular)]
-
-    def measured(shared: Sequence[Array]) -> tuple[Array, Array]:
-        found = best.equations(shared)
-        return marginal(best.T, best.moved, trust * found.H, trust * found.g, regular, limits)
-
-    known = np.asarray(np.linalg.inv(np.linalg.inv(measured(shapes)[1]) + prior), np.float64)
-    T, covariance = measured([*shapes, *best.bends(known, k)])
+    waves = trust * best.waves(settings.wave)
+    measured = partial(marginal, best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits)
+    bends = trust * best.bends(measured(waves)[1], pictures[-1].evidence.intrinsics)
+    T, covariance = measured(np.hstack([waves, bends]))
     both, free, overlap = overlap_of(model, best.T, evidence, first.hand)
     return replace(
         first,
@@ -143,33 +139,34 @@ def fit_image(
 
 @dataclass(frozen=True)
 class _Pass:
-    """A pose T, `moved` (7,) from the prior, the last of it by `step` (7,). Before that step: points (n,) of the contour, length
-    of it that was measured [px], root mean square of the offsets left [px], and `before`, which gives the normal equations of
-    what was measured, with errors that the offsets share."""
+    """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
+    square of the offsets left [px] and the share of the roll that is used. points (n,) of the contour, and
+    equations: what gives the normal equations of their offsets (n,)."""
 
     T: Array
     moved: Array
-    step: Array
-    points: Points
+    H: Array
+    g: Array
     length: float
     rms: float
-    before: Callable[[Sequence[Array]], Equations]
+    rolls: float
+    points: Points
+    equations: Callable[[Array], Equations]
 
-    def equations(self, shared: Sequence[Array] = ()) -> Equations:
-        """The normal equations at the pose: the derivatives are those before the last step, which hardly moved them."""
-        found = self.before(shared)
-        return found._replace(g=found.g - found.H[:, :7] @ self.step)
+    def waves(self, size: float) -> Array:
+        """The right sides (7, k) of `ImageSettings.wave` of this size [px]."""
+        return np.stack([self.equations(size * wave).g for wave in slow_waves(self.points, self.T)], axis=1)
 
-    def bends(self, covariance: Array, intrinsics: Intrinsics) -> list[Array]:
-        """What the equations leave out [px], (n,) each: a pose that is off by one standard deviation moves the contour by more
-        than its derivative, along the directions that a covariance (6, 6) knows least."""
+    def bends(self, covariance: Array, intrinsics: Intrinsics) -> Array:
+        """The right sides (7, BENDS) of what the equations leave out: a pose that is off by one standard deviation moves the
+        contour by more than its derivative, along the directions that a covariance (6, 6) knows least."""
         axis = self.T[:3, 0]
         lever = np.diag([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])
         lever[3:, 3:] -= LEVER_M * np.outer(axis, axis)  # a roll hardly moves the contour, and has a doubt of its own
         variances, directions = np.linalg.eigh(lever @ covariance @ lever)
         off = directions[:, -BENDS:] * np.sqrt(np.maximum(variances[-BENDS:], 0.0))
         off[3:] /= LEVER_M
-        return [_bend(self.points, self.T, error, intrinsics) for error in off.T]
+        return np.stack([self.equations(_bend(self.points, self.T, error, intrinsics)).g for error in off.T], axis=1)
 
 
 @dataclass(frozen=True)
@@ -208,29 +205,30 @@ class _Picture:
         moved = np.zeros(7)
         moved[:6] = rigid.pose_error(T, self.T_prior)
         for _ in range(passes):
-            here, found = self._at(T, moved)
-            step = np.asarray(np.linalg.solve(found.H + self.regular, found.g - self.regular @ moved), np.float64)
+            here = self._at(T, moved)
+            step = np.linalg.solve(here.H + self.regular, here.g - self.regular @ moved)
             step /= max(1.0, float(np.max(np.abs(step[:6]) / MAX_STEP)))
             T, moved = rigid.perturb(T, step[:6]), moved + step
             if np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED:
                 break
-        return replace(here, T=T, moved=moved, step=step)
+        # the derivatives are those before the last step, which hardly moved them
+        return replace(here, T=T, moved=moved, g=here.g - here.H @ step)
 
-    def _at(self, T: Array, moved: Array) -> tuple[_Pass, Equations]:
+    def _at(self, T: Array, moved: Array) -> _Pass:
         evidence, settings, k = self.evidence, self.settings, self.evidence.intrinsics
-        matched = self.model.matched(T, evidence, settings.spacing, LINE, self.hand)
-        points = matched.points
+        found = self.model.matched(T, evidence, settings.spacing, LINE, self.hand)
+        points = found.points
         noise = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
-        r, sigma, kind = offsets(points, self.image, evidence.guarded, matched.r, matched.kind, *noise)
+        r, sigma, kind = offsets(points, self.image, evidence.guarded, found.r, found.kind, *noise)
         weight = points["length"] / (settings.correlation * (sigma**2 + settings.edge**2))
 
-        def equations(shared: Sequence[Array], solving: bool = False) -> Equations:
-            offset, origin, axis = r - moved[6], T[:3, 3], T[:3, 0]
-            return normal_equations(points, offset, kind, weight, origin, axis, k.fx, k.fy, settings.huber, solving, shared)
+        def equations(r: Array) -> Equations:
+            return normal_equations(points, r, kind, weight, T[:3, 3], T[:3, 0], k.fx, k.fy, settings.huber, False)
 
-        found = equations((), solving=True)
-        rms = math.sqrt(found.square / found.length) if found.length > 0 else math.inf
-        return _Pass(T, moved, np.zeros(7), points, found.length, rms, equations), found
+        found_by = equations(r - moved[6])
+        length = found_by.length
+        rms = math.sqrt(found_by.square / length) if length > 0 else math.inf
+        return _Pass(T, moved, found_by.H, found_by.g, length, rms, found_by.rolls, points, equations)
 
 
 def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:

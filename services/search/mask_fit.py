@@ -19,13 +19,12 @@ half a pixel around the limb looks like centimetres of depth.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.contour import DROPPED, Equations, Model, Points, normal_equations, turned
+from penumbra.services.search.contour import DROPPED, Equations, Model, Points, normal_equations
 from penumbra.services.search.evidence import TARGET, Evidence, compare
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
@@ -166,18 +165,11 @@ class Problem:
         return Pass(T, moved, found.points, r, found.kind, equations.H, equations.g, cost)
 
     def normal_equations(
-        self,
-        T: Array,
-        points: Points,
-        r: Array,
-        kind: NDArray[np.uint8],
-        huber: float,
-        solving: bool,
-        shared: Sequence[Array] = (),
+        self, T: Array, points: Points, r: Array, kind: NDArray[np.uint8], huber: float, bounded: bool
     ) -> Equations:
         noise, k = self.noise, self.evidence.intrinsics
         weights = points["length"] / (noise.correlation * noise.edge**2)
-        return normal_equations(points, r, kind, weights, T[:3, 3], T[:3, 0], k.fx, k.fy, huber, solving, shared)
+        return normal_equations(points, r, kind, weights, T[:3, 3], T[:3, 0], k.fx, k.fy, huber, bounded)
 
     def bent(self, here: Pass) -> tuple[float, float]:
         """How many times the offsets of the hand's contour are those of the forearm's, from 1 to MOST_BENT, and how long it is
@@ -275,32 +267,42 @@ def fit(
 
     # the pose is final: only what was measured informs
     moved = here.moved
-    shapes = [turned(here.points, here.T, evidence.intrinsics, regular)]
-    measured = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False, shapes)
+    measured = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False)
     length = measured.length
     rms = math.sqrt(measured.square / length) if length > 0 else math.inf
     misfit = cost / independent
     # a mask or a fit worse than expected: the residuals give the noise
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
     both, free, overlap = overlap_of(model, here.T, evidence, problem.hand)
-    T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, limits)
+    T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, measured.rolls, limits)
     return Fit(
         T, covariance, here.T, length, rms, float(moved[6]), cost, misfit, both, free, overlap, problem.hand
     )  # fmt: skip
 
 
-def marginal(T: Array, moved: Array, H: Array, g: Array, regular: Array, limits: Limits) -> tuple[Array, Array]:
-    """The pose and covariance (6, 6) of the measurement alone, from the normal equations (7 + k, 7 + k), (7 + k,) of pose error,
-    dilation and k errors that the offsets share, at T, which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is
-    left out but for KEPT, dilation and shared errors are marginalised (Schur complement)."""
-    nuisance, pull = H[6:, 6:] + np.eye(len(H) - 6), g[6:].copy()
-    nuisance[0, 0] += regular[6, 6] - 1.0
-    pull[0] -= regular[6, 6] * moved[6]
-    gain = np.linalg.solve(nuisance, H[6:, :6]).T
+def marginal(
+    T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float, limits: Limits, waves: Array | None = None
+) -> tuple[Array, Array]:
+    """The pose and covariance (6, 6) of the measurement alone, from the normal equations of pose error and dilation at T,
+    which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out but for KEPT, the dilation marginalised (Schur
+    complement).
+
+    `rolls`: share of the information about the roll that is used, see `normal_equations`; `waves` (7, k): right sides of
+    errors that all of the contour shares, of one standard deviation each.
+    """
+    gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
     weak = (1.0 - KEPT) * limits.information + KEPT * regular[:6, :6]
-    covariance = np.linalg.inv(H[:6, :6] - gain @ H[6:, :6] + weak)
-    offset = covariance @ (g[:6] - gain @ pull - weak @ moved[:6])
-    return rigid.perturb(T, offset), (covariance + covariance.T) / 2.0
+    covariance = np.linalg.inv(H[:6, :6] - np.outer(gain, H[6, :6]) + weak)
+    offset = covariance @ (g[:6] - gain * (g[6] - regular[6, 6] * moved[6]) - weak @ moved[:6])
+    if waves is not None:
+        bent = covariance @ (waves[:6] - np.outer(gain, waves[6]))
+        covariance = covariance + bent @ bent.T
+    # the roll that a nearly round section shows is uncertain, and so is all that is correlated with it
+    c = covariance[:, 3:] @ T[:3, 0]
+    roll = float(T[:3, 0] @ c[3:])
+    doubt = min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll)
+    covariance = (covariance + covariance.T) / 2.0 + doubt * np.outer(c, c) / roll
+    return rigid.perturb(T, offset), covariance
 
 
 def with_prior(T: Array, covariance: Array, T_prior: Array, prior: Array) -> Array:

@@ -90,8 +90,8 @@ class Rivals:
         axes, covariance = _axes(best), best.covariance
         for which, doubts in enumerate(self._doubts):
             left = [doubt for doubt in doubts if doubt is not None]
-            if not doubts:  # not compared yet: as sure of its place as the pose itself
-                left.append(self._doubt(best, replace(best, T=_start(best, which), covariance=np.zeros((6, 6))), 0.0))
+            if not doubts:  # not compared yet
+                left.append(self._doubt(best, replace(best, T=_start(best, which)), 0.0))
             if left:
                 covariance = covariance + axes @ left[-1] @ axes.T
         return replace(best, covariance=covariance)

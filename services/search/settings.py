@@ -61,9 +61,8 @@ class SearchSettings:
 
     # ---- What the prediction says
 
-    sure: tuple[float, float] = (0.05, 0.1)
-    """Largest standard deviation of the position of a prediction that is called sure: across the line of sight [m], and along it
-    as a share of the distance, where that is more, for a camera hardly sees it. Chosen."""
+    sure: float = 0.05
+    """Largest standard deviation of the position [m], along its worst direction, of a prediction that is called sure. Chosen."""
     expected: float = ONE_IN_10
     """Squared Mahalanobis distance up to which a pose is where the prediction says."""
     prior_inflation: float = 2.0

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.search.contour import DROPPED, MEASURED, Model, slow_waves, stretched, turned
+from penumbra.services.search.contour import DROPPED, MEASURED, Model, slow_waves, stretched
 from penumbra.services.search.evidence import Evidence
 from penumbra.services.search.mask_fit import (
     CONVERGED,
@@ -75,13 +75,14 @@ def fit_shape(
         sigma, hand = _spreads(here, model.wrist, problem.hand, noise.edge, stage[1])
 
     problem.noise = replace(noise, edge=sigma, correlation=max(noise.correlation, BULGE * px_per_m))
-    shapes = [*(sigma * wave for wave in slow_waves(here.points, T)), turned(here.points, T, evidence.intrinsics, regular)]
+    measured = problem.normal_equations(T, here.points, here.r, here.kind, HUBER * sigma, False)
+    shapes = [sigma * wave for wave in slow_waves(here.points, T)]
     sizes = [spread * off for spread, off in zip(size_spread, stretched(here.points, T, evidence.intrinsics), strict=True)]
     _, beyond = _lengths(here, model.wrist, problem.hand)
     bends = [np.where(beyond, problem.hand * sigma * here.points["normal"][:, i], 0.0) for i in (0, 1)]
-    measured = problem.normal_equations(T, here.points, here.r, here.kind, HUBER * sigma, False, (*shapes, *sizes, *bends))
+    errors = [problem.normal_equations(T, here.points, r, here.kind, math.inf, False).g for r in (*shapes, *sizes, *bends)]
     both, free, overlap = overlap_of(model, T, evidence, hand)
-    T_measured, covariance = marginal(T, moved, measured.H, measured.g, regular, limits)
+    T_measured, covariance = marginal(T, moved, measured.H, measured.g, regular, measured.rolls, limits, np.stack(errors, axis=1))
     return replace(
         first,
         T=T_measured,

@@ -231,11 +231,7 @@ class Search:
     def _is_expected(self, found: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
         """Whether the prediction is sure, and the pose found is where it says."""
         covariance, floor = self._predicted(prior_covariance)
-        distance = float(np.linalg.norm(T_start[:3, 3]))
-        sight = T_start[:3, 3] / distance
-        across, along = self.settings.sure[0], max(self.settings.sure[0], self.settings.sure[1] * distance)
-        scaled = np.eye(3) / across + np.outer(sight, sight) * (1.0 / along - 1.0 / across)
-        if np.linalg.eigvalsh(scaled @ covariance[:3, :3] @ scaled)[-1] > 1.0:
+        if np.linalg.eigvalsh(covariance[:3, :3])[-1] > self.settings.sure**2:
             return False
         error = rigid.pose_error(found.T, T_start)
         uncertain = covariance + found.covariance + (floor if prior_covariance is None else 0.0)

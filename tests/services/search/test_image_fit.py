@@ -167,18 +167,3 @@ def test_a_roll_that_a_hidden_hand_leaves_open_is_uncertain(visible):
                 nees.append(error @ np.linalg.solve(estimate.covariance, error))
     assert len(nees) > 10
     assert np.mean(np.array(nees) > 20.1) < 0.1  # beyond three standard deviations
-
-
-@pytest.mark.parametrize("across", [False, True])
-def test_how_far_away_a_distant_limb_is_need_not_be_known_to_expect_it(across):
-    states = []
-    for index in SEEDS:
-        shot = shots.shot(7100, index, 1280, 960, distance_m=6.0, hidden=0.65, domain="easy")
-        sight = shot.T_world_target[:3, 3] - np.array(shot.camera.position)
-        unsure = np.cross(sight, [0.0, 0.0, 1.0]) if across else sight
-        unsure /= np.linalg.norm(unsure)
-        prior = PRIOR.copy()
-        prior[:3, :3] += 0.09**2 * np.outer(unsure, unsure)
-        T = start(shot, index)
-        states.append(Search(shot.cell).update(mask(shot, T), T, prior, shot.joints, shot.image).state)
-    assert "tracking" not in states if across else np.mean([state == "tracking" for state in states]) > 0.7

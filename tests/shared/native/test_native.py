@@ -99,12 +99,11 @@ def calls(rng):
     # fields that Python code too can read as attributes, as kernels do
     contour_points = rng.uniform(0.5, 20.0, (n, 8)).view(contour.POINT)[:, 0].view(np.recarray)
     kind = rng.integers(0, 3, n).astype(np.uint8)
+    sums = np.zeros((7, 7)), np.zeros(7), np.zeros(5)
     weights = rng.uniform(size=n)
     offsets = rng.standard_normal(n)
     axes = rng.standard_normal((2, 3))
-    for solving, shared in ((True, np.empty((0, n))), (False, rng.standard_normal((2, n)))):
-        sums = np.zeros((7 + len(shared),) * 2), np.zeros(7 + len(shared)), np.zeros(4)
-        yield contour._normal_equations, (contour_points, offsets, kind, weights, *axes, 50.0, 50.0, 0.7, solving, shared, *sums)
+    yield contour._normal_equations, (contour_points, offsets, kind, weights, *axes, 50.0, 50.0, 0.7, True, *sums)
     signal, precision = rng.uniform(0, 2, (2, 6)), rng.uniform(1e2, 1e4, (2, 6))
     pads = np.array([0, 3, 6]), rng.uniform(-0.02, 0.02, (6, 3)), rng.uniform(1, 3, 6), rng.uniform(1e3, 1e4, 6)
     yield paper_nearest._fit, (signal, precision, *pads, np.empty((2, 2, 3)), np.empty((2, 2, 3, 3)))
