@@ -46,7 +46,8 @@ class ImageSettings:
     Mahalanobis distance of a pixel; `temperature`: number of a line's pixels that count as one; `mask`: standard deviation of the
     mask's boundary on a line [px]; `huber` [px]; `edge`: standard deviation that an offset has at least [px]; `correlation`:
     length of contour over which offsets err together [px]; `dilation`: of the whole contour [px]; `wave`: of errors that change
-    slowly along each side of the limb, as its shading does [px]: with one side hidden they look like another distance."""
+    slowly along each side of the limb, as its shading does [px]: with one side hidden they look like another distance. Where the
+    offsets are larger than TYPICAL, so are all of these."""
 
     passes: int = 5
     spacing: float = 3.0
@@ -59,7 +60,7 @@ class ImageSettings:
     edge: float = 0.2
     correlation: float = 9.0
     dilation: float = 0.12
-    wave: float = 0.3
+    wave: float = 0.2
 
 
 def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uint8], Evidence]:
@@ -116,8 +117,10 @@ def fit_image(
     for enough, start, way in _further(pictures, T, T_prior if prior.any() else None):
         if best.rms >= enough:
             best = min(best, _through(way, start), key=lambda one: one.rms)
-    trust = min(1.0, (TYPICAL / max(best.rms, 1e-3)) ** 4)
-    waves = trust * best.waves(settings.wave)
+    points = best.length / settings.correlation
+    trust = min(1.0, (TYPICAL / max(unfitted(best.rms, points), 1e-3)) ** 4)
+    regular[6, 6] *= trust
+    waves = trust * best.waves(settings.wave / math.sqrt(trust))
     measured = partial(marginal, best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits)
     bends = trust * best.bends(measured(waves)[1], pictures[-1].evidence.intrinsics)
     T, covariance = measured(np.hstack([waves, bends]))
@@ -127,14 +130,20 @@ def fit_image(
         T=T,
         covariance=covariance,
         T_searched=best.T,
-        length=best.length / evidence.scale,
+        points=points,
         rms=best.rms,
-        cost=best.length / evidence.scale * best.rms**2 / (settings.correlation * settings.edge**2),
+        cost=points / evidence.scale * (best.rms / settings.edge) ** 2,
         both=both,
         free=free,
         overlap=overlap,
         sharp=best.rms < SHARP,
     )
+
+
+def unfitted(rms: float, points: float) -> float:
+    """Root mean square [px] that offsets have about the truth, where a fit of a pose to so many independent points left `rms`: it
+    takes as much of the error away as it has unknowns."""
+    return rms * math.sqrt(points / max(points - UNKNOWNS, 1.0))
 
 
 @dataclass(frozen=True)
@@ -276,11 +285,13 @@ def _bend(points: Points, T: Array, error: Array, intrinsics: Intrinsics) -> Arr
 
 BENDS = 2
 """Number of directions of a pose along which its contour is followed to the second order: distance and tilt."""
+UNKNOWNS = 6
+"""Number of unknowns of a pose."""
 LEVER_M = 0.15
 """Length [m] at which a rotation counts as a way: half of a forearm's."""
 TYPICAL = 0.2
-"""Root mean square [px] of the offsets left up to which the covariance is that of the settings; above, it grows with its fourth
-power."""
+"""Root mean square [px] of the offsets (`unfitted`) up to which the covariance is that of the settings; above, it grows with its
+fourth power, and what the contour's points share grows with it."""
 SHARP = 0.3
 """Root mean square [px] of the offsets left, each limited to `ImageSettings.huber`, below which a pose is accepted."""
 MAX_STEP = np.array([0.02, 0.02, 0.05, 0.1, 0.1, 0.1])

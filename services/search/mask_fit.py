@@ -95,17 +95,17 @@ MISFIT = 3.0
 @dataclass(frozen=True)
 class Fit:
     """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
-    `length`: pixels of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's estimated dilation [px];
-    `cost`: chi^2 of contour, dilation and prior together, or of the contour alone where the image shows it; `misfit`: that of the
-    mask per measurement, 1 to 3 where the pose is right; `both`, `free`: see `evidence.compare`; `overlap`: see `overlap_of`;
-    `hand`: how many times as uncertain as the forearm's the hand's contour was taken for (`Problem.bent`); `sharp`: whether
-    the image has edges along the contour (`image_fit.fit_image`); `shape`: standard deviation of the limb's surface from the
-    mesh's [m], where the contour was fitted with one (`shape_fit.fit_shape`)."""
+    `points`: number of independent points of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's
+    estimated dilation [px]; `cost`: chi^2 of contour, dilation and prior together, or of the contour alone, in the mask's pixels,
+    where the image shows it; `misfit`: that of the mask per measurement, 1 to 3 where the pose is right; `both`, `free`: see
+    `evidence.compare`; `overlap`: see `overlap_of`; `hand`: how many times as uncertain as the forearm's the hand's contour was
+    taken for (`Problem.bent`); `sharp`: whether the image has edges along the contour (`image_fit.fit_image`); `shape`: standard
+    deviation of the limb's surface from the mesh's [m], where the contour was fitted with one (`shape_fit.fit_shape`)."""
 
     T: Array
     covariance: Array
     T_searched: Array
-    length: float
+    points: float
     rms: float
     dilation: float
     cost: float
@@ -276,7 +276,7 @@ def fit(
     both, free, overlap = overlap_of(model, here.T, evidence, problem.hand)
     T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, measured.rolls, limits)
     return Fit(
-        T, covariance, here.T, length, rms, float(moved[6]), cost, misfit, both, free, overlap, problem.hand
+        T, covariance, here.T, length / noise.correlation, rms, float(moved[6]), cost, misfit, both, free, overlap, problem.hand
     )  # fmt: skip
 
 

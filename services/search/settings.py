@@ -49,20 +49,21 @@ class SearchSettings:
 
     hidden: float = 0.95
     """Largest hidden share with which a pose is measured where a sure prediction expects it. Chosen."""
-    shortest_px: float = 30.0
-    """Least measured contour [px] of such a pose. Derived: about four independent points."""
+    least_points: float = 3.0
+    """Least number of independent points of contour of such a pose. Chosen."""
     recognised: float = 0.5
     """Largest hidden share of a shape that nothing sure expects. Chosen: a smaller piece may be anything."""
-    recognised_px: float = 80.0
-    """Least measured contour [px] of such a shape. Chosen."""
+    recognised_points: float = 8.0
+    """Least number of independent points of contour of such a shape. Chosen: two more than a pose has unknowns."""
     covers: float = 0.5
     """Share of the silhouette that must be covered, or outside the picture, for a target that does not show enough to be called
     occluded. Otherwise it is lost. Chosen."""
 
     # ---- What the prediction says
 
-    sure: float = 0.05
-    """Largest standard deviation of the position [m], along its worst direction, of a prediction that is called sure. Chosen."""
+    sure: tuple[float, float] = (0.1, 0.1)
+    """Largest standard deviation of the position of a prediction that is called sure: across the line of sight [m], and along it
+    as a share of the distance, where that is more, for a camera hardly sees it. Chosen."""
     expected: float = ONE_IN_10
     """Squared Mahalanobis distance up to which a pose is where the prediction says."""
     prior_inflation: float = 2.0

@@ -88,7 +88,7 @@ def fit_shape(
         T=T_measured,
         covariance=covariance,
         T_searched=T,
-        length=_measured_px(here, model.wrist, problem.hand),
+        points=_measured_px(here, model.wrist, problem.hand) / noise.correlation,
         rms=math.sqrt(measured.square / measured.length) if measured.length > 0 else math.inf,
         dilation=float(moved[6]),
         both=both,

@@ -112,7 +112,8 @@ class Search:
             seen, best, certain = self._track(mask, T_start, prior_covariance, joints, image)
             tracked = seen, best
             if certain:
-                tracked = seen, self._among_rivals(seen, best, mask.stamp_ns, image)
+                prior = np.zeros((6, 6)) if prior_covariance is None else self._regularising(prior_covariance)
+                tracked = seen, self._among_rivals(seen, best, mask.stamp_ns, image, T_start, prior)
                 return self._judge(*tracked, image is not None, T_start, prior_covariance)
         self._rivals.forget()
         usable = tracked is not None and explains_mask(tracked[1].overlap, tracked[1].misfit, self.settings)
@@ -120,7 +121,7 @@ class Search:
         other = self._detect(mask, T_start, joints, starts) if due else None
         if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
             found = self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
-            tracked = other[0], self._among_rivals(other[0], found, mask.stamp_ns, image)
+            tracked = other[0], self._among_rivals(other[0], found, mask.stamp_ns, image, found.T, np.zeros((6, 6)))
         if tracked is None:
             return self._lost(T_start)
         return self._judge(*tracked, image is not None, T_start if T_prior is not None else None, prior_covariance)
@@ -153,8 +154,10 @@ class Search:
         fits = best.sharp or (first.overlap >= self.settings.fits_well and first.misfit < self.settings.wrong_misfit)
         return seen, best, fits or seen.seen_px < detect.SMALLEST_PX
 
-    def _among_rivals(self, seen: Evidence, best: Fit, stamp_ns: int, image: NDArray[np.uint8] | None) -> Fit:
-        """The pose that the image shows, or its rival's."""
+    def _among_rivals(
+        self, seen: Evidence, best: Fit, stamp_ns: int, image: NDArray[np.uint8] | None, T_prior: Array, prior: Array
+    ) -> Fit:
+        """The pose that image and prediction show, or its rival's. prior: information (6, 6) about T_prior."""
         if image is None or not best.sharp:
             self._rivals.forget()
             return best
@@ -163,7 +166,11 @@ class Search:
             start = replace(best, T=T, T_searched=T, hand=1.0)
             return fit_image(self._model, start, image, seen, T, np.zeros((6, 6)), ImageSettings(passes=passes))
 
-        return self._rivals.contested(best, stamp_ns, shown)
+        def surprise(T: Array, covariance: Array) -> float:
+            away = rigid.pose_error(T, T_prior)
+            return float(away @ np.linalg.solve(np.eye(6) + prior @ covariance, prior @ away))
+
+        return self._rivals.contested(best, stamp_ns, shown, surprise)
 
     def _behind_unknown(
         self, seen: Evidence, labels: NDArray[np.uint8], T_start: Array, prior: Array, image: NDArray[np.uint8]
@@ -231,7 +238,11 @@ class Search:
     def _is_expected(self, found: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
         """Whether the prediction is sure, and the pose found is where it says."""
         covariance, floor = self._predicted(prior_covariance)
-        if np.linalg.eigvalsh(covariance[:3, :3])[-1] > self.settings.sure**2:
+        distance = float(np.linalg.norm(T_start[:3, 3]))
+        sight = T_start[:3, 3] / distance
+        across, along = self.settings.sure[0], max(self.settings.sure[0], self.settings.sure[1] * distance)
+        scaled = np.eye(3) / across + np.outer(sight, sight) * (1.0 / along - 1.0 / across)
+        if np.linalg.eigvalsh(scaled @ covariance[:3, :3] @ scaled)[-1] > 1.0:
             return False
         error = rigid.pose_error(found.T, T_start)
         uncertain = covariance + found.covariance + (floor if prior_covariance is None else 0.0)
@@ -366,7 +377,7 @@ class Search:
             misfit=best.misfit,
             is_sharp=best.sharp,
             shape=best.shape,
-            contour_px=best.length,
+            points=best.points,
             hidden=float(np.clip(1.0 - seen.seen_px / amodal, 0.0, 1.0)),
             covered=1.0 - (best.both + best.free) / amodal,
             has_image=with_image,

@@ -25,16 +25,16 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Findings:
-    """What is known of a fitted pose before it is judged. overlap, misfit, is_sharp, shape: as of `mask_fit.Fit`; contour_px:
-    contour measured [px]; hidden: share of the silhouette in [0, 1] that the mask does not show; covered: share that something
-    covers, or that lies outside the window; has_image: whether an image was there to confirm the pose; is_expected: whether a
-    sure prediction says that the target is there, and it is not just now that it is of another shape than the mesh."""
+    """What is known of a fitted pose before it is judged. overlap, misfit, is_sharp, shape, points: as of `mask_fit.Fit`; hidden:
+    share of the silhouette in [0, 1] that the mask does not show; covered: share that something covers, or that lies outside the
+    window; has_image: whether an image was there to confirm the pose; is_expected: whether a sure prediction says that the target
+    is there, and it is not just now that it is of another shape than the mesh."""
 
     overlap: float
     misfit: float
     is_sharp: bool
     shape: float | None
-    contour_px: float
+    points: float
     hidden: float
     covered: float
     has_image: bool
@@ -44,8 +44,8 @@ class Findings:
 def verdict(found: Findings, settings: SearchSettings) -> Verdict:
     """Judges a fitted pose. A small piece of a target is accepted only where a sure prediction expects it."""
     largest_hidden = settings.hidden if found.is_expected else settings.recognised
-    shortest_px = settings.shortest_px if found.is_expected else settings.recognised_px
-    if found.hidden > largest_hidden or found.contour_px < shortest_px:
+    least_points = settings.least_points if found.is_expected else settings.recognised_points
+    if found.hidden > largest_hidden or found.points < least_points:
         return Verdict.COVERED if found.covered > settings.covers else Verdict.TOO_LITTLE
     if found.shape is not None:
         if found.overlap < settings.fits_shaped:

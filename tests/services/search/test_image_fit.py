@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from penumbra.services.search.image_fit import UNKNOWNS, unfitted
 from penumbra.services.search.rivals import RIVALS
 from penumbra.services.search.tracker import Search, Searched
 from penumbra.shared.contract.labels import Label
@@ -19,6 +20,13 @@ from penumbra.sim.sets.shots import Shot
 PRIOR = np.diag(np.repeat([0.0115**2, 0.04**2], 3))
 """Covariance of the starts: together 2 cm and 4 degrees."""
 SEEDS = range(8)
+
+
+def with_open_roll(T: np.ndarray) -> np.ndarray:
+    """PRIOR of a limb at T whose roll is not known, as of one that was just found."""
+    covariance = PRIOR.copy()
+    covariance[3:, 3:] += 2.0**2 * np.outer(T[:3, 0], T[:3, 0])
+    return covariance
 
 
 def pictures(hidden: float) -> list[Shot]:
@@ -87,7 +95,7 @@ def test_the_covariance_of_the_refined_pose_is_that_of_its_errors(visible, half_
 def test_the_roll_of_a_limb_that_was_just_found_is_open_until_its_rivals_are_compared(visible):
     for seed, shot in enumerate(visible):
         T, search = start(shot, seed), Search(shot.cell)
-        estimates = [search.update(mask(shot, T), T, PRIOR, shot.joints, shot.image) for _ in range(RIVALS)]
+        estimates = [search.update(mask(shot, T), T, with_open_roll(T), shot.joints, shot.image) for _ in range(RIVALS)]
         rolls = [float(np.sqrt(each.T[:3, 0] @ each.covariance[3:, 3:] @ each.T[:3, 0])) for each in estimates]
         assert rolls[0] > 1.0
         assert rolls[-1] < 0.5 * rolls[0]
@@ -134,36 +142,79 @@ def off(shot: Shot, estimate: Searched) -> np.ndarray:
     return rigid.pose_error(shot.T_world_target, estimate.T)
 
 
-def looked_at(shot: Shot, mask: Mask, image: np.ndarray, T: np.ndarray) -> list[Searched]:
+def looked_at(shot: Shot, mask: Mask, image: np.ndarray, T: np.ndarray, prior: np.ndarray) -> list[Searched]:
     """The estimates of pictures of a limb at rest, whose prediction T stays wrong: one round of rivals, and one more."""
     search = Search(shot.cell)
-    return [search.update(mask, T, PRIOR, shot.joints, image) for _ in range(2 * RIVALS)][RIVALS:]
+    return [search.update(mask, T, prior, shot.joints, image) for _ in range(2 * RIVALS)][RIVALS:]
 
 
 @pytest.mark.parametrize("degrees", [-140.0, -60.0, 60.0, 140.0])
 def test_a_limb_with_its_hand_in_sight_does_not_stay_turned_over(visible, degrees):
     right = []
     for shot in visible:
-        estimates = looked_at(shot, mask(shot, shot.T_world_target), shot.image, turned(shot, degrees))
+        estimates = looked_at(shot, mask(shot, shot.T_world_target), shot.image, turned(shot, degrees), PRIOR)
         rolls = [abs(np.degrees(off(shot, estimate)[3:] @ estimate.T[:3, 0])) for estimate in estimates]
         right.append(np.median(rolls) < 10.0)
     assert np.mean(right) > 0.8
 
 
+def with_hand_covered(shot: Shot) -> tuple[Mask, np.ndarray]:
+    """Mask and image of a scene in which something lies before the hand."""
+    image, seen = shot.image.copy(), mask(shot, shot.T_world_target)
+    rows, columns = np.nonzero(shot.labels == Label.HAND)
+    covered = (slice(rows.min() - 4, rows.max() + 5), slice(columns.min() - 4, columns.max() + 5))
+    image[covered] = (90, 120, 60)
+    labels = shot.labels.copy()
+    labels[covered] = Label.OCCLUDER
+    h, w = seen.labels.shape
+    return replace(seen, labels=labels[seen.y0 : seen.y0 + h, seen.x0 : seen.x0 + w]), image
+
+
 def test_a_roll_that_a_hidden_hand_leaves_open_is_uncertain(visible):
     nees = []
     for shot in visible:
-        image, seen = shot.image.copy(), mask(shot, shot.T_world_target)
-        rows, columns = np.nonzero(shot.labels == Label.HAND)
-        covered = (slice(rows.min() - 4, rows.max() + 5), slice(columns.min() - 4, columns.max() + 5))
-        image[covered] = (90, 120, 60)
-        labels = shot.labels.copy()
-        labels[covered] = Label.OCCLUDER
-        h, w = seen.labels.shape
-        behind = replace(seen, labels=labels[seen.y0 : seen.y0 + h, seen.x0 : seen.x0 + w])
-        for estimate in looked_at(shot, behind, image, turned(shot, 120.0)):
+        behind, image = with_hand_covered(shot)
+        T = turned(shot, 120.0)
+        for estimate in looked_at(shot, behind, image, T, with_open_roll(T)):
             if estimate.state == "tracking":
                 error = off(shot, estimate)
                 nees.append(error @ np.linalg.solve(estimate.covariance, error))
     assert len(nees) > 10
     assert np.mean(np.array(nees) > 20.1) < 0.1  # beyond three standard deviations
+
+
+def test_what_the_prediction_knows_stays_known_where_the_hand_is_hidden(visible):
+    for seed, shot in enumerate(visible):
+        behind, image = with_hand_covered(shot)
+        T = start(shot, seed)
+        known, not_known = (looked_at(shot, behind, image, T, prior)[-1] for prior in (PRIOR, with_open_roll(T)))
+        place, open_place = (np.sqrt(np.trace(each.covariance[:3, :3])) for each in (known, not_known))
+        roll, open_roll = (np.sqrt(each.T[:3, 0] @ each.covariance[3:, 3:] @ each.T[:3, 0]) for each in (known, not_known))
+        assert known.state == not_known.state == "tracking"
+        assert place < open_place and roll < 0.9 * open_roll
+        assert error_cm(shot, known) < 3.0 * 100.0 * place
+
+
+@pytest.mark.parametrize("points", [8.0, 16.0, 64.0])
+def test_what_a_fit_leaves_tells_the_noise_whatever_the_number_of_points(points):
+    rng = np.random.default_rng(3)
+    left = []
+    for _ in range(4000):
+        A, r = rng.normal(size=(int(points), UNKNOWNS)), rng.normal(size=int(points))
+        left.append(np.mean((r - A @ np.linalg.lstsq(A, r, rcond=None)[0]) ** 2))
+    assert unfitted(float(np.sqrt(np.mean(left))), points) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("across", [False, True])
+def test_how_far_away_a_distant_limb_is_need_not_be_known_to_expect_it(across):
+    states = []
+    for index in SEEDS:
+        shot = shots.shot(7100, index, 1280, 960, distance_m=6.0, hidden=0.65, domain="easy")
+        sight = shot.T_world_target[:3, 3] - np.array(shot.camera.position)
+        unsure = np.cross(sight, [0.0, 0.0, 1.0]) if across else sight
+        unsure /= np.linalg.norm(unsure)
+        prior = PRIOR.copy()
+        prior[:3, :3] += 0.2**2 * np.outer(unsure, unsure)
+        T = start(shot, index)
+        states.append(Search(shot.cell).update(mask(shot, T), T, prior, shot.joints, shot.image).state)
+    assert "tracking" not in states if across else np.mean([state == "tracking" for state in states]) > 0.7

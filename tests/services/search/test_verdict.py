@@ -15,7 +15,7 @@ GOOD = Findings(
     misfit=1.0,
     is_sharp=True,
     shape=None,
-    contour_px=400.0,
+    points=40.0,
     hidden=0.1,
     covered=0.05,
     has_image=True,
@@ -61,10 +61,10 @@ def test_a_poor_overlap_is_enough_only_for_a_sharp_pose_that_is_expected(overlap
 
 
 def test_a_small_piece_is_accepted_only_where_it_is_expected():
-    for small in ({"hidden": 0.6}, {"contour_px": 50.0}):
+    for small in ({"hidden": 0.6}, {"points": 6.0}):
         assert judged(**small) is Verdict.TOO_LITTLE
         assert judged(**small, is_expected=True) is Verdict.RIGHT
-    for smaller in ({"hidden": 0.96}, {"contour_px": 29.0}):
+    for smaller in ({"hidden": 0.96}, {"points": 2.9}):
         assert judged(**smaller, is_expected=True) is Verdict.TOO_LITTLE
 
 
