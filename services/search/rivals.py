@@ -39,7 +39,7 @@ PREFERRED = 18.0
 """The same from which a rival takes the pose's place. Chosen: half as much let poses that are wrong as well take it."""
 SURPRISING = 9.0
 """Largest squared Mahalanobis distance from the prediction that counts: a prediction may be wrong, so it says no more than a
-picture that refutes. With twice as much, 2 % of the fused poses of the paper's experiment were beyond three sigma in place of
+picture that refutes. With twice as much, 1.7 % of the fused poses of the paper's experiment were beyond three sigma in place of
 0.7 %, and a limb that was predicted the wrong way round stayed so."""
 LASTS = 10.0
 """Number of pictures in a row of which the same one of two poses may be the wrong one. An observer takes the pictures' errors for

@@ -160,6 +160,7 @@ def test_a_limb_with_its_hand_in_sight_does_not_stay_turned_over(visible, degree
 
 def with_hand_covered(shot: Shot) -> tuple[Mask, np.ndarray]:
     """Mask and image of a scene in which something lies before the hand."""
+    assert shot.image is not None
     image, seen = shot.image.copy(), mask(shot, shot.T_world_target)
     rows, columns = np.nonzero(shot.labels == Label.HAND)
     covered = (slice(rows.min() - 4, rows.max() + 5), slice(columns.min() - 4, columns.max() + 5))
