@@ -119,9 +119,10 @@ def fit_image(
             best = min(best, _through(way, start), key=lambda one: one.rms)
     points = best.length / settings.correlation
     trust = min(1.0, (TYPICAL / max(unfitted(best.rms, points), 1e-3)) ** 4)
-    regular[6, 6] *= trust
+    loosened = regular.copy()
+    loosened[6, 6] *= trust
     waves = trust * best.waves(settings.wave / math.sqrt(trust))
-    measured = partial(marginal, best.T, best.moved, trust * best.H, trust * best.g, regular, best.rolls, limits)
+    measured = partial(marginal, best.T, best.moved, trust * best.H, trust * best.g, loosened, best.rolls, limits)
     bends = trust * best.bends(measured(waves)[1], pictures[-1].evidence.intrinsics)
     T, covariance = measured(np.hstack([waves, bends]))
     both, free, overlap = overlap_of(model, best.T, evidence, first.hand)

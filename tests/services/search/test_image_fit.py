@@ -158,6 +158,26 @@ def test_a_limb_with_its_hand_in_sight_does_not_stay_turned_over(visible, degree
     assert np.mean(right) > 0.8
 
 
+def test_a_turn_that_takes_the_pose_s_place_is_doubted_until_the_others_are_compared_with_it(visible):
+    changes = []
+    for shot in visible:
+        T, search = turned(shot, 120.0), Search(shot.cell)
+        estimates = [
+            search.update(mask(shot, shot.T_world_target), T, with_open_roll(T), shot.joints, shot.image)
+            for _ in range(3 * RIVALS)
+        ]
+        errors = [abs(off(shot, each)[3:] @ each.T[:3, 0]) for each in estimates]
+        spreads = [float(np.sqrt(each.T[:3, 0] @ each.covariance[3:, 3:] @ each.T[:3, 0])) for each in estimates]
+        changes += [
+            (spreads[i + 1], spreads[-1])
+            for i in range(len(errors) - 1)
+            if errors[i] > 0.5 and errors[i + 1] < 0.2 and errors[-1] < 0.2
+        ]
+    assert len(changes) >= len(visible) // 2
+    first, last = np.array(changes).T
+    assert first.min() > 1.0 and np.median(last) < 0.5 * np.median(first)
+
+
 def with_hand_covered(shot: Shot) -> tuple[Mask, np.ndarray]:
     """Mask and image of a scene in which something lies before the hand."""
     assert shot.image is not None

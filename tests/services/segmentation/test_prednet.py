@@ -468,11 +468,10 @@ def test_masks_of_the_running_network_are_torch_s_but_for_rounding(precision, ti
     """Where the processor has bfloat16, classes whose logits differ by less than 0.1 are as likely as each other."""
     images, window = scene(), Window(0, 0, 96, 96)
     net, card = prednet.load(inference.WEIGHTS)
+    calibrated = card["calibration"]["target_logit_offset"]
     offset = torch.zeros(len(Label), 1, 1)
-    offset[list(inference.TARGET_LABELS)] = card["calibration"]["target_logit_offset"]
-    ours = inference.Segmenter(
-        prednet.stored(net), card["calibration"]["target_logit_offset"], has_colours=False, precision=precision
-    )
+    offset[list(inference.TARGET_LABELS)] = calibrated
+    ours = inference.Segmenter(prednet.stored(net), calibrated, precision, has_colours=False)
     for t, (image, logits) in enumerate(zip(images, evaluate.run(net, images), strict=True)):
         mask = ours(image, window, (t + 1) * 50_000_000)
         first, second = (logits + offset).topk(2, dim=0).values
