@@ -122,7 +122,8 @@ def fit_image(
     loosened = regular.copy()
     loosened[6, 6] *= trust
     waves = trust * best.waves(settings.wave / math.sqrt(trust))
-    measured = partial(marginal, best.T, best.moved, trust * best.H, trust * best.g, loosened, best.rolls, limits)
+    rolls = best.rolls if first.hand == 1.0 else 0.0  # as in `mask_fit.fit`
+    measured = partial(marginal, best.T, best.moved, trust * best.H, trust * best.g, loosened, rolls, limits)
     bends = trust * best.bends(measured(waves)[1], pictures[-1].evidence.intrinsics)
     T, covariance = measured(np.hstack([waves, bends]))
     both, free, overlap = overlap_of(model, best.T, evidence, first.hand)

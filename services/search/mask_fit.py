@@ -274,7 +274,8 @@ def fit(
     # a mask or a fit worse than expected: the residuals give the noise
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
     both, free, overlap = overlap_of(model, here.T, evidence, problem.hand)
-    T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, measured.rolls, limits)
+    rolls = measured.rolls if problem.hand == 1.0 else 0.0  # a bent hand may be a straight one at another roll
+    T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, rolls, limits)
     return Fit(
         T, covariance, here.T, length / noise.correlation, rms, float(moved[6]), cost, misfit, both, free, overlap, problem.hand
     )  # fmt: skip
