@@ -23,6 +23,7 @@ TESTS = {
     ),
     "x86-64-v3": (
         "tests/services/posecnn/test_posecnn.py",
+        "tests/services/segmentation/test_inference.py",
         "tests/services/segmentation/test_prednet.py",
         "tests/chain/test_replay.py",
     ),
