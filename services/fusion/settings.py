@@ -33,8 +33,8 @@ class FusionSettings:
     jerk: tuple[float, float] = (1.5, 40.0)
     """Density of the white jerk, linear [m^2/s^5] and angular [rad^2/s^5], before it is adapted: of a limb that moves slowly. By
     the NEES; the likelihood of the measurements alone is largest with a sixth of it, and then up to 1.7 % of the poses are beyond
-    three sigma. The angular one is twice that: where the skin alone feels a limb, nothing observes its roll for seconds. With half
-    of it the roll of 0.5 % of the poses was beyond three sigma, in place of 0.2 % (six replays of `arm`)."""
+    three sigma. The angular one is twice that: where the skin alone feels a limb, nothing observes its roll for seconds. With
+    half of it the roll of 0.5 % of the poses was beyond three sigma, in place of 0.2 % (six replays of `arm`)."""
     motion_time: tuple[float, float] = (0.22, 0.22)
     """Time [s] in which such a limb changes its way: the standard deviation of its velocity over that of its acceleration,
     linear and angular. By the NEES."""
