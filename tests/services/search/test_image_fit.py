@@ -204,18 +204,23 @@ def test_a_roll_that_a_hidden_hand_leaves_open_is_uncertain(visible):
     assert np.mean(np.array(nees) > 20.1) < 0.1  # beyond three standard deviations
 
 
-def test_what_the_prediction_knows_stays_known_where_the_hand_is_hidden(visible):
-    is_known = []
-    for seed, shot in enumerate(visible):
-        behind, image = with_hand_covered(shot)
-        T = start(shot, seed)
-        known, not_known = (looked_at(shot, behind, image, T, prior)[-1] for prior in (PRIOR, with_open_roll(T)))
-        place, open_place = (np.sqrt(np.trace(each.covariance[:3, :3])) for each in (known, not_known))
-        roll, open_roll = (np.sqrt(each.T[:3, 0] @ each.covariance[3:, 3:] @ each.T[:3, 0]) for each in (known, not_known))
-        assert known.state == not_known.state == "tracking"
-        assert error_cm(shot, known) < 3.0 * 100.0 * place
-        is_known.append(place < open_place and roll < 0.9 * open_roll)
-    assert np.mean(is_known) > 0.8  # a picture that prefers a wrong turn a little does so each time that it is looked at
+LEFT_OPEN = pytest.mark.xfail(
+    strict=True,
+    reason="a rival 14 degrees away, which the prediction allows, fits a little better, and the picture leaves its roll open",
+)
+
+
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=LEFT_OPEN), *SEEDS[1:]])
+def test_what_the_prediction_knows_stays_known_where_the_hand_is_hidden(visible, seed):
+    shot = visible[seed]
+    behind, image = with_hand_covered(shot)
+    T = start(shot, seed)
+    known, not_known = (looked_at(shot, behind, image, T, prior)[-1] for prior in (PRIOR, with_open_roll(T)))
+    place, open_place = (np.sqrt(np.trace(each.covariance[:3, :3])) for each in (known, not_known))
+    roll, open_roll = (np.sqrt(each.T[:3, 0] @ each.covariance[3:, 3:] @ each.T[:3, 0]) for each in (known, not_known))
+    assert known.state == not_known.state == "tracking"
+    assert place < open_place and roll < 0.9 * open_roll
+    assert error_cm(shot, known) < 3.0 * 100.0 * place
 
 
 @pytest.mark.parametrize("points", [8.0, 16.0, 64.0])
