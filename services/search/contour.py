@@ -408,12 +408,15 @@ def _match(points, field, guarded, shown, state, known, reach, r, kind):
 def slow_waves(points: Points, T: Array) -> list[Array]:
     """Shapes (n,) that an error of the contour of a limb at T_camera_target (4, 4) may have: on either side, straight and bent
     along it."""
-    axis = T[:3, 0]
-    along = (points["position"] - T[:3, 3]) @ axis
+    along = (points["position"] - T[:3, 3]) @ T[:3, 0]
     s = 2.0 * (along - along.min(initial=0.0)) / max(float(np.ptp(along)) if len(along) else 0.0, 1e-6) - 1.0
-    normal = points["normal"]
-    across = normal[:, 0] * axis[1] - normal[:, 1] * axis[0] > 0.0
-    return [np.where(across == side, shape, 0.0) for side in (False, True) for shape in (s, 1.5 * s**2 - 0.5)]
+    return [np.where(side, shape, 0.0) for side in sides(points, T) for shape in (s, 1.5 * s**2 - 0.5)]
+
+
+def sides(points: Points, T: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which points of a contour (n,) are on the one and on the other side of a limb at T_camera_target (4, 4) in the image."""
+    across = points["normal"][:, 0] * T[1, 0] - points["normal"][:, 1] * T[0, 0] > 0.0
+    return ~across, across
 
 
 def stretched(points: Points, T: Array, k: Intrinsics) -> tuple[Array, Array]:
