@@ -64,6 +64,7 @@ class Search:
         self._axes = np.kron(np.eye(2), self._camera.T_world_camera[:3, :3])  # covariances: camera axes to world axes
         self._robots = RobotDepth(cell, self._T_camera_world)
         self._detected_ns: int | None = None
+        self._last: tuple[int, Array] | None = None  # stamp and T_camera_target of the last picture in which it was tracked
         self._rivals = Rivals(self._limits)
         self._has_other_shape = False  # than the mesh: as the last pose that was tracked says
         self._sharp = 0  # pictures that showed the mesh, less those in which the target was lost since
@@ -77,7 +78,7 @@ class Search:
         mask = Mask(stamp_ns=0, labels=shown * np.uint8(self._target.label_values[0]), x0=0, y0=0, scale=1)
         image = np.repeat(mask.labels[..., None] * np.uint8(20), 3, axis=2)
         self.update(mask, T_home, 1e-4 * np.eye(6), joints, image)
-        self._detected_ns, self._has_other_shape, self._sharp = None, False, 0
+        self._detected_ns, self._last, self._has_other_shape, self._sharp = None, None, False, 0
         self._rivals.forget()
 
     def update(
@@ -111,24 +112,45 @@ class Search:
         T_start = self._T_camera_world @ (self._target.home.transform if T_prior is None else T_prior)
         if self.method == "paper":
             return self._paper(self._gather(mask, T_start, joints), T_start)
-        tracked: tuple[Evidence, Fit] | None = None
+        tracked, is_certain = None, False
         if T_prior is not None:
-            seen, best, certain = self._track(mask, T_start, prior_covariance, joints, image)
+            seen, best, is_certain = self._track(mask, T_start, prior_covariance, joints, image)
             tracked = seen, best
-            if certain:
+            if is_certain:
                 prior = np.zeros((6, 6)) if prior_covariance is None else self._regularising(prior_covariance)
                 tracked = seen, self._among_rivals(seen, best, mask.stamp_ns, image, T_start, prior)
-                return self._judge(*tracked, image is not None, T_start, prior_covariance)
-        self._rivals.forget()
+        if not is_certain:
+            tracked = self._found_again(mask, tracked, T_start, prior_covariance, joints, image, starts)
+        if tracked is None:
+            return self._lost(T_start)
+        found = self._judge(*tracked, image is not None, T_start if T_prior is not None else None, prior_covariance)
+        if found.state == "tracking":
+            self._last = mask.stamp_ns, tracked[1].T_searched
+        return found
+
+    def _found_again(
+        self,
+        mask: Mask,
+        tracked: tuple[Evidence, Fit] | None,
+        T_start: Array,
+        prior_covariance: Array | None,
+        joints: Mapping[str, Array] | None,
+        image: NDArray[np.uint8] | None,
+        starts: Sequence[Array],
+    ) -> tuple[Evidence, Fit] | None:
+        """The pose found elsewhere than at the prediction where that is better than the one `tracked` from there, if any: where the
+        last pictures showed the target, at one of the starts, or anywhere in the mask."""
+        if self._last is not None and 0 < mask.stamp_ns - self._last[0] < self.settings.recent_ns:
+            starts = (self._last[1], *starts)
+        else:
+            self._rivals.forget()
         usable = tracked is not None and explains_mask(tracked[1].overlap, tracked[1].misfit, self.settings)
         due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost", bool(starts))
         other = self._detect(mask, T_start, joints, starts) if due else None
-        if other is not None and (tracked is None or self._is_better(other[1], tracked[1], T_start, prior_covariance)):
-            found = self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
-            tracked = other[0], self._among_rivals(other[0], found, mask.stamp_ns, image, found.T, np.zeros((6, 6)))
-        if tracked is None:
-            return self._lost(T_start)
-        return self._judge(*tracked, image is not None, T_start if T_prior is not None else None, prior_covariance)
+        if other is None or (tracked is not None and not self._is_better(other[1], tracked[1], T_start, prior_covariance)):
+            return tracked
+        found = self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
+        return other[0], self._among_rivals(other[0], found, mask.stamp_ns, image, found.T, np.zeros((6, 6)))
 
     def _track(
         self,
