@@ -140,13 +140,16 @@ class Search:
     ) -> tuple[Evidence, Fit] | None:
         """The pose found elsewhere than at the prediction where that is better than the one `tracked` from there, if any: where the
         last pictures showed the target, at one of the starts, or anywhere in the mask."""
+        other = None
         if self._last is not None and 0 < mask.stamp_ns - self._last[0] < self.settings.recent_ns:
-            starts = (self._last[1], *starts)
-        else:
+            seen, found = self._near(mask, self._last[1], T_start, joints)
+            if explains_mask(found.overlap, found.misfit, self.settings):
+                other = seen, found
+        if other is None:
             self._rivals.forget()
-        usable = tracked is not None and explains_mask(tracked[1].overlap, tracked[1].misfit, self.settings)
-        due = self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost", bool(starts))
-        other = self._detect(mask, T_start, joints, starts) if due else None
+            usable = tracked is not None and explains_mask(tracked[1].overlap, tracked[1].misfit, self.settings)
+            if self._is_detection_due(mask.stamp_ns, "doubtful" if usable else "lost", bool(starts)):
+                other = self._detect(mask, T_start, joints, starts)
         if other is None or (tracked is not None and not self._is_better(other[1], tracked[1], T_start, prior_covariance)):
             return tracked
         found = self._closer(*other, other[1].T_searched, np.zeros((6, 6)), image)
@@ -312,8 +315,7 @@ class Search:
         for window, pieces in detect.regions(mask, self._target.label_values, reach_px):
             whole = self._gather(window, T_home, joints)
             for T in self._first_poses(whole, pieces, T_home, joints, starts):
-                seen = self._gather(window, T, joints, limb=T)
-                found = self._settled(seen, self._fit(seen, T, T_home, information), T_home, information)
+                seen, found = self._near(window, T, T_home, joints)
                 away = rigid.pose_error(found.T_searched, T_home)
                 explains = explains_mask(found.overlap, found.misfit, self.settings)
                 fits = explains, self._overlap(whole, found.T_searched)
@@ -324,6 +326,11 @@ class Search:
             if most > (True, self.settings.explained):
                 break
         return best
+
+    def _near(self, mask: Mask, T: Array, T_home: Array, joints: Mapping[str, Array] | None) -> tuple[Evidence, Fit]:
+        """The pose near T that explains a mask best, not too far from home."""
+        seen, information = self._gather(mask, T, joints, limb=T), self._home_information
+        return seen, self._settled(seen, self._fit(seen, T, T_home, information), T_home, information)
 
     def _first_poses(
         self, whole: Evidence, pieces: Sequence[Mask], T_home: Array, joints: Mapping[str, Array] | None, starts: Sequence[Array]

@@ -262,11 +262,23 @@ def test_a_small_piece_is_accepted_only_where_a_sure_prediction_expects_it(searc
 
 
 def test_the_costly_search_of_the_whole_mask_waits_a_little_before_it_is_tried_again(search):
-    s = scene(3000)
+    first, other = scene(3000), scene(3001)  # the second one somewhere else
     second = 10**9
     stamps = (5 * second, 5 * second + 50_000_000, 5 * second + 300_000_000, second)  # the last one: a recording starts again
-    states = [search.update(replace(s.mask, stamp_ns=stamp)).state for stamp in stamps]
+    masks = (first.mask, other.mask, other.mask, first.mask)
+    states = [search.update(replace(mask, stamp_ns=stamp)).state for mask, stamp in zip(masks, stamps, strict=True)]
     assert states == ["tracking", "lost", "tracking", "tracking"]
+
+
+def test_a_limb_is_found_where_the_last_picture_showed_it_while_the_prediction_is_elsewhere(search):
+    for seed in range(3000, 3005):
+        s = scene(seed)
+        assert search.update(replace(s.mask, stamp_ns=10**9), s.T, PRIOR).state == "tracking"
+        elsewhere = s.T.copy()
+        elsewhere[:3, 3] += (0.15, -0.1, 0.1)
+        again = search.update(replace(s.mask, stamp_ns=10**9 + 50_000_000), elsewhere, PRIOR)
+        assert again.state == "tracking"
+        assert np.linalg.norm(again.T[:3, 3] - s.T[:3, 3]) < 0.06  # the prediction is 20 cm off
 
 
 def test_a_coarser_mask_and_one_that_hangs_over_the_border_give_the_same_pose(search):
