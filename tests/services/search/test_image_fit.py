@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from penumbra.services.search.image_fit import UNKNOWNS, unfitted
+from penumbra.services.search.contour import MEASURED, POINT
+from penumbra.services.search.image_fit import UNKNOWNS, ImageSettings, offsets, unfitted
 from penumbra.services.search.rivals import RIVALS
 from penumbra.services.search.tracker import Search, Searched
 from penumbra.shared.contract.labels import Label
@@ -218,6 +219,22 @@ def test_what_the_prediction_knows_stays_known_where_the_hand_is_hidden(visible,
     assert known.state == not_known.state == "tracking"
     assert place < open_place and roll < 0.9 * open_roll
     assert error_cm(shot, known) < 3.0 * 100.0 * place
+
+
+def test_the_edge_of_a_side_in_the_shade_is_found_where_it_is():
+    # a limb above row 30 darkens towards its edge, to what is behind it but for a little blue
+    depth = np.arange(29.5, -31.0, -1.0)[:60, None]
+    limb, behind = np.array([103.0, 85.0, 74.0]) + np.clip(depth - 1.0, 0.0, 12.0) * [9.0, 6.0, 5.0], np.array([104.0, 88.0, 90.0])
+    light = np.repeat(np.where(depth > 0.0, limb, behind)[:, None] ** 2, 80, axis=1)
+    values = np.sqrt(cv2.GaussianBlur(light, (0, 0), 0.7)) + np.random.default_rng(1).normal(0.0, 1.5, light.shape)
+    points = np.zeros(20, POINT)
+    points["pixel"] = np.column_stack([np.arange(10.0, 70.0, 3.0), np.full(20, 29.5)])
+    points["normal"], points["length"] = (0.0, 1.0), 3.0
+    nothing, settings = np.zeros((60, 80), np.uint8), ImageSettings()
+    noise = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
+    r, _, kind = offsets(points, np.rint(values).astype(np.uint8), nothing, np.zeros(20), nothing[0, :20].copy(), *noise)
+    assert (kind == MEASURED).all()
+    assert abs(np.mean(r)) < 0.1
 
 
 @pytest.mark.parametrize("points", [8.0, 16.0, 64.0])
