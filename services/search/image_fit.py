@@ -37,10 +37,10 @@ BLUR = 0.7
 NEAREST = 1
 """The pixel on the contour shows both sides; from this distance on [px] the colours of its sides are learned."""
 NEAR, SPREADS = 1.5, (1.0, 1.5)
-"""Distance [px] at which a pixel's colour counts most for its side, and standard deviations [px] of that weight inside and outside:
-nearer the sides are mixed, and farther inside a limb is in another light. With equal weights the edge of a side in the shade was
-found up to 0.9 px too far inside, since its last pixels look more like what is behind it than like the limb's others. Chosen on
-seven replays and 1120 single pictures."""
+"""Distance [px] at which a pixel's colour counts most for its side, and standard deviations [px] of that weight inside and
+outside: nearer the sides are mixed, and farther inside a limb is in another light. With equal weights the edge of a side in the
+shade was found up to 0.9 px too far inside, since its last pixels look more like what is behind it than like the limb's others.
+Chosen on seven replays and 1120 single pictures."""
 
 
 @dataclass(frozen=True)

@@ -86,8 +86,8 @@ class SearchSettings:
     """Least time [ns] between two detections, while the target is lost and while its pose is only doubtful. Chosen: a detection
     takes as long as twenty tracked frames."""
     recent_ns: int = 250_000_000
-    """Time [ns] for which the place where a target was tracked is searched again where the prediction does not lead to it: an observer
-    that another sense has led away takes some pictures to follow. Chosen: a reaching arm stays within a fit's reach."""
+    """Time [ns] for which a target is looked for where it was tracked last, too, where the prediction does not lead to it: an
+    observer that another sense has led away takes some pictures to follow. Chosen: a reaching arm stays within a fit's reach."""
     explained: float = 0.5
     """Overlap with all of a region, a bare upper arm included, from which no other region is tried. Chosen."""
     detect_fits: int = 4

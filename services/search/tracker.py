@@ -138,8 +138,8 @@ class Search:
         image: NDArray[np.uint8] | None,
         starts: Sequence[Array],
     ) -> tuple[Evidence, Fit] | None:
-        """The pose found elsewhere than at the prediction where that is better than the one `tracked` from there, if any: where the
-        last pictures showed the target, at one of the starts, or anywhere in the mask."""
+        """The pose found elsewhere than at the prediction where that is better than the one `tracked` from there, if any: where
+        the last pictures showed the target, at one of the starts, or anywhere in the mask."""
         other = None
         if self._last is not None and 0 < mask.stamp_ns - self._last[0] < self.settings.recent_ns:
             seen, found = self._near(mask, self._last[1], T_start, joints)

@@ -224,8 +224,8 @@ def test_what_the_prediction_knows_stays_known_where_the_hand_is_hidden(visible,
 def test_the_edge_of_a_side_in_the_shade_is_found_where_it_is():
     # a limb above row 30 darkens towards its edge, to what is behind it but for a little blue
     depth = np.arange(29.5, -31.0, -1.0)[:60, None]
-    limb, behind = np.array([103.0, 85.0, 74.0]) + np.clip(depth - 1.0, 0.0, 12.0) * [9.0, 6.0, 5.0], np.array([104.0, 88.0, 90.0])
-    light = np.repeat(np.where(depth > 0.0, limb, behind)[:, None] ** 2, 80, axis=1)
+    limb = np.array([103.0, 85.0, 74.0]) + np.clip(depth - 1.0, 0.0, 12.0) * [9.0, 6.0, 5.0]
+    light = np.repeat(np.where(depth > 0.0, limb, [104.0, 88.0, 90.0])[:, None] ** 2, 80, axis=1)
     values = np.sqrt(cv2.GaussianBlur(light, (0, 0), 0.7)) + np.random.default_rng(1).normal(0.0, 1.5, light.shape)
     points = np.zeros(20, POINT)
     points["pixel"] = np.column_stack([np.arange(10.0, 70.0, 3.0), np.full(20, 29.5)])
