@@ -64,8 +64,8 @@ class ImageSettings:
     huber: float = 0.5
     edge: float = 0.2
     correlation: float = 9.0
-    dilation: float = 0.07
-    wave: float = 0.15
+    dilation: float = 0.09
+    wave: float = 0.12
 
 
 def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uint8], Evidence]:
