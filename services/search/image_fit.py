@@ -51,8 +51,8 @@ class ImageSettings:
     mask's boundary on a line [px]; `huber` [px]; `edge`: standard deviation that an offset has at least [px]; `correlation`:
     length of contour over which offsets err together [px]; `dilation`: of the whole contour [px]; `wave`: of errors that change
     slowly along each side of the limb, as its shading does [px]: with one side hidden they look like another distance. Where both
-    sides of an edge are so alike that its offset is uncertain by more than `edge`, these are as many times larger, and the whole
-    side of the limb errs together as well. Where the offsets are larger than TYPICAL, so are all of these."""
+    sides of an edge are so alike that its offset is uncertain by more than that, these are as large, and by what that is above
+    `edge` the whole side of the limb errs together. Where the offsets are larger than TYPICAL, so are all of these."""
 
     passes: int = 5
     spacing: float = 3.0
@@ -64,8 +64,8 @@ class ImageSettings:
     huber: float = 0.5
     edge: float = 0.2
     correlation: float = 9.0
-    dilation: float = 0.09
-    wave: float = 0.12
+    dilation: float = 0.07
+    wave: float = 0.13
 
 
 def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uint8], Evidence]:
@@ -126,7 +126,7 @@ def fit_image(
     trust = min(1.0, (TYPICAL / max(unfitted(best.rms, points), 1e-3)) ** 4)
     loosened = regular.copy()
     loosened[6, 6] *= trust
-    waves = trust * best.waves(settings.wave / math.sqrt(trust))
+    waves = trust * best.waves(settings, 1.0 / math.sqrt(trust))
     rolls = best.rolls if first.hand == 1.0 else 0.0  # as in `mask_fit.fit`
     measured = partial(marginal, best.T, best.moved, trust * best.H, trust * best.g, loosened, rolls, limits)
     bends = trust * best.bends(measured(waves)[1], pictures[-1].evidence.intrinsics)
@@ -139,7 +139,7 @@ def fit_image(
         T_searched=best.T,
         points=points,
         rms=best.rms,
-        cost=points / evidence.scale * (best.rms / settings.edge) ** 2,
+        cost=points / evidence.scale * best.misfit / settings.edge**2,
         both=both,
         free=free,
         overlap=overlap,
@@ -156,9 +156,9 @@ def unfitted(rms: float, points: float) -> float:
 @dataclass(frozen=True)
 class _Pass:
     """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
-    square of the offsets left [px] and the share of the roll that is used. points (n,) of the contour, vague (n,): how many times
-    `ImageSettings.edge` their offsets are uncertain by, at least 1, and equations: what gives the normal equations of their
-    offsets (n,)."""
+    square of the offsets left [px] and the share of the roll that is used. points (n,) of the contour, sigma (n,) [px]: standard
+    deviations of their offsets, and equations: what gives the normal equations of offsets (n,). misfit: mean square [px^2] of the
+    offsets left and of what they leave open, so that a contour along which nothing is seen is no good one."""
 
     T: Array
     moved: Array
@@ -168,14 +168,16 @@ class _Pass:
     rms: float
     rolls: float
     points: Points
-    vague: Array
+    sigma: Array
+    misfit: float
     equations: Callable[[Array], Equations]
 
-    def waves(self, size: float) -> Array:
-        """The right sides (7, k) of `ImageSettings.wave` of this size [px]."""
-        waves = [self.vague * wave for wave in slow_waves(self.points, self.T)]
-        whole = [(self.vague - 1.0) * side for side in sides(self.points, self.T)]
-        return np.stack([self.equations(size * wave).g for wave in (*waves, *whole)], axis=1)
+    def waves(self, settings: ImageSettings, larger: float) -> Array:
+        """The right sides (7, k) of `ImageSettings.wave`, so many times larger."""
+        shared, whole = np.maximum(self.sigma, settings.wave), np.maximum(self.sigma - settings.edge, 0.0)
+        errors = [shared * wave for wave in slow_waves(self.points, self.T)]
+        errors += [whole * side for side in sides(self.points, self.T)]
+        return np.stack([self.equations(larger * error).g for error in errors], axis=1)
 
     def bends(self, covariance: Array, intrinsics: Intrinsics) -> Array:
         """The right sides (7, BENDS) of what the equations leave out: a pose that is off by one standard deviation moves the
@@ -221,18 +223,21 @@ class _Picture:
         return replace(self, image=half(self.image).astype(np.uint8, copy=False), evidence=smaller)
 
     def descend(self, T: Array, passes: int) -> _Pass:
-        """The pose reached from T by Gauss-Newton's steps."""
+        """The pose of the best of Gauss-Newton's steps from T: where little shows, they do not always end there."""
         moved = np.zeros(7)
         moved[:6] = rigid.pose_error(T, self.T_prior)
+        best: _Pass | None = None
         for _ in range(passes):
             here = self._at(T, moved)
             step = np.linalg.solve(here.H + self.regular, here.g - self.regular @ moved)
             step /= max(1.0, float(np.max(np.abs(step[:6]) / MAX_STEP)))
             T, moved = rigid.perturb(T, step[:6]), moved + step
+            if best is None or here.rms < best.rms:  # the derivatives are those before the step, which hardly moves them
+                best = replace(here, T=T, moved=moved, g=here.g - here.H @ step)
             if np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED:
                 break
-        # the derivatives are those before the last step, which hardly moved them
-        return replace(here, T=T, moved=moved, g=here.g - here.H @ step)
+        assert best is not None, "expected at least one pass"
+        return best
 
     def _at(self, T: Array, moved: Array) -> _Pass:
         evidence, settings, k = self.evidence, self.settings, self.evidence.intrinsics
@@ -248,8 +253,10 @@ class _Picture:
         found_by = equations(r - moved[6])
         length = found_by.length
         rms = math.sqrt(found_by.square / length) if length > 0 else math.inf
-        vague = np.maximum(sigma / settings.edge, 1.0)
-        return _Pass(T, moved, found_by.H, found_by.g, length, rms, found_by.rolls, points, vague, equations)
+        seen = points["length"] * (kind == MEASURED)
+        left = np.minimum((r - moved[6]) ** 2 + sigma**2, settings.huber**2)
+        misfit = float(seen @ left) / length if length > 0 else math.inf
+        return _Pass(T, moved, found_by.H, found_by.g, length, rms, found_by.rolls, points, sigma, misfit, equations)
 
 
 def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:
