@@ -114,6 +114,15 @@ def test_what_is_pasted_lies_in_front_with_its_labels():
     assert (out[..., 4] == 200).all(), "what is known of the robot"
 
 
+def test_the_people_of_another_recording_hide_what_is_behind_them():
+    film, over = np.zeros((2, 32, 32, 4), np.uint8), np.full((2, 32, 32, 4), 200, np.uint8)
+    film[..., 3], over[..., 3] = Label.HAND, Label.BACKGROUND
+    over[:, 16:, :, 3], over[:, :, 24:, 3] = Label.FOREARM, UNLABELLED
+    out = data.covered(film, over, data.PERSON)
+    assert (out[:, 16:, :24, 3] == Label.FOREARM).all() and (out[:, 20:, :20, :3] == 200).all()
+    assert (out[:, :16, :, 3] == Label.HAND).all() and (out[:, :, 24:, 3] == Label.HAND).all() and not out[:, :12, :, :3].any()
+
+
 def test_recordings_and_simulated_sequences_are_mixed_by_their_share_and_both_are_scored(folder):
     tiny = sequences.Variety(frames=data.VARIETY.frames, size=data.VARIETY.size)
 

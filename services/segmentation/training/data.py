@@ -31,6 +31,9 @@ ARM_SHARE = 0.08
 """Width of an arm that a recording without any might show, as a share of its longer side."""
 CLOTHED = 0.35
 """Share of the sequences of recordings whose arms get other sleeves or gloves."""
+BORROWED = 0.4
+"""Share of the sequences of recordings before which the people of another recording are put."""
+PERSON = (Label.TORSO, Label.UPPER_ARM, Label.FOREARM, Label.HAND)
 AROUND = {"target": 0.55, "rest": 0.25}
 """Shares of the pieces of pictures that lie around a pixel of the target, and of the rest of a person (faces look like hands, and
 sleeves like what is worn above them); the others lie anywhere."""
@@ -125,8 +128,9 @@ class Simulated:
 
 
 class Mixed:
-    """Recordings and simulated sequences. `share`: how many of those that are learned from are simulated; of the recordings, half
-    have simulated robots and occluders in front, some of these an arm, too. Calibrated and scored on as many of both."""
+    """Recordings and simulated sequences. `share`: how many of those that are learned from are simulated; before some recordings
+    are the people of others, with what they hold (Ghiasi et al. 2021, arXiv:2012.07177); half have simulated robots and
+    occluders in front, some of these an arm, too. Calibrated and scored on as many of both."""
 
     jitter = 0.3
     """Jitter of the colours, between that of simulated sequences and that of recordings alone."""
@@ -156,14 +160,19 @@ class Mixed:
         rng = np.random.default_rng([self._seed, 5, index])
         if rng.random() < self._share:
             return self._simulated[index]
-        film = moved(self._recorded[int(rng.integers(self._recorded.count))], VARIETY.frames, VARIETY.size, rng)
-        if rng.random() < CLOTHED:
-            film = clothes.worn(film, rng)
+        film = self._filmed(rng)
+        if rng.random() < BORROWED:
+            film = covered(film, self._filmed(rng), (*PERSON, Label.OCCLUDER))
         known = priors.packed(priors.of_labels(film[..., 3], np.random.default_rng([self._seed, 6, index])))
         film = np.concatenate([film, known], axis=-1)
         if rng.random() < 0.5:
             film = pasted(film, self._simulated[index], rng)
         return np.concatenate([looks.filmed(film[..., :3], rng), film[..., 3:]], axis=-1)
+
+    def _filmed(self, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """A drawn recording as a camera shows it (frames, h, w, 4), some with other clothes."""
+        film = moved(self._recorded[int(rng.integers(self._recorded.count))], VARIETY.frames, VARIETY.size, rng)
+        return clothes.worn(film, rng) if rng.random() < CLOTHED else film
 
     def close(self) -> None:
         """Nothing is open."""
@@ -232,11 +241,17 @@ def pasted(film: NDArray[np.uint8], over: NDArray[np.uint8], rng: np.random.Gene
     front, out = [Label.ROBOT, Label.OCCLUDER], film.copy()
     out[..., 4] = over[..., 4]
     if rng.random() < 0.5:
-        front += [Label.TORSO, Label.UPPER_ARM, Label.FOREARM, Label.HAND]
+        front += PERSON
         if rng.random() < 0.5:
             out[..., 5] = over[..., 5]
+    return covered(out, over, front)
+
+
+def covered(film: NDArray[np.uint8], over: NDArray[np.uint8], classes: Sequence[Label]) -> NDArray[np.uint8]:
+    """A film (frames, h, w, 4 or more) with what is of these classes in another one in front."""
+    out = film.copy()
     for below, above in zip(out, over, strict=True):
-        cover = np.isin(above[..., 3], front)
+        cover = np.isin(above[..., 3], classes)
         soft = cv2.GaussianBlur(cover.astype(np.float32), (0, 0), 0.7)[..., None]  # as the lens does along an edge
         below[..., :3] = (soft * above[..., :3] + (1.0 - soft) * below[..., :3] + 0.5).astype(np.uint8)
         below[cover, 3] = above[cover, 3]
