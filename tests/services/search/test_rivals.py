@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from penumbra.services.search import detect
 from penumbra.services.search.mask_fit import Fit, Limits
 from penumbra.services.search.rivals import RIVALS, TURNS, Rivals
 from penumbra.shared.geometry import rigid
@@ -69,3 +70,21 @@ def test_a_rival_that_took_the_place_keeps_it_where_fits_begin_from_the_turn_bef
     said = np.abs(taken(25.0, 4 * RIVALS))
     first = int(np.argmax(said > 0.1))
     assert (said[first:] > 0.1).all()
+
+
+def test_a_limb_found_with_the_wrong_tilt_has_the_right_one_after_two_pictures_against_the_prediction():
+    tilted = rigid.transform([0.0, 0.0, 1.5], [0.0, np.sin(0.25), 0.0, np.cos(0.25)])
+    mirror = detect.mirrored(tilted)[0]
+
+    def apart(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.linalg.norm(rigid.pose_error(a, b)[3:]))
+
+    def shown(T: np.ndarray, passes: int) -> Fit:
+        return fitted(T, 80.0 if apart(T, mirror) < 0.1 else 100.0)
+
+    def surprise(T: np.ndarray, covariance: np.ndarray) -> float:
+        return 0.0 if apart(T, tilted) < 0.1 else 100.0
+
+    rivals = Rivals(Limits())
+    said = [rivals.contested(shown(tilted, 1), PICTURE_NS * i, shown, surprise).T for i in (1, 2)]
+    assert apart(said[0], tilted) < 0.1 and apart(said[1], mirror) < 0.1
