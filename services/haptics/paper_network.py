@@ -25,6 +25,9 @@ from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin import response
 from penumbra.shared.skin.layout import Skin
 
+HEAD_ON = 1e-6
+"""Sine of the angle between a limb's axis and the direction to the nearest pad, below which no side of the limb is the nearer."""
+
 
 def features(
     skin: Skin, home: Array, signal: Array, variance: Array, T_world_pads: Array, joints: ArrayLike
@@ -62,8 +65,10 @@ class Relative:
         normal = T_world_pads[skin.pad_of[used][k], :3, 2]
         axial = T[:3, 0]
         away = -(T[:3, :3] @ gradient[k])
+        if np.linalg.norm(np.cross(away, axial)) < HEAD_ON:
+            away = np.eye(3)[np.argmin(np.abs(axial))]
         away -= (away @ axial) * axial
-        away /= np.linalg.norm(away) + 1e-12
+        away /= np.linalg.norm(away)
         pose = np.array(
             [np.log(max(distance[k], 0.003)), nearest[k, 0], 1.0 - abs(float(away @ normal)), abs(float(axial @ normal))]
         )

@@ -440,6 +440,15 @@ def test_r_c_is_what_the_errors_were_and_grows_with_the_gap(scenes: train.Scenes
     assert found.variances(relative.pose)[:3] == pytest.approx((scenes.spread[[0, 1, 2]] / train.ENLARGED) ** 2, rel=0.6)
 
 
+def test_a_limb_whose_end_is_before_a_pad_has_a_frame(scenes: train.Scenes) -> None:
+    pads = scenes.skin.T_world_pads()
+    T = np.eye(4)[:, [2, 0, 1, 3]]  # stands on its elbow
+    T[:3, 3] = scenes.skin.positions(pads)[0] + [0.0, 0.0, 0.05 - scenes.surface.vertices[:, 0].min()]
+    relative = Relative.of(scenes.skin, scenes.surface, pads, np.ones(len(scenes.skin), bool), T)
+    assert relative.frame @ relative.frame.T == pytest.approx(np.eye(3), abs=1e-9)
+    assert relative.pose[0] == pytest.approx(np.log(0.05))
+
+
 def test_weights_of_another_cell_are_refused_and_a_calibration_is_no_other_cell(table: cells.Cell) -> None:
     body = table.body.model_copy(update={"forearm_length": 0.3})
     other = table.model_copy(update={"body": body})
