@@ -11,8 +11,7 @@ pictures before: a limb does not turn over because something hides its hand.
 
 One is compared in a picture: eight times as many in the first ones would have a limb that was just found wait, and it would be
 elsewhere by then. The mirror image comes first, as it is the farthest away: a limb found again with the wrong tilt is 10 cm off.
-One that the pictures alone would have take the pose's place is compared again in the next. Where all are refuted, pictures go by
-without: a comparison costs as much as the pose itself.
+Where all are refuted, pictures go by without: a comparison costs as much as the pose itself.
 """
 
 from __future__ import annotations
@@ -71,6 +70,10 @@ class Rivals:
     def forget(self) -> None:
         """Begin anew, as with another limb."""
         self._next = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Compare all again with another pose of the same limb."""
         self._evidence: list[float | None] = [None] * RIVALS
         self._doubts: list[Array | None] = [None] * RIVALS
         self._before: Array | None = None
@@ -95,16 +98,14 @@ class Rivals:
             if other.sharp and excess < (PREFERRED if None in self._evidence else -PREFERRED):
                 best = other
             else:
-                self.forget()
+                self._begin()
         if self._is_due(stamp_ns):
-            which = self._next
+            which, self._next = self._next, (self._next + 1) % RIVALS
             other = shown(_start(best, which), PASSES)
             evidence = KEPT * (self._evidence[which] or 0.0) + min(_excess(other, best, shown), MOST)
-            if evidence > -PREFERRED:
-                self._next = (which + 1) % RIVALS
             excess = evidence + unlikelier(other.T, other.covariance)
             if excess < -PREFERRED:
-                self.forget()
+                self._begin()
                 best = other
             else:
                 self._evidence[which] = evidence
