@@ -34,6 +34,7 @@ CLOTHED = 0.35
 BORROWED = 0.4
 """Share of the sequences of recordings before which the people of another recording are put."""
 PERSON = (Label.TORSO, Label.UPPER_ARM, Label.FOREARM, Label.HAND)
+"""The classes of people."""
 AROUND = {"target": 0.55, "rest": 0.25}
 """Shares of the pieces of pictures that lie around a pixel of the target, and of the rest of a person (faces look like hands, and
 sleeves like what is worn above them); the others lie anywhere."""
