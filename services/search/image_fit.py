@@ -127,7 +127,7 @@ def fit_image(
     loosened = regular.copy()
     loosened[6, 6] *= trust
     waves = trust * best.waves(settings, 1.0 / math.sqrt(trust))
-    rolls = best.rolls if first.hand == 1.0 else 0.0  # as in `mask_fit.fit`
+    rolls = best.rolls if first.hand == 1.0 else None
     measured = partial(marginal, best.T, best.moved, trust * best.H, trust * best.g, loosened, rolls, limits)
     bends = trust * best.bends(measured(waves)[1], pictures[-1].evidence.intrinsics)
     T, covariance = measured(np.hstack([waves, bends]))

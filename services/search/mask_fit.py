@@ -274,7 +274,7 @@ def fit(
     # a mask or a fit worse than expected: the residuals give the noise
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
     both, free, overlap = overlap_of(model, here.T, evidence, problem.hand)
-    rolls = measured.rolls if problem.hand == 1.0 else 0.0  # a bent hand may be a straight one at another roll
+    rolls = measured.rolls if problem.hand == 1.0 else None
     T, covariance = marginal(here.T, moved, measured.H * trust, measured.g * trust, regular, rolls, limits)
     return Fit(
         T, covariance, here.T, length / noise.correlation, rms, float(moved[6]), cost, misfit, both, free, overlap, problem.hand
@@ -282,14 +282,15 @@ def fit(
 
 
 def marginal(
-    T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float, limits: Limits, waves: Array | None = None
+    T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float | None, limits: Limits, waves: Array | None = None
 ) -> tuple[Array, Array]:
     """The pose and covariance (6, 6) of the measurement alone, from the normal equations of pose error and dilation at T,
     which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out but for KEPT, the dilation marginalised (Schur
     complement).
 
-    `rolls`: share of the information about the roll that is used, see `normal_equations`; `waves` (7, k): right sides of
-    errors that all of the contour shares, of one standard deviation each.
+    `rolls`: share of the information about the roll that is used, see `normal_equations`; None where the hand is bent, which may
+    be a straight one at another roll; `waves` (7, k): right sides of errors that all of the contour shares, of one standard
+    deviation each.
     """
     gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
     weak = (1.0 - KEPT) * limits.information + KEPT * regular[:6, :6]
@@ -298,11 +299,13 @@ def marginal(
     if waves is not None:
         bent = covariance @ (waves[:6] - np.outer(gain, waves[6]))
         covariance = covariance + bent @ bent.T
-    # the roll that a nearly round section shows is uncertain, and so is all that is correlated with it
+    covariance = (covariance + covariance.T) / 2.0
     c = covariance[:, 3:] @ T[:3, 0]
     roll = float(T[:3, 0] @ c[3:])
-    doubt = min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll)
-    covariance = (covariance + covariance.T) / 2.0 + doubt * np.outer(c, c) / roll
+    if rolls is None:  # however the hand is bent, the forearm is where it is
+        covariance[3:, 3:] += limits.rotation**2 * np.outer(T[:3, 0], T[:3, 0])
+    else:  # the roll that a nearly round section shows is uncertain, and so is all that is correlated with it
+        covariance += min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll) * np.outer(c, c) / roll
     return rigid.perturb(T, offset), covariance
 
 
