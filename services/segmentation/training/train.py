@@ -6,6 +6,9 @@ interrupted and resumed ends with the same weights as one that was not. For days
 
   OMP_NUM_THREADS=1 nice -n 19 penumbra segmentation train --size 16 32 64 128 --steps 150000 --resume --compact FILE
 
+Weights from the ends of successive trainings, each with its rate down, differ in what they get wrong, and their mean may be better
+than each: --mean (Izmailov et al. 2018, arXiv:1803.05407).
+
 With --priors the network also receives what is known of the robot and of the target, with --encoder what filters that photographs
 have taught find in the picture. A network without, from --start or --resume, is given both, and gives the same masks until it
 has learned to use them.
@@ -15,7 +18,7 @@ from __future__ import annotations
 
 import datetime
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -156,8 +159,7 @@ class Trainer(training.Trainer[PredNet, Data]):
         trainer = cls(net.settings, schedule, seed)
         trainer.net.load_state_dict(net.state_dict())
         trainer.average.load_state_dict(net.state_dict())
-        trainer.started_from = {key: card[key] for key in ("seed", "date", "started_from") if key in card}
-        trainer.started_from |= {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
+        trainer.started_from = _named(card)
         return trainer
 
     def extended(self, has_priors: bool, pretrained: Mapping[str, torch.Tensor] | None) -> Trainer:
@@ -180,9 +182,22 @@ class Trainer(training.Trainer[PredNet, Data]):
         return trainer
 
 
-def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
-    """Calibrate and score the averaged weights on held-out sequences, write them with their card; returns the card."""
-    offset, calibrated = calibrate(trainer.average, data.calibration)
+def mean(net: PredNet, others: Sequence[PredNet]) -> PredNet:
+    """The network whose weights are the mean of those of all. Raises ValueError where they are not of one form."""
+    for other in others:
+        if other.settings != net.settings:
+            raise ValueError(f"expected weights of {net.settings}, got some of {other.settings}")
+    states = [each.state_dict() for each in (net, *others)]
+    out = PredNet(net.settings)
+    out.load_state_dict({name: torch.stack([state[name] for state in states]).mean(0) for name in states[0]})
+    return out.eval()
+
+
+def export(trainer: Trainer, out: Path, data: Data, others: Sequence[tuple[PredNet, dict[str, Any]]] = ()) -> dict[str, Any]:
+    """Calibrate and score the averaged weights, or their mean with those of other networks with cards, on held-out sequences, and
+    write them with their card; returns the card. Raises ValueError as `mean`."""
+    net = mean(trainer.average, [other for other, _ in others])
+    offset, calibrated = calibrate(net, data.calibration)
     card = {
         "seed": trainer.seed,
         "date": datetime.date.today().isoformat(),
@@ -192,14 +207,21 @@ def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
             "minutes": round(trainer.minutes, 1),
         },
         **({"started_from": trainer.started_from} if trainer.started_from else {}),
+        **({"mean_with": [_named(card) for _, card in others]} if others else {}),
         "parameters": sum(p.numel() for p in trainer.net.parameters()),
         "learned_from": [*data.origins, *([pretrained.ORIGIN] if trainer.settings.encoder else [])],
         "calibration": {**data.sources[0], "target_logit_offset": offset, **calibrated},
-        "held_out": {**data.sources[1], **held_out(trainer.average, offset, data.held_out)},
+        "held_out": {**data.sources[1], **held_out(net, offset, data.held_out)},
     }
     out.parent.mkdir(parents=True, exist_ok=True)
-    prednet.save(out, trainer.average, card)
+    prednet.save(out, net, card)
     return card
+
+
+def _named(card: Mapping[str, Any]) -> dict[str, Any]:
+    """What another card says of weights with this one."""
+    named = {key: card[key] for key in ("seed", "date", "started_from") if key in card}
+    return named | {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
 
 
 @flags.command(
@@ -235,6 +257,13 @@ def export(trainer: Trainer, out: Path, data: Data) -> dict[str, Any]:
         without=str(inference.WEIGHTS),
         metavar="[FILE]",
         help="start from these weights (without a value: the committed ones), grown to --size, instead of random ones",
+    ),
+    flags.Option(
+        "--mean",
+        type=Path,
+        takes="many",
+        metavar="FILE ...",
+        help="write the mean with these weights, of earlier steps or from the same start",
     ),
     flags.Option(
         "--data",
@@ -286,6 +315,12 @@ def main(options: flags.Options) -> int:
             file=sys.stderr,
         )
         return 2
+    try:
+        others = [prednet.load(path) for path in options.mean or ()]
+        mean(trainer.average, [other for other, _ in others])
+    except (OSError, ValueError) as error:
+        print(f"penumbra segmentation train: --mean: {error}", file=sys.stderr)
+        return 2
     simulated = Simulated(trainer.seed, options.held_out)
     data: Data = simulated
     try:
@@ -299,6 +334,6 @@ def main(options: flags.Options) -> int:
     out = options.out or (Path("segmentation.npz") if options.data else inference.WEIGHTS)
     if not training.complete(trainer, data, options):
         return 130
-    card = export(trainer, out, data)
+    card = export(trainer, out, data, others)
     print(f"{out}: {card['held_out']}")
     return 0

@@ -342,6 +342,25 @@ def test_training_may_start_from_weights_and_its_card_names_them(tmp_path):
     assert again.started_from == {"seed": 7, "date": "2026-01-01", "minutes": 3.0}
 
 
+def test_weights_are_written_as_the_mean_with_others_of_the_same_form_only(tmp_path):
+    def rendered(seed: int, index: int) -> sequences.Sequence:
+        return sequences.render(seed, index, TINY)
+
+    data = Simulated(1, each=2, learned=rendered, scored=rendered)
+    trainer, other = train.Trainer(SMALL, train.Schedule(), seed=1), PredNet(SMALL)
+    with torch.no_grad():
+        for mine, its in zip(trainer.average.parameters(), other.parameters(), strict=True):
+            mine.fill_(1.0)
+            its.fill_(4.0)
+    card = {"seed": 7, "date": "2026-01-01", "settings": {"steps": 9}}
+    card = train.export(trainer, tmp_path / "mean.npz", data, [(other, card), (other, card)])
+    net, _ = prednet.load(tmp_path / "mean.npz")
+    assert all((value == 3.0).all() for value in net.parameters())
+    assert card["mean_with"] == 2 * [{"seed": 7, "date": "2026-01-01", "steps": 9}]
+    with pytest.raises(ValueError, match=r"expected weights of .* got some of"):
+        train.mean(trainer.average, [PredNet(replace(SMALL, priors=2))])
+
+
 @pytest.mark.slow
 def test_training_lowers_the_loss(data):
     trainer = train.Trainer(SMALL, train.Schedule(frames=2, patches=((0.0, 64, 4),), warm_up=10), seed=1)
