@@ -6,8 +6,8 @@ interrupted and resumed ends with the same weights as one that was not. For days
 
   OMP_NUM_THREADS=1 nice -n 19 penumbra segmentation train --size 16 32 64 128 --steps 150000 --resume --compact FILE
 
-Weights from the ends of successive trainings, each with its rate down, differ in what they get wrong, and their mean may be better
-than each: --mean (Izmailov et al. 2018, arXiv:1803.05407).
+Weights from the ends of successive trainings, each with its rate down, differ in what they get wrong, and their mean may be
+better than each: --mean (Izmailov et al. 2018, arXiv:1803.05407).
 
 With --priors the network also receives what is known of the robot and of the target, with --encoder what filters that photographs
 have taught find in the picture. A network without, from --start or --resume, is given both, and gives the same masks until it
