@@ -159,7 +159,7 @@ class Trainer(training.Trainer[PredNet, Data]):
         trainer = cls(net.settings, schedule, seed)
         trainer.net.load_state_dict(net.state_dict())
         trainer.average.load_state_dict(net.state_dict())
-        trainer.started_from = _named(card)
+        trainer.started_from = _named(card) | ({"started_from": card["started_from"]} if "started_from" in card else {})
         return trainer
 
     def extended(self, has_priors: bool, pretrained: Mapping[str, torch.Tensor] | None) -> Trainer:
@@ -219,8 +219,8 @@ def export(trainer: Trainer, out: Path, data: Data, others: Sequence[tuple[PredN
 
 
 def _named(card: Mapping[str, Any]) -> dict[str, Any]:
-    """What another card says of weights with this one."""
-    named = {key: card[key] for key in ("seed", "date", "started_from") if key in card}
+    """How a card names the weights of another one."""
+    named = {key: card[key] for key in ("seed", "date") if key in card}
     return named | {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
 
 
