@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from penumbra.services.search.contour import MEASURED, POINT
 from penumbra.services.search.image_fit import UNKNOWNS, ImageSettings, offsets, unfitted
+from penumbra.services.search.mask_fit import Limits, marginal
 from penumbra.services.search.rivals import RIVALS
 from penumbra.services.search.tracker import Search, Searched
 from penumbra.shared.contract.labels import Label
@@ -203,6 +204,15 @@ def test_a_roll_that_a_hidden_hand_leaves_open_is_uncertain(visible):
                 nees.append(error @ np.linalg.solve(estimate.covariance, error))
     assert len(nees) > 10
     assert np.mean(np.array(nees) > 20.1) < 0.1  # beyond three standard deviations
+
+
+def test_a_bent_hand_leaves_the_roll_open_and_nothing_else():
+    rng = np.random.default_rng(4)
+    T, limits = rigid.perturb(np.eye(4), rng.normal(size=6)), Limits()
+    J = rng.normal(size=(40, 7)) * [3e3, 3e3, 1e3, 3e2, 3e2, 3e2, 1.0]
+    straight, bent = (marginal(T, np.zeros(7), J.T @ J, np.zeros(7), np.eye(7), rolls, limits)[1] for rolls in (1.0, None))
+    axis = np.concatenate([np.zeros(3), T[:3, 0]])
+    np.testing.assert_allclose(bent - straight, limits.rotation**2 * np.outer(axis, axis), atol=1e-12)
 
 
 LEFT_OPEN = pytest.mark.xfail(strict=True, reason="the edges are seen 0.31 px off at the true pose, which confirms none")
