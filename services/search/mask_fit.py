@@ -300,11 +300,11 @@ def marginal(
         bent = covariance @ (waves[:6] - np.outer(gain, waves[6]))
         covariance = covariance + bent @ bent.T
     covariance = (covariance + covariance.T) / 2.0
-    c = covariance[:, 3:] @ T[:3, 0]
-    roll = float(T[:3, 0] @ c[3:])
     if rolls is None:  # however the hand is bent, the forearm is where it is
         covariance[3:, 3:] += limits.rotation**2 * np.outer(T[:3, 0], T[:3, 0])
     else:  # the roll that a nearly round section shows is uncertain, and so is all that is correlated with it
+        c = covariance[:, 3:] @ T[:3, 0]
+        roll = float(T[:3, 0] @ c[3:])
         covariance += min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll) * np.outer(c, c) / roll
     return rigid.perturb(T, offset), covariance
 

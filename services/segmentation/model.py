@@ -112,9 +112,13 @@ def save(path: Path, model: Model, card: dict[str, Any]) -> None:
 
 
 def load(path: Path) -> tuple[Model, dict[str, Any]]:
-    """The network of a weights file and its card."""
+    """The network of a weights file and its card. Raises ValueError for a card of something else."""
     card = json.loads(path.with_suffix(".json").read_text())
-    network = {key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"]["network"].items()}
+    try:
+        network = {key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"]["network"].items()}
+        settings = Settings(**network)  # type: ignore[arg-type]
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected a card of the segmentation network beside it, got another one: {error}") from None
     with np.load(path, allow_pickle=False) as stored:
         weights = {name: stored[name].astype(np.float32) for name in stored.files}
-    return Model(Settings(**network), weights), card  # type: ignore[arg-type]
+    return Model(settings, weights), card

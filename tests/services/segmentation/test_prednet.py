@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from penumbra.services.posecnn import estimator
 from penumbra.services.segmentation import encoder, inference, model, prednet
 from penumbra.services.segmentation.prednet import PredNet, Settings
 from penumbra.services.segmentation.shift import shift_state
@@ -359,6 +360,11 @@ def test_weights_are_written_as_the_mean_with_others_of_the_same_form_only(tmp_p
     assert card["mean_with"] == 2 * [{"seed": 7, "date": "2026-01-01", "steps": 9}]
     with pytest.raises(ValueError, match=r"expected weights of .* got some of"):
         train.mean(trainer.average, [PredNet(replace(SMALL, priors=2))])
+
+
+def test_weights_of_another_network_are_refused_by_their_card():
+    with pytest.raises(ValueError, match=r"posecnn.npz: expected a card of the segmentation network beside it, got another one"):
+        prednet.load(estimator.WEIGHTS)
 
 
 @pytest.mark.slow
