@@ -66,7 +66,7 @@ def _good(kind: type[messages.Message]) -> bytes:
     }
     fields |= {"x0": 0, "y0": 0, "scale": 1, "period_ns": 10**6, "overlap": 0.9, "hidden": 0.1, "gap": 0.05}
     point = messages.SurfacePoint("arm/link5", (0.0, 0.0, 0.1), distance=0.05, along=0.005, across=0.02, gap=0.05)
-    fields |= {"surface": {"pad": point}, "contact": "touch", "touched": ("pad",)}
+    fields |= {"surface": {"pad": point}, "contact": "touch", "touched": ("pad",), "step": np.zeros(6)}
     if kind is messages.Joints:
         fields["position"] = np.zeros(7)
     return messages.encode(kind(**{name: fields[name] for name in kind.__struct_fields__}))

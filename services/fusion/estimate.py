@@ -224,19 +224,20 @@ def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int 
     return RefusedMeasurement(FATES[fate], text)
 
 
-def measured(message: Message, measures: Measures) -> tuple[Array, Array]:
-    """The pose (4, 4) that a message of a sense reports, and its information (6, 6), zero along what is not observed. Raises
-    RefusedMeasurement where its covariance is not symmetric and positive definite."""
+def measured(message: Message, measures: Measures) -> tuple[Array, Array, Array | None]:
+    """The pose (4, 4) that a message of a sense reports, its information (6, 6), zero along what is not observed, and the step
+    (6,) to it from where that was linearised, None where nothing is said of that. Raises RefusedMeasurement where its covariance
+    is not symmetric and positive definite."""
     of: Any = message
     match measures:
         case Measures.POSE:
-            return rigid.transform(of.position, of.orientation), information(of.covariance)
+            return rigid.transform(of.position, of.orientation), information(of.covariance), None
         case Measures.POSE_INFORMATION:
-            return rigid.transform(of.position, of.orientation), of.information
+            return rigid.transform(of.position, of.orientation), of.information, getattr(of, "step", None)
         case Measures.POSITION:
             seen = np.zeros((6, 6))
             seen[:3, :3] = information(of.covariance)
-            return rigid.transform(of.position), seen
+            return rigid.transform(of.position), seen, None
 
 
 def stream_of(sense: Sense, message: Any, target: str, cell: Cell) -> str:

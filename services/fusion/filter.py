@@ -96,8 +96,9 @@ def forget(state):  # type: ignore[no-untyped-def]
 
 
 @inner
-def reduce(model, source, stamp_ns, T, information, m):  # type: ignore[no-untyped-def]
-    """Writes a pose (4, 4) with its information (6, 6) as the MEASUREMENT m."""
+def reduce(model, source, stamp_ns, T, information, step, m):  # type: ignore[no-untyped-def]
+    """Writes a pose (4, 4) with its information (6, 6) as the MEASUREMENT m; step (6,): from there to where its likelihood
+    peaks."""
     m.stamp_ns, m.source = stamp_ns, source
     for i in range(3):
         m.p[i] = T[i, 3]
@@ -115,6 +116,7 @@ def reduce(model, source, stamp_ns, T, information, m):  # type: ignore[no-untyp
                 m.directions[k, i] = vectors[i, e]
                 m.basis[k, i] = vectors[i, e] / UNITS[i]
             m.sigma[k] = math.sqrt(1.0 / scaled[e, e])
+            m.ahead[k] = so3.dot(m.basis[k], step)
             k += 1
     m.rank, m.has_axis, m.slides = k, 0, 0
     if 0 < k < POSE:
@@ -122,6 +124,19 @@ def reduce(model, source, stamp_ns, T, information, m):  # type: ignore[no-untyp
         for i in range(3):
             m.axis[i] = vectors[i, 0]
         m.slides = _weakest(m, 0, vectors) < 1e-3
+
+
+@inner
+def undo(step, T, information):  # type: ignore[no-untyped-def]
+    """Takes a pose (4, 4) and its information (6, 6) back by a step (6,), to where its likelihood was linearised."""
+    back, turn = np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        back[i] = -step[3 + i]
+        T[i, 3] -= step[i]
+    so3.exp(back, turn)
+    so3.turn(turn, T[:, :3], 0)
+    so3.turn(turn, information, 3)
+    so3.turn_columns(turn, information, 3)
 
 
 @inner
@@ -435,7 +450,7 @@ def error(p, R, m, value, derivative):  # type: ignore[no-untyped-def]
     if m.slides:
         so3.exp(back, slide)
     for k in range(m.rank):
-        value[k] = 0.0
+        value[k] = -m.ahead[k]
         for i in range(3):
             derivative[k, i] = 0.0 if m.slides else m.basis[k, i]
             derivative[k, 3 + i] = 0.0

@@ -29,7 +29,7 @@ from penumbra.services.fusion.estimate import (
     fault,
     state_of,
 )
-from penumbra.services.fusion.filter import Model, State, forget, is_contested, reduce, spread, step
+from penumbra.services.fusion.filter import Model, State, forget, is_contested, reduce, spread, step, undo
 from penumbra.services.fusion.motion import move, within_reach
 from penumbra.services.fusion.records import (
     ESTIMATE,
@@ -207,7 +207,7 @@ def adopt(
 
 @kernel(
     "MODEL[t], SENSE_MODEL[n], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], "
-    "out i8[t, 2], i8[m], i8[m], i8[m], f8[m, 4, 4], f8[m, 6, 6], i8, out i8[m], out MEASUREMENT[1], out f8[size, 6]",
+    "out i8[t, 2], i8[m], i8[m], i8[m], f8[m, 4, 4], f8[m, 6, 6], f8[m, 6], i8, out i8[m], out MEASUREMENT[1], out f8[size, 6]",
     MODEL=MODEL,
     SENSE_MODEL=SENSE_MODEL,
     MEASUREMENT=MEASUREMENT,
@@ -216,16 +216,19 @@ def adopt(
 )
 def measure_all(
     models, sense_models, measurements, states, senses, P, rings,
-    targets, sources, stamps_ns, T, information, latest_ns, fates, taken, PHt,
+    targets, sources, stamps_ns, T, information, steps, latest_ns, fates, taken, PHt,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """`Bank.measure`, one after the other. taken, PHt : memory for the measurement under way, and for `step`."""
-    m = taken[0]
+    m, there, known = taken[0], np.empty((4, 4)), np.empty((POSE, POSE))
     for r in range(len(targets)):
         i = targets[r]
-        fates[r] = fault(stamps_ns[r], T[r], information[r], latest_ns)
+        so3.copy(T[r], there)
+        so3.copy(information[r], known)
+        undo(steps[r], there, known)
+        fates[r] = fault(stamps_ns[r], there, known, latest_ns)
         if fates[r] == 0:
             model = Model(models[i], sense_models)
-            reduce(model, sources[r], stamps_ns[r], T[r], information[r], m)
+            reduce(model, sources[r], stamps_ns[r], there, known, steps[r], m)
             history = Entries(measurements[i], states[i], senses[i], P[i], rings[i])
             fates[r] = insert(model, history, m, PHt) if m.rank else NOTHING
 

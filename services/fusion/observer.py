@@ -57,16 +57,19 @@ class Bank:
         T: Array,
         information: Array,
         now_ns: int | None = None,
+        steps: Array | None = None,
     ) -> NDArray[np.int64]:
-        """Takes m poses T (m, 4, 4) with their information (m, 6, 6), one after the other; their fates (m,), of FATES.
+        """Takes m poses T (m, 4, 4) with their information (m, 6, 6) and steps (m, 6), one after the other; their fates (m,), of
+        FATES.
 
         targets, sources (m,) : which target each belongs to, and which of `names` it comes from; otherwise as
         `ErrorStateObserver.measure`. What is refused is counted, and the others are taken.
         """
         fates = np.empty(len(targets), np.int64)
+        steps = np.zeros((len(targets), POSE)) if steps is None else steps
         history.measure_all(
             *(self._models, self._sense_models, *self._history),
-            *(targets, sources, stamps_ns, T, information, latest(now_ns), fates, *self._room),
+            *(targets, sources, stamps_ns, T, information, steps, latest(now_ns), fates, *self._room),
         )
         columns = (each.tolist() for each in (targets, sources, stamps_ns, fates))
         for target, source, stamp_ns, fate in zip(*columns, strict=True):
@@ -155,10 +158,18 @@ class ErrorStateObserver:
         self.settings, self.subject, self.log = bank.settings, bank.subjects[target], bank.logs[target]
 
     def measure(
-        self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None, now_ns: int | None = None
+        self,
+        source: str,
+        stamp_ns: int,
+        T: Array,
+        information: Array,
+        hidden: float | None = None,
+        now_ns: int | None = None,
+        step: Array | None = None,
     ) -> bool:
         """Takes a pose T (4, 4) with its information (6, 6, zero along what is not observed). True if it was accepted.
 
+        `step` (6,) is the pose error that leads to T from the pose at which its likelihood was linearised; None: it was at T.
         `hidden` is not used: the information says how good the measurement is. `now_ns` is the reader's clock, where the stamp is
         to be compared with it. Raises RefusedMeasurement, which is counted and leaves the state as it is, for a pose that is no
         rigid transform, an information that is not symmetric and positive semi-definite, and a stamp from the future; ValueError
@@ -166,8 +177,9 @@ class ErrorStateObserver:
         """
         self.log.check(source)
         T, information = shaped(T, (4, 4)), shaped(information, (POSE, POSE))
+        steps = None if step is None else shaped(step, (POSE,))[None]
         target, which, stamp = np.array([[self._target], [self._bank.names.index(source)], [stamp_ns]])
-        fate = int(self._bank.measure(target, which, stamp, T[None], information[None], now_ns)[0])
+        fate = int(self._bank.measure(target, which, stamp, T[None], information[None], now_ns, steps)[0])
         if fate >= FUTURE:
             raise refusal(fate, stamp_ns, T, information, now_ns)
         return fate == ACCEPTED

@@ -126,13 +126,21 @@ class PaperObserver:
         self.log.first_ns.clear()
 
     def measure(
-        self, source: str, stamp_ns: int, T: Array, information: Array, hidden: float | None = None, now_ns: int | None = None
+        self,
+        source: str,
+        stamp_ns: int,
+        T: Array,
+        information: Array,
+        hidden: float | None = None,
+        now_ns: int | None = None,
+        step: Array | None = None,
     ) -> bool:
         """Takes a pose T (4, 4) with its information (6, 6). True if it is newer than the one before of this source.
 
-        source : `vision` (R_v from the share `hidden`) or `haptic` (R_c from the information). Raises RefusedMeasurement, which
-        is counted, for a pose that is no rigid transform, an information that is not symmetric and positive semi-definite, and a
-        stamp ahead of the reader's clock `now_ns` (where it is given); ValueError on an unknown source.
+        source : `vision` (R_v from the share `hidden`) or `haptic` (R_c from the information). `step` is not used. Raises
+        RefusedMeasurement, which is counted, for a pose that is no rigid transform, an information that is not symmetric and
+        positive semi-definite, and a stamp ahead of the reader's clock `now_ns` (where it is given); ValueError on an unknown
+        source.
         """
         T, information = self.log.admitted(source, stamp_ns, T, information, now_ns)
         before = self._held.get(source)

@@ -63,6 +63,7 @@ MEASUREMENT = np.dtype(
         ("directions", "f8", (POSE, POSE)),  # unit vectors (k, 6), in UNITS
         ("basis", "f8", (POSE, POSE)),  # (k, 6): `basis @ error` has independent entries ...
         ("sigma", "f8", POSE),  # ... with these standard deviations (k,)
+        ("ahead", "f8", POSE),  # `basis @` the pose error from p, R to where its likelihood peaks (k,)
         ("has_axis", "i8"),  # whether the rotation about `axis` is not observed (a limb's, where its roll is not seen)
         ("axis", "f8", 3),
         ("slides", "i8"),  # whether a translation is not observed (along a limb, where neither of its ends is seen)

@@ -177,7 +177,8 @@ class Fusion:
                 return
             hidden = getattr(message, "hidden", None)  # the share by which the paper's observer weighs the camera
             try:
-                self.observer.measure(sense.name, message.stamp_ns, *found, hidden, now_ns)
+                T, information, step = found
+                self.observer.measure(sense.name, message.stamp_ns, T, information, hidden, now_ns, step)
             except RefusedMeasurement as error:
                 self._log(sense.name, error)
 

@@ -101,16 +101,18 @@ def turned(turn: Array, P: Array) -> Array:
 
 @dataclass(frozen=True)
 class Taken:
-    """Measurements (m,) in the order of their stamps: sources, stamps [ns], poses (m, 4, 4), information (m, 6, 6)."""
+    """Measurements (m,) in the order of their stamps: sources, stamps [ns], poses (m, 4, 4), information (m, 6, 6),
+    steps (m, 6)."""
 
     sources: Indices
     stamps_ns: Indices
     T: Array
     information: Array
+    steps: Array
 
     def of(self, which: Indices | Flags) -> Taken:
         """Some of them."""
-        return Taken(self.sources[which], self.stamps_ns[which], self.T[which], self.information[which])
+        return Taken(self.sources[which], self.stamps_ns[which], self.T[which], self.information[which], self.steps[which])
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -140,7 +142,7 @@ class Filter:
         fates, room = np.empty(count, np.int64), (np.empty(1, MEASUREMENT), np.empty((size(n), POSE)))
         history.measure_all(
             *(self.one, self.senses, *memory, np.zeros(count, np.int64)),
-            *(taken.sources, taken.stamps_ns, taken.T, taken.information, NO_CLOCK, fates, *room),
+            *(taken.sources, taken.stamps_ns, taken.T, taken.information, taken.steps, NO_CLOCK, fates, *room),
         )
         known = slice(1, int(memory.rings[0, 1]))  # before the first one there is a state without information
         states = States(memory.states[0, known], memory.senses[0, known], memory.P[0, known])
@@ -280,15 +282,17 @@ class Smoother:
     def __init__(self, subject: Subject, settings: FusionSettings | None = None, senses: Sequence[Sense] = SENSES):
         self._subject, self._settings, self._senses = subject, settings or FusionSettings(), tuple(senses)
         self._names = tuple(sense.name for sense in senses)
-        self._measured: list[tuple[int, int, Array, Array]] = []
+        self._measured: list[tuple[int, int, Array, Array, Array]] = []
         self.log = Log(self._names)
         self.reinstated = self.dismissed = 0
 
-    def measure(self, source: str, stamp_ns: int, T: Array, information: Array) -> None:
-        """Takes a pose T (4, 4) with its information (6, 6), as `ErrorStateObserver.measure`; what is wrong with it is counted by
-        `trajectory`. Raises ValueError on an unknown source."""
+    def measure(self, source: str, stamp_ns: int, T: Array, information: Array, step: Array | None = None) -> None:
+        """Takes a pose T (4, 4) with its information (6, 6) and step (6,), as `ErrorStateObserver.measure`; what is wrong with it
+        is counted by `trajectory`. Raises ValueError on an unknown source."""
         self.log.check(source)
-        self._measured.append((stamp_ns, self._names.index(source), shaped(T, (4, 4)), shaped(information, (POSE, POSE))))
+        step = np.zeros(POSE) if step is None else shaped(step, (POSE,))
+        which, T, information = self._names.index(source), shaped(T, (4, 4)), shaped(information, (POSE, POSE))
+        self._measured.append((stamp_ns, which, T, information, step))
 
     def trajectory(self) -> Trajectory:
         """The trajectory, from the measurements so far. Raises NothingMeasuredError where none of them can be used."""
@@ -321,9 +325,9 @@ class Smoother:
         which have passed, and which are to be used."""
         if not self._measured:
             raise NothingMeasuredError(f"expected poses of {' or '.join(self._names)}, got none")
-        stamps_ns, sources, T, information = (np.array(column) for column in zip(*self._measured, strict=True))
-        order = np.lexsort((*T[:, 2::-1, 3].T, sources, stamps_ns))  # as `history` orders them
-        taken = Taken(sources, stamps_ns, T, information).of(order)
+        stamps_ns, sources, T, information, steps = (np.array(column) for column in zip(*self._measured, strict=True))
+        order = np.lexsort((*(T[:, :3, 3] - steps[:, :3])[:, ::-1].T, sources, stamps_ns))  # as `history` orders them
+        taken = Taken(sources, stamps_ns, T, information, steps).of(order)
         gated = Filter(self._subject, self._settings, self._senses, is_gated=True)
         measurements, states, fates = gated.known(taken)
         for source, stamp_ns, fate in zip(taken.sources, taken.stamps_ns.tolist(), fates.tolist(), strict=True):

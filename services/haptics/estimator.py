@@ -56,13 +56,15 @@ WHY = {"in_range": "", "unidentified": UNIDENTIFIED, "object": FOREIGN, "out_of_
 @dataclass(frozen=True)
 class HapticEstimate:
     """T_world_target (4, 4) and information (6, 6) of the voltages alone, zero along what they do not show, and all zero where
-    they are not a limb's; gap [m]: the smallest from an electrode to the skin, at most `HapticSettings.farthest_gap`; state: see
-    `HapticPose`, only what is in range is worth using; why: the reason where it is not; residuals (n,): what the limb leaves
-    unexplained, in standard deviations; surface: the nearest point before each pad that feels something; contact, touched:
-    whether something touches, and which pads."""
+    they are not a limb's; step (6,): the pose error that leads to T from where the likelihood was linearised; gap [m]: the
+    smallest from an electrode to the skin, at most `HapticSettings.farthest_gap`; state: see `HapticPose`, only what is in range
+    is worth using; why: the reason where it is not; residuals (n,): what the limb leaves unexplained, in standard deviations;
+    surface: the nearest point before each pad that feels something; contact, touched: whether something touches, and which
+    pads."""
 
     T: Array
     information: Array
+    step: Array
     gap: float
     state: HapticState
     why: str
@@ -130,7 +132,7 @@ class Estimator:
     def nothing(self, why: str) -> HapticEstimate:
         """The estimate when nothing can be felt: home, without information."""
         return HapticEstimate(
-            self._home.T, np.zeros((6, 6)), self.settings.farthest_gap, "out_of_range", why, np.zeros(len(self.skin))
+            self._home.T, np.zeros((6, 6)), np.zeros(6), self.settings.farthest_gap, "out_of_range", why, np.zeros(len(self.skin))
         )
 
     def warm_up(self, joints: int) -> None:
@@ -218,7 +220,7 @@ class Estimator:
         T, information = self.network.likelihood(x, relative)
         gap = self._limb.gap(reading, T, self.size.mean)
         state: HapticState = "in_range" if self._is_felt(information, gap) else "out_of_range"
-        return self._estimate(T, information, gap, state, np.zeros(len(self.skin)))
+        return self._estimate(T, information, np.zeros(6), gap, state, np.zeros(len(self.skin)))
 
     def _by_solve(self, reading: Reading, expected: Place | None, elapsed_s: float) -> tuple[HapticEstimate, Seen | None]:
         """The estimate, and what a camera predicts of the window. expected: where it has just seen the limb."""
@@ -237,7 +239,8 @@ class Estimator:
         state = self._identified(reading, solution, gap, expected, elapsed_s) if is_felt else self._absent(elapsed_s)
         self._pads.update(solution.residuals, np.isfinite(reading.variance))
         seen = None if expected is None or state == "object" else self._seen(solution, expected)
-        return self._estimate(T, information, gap, state, solution.residuals), seen
+        step = pose_error(T, solution.T)
+        return self._estimate(T, information, step, gap, state, solution.residuals), seen
 
     def _watch_absence(self, in_range: bool, elapsed_s: float) -> None:
         """Forgets the size of a limb that has been away: the next one may be another person's."""
@@ -379,7 +382,9 @@ class Estimator:
             return False
         return float(np.linalg.eigvalsh(information * SCALES)[-1]) > 1.0 / self.settings.worst_sigma**2
 
-    def _estimate(self, T: Array, information: Array, gap: float, state: HapticState, residuals: Array) -> HapticEstimate:
+    def _estimate(
+        self, T: Array, information: Array, step: Array, gap: float, state: HapticState, residuals: Array
+    ) -> HapticEstimate:
         known = information if state in ("in_range", "unidentified") else np.zeros((6, 6))
         gap = min(max(gap, 0.0), self.settings.farthest_gap)
-        return HapticEstimate(T, known, gap, state, WHY[state], residuals)
+        return HapticEstimate(T, known, step, gap, state, WHY[state], residuals)

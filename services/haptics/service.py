@@ -251,4 +251,5 @@ def _message(estimate: HapticEstimate, window: VoltageWindow, target: str, cell:
         },
         contact=estimate.contact,
         touched=estimate.touched,
+        step=estimate.step,
     )

@@ -237,14 +237,17 @@ class SurfacePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HapticPose(Message, frozen=True, kw_only=True):
-    """What the skin says. `information` (6 x 6, inverse covariance) is zero along directions that it does not observe.
-    `stamp_ns` is the time that the pose belongs to, `sample_stamp_ns` that of the newest voltage sample in it. `state`: in_range
-    (a limb), unidentified (a limb or something else: the pose is that of the limb that would feel so), object (no limb: the same,
-    without information) or out_of_range (nothing near). Use in_range alone as the target's pose. `surface`: by pad, the nearest
-    point of whatever is there, for each pad that feels something: the `link` that carries the pad, the point's `position` in
-    `frame`, its `distance` from the pad's middle with the standard deviations `along` and `across` the line between them, and the
-    surface's `gap` to the pad's board [m]; no shape is assumed, and the points belong to no target. `contact`: none, touch (a
-    surface is within 5 mm of a pad) or grip (on opposite sides of one link), whatever the `state`, of the pads `touched`."""
+    """What the skin says. `information` (6 x 6, inverse covariance) is zero along directions that it does not observe. `stamp_ns`
+    is the time that the pose belongs to, `sample_stamp_ns` that of the newest voltage sample in it. `state`: in_range (a limb),
+    unidentified (a limb or something else: the pose is that of the limb that would feel so), object (no limb: the same, without
+    information) or out_of_range (nothing near). Use in_range alone as the target's pose. `surface`: by pad, the nearest point of
+    whatever is there, for each pad that feels something: the `link` that carries the pad, the point's `position` in `frame`, its
+    `distance` from the pad's middle with the standard deviations `along` and `across` the line between them, and the surface's
+    `gap` to the pad's board [m]; no shape is assumed, and the points belong to no target. `contact`: none, touch (a surface is
+    within 5 mm of a pad) or grip (on opposite sides of one link), whatever the `state`, of the pads `touched`. `step`: the
+    translation [m] and the rotation vector [rad], about the frame's axes, that lead to this pose from the one at which its
+    likelihood was linearised: where poses that are uncertain by tens of degrees are put together, that is done about the latter,
+    as fusion does."""
 
     target: Name
     frame: Name
@@ -257,6 +260,7 @@ class HapticPose(Message, frozen=True, kw_only=True):
     surface: Annotated[dict[Name, SurfacePoint], msgspec.Meta(max_length=MOST_PADS)] = {}
     contact: ContactState = "none"
     touched: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_PADS)] = ()
+    step: Twist = msgspec.field(default_factory=lambda: np.zeros(6))
 
 
 class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -357,7 +361,10 @@ class Codec(typing.Generic[M]):
         if not payload.startswith(_LED, 1) and _version(payload) != VERSION:  # msgspec takes a map without a version, too
             raise self.refusal(payload, msgspec.ValidationError("no version"))
         for name, spec in self.arrays:
-            _, shape, data = getattr(message, name)
+            given = getattr(message, name)
+            if isinstance(given, np.ndarray):  # what stands for a field that was not sent
+                continue
+            _, shape, data = given
             try:
                 force_setattr(message, name, spec.read(shape, data))  # nobody else has seen this message
             except BadMessage as error:

@@ -18,7 +18,8 @@ class Measures(Enum):
     POSE = ("position", "orientation", "covariance")
     """A pose with its covariance (6, 6)."""
     POSE_INFORMATION = ("position", "orientation", "information")
-    """A pose with its information (6, 6), the inverse covariance: zero along directions that are not observed."""
+    """A pose with its information (6, 6), the inverse covariance: zero along directions that are not observed. It may have a
+    `step`, too: the pose error (6,) that leads to the pose from the one at which its likelihood was linearised."""
     POSITION = ("position", "covariance")
     """The position of the target's origin with its covariance (3, 3)."""
 

@@ -307,7 +307,7 @@ def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: A
         estimate = estimator.update(window.stamp_ns, window.amplitude, window.samples, rig.pads, rig.joints)
         ms.append(1e3 * (time.perf_counter() - begin))
         if estimate.may_be_limb:  # it is one
-            observer.measure("haptic", window.stamp_ns, estimate.T, estimate.information)
+            observer.measure("haptic", window.stamp_ns, estimate.T, estimate.information, step=estimate.step)
         if stamp_ns < SETTLED_S * 1e9:
             continue
         errors.append(rig.axes(T, 8) @ rigid.pose_error(T, estimator.pose))

@@ -43,7 +43,7 @@ HIDE_S, SEE_S, SLIDE_S = (0.5, 1.0, 1.5, 2.0), 1.4, 0.8
 """In turn: for how long the panel hides the limb wholly, for how long it is away, and how long it takes from one to the other."""
 EVERY = 22
 """Of the published poses one in so many is scored: as often as in `penumbra bench fusion`."""
-Measurement = tuple[str, int, Array, Array]
+Measurement = tuple[str, int, Array, Array, Array | None]
 Score = tuple[float, float]
 """Position error [m] and NEES."""
 
@@ -57,7 +57,8 @@ def trajectories(subject: Subject, measurements: Sequence[Measurement], stamps_n
     found, taken = [], 0
     for stamp_ns, smoothed in zip(stamps_ns, smoother.trajectory().estimates(np.array(stamps_ns)), strict=True):
         while taken < len(in_order) and in_order[taken][1] <= stamp_ns:
-            observer.measure(*in_order[taken])
+            source, at_ns, T, information, step = in_order[taken]
+            observer.measure(source, at_ns, T, information, step=step)
             taken += 1
         found.append({"stamp": observer.estimate(stamp_ns), "smoothed": smoothed})
     return found
@@ -98,7 +99,7 @@ def of_senses(seed: int, count: int, seconds: float, console: Console) -> dict[s
             observer = ErrorStateObserver(scores.HOME, scores.SPREAD)
             player = scores.Player(run, [scores.taking(observer)])
             times = [t for t in scores.instants(run) if t < max(m.stamp for m in run.messages)]
-            told = [(m.source, runs.ns(m.stamp), m.T, m.information) for m in run.messages]
+            told = [(m.source, runs.ns(m.stamp), m.T, m.information, None) for m in run.messages]
             subject = Subject(scores.HOME, scores.SPREAD)
             for t, poses in zip(times, trajectories(subject, told, [runs.ns(t) for t in times]), strict=True):
                 player.until(t)

@@ -76,6 +76,7 @@ KINDS: dict[type[messages.Message], dict[str, Any]] = {
         "surface": st.dictionaries(NAMES, POINTS, max_size=4),
         "contact": st.sampled_from(["none", "touch", "grip"]),
         "touched": st.lists(NAMES, max_size=4).map(tuple),
+        "step": vector(6),
     },
     messages.FusedPose: {
         **POSE,

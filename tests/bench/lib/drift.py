@@ -129,7 +129,7 @@ class _Life:
             volts = self.volts(signal, warmer, rng)
             estimate = estimator.update(stamp_ns, volts, np.full(len(rig.skin), SAMPLES), rig.pads, rig.joints, expected)
             if estimate.may_be_limb:
-                observer.measure("haptic", stamp_ns, estimate.T, estimate.information)
+                observer.measure("haptic", stamp_ns, estimate.T, estimate.information, step=estimate.step)
             if t < SETTLED_S:
                 continue
             errors.append(axes @ rigid.pose_error(T, estimator.pose))

@@ -471,6 +471,9 @@ def test_no_measurement_is_trusted_beyond_the_floor() -> None:
     assert (sigma >= floor).all() and (sigma < 1.5 * floor).all()
 
 
+STEP = np.array([0.02, -0.01, 0.03, 0.0, 0.2, -0.6])
+
+
 def test_the_compiled_filter_does_what_its_source_says(monkeypatch: pytest.MonkeyPatch) -> None:
     def played() -> Estimate:
         observer = ErrorStateObserver(HOME, SPREAD)
@@ -479,6 +482,7 @@ def test_the_compiled_filter_does_what_its_source_says(monkeypatch: pytest.Monke
         late = [*measurements[:10], *measurements[15:], *measurements[10:15]]
         for measurement in late:
             observer.measure(*measurement)
+        observer.measure("haptic", ns(0.31), perturb(HOME, STEP), VISION, step=STEP)
         return observer.estimate(ns(0.32))
 
     def interpreted(compiled: Kernel) -> Callable[..., object]:
@@ -531,6 +535,69 @@ def test_a_roll_that_is_made_up_does_not_disturb_the_axis(make: type) -> None:
     assert rigid.axis_angle_error(T, estimate.T) < 1e-3
     roll_variance = T[:3, 0] @ estimate.covariance[3:, 3:] @ T[:3, 0]
     assert roll_variance > 0.5 * SPREAD[1] ** 2  # nobody saw it
+
+
+# ---- likelihoods that were linearised elsewhere than where they peak
+
+
+def test_a_pose_is_believed_as_it_is_wherever_its_likelihood_was_linearised() -> None:
+    T = perturb(HOME, STEP)
+    observer = ErrorStateObserver(HOME, SPREAD)
+    for k in range(100):
+        observer.measure("haptic", ns(0.01 * k), T, 100.0 * VISION, step=STEP)
+    np.testing.assert_allclose(pose_error(T, observer.estimate(ns(1.0)).T), 0.0, atol=1e-3)
+
+
+def test_steps_of_poses_with_one_origin_average_as_vectors() -> None:
+    observer, other = ErrorStateObserver(HOME, SPREAD), perturb(HOME, 0.5 * STEP)
+    for k in range(200):
+        step = STEP * (1.0 if k % 2 else 0.0)
+        observer.measure("haptic", ns(0.01 * k), perturb(HOME, step), VISION, step=step)
+    np.testing.assert_allclose(pose_error(other, observer.estimate(ns(1.99)).T), 0.0, atol=0.02)
+
+
+def test_poses_that_are_uncertain_by_tens_of_degrees_add_up_where_they_were_linearised() -> None:
+    """Each window has four pads that feel how far a limb is, at different places along it, from nearly one side. Poses that are
+    taken where they peak lead the yaw away, together, by 36 and 58 degrees."""
+    known = np.array([0, 1, 2, 4, 5])
+    for seed in range(2):
+        rng, errors, squares = np.random.default_rng(seed), [], []
+        observer = ErrorStateObserver(HOME, SPREAD)
+        for k in range(500):
+            information = felt_from_one_side(rng)
+            w, V = np.linalg.eigh(information)
+            seen = w > 1e-6 * w[-1]
+            step = V[:, seen] @ (rng.standard_normal(seen.sum()) / np.sqrt(w[seen]))
+            T, turn = perturb(HOME, step), np.eye(6)
+            turn[3:, 3:] = rigid.rotation(step[3:])
+            observer.measure("haptic", ns(0.02 * k), T, turn @ information @ turn.T, step=step)
+            if k >= 150 and k % 10 == 0:
+                estimate = observer.estimate(ns(0.02 * k))
+                error, covariance = pose_error(HOME, estimate.T)[known], estimate.covariance[np.ix_(known, known)]
+                errors.append(error)
+                squares.append(float(error @ np.linalg.solve(covariance, error)) / len(known))
+        assert np.degrees(np.sqrt(np.mean(np.square(errors), 0)[-1])) < 20.0
+        assert np.mean(squares) < 1.0
+
+
+def felt_from_one_side(rng: np.random.Generator) -> Array:
+    """Information (6, 6) of four distances to points of HOME's axis, each with a standard deviation of 4 cm."""
+    information = np.zeros((6, 6))
+    for _ in range(4):
+        off = 0.3 * rng.normal()
+        toward = np.array([0.3 * rng.normal(), np.sin(off), np.cos(off)])
+        toward /= np.linalg.norm(toward)
+        row = np.concatenate([toward, np.cross([rng.uniform(-0.06, 0.06), 0.0, 0.0], toward)])
+        row[3] = 0.0  # the roll is not felt
+        information += np.outer(row, row) / 0.04**2
+    return information
+
+
+def test_a_step_that_is_not_finite_is_refused() -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    with pytest.raises(RefusedMeasurement, match="pose: expected a finite rigid transform"):
+        observer.measure("haptic", ns(0.0), HOME, VISION, step=np.full(6, np.nan))
+    assert observer.log.counts["haptic"].refused == {"pose": 1}
 
 
 def test_the_first_haptic_pose_is_completed_by_home() -> None:

@@ -259,6 +259,19 @@ def test_the_size_is_learnt_close_in_and_makes_the_height_sure_farther_away(
     assert sure(knowing, 50) > 1.5 * sure(fresh, 0)
 
 
+def test_a_step_leads_from_the_track_to_the_pose_that_a_window_alone_says(
+    skin: Skin, response: Response, forearm: Surface
+) -> None:
+    T = rigid.from_rpy([0.03, -0.02, 0.14], [0, 0, 0.3])
+    which = estimator(skin, response, forearm, rigid.transform([0, 0, 0.16]))
+    lengths = []
+    for begin in range(0, 60, 5):
+        *_, estimate = windows(which, skin, signal(skin, response, T), 5, seed=begin, begin=begin)
+        np.testing.assert_allclose(rigid.perturb(which.pose, estimate.step), estimate.T, atol=1e-9)
+        lengths.append(float(np.linalg.norm(estimate.step[3:])))
+    assert max(lengths) > 0.1, "far away, a window alone is off by more than ten degrees in some cases"
+
+
 def test_a_limb_out_of_reach_gives_no_information(skin: Skin, response: Response, forearm: Surface) -> None:
     which = estimator(skin, response, forearm, rigid.transform([0, 0, 0.2]))
     estimates = windows(which, skin, signal(skin, response, rigid.transform([0, 0, 0.60])), 20, seed=3)
@@ -292,7 +305,7 @@ def test_of_two_places_that_feel_alike_far_away_neither_is_called_certain(
             felt = feel(skin, signal(skin, response, T, size), rng, 20)
             estimate = which.update(step_ns * (i + 1), felt, np.full(len(skin), 20), pads)
             if estimate.may_be_limb:  # it is one
-                observer.measure("haptic", step_ns * (i + 1), estimate.T, estimate.information)
+                observer.measure("haptic", step_ns * (i + 1), estimate.T, estimate.information, step=estimate.step)
             fused = observer.estimate(step_ns * (i + 1))
             if fused.state == "tracking":
                 error = rigid.pose_error(T, fused.T)

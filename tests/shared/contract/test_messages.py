@@ -3,6 +3,7 @@
 import threading
 import time
 import tracemalloc
+from typing import Any
 
 import msgpack
 import msgspec
@@ -17,6 +18,19 @@ from penumbra.tests.support.inputs import ANYTHING, KINDS
 from penumbra.tests.support.nodes import pose
 
 ALL = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+
+
+KNOWN_HAPTIC: dict[str, Any] = {
+    "stamp_ns": 1,
+    "sample_stamp_ns": 1,
+    "target": "forearm",
+    "frame": "world",
+    "position": np.zeros(3),
+    "orientation": np.array([0.0, 0.0, 0.0, 1.0]),
+    "information": np.eye(6),
+    "gap": 0.1,
+    "state": "in_range",
+}
 
 
 def same(a, b):
@@ -219,6 +233,14 @@ def test_an_array_is_plain_message_pack_and_is_read_where_it_lies():
         assert (array == expected).all()
         assert np.shares_memory(array, np.frombuffer(payload, np.uint8))
         assert not array.flags.writeable
+
+
+def test_a_haptic_pose_of_a_sense_that_knows_no_steps_has_none():
+    sent = msgpack.unpackb(encode(messages.HapticPose(**KNOWN_HAPTIC)))
+    del sent["step"]
+    found = decode(messages.HapticPose, msgpack.packb(sent))
+    np.testing.assert_array_equal(found.step, np.zeros(6))
+    same(decode(messages.HapticPose, encode(found)), found)
 
 
 def test_the_fields_of_a_map_may_come_in_any_order_as_other_libraries_write_them():
