@@ -49,6 +49,11 @@ class SearchSettings:
 
     hidden: float = 0.95
     """Largest hidden share with which a pose is measured where a sure prediction expects it. Chosen."""
+    turning: tuple[float, float] = (0.05, 0.1)
+    """Hidden share from which a roll is off by more than its covariance says, and by how much more [rad]: it is looked for near
+    the prediction. Measured in 30 replays, of limbs that are hidden by a third to two thirds: where a roll is called sure to 12
+    degrees it is off by more than three standard deviations in 2 to 4 % of the pictures, in which limbs turn by 30 to 50 degrees
+    a second. Chosen: twice as much makes covariances too cautious where limbs rest."""
     least_points: float = 3.0
     """Least number of independent points of contour of such a pose. Chosen: where two thirds of a limb are hidden
     6 m away, 3.4 to 3.6 are left in a picture 1280 pixels wide."""

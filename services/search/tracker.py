@@ -398,7 +398,11 @@ class Search:
         self._sharp = min(self._sharp + best.sharp, self.settings.shape_known[1]) if state != "lost" else max(self._sharp - 1, 0)
         if state == "tracking":
             self._has_other_shape = best.shape is not None
-            return self._estimate(best.T, best.covariance, best.overlap, found.hidden, state, T_probable)
+            covariance = best.covariance.copy()
+            if found.hidden > self.settings.turning[0]:
+                axis = best.T[:3, 0]
+                covariance[3:, 3:] += self.settings.turning[1] ** 2 * np.outer(axis, axis)
+            return self._estimate(best.T, covariance, best.overlap, found.hidden, state, T_probable)
         return self._estimate(best.T_searched, self._limits.covariance, best.overlap, found.hidden, state, best.T_searched)
 
     def _shaped(self, seen: Evidence, found: Fit, T_prior: Array, prior: Array) -> Fit:

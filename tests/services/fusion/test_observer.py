@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from penumbra.services.fusion import history
-from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, Estimate, Limits, RefusedMeasurement
+from penumbra.services.fusion.estimate import ACCEPTED, DUPLICATE, FATES, STRAIGHT, Estimate, Limits, RefusedMeasurement, straight
 from penumbra.services.fusion.observer import Bank, ErrorStateObserver
 from penumbra.services.fusion.paper import PaperObserver
 from penumbra.services.fusion.settings import Arm, FusionSettings, Subject
@@ -535,6 +535,20 @@ def test_a_roll_that_is_made_up_does_not_disturb_the_axis(make: type) -> None:
     assert rigid.axis_angle_error(T, estimate.T) < 1e-3
     roll_variance = T[:3, 0] @ estimate.covariance[3:, 3:] @ T[:3, 0]
     assert roll_variance > 0.5 * SPREAD[1] ** 2  # nobody saw it
+
+
+def test_a_turn_that_a_pose_leaves_open_is_bound_to_the_rest_no_farther_than_it_is_straight() -> None:
+    slope = np.array([0.02, -0.1, 0.05, 1.0, 0.0, 0.0])  # of the others by the roll
+    near = np.diag(np.square([0.002, 0.004, 0.003, 0.05, 0.01, 0.02]))
+    vague = near + 1.5**2 * np.outer(slope, slope)
+    found = straight(vague)
+    np.testing.assert_allclose(found[3:, 3:], vague[3:, 3:], atol=1e-12)
+    assert 1.0 / np.linalg.inv(vague)[3, 3] < 0.1**2 and 1.0 / np.linalg.inv(found)[3, 3] > 1.0
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(found)[:3]), np.hypot(np.sqrt(np.diag(near)[:3]), STRAIGHT * np.abs(slope[:3])), rtol=0.1
+    )
+    sure = near + 0.3**2 * np.outer(slope, slope)
+    np.testing.assert_array_equal(straight(sure), sure)
 
 
 # ---- likelihoods that were linearised elsewhere than where they peak

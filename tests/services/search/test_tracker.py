@@ -150,6 +150,17 @@ def test_depth_is_known_worst_and_the_roll_is_lost_with_the_hand(search):
     assert axis @ handless.covariance @ axis > 4.0 * axis @ whole.covariance @ axis
 
 
+def test_a_limb_that_may_turn_behind_something_has_a_roll_that_is_less_certain(search):
+    least, more = search.settings.turning
+    for hidden in (0.0, 0.3):
+        s = scene(5, hidden)
+        assert (s.hidden > least) == (hidden > 0.0)
+        estimate = search.update(s.mask, s.T_start, PRIOR)
+        axis = estimate.T[:3, 0]
+        roll = np.sqrt(axis @ estimate.covariance[3:, 3:] @ axis)
+        assert estimate.state == "tracking" and (roll > more) == (hidden > 0.0)
+
+
 def test_a_round_limb_made_of_facets_does_not_show_its_roll():
     x = np.linspace(-0.13, 0.13, 7)
     vertices, faces = anatomy.loft(np.column_stack([x, 0 * x, 0 * x]), 0.045 - 0.05 * x, 0.045 - 0.05 * x, 18)
