@@ -29,10 +29,12 @@ ARM_PX = (12.0, float(WIDEST_ARM_PX))
 """Width [px] that arms of recordings get."""
 ARM_SHARE = 0.08
 """Width of an arm that a recording without any might show, as a share of its longer side."""
-CLOTHED = 0.35
+CLOTHED = 0.15
 """Share of the sequences of recordings whose arms get other sleeves or gloves."""
-BORROWED = 0.4
+BORROWED = 0.15
 """Share of the sequences of recordings before which the people of another recording are put."""
+COVERED = 0.2
+"""Share of the sequences of recordings that have simulated robots, occluders and people in front."""
 PERSON = (Label.TORSO, Label.UPPER_ARM, Label.FOREARM, Label.HAND)
 """The classes of people."""
 AROUND = {"target": 0.55, "rest": 0.25}
@@ -130,11 +132,11 @@ class Simulated:
 
 class Mixed:
     """Recordings and simulated sequences. `share`: how many of those that are learned from are simulated; before some recordings
-    are the people of others, with what they hold (Ghiasi et al. 2021, arXiv:2012.07177); half have simulated robots and
-    occluders in front, some of these an arm, too. Calibrated and scored on as many of both."""
+    are the people of others, with what they hold (Ghiasi et al. 2021, arXiv:2012.07177); some have simulated robots and
+    occluders in front, half of these an arm, too. Calibrated and scored on as many of both."""
 
-    jitter = 0.3
-    """Jitter of the colours, between that of simulated sequences and that of recordings alone."""
+    jitter = 0.15
+    """Jitter of the colours: photographs are many, and differ themselves."""
     side = VARIETY.size
     count = ENDLESS
 
@@ -166,7 +168,7 @@ class Mixed:
             film = covered(film, self._filmed(rng), (*PERSON, Label.OCCLUDER))
         known = priors.packed(priors.of_labels(film[..., 3], np.random.default_rng([self._seed, 6, index])))
         film = np.concatenate([film, known], axis=-1)
-        if rng.random() < 0.5:
+        if rng.random() < COVERED:
             film = pasted(film, self._simulated[index], rng)
         return np.concatenate([looks.filmed(film[..., :3], rng), film[..., 3:]], axis=-1)
 
