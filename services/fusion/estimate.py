@@ -259,8 +259,8 @@ def stream_of(sense: Sense, message: Any, target: str, cell: Cell) -> str:
 
 
 def straight(covariance: Array) -> Array:
-    """A covariance (6, 6) of a pose in which no turn is bound to the rest farther than over STRAIGHT. What a pose leaves open,
-    the roll of a limb say, changes the others along a line only at first; beyond, it is open and nothing else."""
+    """A pose's covariance (6, 6) in which its least certain turn is bound to the rest no farther than over STRAIGHT. With what a
+    pose leaves open, the roll of a limb say, the rest changes along a line only at first; beyond, it is open and nothing else."""
     variances, axes = np.linalg.eigh(covariance[3:, 3:])
     variance, near = float(variances[-1]), STRAIGHT**2
     if not variance > near:

@@ -18,6 +18,10 @@ moves, as surely as their noise lets them. How fast the offset wanders is learne
 of the limb. The offset is given up where a measurement without it passes the gate, for the sense is right again, and where the
 sense or another one surprises: then the sense is not used until it is right again.
 
+A likelihood that leaves tens of degrees open may peak as far from where it was linearised, as that of a window of the skin does.
+Such a measurement keeps the pose at which that was, and how far `ahead` of it the peak is: taken at the peak, what it knows well
+would be turned as far, and many of them would lead the pose away together.
+
 Three numbers adapt to the innovations, by whether each resembles the one before of the same sense. Those of a wrong sense, beside
 its offset, that resemble each other mean that it runs away: the offset's walk grows. Those of others that resemble each
 other mean that the filter lags behind the limb: the process noise grows, linear and angular each on its own, because otherwise a
