@@ -45,6 +45,12 @@ def test_the_bounds_information_is_that_of_the_full_fields_derivatives(rig: benc
 
 
 @pytest.mark.slow
+def test_the_observer_is_not_sure_of_a_wrong_axis_of_a_limb_that_rests_far_from_the_hull() -> None:
+    """Windows that were taken where their likelihoods peak led its yaw away by 74 degrees: 10 in place of 0.3."""
+    assert bench.resting(bench.Rig("hull"), 4131, 0.125, 2).fused < 1.0
+
+
+@pytest.mark.slow
 def test_the_benchmark_writes_rows_as_promised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "QUICK", bench.Plan(1, 1, 1, 1, 1.2, 1))
     for name, value in (("GAPS", (0.03, 0.10)), ("PADS", (8, 1)), ("RESTING_GAPS", (0.03,)), ("REST_S", 1.5)):
