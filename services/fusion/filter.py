@@ -18,18 +18,14 @@ moves, as surely as their noise lets them. How fast the offset wanders is learne
 of the limb. The offset is given up where a measurement without it passes the gate, for the sense is right again, and where the
 sense or another one surprises: then the sense is not used until it is right again.
 
-A likelihood that leaves tens of degrees open may peak as far from where it was linearised, as that of a window of the skin does.
-Such a measurement keeps the pose at which that was, and how far `ahead` of it the peak is: taken at the peak, what it knows well
-would be turned as far, and many of them would lead the pose away together.
-
 Three numbers adapt to the innovations, by whether each resembles the one before of the same sense. Those of a wrong sense, beside
 its offset, that resemble each other mean that it runs away: the offset's walk grows. Those of others that resemble each
 other mean that the filter lags behind the limb: the process noise grows, linear and angular each on its own, because otherwise a
 limb that turns would let a sense that is wrong about its position pass. Innovations that are too large and do not resemble each
 other mean that the sense is noisier than it says: its covariance grows, and is never less than what it says.
 
-Everything works in place on the records of `records.py`; `history.py` calls `reduce` and `step`. The number of senses is
-that of the records. Functions write what they find to their last arguments.
+Everything works in place on the records of `records.py`; `history.py` calls `step` with what `measurement.py` makes of poses. The
+number of senses is that of the records. Functions write what they find to their last arguments.
 
 Sources: error-state filter on SO(3): Sola, "Quaternion kinematics for the error-state Kalman filter" (2017), arXiv:1711.02508;
 coloured measurement noise by state augmentation: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
@@ -46,6 +42,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from penumbra.services.fusion.measurement import error
 from penumbra.services.fusion.motion import flow, move, transit
 from penumbra.services.fusion.records import MOTION, NEVER, NOBODY, POSE, UNITS
 from penumbra.shared.geometry import so3
@@ -97,63 +94,6 @@ def forget(state):  # type: ignore[no-untyped-def]
         sense.gain, sense.doubt = 0.0, 1.0
         for i in range(POSE):
             sense.bias[i] = 0.0
-
-
-@inner
-def reduce(model, source, stamp_ns, T, information, step, m):  # type: ignore[no-untyped-def]
-    """Writes a pose (4, 4) with its information (6, 6) as the MEASUREMENT m; step (6,): from there to where its likelihood
-    peaks."""
-    m.stamp_ns, m.source = stamp_ns, source
-    for i in range(3):
-        m.p[i] = T[i, 3]
-        for j in range(3):
-            m.R[i, j] = T[i, j]
-    scaled, vectors = np.empty((POSE, POSE)), np.empty((POSE, POSE))
-    for i in range(POSE):
-        for j in range(POSE):
-            scaled[i, j] = 0.5 * (information[i, j] + information[j, i]) * UNITS[i] * UNITS[j]
-    so3.eigen(scaled, POSE, vectors)
-    k = 0
-    for e in range(POSE):
-        if scaled[e, e] > max(model.one.unobserved**-2, 1e-9 * scaled[POSE - 1, POSE - 1]):
-            for i in range(POSE):
-                m.directions[k, i] = vectors[i, e]
-                m.basis[k, i] = vectors[i, e] / UNITS[i]
-            m.sigma[k] = math.sqrt(1.0 / scaled[e, e])
-            m.ahead[k] = so3.dot(m.basis[k], step)
-            k += 1
-    m.rank, m.has_axis, m.slides = k, 0, 0
-    if 0 < k < POSE:
-        m.has_axis = _weakest(m, 3, vectors) < 1e-3
-        for i in range(3):
-            m.axis[i] = vectors[i, 0]
-        m.slides = _weakest(m, 0, vectors) < 1e-3
-
-
-@inner
-def undo(step, T, information):  # type: ignore[no-untyped-def]
-    """Takes a pose (4, 4) and its information (6, 6) back by a step (6,), to where its likelihood was linearised."""
-    back, turn = np.empty(3), np.empty((3, 3))
-    for i in range(3):
-        back[i] = -step[3 + i]
-        T[i, 3] -= step[i]
-    so3.exp(back, turn)
-    so3.turn(turn, T[:, :3], 0)
-    so3.turn(turn, information, 3)
-    so3.turn_columns(turn, information, 3)
-
-
-@inner
-def _weakest(m, first, vectors):  # type: ignore[no-untyped-def]
-    """The smallest eigenvalue of the sum (3, 3) of the outer products of the directions' translations (first 0) or rotations
-    (first 3); writes the eigenvectors."""
-    seen = np.zeros((3, 3))
-    for k in range(m.rank):
-        for i in range(3):
-            for j in range(3):
-                seen[i, j] += m.directions[k, first + i] * m.directions[k, first + j]
-    so3.eigen(seen, 3, vectors)
-    return seen[0, 0]
 
 
 @inner
@@ -427,42 +367,6 @@ def transition(model, now, stamp_ns, F):  # type: ignore[no-untyped-def]
     transit(F, turn, rotation, by)
     for i in range(MOTION, len(F) - POSE):
         F[i, i] = math.exp(-dt / model.senses[(i - MOTION) // POSE].time_constant)
-
-
-@inner
-def error(p, R, m, value, derivative):  # type: ignore[no-untyped-def]
-    """The error of a pose p (3,), R (3, 3) along the directions of a measurement (k,), and its derivative (k, 6) by the pose.
-
-    What is not observed belongs to the limb and turns with it: the roll about its axis, the way along it. Were the directions
-    those at the measured pose, their noise would let information leak into what nobody observes; so they are turned to the
-    pose in question. A roll that is made up, however large, says nothing (swing-twist decomposition).
-    """
-    turn, rotation, jacobian, slide = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    back = np.empty(3)
-    so3.product_transposed(R, m.R, turn)
-    if m.has_axis:
-        so3.turned(turn, m.axis, back)
-        so3.swing(m.axis, back, rotation)
-    else:
-        so3.log(turn, rotation)
-    for i in range(3):
-        back[i] = -rotation[i]
-    if m.has_axis:
-        so3.exp(back, jacobian)
-    else:
-        so3.left_jacobian_inverse(rotation, jacobian)
-    if m.slides:
-        so3.exp(back, slide)
-    for k in range(m.rank):
-        value[k] = -m.ahead[k]
-        for i in range(3):
-            derivative[k, i] = 0.0 if m.slides else m.basis[k, i]
-            derivative[k, 3 + i] = 0.0
-            for j in range(3):
-                if m.slides:
-                    derivative[k, i] += m.basis[k, j] * slide[j, i]
-                derivative[k, 3 + i] += m.basis[k, 3 + j] * jacobian[j, i]
-            value[k] += derivative[k, i] * (p[i] - m.p[i]) + m.basis[k, 3 + i] * rotation[i]
 
 
 @inner

@@ -29,7 +29,8 @@ from penumbra.services.fusion.estimate import (
     fault,
     state_of,
 )
-from penumbra.services.fusion.filter import Model, State, forget, is_contested, reduce, spread, step, undo
+from penumbra.services.fusion.filter import Model, State, forget, is_contested, spread, step
+from penumbra.services.fusion.measurement import reduce, undo
 from penumbra.services.fusion.motion import move, within_reach
 from penumbra.services.fusion.records import (
     ESTIMATE,
