@@ -66,6 +66,9 @@ class Data(Protocol):
         """How many sequences there are to choose from."""
 
     def __getitem__(self, index: int, /) -> Any: ...
+    def plain(self, index: int, /) -> Any:
+        """A sequence without anything put before it, which the encoder learns from while it is alone."""
+
     def close(self) -> None:
         """Make no more."""
 
@@ -100,6 +103,10 @@ class Simulated:
     def __getitem__(self, index: int) -> NDArray[np.uint8]:
         """Red, green, blue, class and priors (frames, h, w, 6) of a sequence."""
         return self._kept(index)
+
+    def plain(self, index: int) -> NDArray[np.uint8]:
+        """The same one: it is whole as it is."""
+        return self[index]
 
     def _rendered(self, index: int) -> NDArray[np.uint8]:
         sequence = self._learned(self._seed, index)
@@ -172,10 +179,17 @@ class Mixed:
             film = pasted(film, self._simulated[index], rng)
         return np.concatenate([looks.filmed(film[..., :3], rng), film[..., 3:]], axis=-1)
 
+    def plain(self, index: int) -> NDArray[np.uint8]:
+        """One frame of a recording (1, h, w, 4), turned and moved."""
+        return self._shown(np.random.default_rng([self._seed, 9, index]), 1)
+
     def _filmed(self, rng: np.random.Generator) -> NDArray[np.uint8]:
         """A drawn recording as a camera shows it (frames, h, w, 4), some with other clothes."""
-        film = moved(self._recorded[int(rng.integers(self._recorded.count))], VARIETY.frames, VARIETY.size, rng)
+        film = self._shown(rng, VARIETY.frames)
         return clothes.worn(film, rng) if rng.random() < CLOTHED else film
+
+    def _shown(self, rng: np.random.Generator, frames: int) -> NDArray[np.uint8]:
+        return moved(self._recorded[int(rng.integers(self._recorded.count))], frames, VARIETY.size, rng)
 
     def close(self) -> None:
         """Nothing is open."""

@@ -153,6 +153,10 @@ class Recordings:
         turn, folder = divmod(index, len(self._train))
         return self._train[folder][turn % len(self._train[folder])]
 
+    def plain(self, index: int) -> Recorded:
+        """The same one: it is whole as it is."""
+        return self[index]
+
     def close(self) -> None:
         """Nothing is open."""
 

@@ -43,9 +43,10 @@ class Schedule:
     """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`;
     `encoder_share`: of that rate, at which the encoder learns, which knows much already; `frames`: that a step plays, few, as
     many sequences teach more than long ones; `alone`: steps, from the first one on, in which the encoder learns masks by itself,
-    at half of a step's cost; `patches`: (from which progress on, pixels a side, sequences a batch);
-    `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's norm; `averaging`: of the
-    weights that are exported; `seen`: (frames that the state has seen before those that are learned from, how often)."""
+    of as many single frames, each of another sequence, at half of a step's cost; `patches`: (from which progress on, pixels a
+    side, sequences a batch); `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's
+    norm; `averaging`: of the weights that are exported; `seen`: (frames that the state has seen before those that are learned
+    from, how often)."""
 
     peak_rate: float = 2e-3
     encoder_share: float = 0.2
@@ -98,15 +99,16 @@ class Trainer(training.Trainer[PredNet, Data]):
         """One step of gradient descent; returns the parts of the loss."""
         size, batch = self.schedule.patch(progress)
         size = min(size, data.side)
-        rng = np.random.default_rng([self.seed, 1, self.step])
-        chosen = [data[int(i)] for i in rng.integers(data.count, size=batch)]
-        images, labels, known = draw_batch(chosen, self.schedule.frames, size, rng, data.jitter)
+        rng, schedule = np.random.default_rng([self.seed, 1, self.step]), self.schedule
+        is_alone = self.step < schedule.alone
+        draw, count, frames = (data.plain, batch * schedule.frames, 1) if is_alone else (data.__getitem__, batch, schedule.frames)
+        chosen = [draw(int(i)) for i in rng.integers(data.count, size=count)]
+        images, labels, known = draw_batch(chosen, frames, size, rng, data.jitter)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
-            if self.step < self.schedule.alone:
+            if is_alone:
                 parts = self._masks(self.net.glimpsed(images.flatten(0, 1)).float(), labels.flatten(0, 1))
             else:
-                parts = self._losses(images, labels, known, self.schedule.before(rng))
-        schedule = self.schedule
+                parts = self._losses(images, labels, known, schedule.before(rng))
         weights = {"focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
         total = parts["dice"] + sum(weight * parts[name] for name, weight in weights.items() if name in parts)
         rate = schedule.rate(progress, self.step - self.warm_from)
@@ -247,7 +249,7 @@ def _named(card: Mapping[str, Any]) -> dict[str, Any]:
         type=flags.positive,
         metavar="N",
         show_default="0",
-        help="the encoder learns masks by itself in the first N steps, as far as it can; then with the network",
+        help="the encoder learns by itself in the first N steps, of recordings with nothing put before them; then all learns",
     ),
     flags.Option("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate"),
     flags.Option(
