@@ -135,6 +135,9 @@ def test_recordings_and_simulated_sequences_are_mixed_by_their_share_and_both_ar
     simulated.count = data.ENDLESS
     share = np.mean([(mixed[index][..., 3] == Label.TORSO).all() for index in range(30)])
     assert 0.2 < share < 0.8  # 30 draws of a half
+    plain = [mixed.plain(index) for index in range(30)]
+    assert all(film.shape == (1, data.VARIETY.size, data.VARIETY.size, 4) for film in plain)
+    assert set(np.unique([film[..., 3] for film in plain])) == {Label.BACKGROUND, Label.FOREARM, UNLABELLED}
     for kept in (list(mixed.calibration), list(mixed.held_out)):
         is_recorded = [bool(np.isnan(sequence.hidden).all()) for sequence in kept]
         assert is_recorded == [False, False, True, True]

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from penumbra.services.posecnn import estimator
 from penumbra.services.segmentation import encoder, inference, model, prednet
@@ -330,6 +331,23 @@ def test_the_encoder_learns_masks_alone_before_the_network_learns_with_it(data):
 
     assert moved_by_a_step() == moved_by_a_step() == {True}
     assert moved_by_a_step() == {True, False}
+
+
+def test_the_encoder_alone_learns_of_as_many_plain_pictures_as_a_step_has_frames():
+    class Plain(Simulated):
+        """Sequences, of which the plain ones that were asked for are known."""
+
+        drawn = 0
+
+        def plain(self, index: int) -> NDArray[np.uint8]:
+            self.drawn += 1
+            return super().plain(index)
+
+    plain = Plain(1, learned=lambda seed, index: sequences.render(seed, index, TINY), most=2)
+    schedule = train.Schedule(alone=1, patches=((0.0, 64, 2),), frames=3)
+    trainer = train.Trainer(SMALL, schedule, seed=1).extended(has_priors=False, pretrained=prednet.Encoder().state_dict())
+    trainer.train_step(plain, 0.1)
+    assert plain.drawn == 2 * schedule.frames
 
 
 def test_training_may_start_from_weights_and_its_card_names_them(tmp_path):
