@@ -236,8 +236,8 @@ def test_clones_become_folders_to_train_on_and_what_is_missing_is_named(sources,
     assert not recordings.read_mask(scenes / "masks" / "desk.png").any()
     image, mask = seen(scenes / "images" / "white-0.jpg"), recordings.read_mask(scenes / "masks" / "white-0.png")
     assert (mask == Label.HAND).sum() > 600 and image.min(2).max() < 180, "no white is left"
-    (made_of,) = recordings.Recordings([scenes], 1).origins
-    assert made_of["folder"] == "scenes" and made_of["sequences"] > 0
+    (made_of,) = recordings.Recordings([scenes, scenes], 1).origins
+    assert made_of["folder"] == "scenes" and made_of["sequences"] > 0 and made_of["times"] == 2
     assert {one["repository"]: one["licence"] for one in made_of["sources"]}.keys() == {"somebody/pictures", photographs.HANDS}
     before = {path.name: path.read_bytes() for path in scenes.rglob("*.*")}
     assert photographs.main(call) == 0 and before == {path.name: path.read_bytes() for path in scenes.rglob("*.*")}

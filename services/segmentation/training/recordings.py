@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,9 +139,10 @@ class Recordings:
             self._train.append([pieces[i] for i in order[2 * tenth :]])
         self.count = len(folders) * max(len(pieces) for pieces in self._train)
         self.side = min(piece.side for piece in itertools.chain(self.calibration, self.held_out, *self._train))
+        times = Counter(folders)
         self.origins = [
-            {"folder": folder.name, "sequences": len(pieces), "sources": _sources(folder)}
-            for folder, pieces in zip(folders, self._train, strict=True)
+            {"folder": folder.name, "sequences": len(pieces), "times": times[folder], "sources": _sources(folder)}
+            for folder, pieces in dict(zip(folders, self._train, strict=True)).items()
         ]
         names = ", ".join(folder.name for folder in folders)
         self.sources = (
