@@ -18,7 +18,7 @@ from rich.progress import track
 from penumbra.services import flags
 from penumbra.services.segmentation import inference
 from penumbra.shared.contract.labels import COLOURS, TARGET_LABELS, Label
-from penumbra.shared.perception.lookout import STEP, Window, whole_frame
+from penumbra.shared.perception.lookout import STEP, Window, reduced, whole_frame
 
 SETTLE = 4
 """Number of times that a picture without a predecessor is shown to the network. Chosen, not measured."""
@@ -134,15 +134,12 @@ def frames(source: cv2.VideoCapture) -> Iterator[NDArray[np.uint8]]:
 
 
 def whole_mask(segmenter: inference.Segmenter, image: NDArray[np.uint8], scale: int | None, stamp_ns: int) -> NDArray[np.uint8]:
-    """Classes (h, w) of a whole image (h, w, 3), looked at as the service does where it knows of no pose; what is left over at
-    the edges is background. Raises FileError where the image is too small for the network."""
+    """Classes (h, w) of a whole image (h, w, 3), looked at as the service does where it knows of no pose; pixels left over at the
+    edges, less than the scale, are background. Raises FileError where the image is too small for the network."""
     height, width = image.shape[:2]
-    if scale is None:
-        window = whole_frame(Window(0, 0, width, height))
-    else:
-        window = Window(0, 0, width // (STEP * scale) * STEP, height // (STEP * scale) * STEP, scale)
-    if not (0 < window.right <= width and 0 < window.bottom <= height):
-        least = STEP * window.scale
+    picture = Window(0, 0, width, height)
+    window = whole_frame(picture) if scale is None else reduced(picture, scale)
+    if min(width, height) < (least := STEP * window.scale):
         raise FileError(f"expected a picture of at least {least} x {least} pixels, got {width} x {height}")
     labels = segmenter(image, window, stamp_ns)
     mask = np.full((height, width), Label.BACKGROUND, np.uint8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ class Segmenter:
 
     def __init__(self, network: Model, offset: float = 0.0, precision: Precision | None = None, has_colours: bool = True):
         self._compiled = Compiled(network, precision or ("bf16" if processor.has_bfloat16() else "f32"))
-        self._strides, self._offset = network.settings.strides, np.float32(offset)
+        self._strides, self._multiple, self._offset = network.settings.strides, network.settings.multiple, np.float32(offset)
         self._has_priors = network.settings.priors > 0
         self._colours = Colours() if has_colours else None
         self._state: State | None = None
@@ -55,16 +56,20 @@ class Segmenter:
         priors (window.height, window.width, 2): what is known of the window beside the picture (`model.PRIORS`), None where
         nothing is.
 
-        The state is forgotten where the scale changes, and with the colours where time stands, goes back or jumps by more than
-        MAX_GAP_S.
+        The network sees what it can take: a window of another size is continued at the right and lower edge. The state is
+        forgotten where the scale changes, and with the colours where time stands, goes back or jumps by more than MAX_GAP_S.
         Raises ValueError where the window does not lie in the image.
         """
         picture, elapsed_s = cut(image, window), (stamp_ns - self._stamp_ns) * 1e-9
         if not 0.0 < elapsed_s <= MAX_GAP_S:
             self._forget()
             elapsed_s = 0.0  # of what is remembered, nothing
-        logits, self._state = self._compiled(picture, self._remembered(window), priors)
-        self._window, self._stamp_ns = window, stamp_ns
+        seen = self._seen(window)
+        known = None if priors is None else _continued(priors, seen)
+        logits, self._state = self._compiled(_continued(picture, seen), self._remembered(seen), known)
+        self._window, self._stamp_ns = seen, stamp_ns
+        if seen != window:
+            logits = np.ascontiguousarray(logits[:, : window.height, : window.width])
         for label in TARGET_LABELS:
             logits[label] += self._offset
         if self._colours is None:
@@ -81,11 +86,17 @@ class Segmenter:
 
     def prepare(self, *windows: Window) -> None:
         """Make ready, in the background, for windows of these sizes, one after another."""
-        self._compiled.prepare([(window.height, window.width) for window in windows])
+        self._compiled.prepare([(seen.height, seen.width) for seen in map(self._seen, windows)])
 
     def is_prepared(self, window: Window) -> bool:
         """Whether a window of this size waits for nothing."""
-        return self._compiled.is_prepared((window.height, window.width))
+        seen = self._seen(window)
+        return self._compiled.is_prepared((seen.height, seen.width))
+
+    def _seen(self, window: Window) -> Window:
+        """What the network is shown for a window: one of a size that it can take."""
+        height, width = (-(-n // self._multiple) * self._multiple for n in (window.height, window.width))
+        return replace(window, height=height, width=width)
 
     def _forget(self) -> None:
         self._state = self._window = None
@@ -98,6 +109,12 @@ class Segmenter:
         if self._window == window:
             return self._state
         return shift_state(self._state, self._strides, self._window, window)
+
+
+def _continued(picture: NDArray[np.float32], window: Window) -> NDArray[np.float32]:
+    """A picture (h, w, channels) as large as a window that begins where it does, its last pixels repeated."""
+    below, beside = window.height - picture.shape[0], window.width - picture.shape[1]
+    return np.pad(picture, ((0, below), (0, beside), (0, 0)), "edge") if below or beside else picture
 
 
 def cut(image: NDArray[np.uint8], window: Window) -> NDArray[np.float32]:

@@ -16,7 +16,8 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.perception.prediction import predict
 
 STEP = 16
-"""Windows lie and measure in multiples of this many of their own pixels: the stride of the coarsest of five layers."""
+"""Windows begin at multiples of this many of their own pixels, the stride of the coarsest of five layers. Their sides are
+multiples of it, too, unless they end where the picture does."""
 SIZE_STEP = 32
 """Sizes are rounded up to this, so that the size seldom changes while the target turns."""
 MAX_PIXELS = 224 * 224
@@ -77,12 +78,16 @@ class Sized(Protocol):
 
 
 def whole_frame(camera: Sized) -> Window:
-    """The window of (nearly) the whole frame: what is left over at the right and lower edge is less than STEP pixels."""
+    """The window of the whole frame, at the scale at which it is looked at."""
     scale = 1
     while camera.width * camera.height > MAX_PIXELS_WIDE * scale * scale:
         scale *= 2
-    unit = STEP * scale
-    return Window(0, 0, max(camera.width // unit, 1) * STEP, max(camera.height // unit, 1) * STEP, scale)
+    return reduced(camera, scale)
+
+
+def reduced(picture: Sized, scale: int) -> Window:
+    """The window of a whole picture at a scale, but for less than `scale` pixels at the right and lower edge."""
+    return Window(0, 0, max(picture.width // scale, 1), max(picture.height // scale, 1), scale)
 
 
 class Lookout:
@@ -192,17 +197,21 @@ def window_of(
     scale = 1
     while np.prod(np.maximum((high - low) / scale, 2 * STEP)) > most or arm_px > WIDEST_ARM_PX * scale:
         scale *= 2
-    if previous is not None and previous.scale == scale and _fits(previous, low, high):
+    size = size // scale * scale  # less than a pixel of the window is left over
+    if previous is not None and previous.scale == scale and _fits(previous, low, np.minimum(high, size - 1.0)):
         return previous
     unit = STEP * scale
     limit = np.maximum(size // unit * STEP, STEP)
     extent = np.minimum(np.ceil((high - low) / (scale * SIZE_STEP)).astype(int) * SIZE_STEP, limit)
     if previous is not None and previous.scale == scale:
-        old = np.array([previous.width, previous.height])
+        old = np.array([previous.width, previous.height]) // STEP * STEP
         extent = np.where((old >= extent) & (old <= extent + SIZE_STEP), old, extent)
     middle = (low + high) / 2.0
-    x0, y0 = np.clip(np.round((middle - extent * scale / 2.0) / unit).astype(int), 0, (limit - extent) // STEP) * unit
-    return Window(int(x0), int(y0), int(extent[0]), int(extent[1]), scale)
+    first = np.clip(np.round((middle - extent * scale / 2.0) / unit).astype(int), 0, (limit - extent) // STEP) * STEP
+    left = size // scale - first
+    width, height = np.where(left - extent < STEP, left, extent).tolist()
+    x0, y0 = (first * scale).tolist()
+    return Window(x0, y0, width, height, scale)
 
 
 def _fits(window: Window, low: Array, high: Array) -> bool:

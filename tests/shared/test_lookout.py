@@ -9,7 +9,16 @@ from penumbra.shared.body import anatomy
 from penumbra.shared.cell import description
 from penumbra.shared.contract.messages import FusedPose
 from penumbra.shared.geometry import rigid
-from penumbra.shared.perception.lookout import MAX_PIXELS_WIDE, Lookout, Window, corners_of, whole_frame, window_around
+from penumbra.shared.perception.lookout import (
+    MAX_PIXELS_WIDE,
+    STEP,
+    Lookout,
+    Window,
+    corners_of,
+    whole_frame,
+    window_around,
+    window_of,
+)
 from penumbra.tests.support.cells import derive
 
 S = 1_000_000_000
@@ -28,6 +37,25 @@ def test_the_window_holds_the_whole_target_and_stays_while_it_does():
     assert window.x0 % 8 == window.y0 % 8 == window.width % 8 == window.height % 8 == 0
     nudged = rigid.perturb(T, np.array([0.005, 0, 0, 0, 0, 0]))
     assert window_around(camera, [(nudged, corners)], window) == window
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_window_lies_in_a_picture_of_any_size_and_reaches_its_edges_where_a_target_does(seed):
+    rng = np.random.default_rng(seed)
+    picture = Window(0, 0, *rng.integers(100, 2000, size=2).tolist())
+    size, previous = np.array([picture.width, picture.height]), None
+    for _ in range(50):  # each from where the one before has looked
+        low, high = np.sort(rng.uniform(-0.2, 1.2, (2, 2)) * size, axis=0)
+        window = window_of(picture, low, high, float(rng.uniform(1.0, 0.3 * size.min())), previous)
+        if window is None:
+            assert np.any(np.minimum(high, size - 1.0) - np.maximum(low, 0.0) < 2.0)
+            continue
+        unit, ends = STEP * window.scale, np.array([window.right, window.bottom])
+        assert window.x0 % unit == window.y0 % unit == 0 and (ends <= size).all()
+        begins, at_edge = np.array([window.x0, window.y0]), np.array([low <= 0.0, high >= size])
+        assert (np.where(at_edge[0], begins == 0, begins <= low + unit / 2.0)).all(), "rounded to the nearest multiple"
+        assert (np.where(at_edge[1], ends > size - window.scale, ends >= high - unit / 2.0)).all()
+        previous = window
 
 
 def test_a_target_out_of_the_picture_has_no_window_and_the_whole_frame_is_coarse():

@@ -29,7 +29,7 @@ from penumbra.services.segmentation.inference import cut
 from penumbra.services.segmentation.training.models import FOLDER
 from penumbra.services.segmentation.training.recordings import PIECE
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
-from penumbra.shared.perception import landmarks
+from penumbra.shared.perception import landmarks, lookout
 from penumbra.shared.perception.landmarks import Hand, Landmarks, Points
 from penumbra.shared.perception.limbs import FOREARM, Limb, find, limb_of
 from penumbra.shared.perception.lookout import ARM_M, MARGIN_M, Window, window_of
@@ -362,9 +362,8 @@ def scale(picture: Window, limbs: Iterable[Limb]) -> int:
 
 def reduced(image: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
     """An image (h, w, 3) as the service sees it at a scale."""
-    return np.asarray(
-        np.round(255.0 * cut(image, Window(0, 0, image.shape[1] // scale, image.shape[0] // scale, scale))), np.uint8
-    )
+    window = lookout.reduced(Window(0, 0, image.shape[1], image.shape[0]), scale)
+    return np.asarray(np.round(255.0 * cut(image, window)), np.uint8)
 
 
 def labelled(models: Landmarks, path: Path, every: int) -> Iterator[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]]:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -44,6 +45,24 @@ def test_a_segmenter_forgets_when_time_jumps_and_remembers_when_it_flows():
         np.testing.assert_array_equal(first(image, window, 10**9 - 3600 * 10**9), start)
     with pytest.raises(ValueError, match="expected a window inside the image of 64 x 64"):
         first(image, Window(8, 0, 64, 64), 10**9 + 10**10)
+
+
+def test_a_window_that_the_network_cannot_take_is_continued_at_its_edges_and_its_state_kept():
+    net = prednet.stored(PredNet(replace(SMALL, priors=2)).eval())
+    rng = np.random.default_rng(0)
+    images, priors = rng.integers(0, 255, (3, 70, 90, 3), dtype=np.uint8), rng.uniform(-1.0, 1.0, (70, 90, 2)).astype(np.float32)
+    window, whole = Window(0, 0, 90, 70), Window(0, 0, 96, 72)
+    ours, theirs = (inference.Segmenter(net, precision="f32", has_colours=False) for _ in range(2))
+    for t, image in enumerate(images):
+        found = ours(image, window, 10**9 + t * 50_000_000, priors)
+        continued = (np.pad(of, ((0, 2), (0, 6), (0, 0)), "edge") for of in (image, priors))
+        wanted = theirs(next(continued), whole, 10**9 + t * 50_000_000, next(continued))
+        assert found.shape == (70, 90)
+        np.testing.assert_array_equal(found, wanted[:70, :90])
+    moved = ours(images[0], Window(8, 0, 82, 70), 10**9 + 3 * 50_000_000)
+    assert moved.shape == (70, 82)
+    ours.prepare(window)
+    wait_for(lambda: ours.is_prepared(window), 20.0, "a compiled window")
 
 
 @pytest.mark.parametrize(
