@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 
 class Data(Protocol):
@@ -65,10 +66,9 @@ class Trainer(ABC, Generic[N, D]):
         self.optimizer.step()
         self.step += 1
         keep = min(averaging, self.step / (self.step + 10.0))
-        with torch.no_grad():
-            for mean, value in zip(self.average.state_dict().values(), self.net.state_dict().values(), strict=True):
-                if mean.is_floating_point():
-                    mean.lerp_(value, 1.0 - keep)
+        pairs = zip(self.average.state_dict().values(), self.net.state_dict().values(), strict=True)
+        means, values = zip(*((mean, value) for mean, value in pairs if mean.is_floating_point()), strict=True)
+        get_ema_multi_avg_fn(keep)(means, values, None)
 
     def save(self, path: Path, is_compact: bool = False) -> None:
         """Writes a checkpoint from which `restore` goes on: exactly, or, `is_compact`, of a quarter of the size, in half
@@ -96,7 +96,7 @@ class Trainer(ABC, Generic[N, D]):
     @classmethod
     def restore(cls, path: Path, schedule: Any) -> Self:
         """The trainer of a checkpoint, exact or compact; network and seed are the checkpoint's."""
-        content = torch.load(path, weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
         trainer = cls(cls.SETTINGS(**content["settings"]), schedule, content["seed"])  # type: ignore[call-arg]
         trainer.net.load_state_dict(content["net"])
         trainer.average.load_state_dict(content["average"])

@@ -17,14 +17,17 @@ has learned to use them.
 from __future__ import annotations
 
 import datetime
+import itertools
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
+from torch.utils.data import DataLoader, Dataset
 
 from penumbra.services import flags
 from penumbra.services.segmentation import inference, prednet
@@ -43,8 +46,8 @@ class Schedule:
     """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`;
     `encoder_share`: of that rate, at which the encoder learns, which knows much already; `frames`: that a step plays, few, as
     many sequences teach more than long ones; `alone`: steps, from the first one on, in which the encoder learns masks by itself,
-    of as many single frames, each of another sequence, at half of a step's cost; `patches`: (from which progress on, pixels a
-    side, sequences a batch); `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's
+    of as many single frames, each of another sequence, at half of a step's cost; `beside`: such frames that it also learns from
+    in each later step, as a share of that step's; `patches`: (from which progress on, pixels a side, sequences a batch); `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's
     norm; `averaging`: of the weights that are exported; `seen`: (frames that the state has seen before those that are learned
     from, how often)."""
 
@@ -54,6 +57,7 @@ class Schedule:
     cool_down: float = 0.4
     frames: int = 2
     alone: int = 0
+    beside: float = 0.0
     patches: tuple[tuple[float, int, int], ...] = ((0.0, 128, 10), (0.6, 160, 6))
     error_weight: float = 0.3
     focal_weight: float = 5.0
@@ -75,6 +79,47 @@ class Schedule:
         """Pixels a side and sequences a batch at a progress."""
         return next((size, batch) for start, size, batch in reversed(self.patches) if progress >= start)
 
+    def drawn(self, step: int, progress: float) -> Drawn:
+        """What a step at a progress learns from."""
+        size, batch = self.patch(progress)
+        frames = batch * self.frames
+        if step < self.alone:
+            return Drawn(step, size, sequences=0, frames=self.frames, plain=frames)
+        return Drawn(step, size, sequences=batch, frames=self.frames, plain=round(self.beside * frames))
+
+
+class Drawn(NamedTuple):
+    """What a step learns from: patches of `size` pixels a side of so many sequences with `frames` each, and of so many plain
+    frames."""
+
+    step: int
+    size: int
+    sequences: int
+    frames: int
+    plain: int
+
+
+Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+"""Of `draw_batch`."""
+
+
+class Batches(Dataset[tuple[Batch | None, Batch | None]]):
+    """What steps learn from, drawn from data: of sequences, and of plain frames."""
+
+    def __init__(self, data: Data, seed: int):
+        self.data, self._seed = data, seed
+
+    def __getitem__(self, drawn: Drawn) -> tuple[Batch | None, Batch | None]:
+        rng, data = np.random.default_rng([self._seed, 1, drawn.step]), self.data
+        size = min(drawn.size, data.side)
+        sequences, plain = (
+            draw_batch((draw(int(i)) for i in rng.integers(data.count, size=count)), frames, size, rng, data.jitter)
+            if count
+            else None
+            for draw, count, frames in ((data.__getitem__, drawn.sequences, drawn.frames), (data.plain, drawn.plain, 1))
+        )
+        return sequences, plain
+
 
 class Trainer(training.Trainer[PredNet, Data]):
     """PredNet being trained."""
@@ -93,27 +138,63 @@ class Trainer(training.Trainer[PredNet, Data]):
         if of_encoder:
             groups.append({"params": of_encoder, "share": schedule.encoder_share})
         super().__init__(settings, schedule, seed, net, torch.optim.Adam(groups, betas=(0.9, 0.98)))
-        self._half = processor.has_bfloat16()
+        self.device, self.workers = torch.device("cpu"), 0
+        self._progress = 0.0
+        self._batches: tuple[Data, Iterator[Any]] | None = None
+
+    def place(self, device: torch.device, workers: int) -> None:
+        """The network on a device, and so many processes that draw what the next steps learn from; with 0 each step draws."""
+        for net in (self.net, self.average):
+            net.to(device)
+        self.optimizer.load_state_dict(self.optimizer.state_dict())  # moves to where the weights are
+        self.device, self.workers = device, workers
 
     def train_step(self, data: Data, progress: float) -> dict[str, float]:
         """One step of gradient descent; returns the parts of the loss."""
-        size, batch = self.schedule.patch(progress)
-        size = min(size, data.side)
-        rng, schedule = np.random.default_rng([self.seed, 1, self.step]), self.schedule
-        is_alone = self.step < schedule.alone
-        draw, count, frames = (data.plain, batch * schedule.frames, 1) if is_alone else (data.__getitem__, batch, schedule.frames)
-        chosen = [draw(int(i)) for i in rng.integers(data.count, size=count)]
-        images, labels, known = draw_batch(chosen, frames, size, rng, data.jitter)
-        with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
-            if is_alone:
-                parts = self._masks(self.net.glimpsed(images.flatten(0, 1)).float(), labels.flatten(0, 1))
-            else:
-                parts = self._losses(images, labels, known, schedule.before(rng))
-        weights = {"focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
-        total = parts["dice"] + sum(weight * parts[name] for name, weight in weights.items() if name in parts)
+        self._progress = progress
+        if self._batches is None or self._batches[0] is not data:
+            self._batches = data, self._coming(data)
+        sequences, plain = next(self._batches[1])
+        schedule, parts = self.schedule, {}
+        weights = {"dice": 1.0, "focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
+        total = torch.zeros((), device=self.device)
+        is_half = self.device.type != "cpu" or processor.has_bfloat16()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=is_half):
+            if sequences is not None:
+                before = schedule.before(np.random.default_rng([self.seed, 2, self.step]))
+                parts |= self._losses(*self._here(sequences), before)
+            if plain is not None:
+                images, labels, _ = self._here(plain)
+                of_plain = self._masks(self.net.glimpsed(images.flatten(0, 1)).float(), labels.flatten(0, 1))
+                parts |= {f"plain {name}": value for name, value in of_plain.items()}
+        for name, value in parts.items():
+            total = total + weights[name.removeprefix("plain ")] * value
         rate = schedule.rate(progress, self.step - self.warm_from)
         self.descend(total, rate, schedule.clip, schedule.averaging)
-        return {name: float(value.detach()) for name, value in parts.items()} | {"total": float(total.detach())}
+        values = torch.stack([*parts.values(), total]).tolist()
+        return dict(zip((*parts, "total"), values, strict=True))
+
+    def _coming(self, data: Data) -> Iterator[Any]:
+        """What this step and those after it learn from."""
+
+        def following() -> Iterator[Drawn]:
+            for step in itertools.count(self.step):
+                yield self.schedule.drawn(step, self._progress * step / self.step if self.step else 0.0)
+
+        return iter(
+            DataLoader(
+                Batches(data, self.seed),
+                batch_size=None,
+                sampler=following(),
+                num_workers=self.workers,
+                pin_memory=self.device.type == "cuda",
+                worker_init_fn=_alone_on_a_core,
+            )
+        )
+
+    def _here(self, batch: Batch) -> Batch:
+        images, labels, known = (part.to(self.device, non_blocking=True) for part in batch)
+        return images, labels, known
 
     def _losses(self, images: torch.Tensor, labels: torch.Tensor, known: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
         """images (batch, frames, 3, h, w) in [0, 1], labels (batch, frames, h, w), known: priors (batch, frames, 2, h, w), for a
@@ -184,6 +265,10 @@ class Trainer(training.Trainer[PredNet, Data]):
         return trainer
 
 
+def _alone_on_a_core(_: int) -> None:
+    cv2.setNumThreads(0)  # as many threads as cores, in as many processes, only wait for each other
+
+
 def mean(net: PredNet, others: Sequence[PredNet]) -> PredNet:
     """The network whose weights are the mean of those of all. Raises ValueError where they are not of one form."""
     for other in others:
@@ -198,7 +283,7 @@ def mean(net: PredNet, others: Sequence[PredNet]) -> PredNet:
 def export(trainer: Trainer, out: Path, data: Data, others: Sequence[tuple[PredNet, dict[str, Any]]] = ()) -> dict[str, Any]:
     """Calibrate and score the averaged weights, or their mean with those of other networks with cards, on held-out sequences, and
     write them with their card; returns the card. Raises ValueError as `mean`."""
-    net = mean(trainer.average, [other for other, _ in others])
+    net = mean(trainer.average.cpu(), [other for other, _ in others])
     offset, calibrated = calibrate(net, data.calibration)
     card = {
         "seed": trainer.seed,
@@ -226,6 +311,14 @@ def _named(card: Mapping[str, Any]) -> dict[str, Any]:
     return named | {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
 
 
+def _device(text: str) -> torch.device:
+    try:
+        return torch.empty(0, device=text).device
+    except (RuntimeError, AssertionError) as error:
+        there = ", ".join(["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))])
+        raise ValueError(f"expected a device that torch has here ({there}), got {text!r}: {error}") from None
+
+
 @flags.command(
     "segmentation train",
     "Trains the segmentation network on simulated sequences, on your own frames and masks, or both.\n\n"
@@ -250,6 +343,13 @@ def _named(card: Mapping[str, Any]) -> dict[str, Any]:
         metavar="N",
         show_default="0",
         help="the encoder learns by itself in the first N steps, of recordings with nothing put before them; then all learns",
+    ),
+    flags.Option(
+        "--beside",
+        type=flags.above_zero,
+        metavar="SHARE",
+        show_default="0",
+        help="in each later step, too, the encoder learns by itself from so many single frames, as a share of the step's",
     ),
     flags.Option("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate"),
     flags.Option(
@@ -291,11 +391,23 @@ def _named(card: Mapping[str, Any]) -> dict[str, Any]:
     flags.Option(
         "--held-out", type=flags.positive, default=60, help="simulated sequences for calibration, and as many for the score"
     ),
+    flags.Option("--device", type=_device, default="cpu", help="that the network is on, as torch names it: cuda, say"),
+    flags.Option(
+        "--workers",
+        type=flags.natural,
+        default=0,
+        metavar="N",
+        help="other processes that draw what is learned from; their time is not counted",
+    ),
+    flags.Option(
+        "--times", type=flags.positive, default=1, metavar="N", help="as many sequences a step, where a device has room for them"
+    ),
     example="penumbra segmentation train --data recordings --start --minutes 60",
 )
 def main(options: flags.Options) -> int:
     """Trains, then writes weights and card."""
-    schedule = Schedule(peak_rate=options.rate, alone=options.alone or 0)
+    patches = tuple((start, size, batch * options.times) for start, size, batch in Schedule.patches)
+    schedule = Schedule(peak_rate=options.rate, alone=options.alone or 0, beside=options.beside or 0.0, patches=patches)
     if options.error_weight is not None:
         schedule = replace(schedule, error_weight=options.error_weight)
     if checkpoint := training.begun(options):
@@ -334,6 +446,7 @@ def main(options: flags.Options) -> int:
         print(f"penumbra segmentation train: {error}", file=sys.stderr)
         return 2
     out = options.out or (Path("segmentation.npz") if options.data else inference.WEIGHTS)
+    trainer.place(options.device, options.workers)
     if not training.complete(trainer, data, options):
         return 130
     card = export(trainer, out, data, others)
