@@ -35,7 +35,7 @@ def target_dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
     which little is visible weighs as much as another. Shapes as for `dice`."""
     target = list(TARGET_LABELS)
     probability = logits.softmax(1)[:, target].sum(1) * (labels != UNLABELLED)
-    truth = torch.isin(labels, torch.tensor(target)).to(probability.dtype)
+    truth = torch.isin(labels, labels.new_tensor(target)).to(probability.dtype)
     both, sum_p, sum_t = ((probability * truth).sum((1, 2)), probability.sum((1, 2)), truth.sum((1, 2)))
     score = (2.0 * both + smooth) / (sum_p + sum_t + smooth)
     shown = sum_t > 0
