@@ -187,7 +187,6 @@ class Trainer(training.Trainer[PredNet, Data]):
                 batch_size=None,
                 sampler=following(),
                 num_workers=self.workers,
-                pin_memory=self.device.type == "cuda",
                 worker_init_fn=_alone_on_a_core,
             )
         )
