@@ -39,8 +39,8 @@ class Trainer(ABC, Generic[N, D]):
     """A network `net` that learns from data, its optimiser, and the running average of its weights, which is exported.
 
     SETTINGS: the dataclass of the network's settings. step, minutes (of the processor's time): so many so far, over all runs.
-    warm_from: the step at which the optimiser was empty. started_from: the entry in the card of the weights that it began with,
-    None where it began with none.
+    steps: how many there will be, None where minutes end the training. warm_from: the step at which the optimiser was empty.
+    started_from: the entry in the card of the weights that it began with, None where it began with none.
     """
 
     SETTINGS: ClassVar[type]
@@ -49,6 +49,7 @@ class Trainer(ABC, Generic[N, D]):
         self.settings, self.schedule, self.seed = settings, schedule, seed
         self.net, self.average, self.optimizer = net, copy.deepcopy(net), optimizer
         self.step, self.minutes, self.warm_from = 0, 0.0, 0
+        self.steps: int | None = None
         self.started_from: dict[str, Any] | None = None
 
     @abstractmethod
@@ -178,6 +179,7 @@ def run(
     every checkpoint. Returns the loss's parts, smoothed."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     total = steps if steps is not None else int(minutes * 60)
+    trainer.steps = steps
     saved, last = time.monotonic(), time.process_time()
     smooth: dict[str, float] = {}
     with Progress(*columns) as bar:

@@ -45,11 +45,12 @@ from penumbra.shared.perception.landmarks import ModelsError, kept
 class Schedule:
     """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`;
     `encoder_share`: of that rate, at which the encoder learns, which knows much already; `frames`: that a step plays, few, as
-    many sequences teach more than long ones; `alone`: steps, from the first one on, in which the encoder learns masks by itself,
-    of as many single frames, each of another sequence, at half of a step's cost; `beside`: such frames that it also learns from
-    in each later step, as a share of that step's; `patches`: (from which progress on, pixels a side, sequences a batch); `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's
-    norm; `averaging`: of the weights that are exported; `seen`: (frames that the state has seen before those that are learned
-    from, how often)."""
+    many sequences teach more than long ones; `alone`: steps, from the first one on, in which the encoder learns masks by
+    itself, of as many single frames, each of another sequence, at half of a step's cost; `beside`: such frames that it also
+    learns from in each later step, as a share of that step's; `patches`: (from which progress on, pixels a side, sequences a
+    batch); `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's norm;
+    `averaging`: of the weights that are exported; `seen`: (frames that the state has seen before those that are learned from,
+    how often)."""
 
     peak_rate: float = 2e-3
     encoder_share: float = 0.2
@@ -155,9 +156,9 @@ class Trainer(training.Trainer[PredNet, Data]):
         if self._batches is None or self._batches[0] is not data:
             self._batches = data, self._coming(data)
         sequences, plain = next(self._batches[1])
-        schedule, parts = self.schedule, {}
+        schedule = self.schedule
         weights = {"dice": 1.0, "focal": schedule.focal_weight, "target": schedule.target_weight, "error": schedule.error_weight}
-        total = torch.zeros((), device=self.device)
+        parts: dict[str, torch.Tensor] = {}
         is_half = self.device.type != "cpu" or processor.has_bfloat16()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=is_half):
             if sequences is not None:
@@ -167,19 +168,19 @@ class Trainer(training.Trainer[PredNet, Data]):
                 images, labels, _ = self._here(plain)
                 of_plain = self._masks(self.net.glimpsed(images.flatten(0, 1)).float(), labels.flatten(0, 1))
                 parts |= {f"plain {name}": value for name, value in of_plain.items()}
-        for name, value in parts.items():
-            total = total + weights[name.removeprefix("plain ")] * value
+        total = torch.stack([weights[name.removeprefix("plain ")] * value for name, value in parts.items()]).sum()
         rate = schedule.rate(progress, self.step - self.warm_from)
         self.descend(total, rate, schedule.clip, schedule.averaging)
         values = torch.stack([*parts.values(), total]).tolist()
         return dict(zip((*parts, "total"), values, strict=True))
 
     def _coming(self, data: Data) -> Iterator[Any]:
-        """What this step and those after it learn from."""
+        """What this step and those after it learn from. Where minutes end the training and others draw, patches get their next
+        size as many steps late as these are ahead."""
 
         def following() -> Iterator[Drawn]:
             for step in itertools.count(self.step):
-                yield self.schedule.drawn(step, self._progress * step / self.step if self.step else 0.0)
+                yield self.schedule.drawn(step, step / self.steps if self.steps else self._progress)
 
         return iter(
             DataLoader(
@@ -192,7 +193,7 @@ class Trainer(training.Trainer[PredNet, Data]):
         )
 
     def _here(self, batch: Batch) -> Batch:
-        images, labels, known = (part.to(self.device, non_blocking=True) for part in batch)
+        images, labels, known = (part.to(self.device) for part in batch)
         return images, labels, known
 
     def _losses(self, images: torch.Tensor, labels: torch.Tensor, known: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
@@ -422,9 +423,10 @@ def main(options: flags.Options) -> int:
     except ModelsError as error:
         print(f"penumbra segmentation train: {error}", file=sys.stderr)
         return 2
-    if options.alone and not trainer.settings.encoder:
+    given = [flag for flag, value in (("--alone", options.alone), ("--beside", options.beside)) if value]
+    if given and not trainer.settings.encoder:
         print(
-            "penumbra segmentation train: --alone: expected a network with an encoder, got one without; add --encoder",
+            f"penumbra segmentation train: {given[0]}: expected a network with an encoder, got one without; add --encoder",
             file=sys.stderr,
         )
         return 2

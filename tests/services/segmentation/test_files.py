@@ -184,9 +184,17 @@ def test_a_folder_that_does_not_fit_is_refused_with_what_was_expected(tmp_path, 
     assert "penumbra segmentation train: " in capsys.readouterr().err
 
 
-def test_only_an_encoder_can_learn_alone(tmp_path, capsys):
-    assert train.main(["--alone", "3", "--steps", "1", "--out", str(tmp_path / "net.npz")]) == 2
-    assert "expected a network with an encoder, got one without; add --encoder" in capsys.readouterr().err
+@pytest.mark.parametrize("flag", ["--alone", "--beside"])
+def test_only_an_encoder_can_learn_alone(tmp_path, capsys, flag):
+    assert train.main([flag, "3", "--steps", "1", "--out", str(tmp_path / "net.npz")]) == 2
+    assert f"{flag}: expected a network with an encoder, got one without; add --encoder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["nothing", "cuda:99"])
+def test_a_device_that_is_not_there_is_refused_with_those_that_are(capsys, name):
+    with pytest.raises(SystemExit):
+        train.main(["--device", name, "--steps", "1"])
+    assert "--device: expected a device that torch has here (cpu" in (said := capsys.readouterr().err) and repr(name) in said
 
 
 def test_training_on_one_s_own_frames_keeps_some_apart_and_says_so_in_the_card(tmp_path, scene, weights):

@@ -154,22 +154,30 @@ def data():
     return Simulated(1, learned=lambda seed, index: sequences.render(seed, index, TINY), most=24)
 
 
-def trained(data, steps: int, checkpoint, resume_at: int | None = None) -> train.Trainer:
-    schedule = train.Schedule(frames=2, patches=((0.0, 64, 2),))
+def trained(data, steps: int, checkpoint, resume_at: int | None = None, workers: int = 0) -> train.Trainer:
+    schedule = train.Schedule(frames=2, patches=((0.0, 32, 2), (0.5, 64, 2)))
     trainer = train.Trainer(SMALL, schedule, seed=1)
     if resume_at:
         for _ in range(resume_at):
             trainer.train_step(data, trainer.step / steps)
         trainer.save(checkpoint)
         trainer = train.Trainer.restore(checkpoint, schedule)
+    trainer.place(torch.device("cpu"), workers)
     training.run(trainer, data, steps, 0.0, checkpoint)
     return trainer
 
 
-def test_training_that_was_interrupted_ends_with_the_same_weights(data, tmp_path):
-    straight = trained(data, 6, tmp_path / "a")
-    resumed = trained(data, 6, tmp_path / "b", resume_at=3)
-    for (name, a), b in zip(straight.net.state_dict().items(), resumed.net.state_dict().values(), strict=True):
+@pytest.fixture(scope="module")
+def straight(data, tmp_path_factory):
+    return trained(data, 6, tmp_path_factory.mktemp("straight") / "checkpoint").net.state_dict()
+
+
+@pytest.mark.parametrize(("resume_at", "workers"), [(2, 0), (None, 2), (2, 2)])
+def test_training_ends_with_the_same_weights_where_it_was_interrupted_and_where_other_processes_draw(
+    data, straight, tmp_path, resume_at, workers
+):
+    other = trained(data, 6, tmp_path / "checkpoint", resume_at, workers)
+    for (name, a), b in zip(straight.items(), other.net.state_dict().values(), strict=True):
         torch.testing.assert_close(a, b, msg=name)
 
 
@@ -333,7 +341,7 @@ def test_the_encoder_learns_masks_alone_before_the_network_learns_with_it(data):
     assert moved_by_a_step() == {True, False}
 
 
-def test_the_encoder_alone_learns_of_as_many_plain_pictures_as_a_step_has_frames():
+def test_the_encoder_learns_of_as_many_plain_pictures_as_a_step_has_frames_or_a_share_of_them():
     class Plain(Simulated):
         """Sequences, of which the plain ones that were asked for are known."""
 
@@ -344,10 +352,12 @@ def test_the_encoder_alone_learns_of_as_many_plain_pictures_as_a_step_has_frames
             return super().plain(index)
 
     plain = Plain(1, learned=lambda seed, index: sequences.render(seed, index, TINY), most=2)
-    schedule = train.Schedule(alone=1, patches=((0.0, 64, 2),), frames=3)
+    schedule = train.Schedule(alone=1, beside=0.5, patches=((0.0, 64, 2),), frames=3)
     trainer = train.Trainer(SMALL, schedule, seed=1).extended(has_priors=False, pretrained=prednet.Encoder().state_dict())
-    trainer.train_step(plain, 0.1)
-    assert plain.drawn == 2 * schedule.frames
+    parts = trainer.train_step(plain, 0.1)
+    assert plain.drawn == 6 and all(name == "total" or name.startswith("plain ") for name in parts)
+    parts = trainer.train_step(plain, 0.1)
+    assert plain.drawn == 6 + 3 and {"dice", "error", "plain dice"} <= set(parts)
 
 
 def test_training_may_start_from_weights_and_its_card_names_them(tmp_path):
