@@ -6,6 +6,10 @@ interrupted and resumed ends with the same weights as one that was not. For days
 
   OMP_NUM_THREADS=1 nice -n 19 penumbra segmentation train --size 16 32 64 128 --steps 150000 --resume --compact FILE
 
+On a GPU drawing is what takes longest, so that other processes do it, one for each core, and a step learns from more at once:
+
+  OMP_NUM_THREADS=1 penumbra segmentation train --device cuda --workers 15 --times 4 --steps 5000
+
 Weights from the ends of successive trainings, each with its rate down, differ in what they get wrong, and their mean may be
 better than each: --mean (Izmailov et al. 2018, arXiv:1803.05407).
 
@@ -391,7 +395,9 @@ def _device(text: str) -> torch.device:
     flags.Option(
         "--held-out", type=flags.positive, default=60, help="simulated sequences for calibration, and as many for the score"
     ),
-    flags.Option("--device", type=_device, default="cpu", help="that the network is on, as torch names it: cuda, say"),
+    flags.Option(
+        "--device", type=_device, default="cpu", metavar="NAME", help="that the network is on, as torch names it: cuda, say"
+    ),
     flags.Option(
         "--workers",
         type=flags.natural,
