@@ -112,10 +112,10 @@ class Batches(Dataset[tuple[Batch | None, Batch | None]]):
     """What steps learn from, drawn from data: of sequences, and of plain frames."""
 
     def __init__(self, data: Data, seed: int):
-        self.data, self._seed = data, seed
+        self._data, self._seed = data, seed
 
     def __getitem__(self, drawn: Drawn) -> tuple[Batch | None, Batch | None]:
-        rng, data = np.random.default_rng([self._seed, 1, drawn.step]), self.data
+        rng, data = np.random.default_rng([self._seed, 1, drawn.step]), self._data
         size = min(drawn.size, data.side)
         sequences, plain = (
             draw_batch((draw(int(i)) for i in rng.integers(data.count, size=count)), frames, size, rng, data.jitter)
@@ -406,7 +406,11 @@ def _device(text: str) -> torch.device:
         help="other processes that draw what is learned from; their time is not counted",
     ),
     flags.Option(
-        "--times", type=flags.positive, default=1, metavar="N", help="as many sequences a step, where a device has room for them"
+        "--times",
+        type=flags.positive,
+        default=1,
+        metavar="N",
+        help="N times as many sequences a step, where a device has room for them",
     ),
     example="penumbra segmentation train --data recordings --start --minutes 60",
 )

@@ -417,7 +417,9 @@ def test_a_replica_with_a_hanging_handler_leaves_its_streams_to_the_others_until
         hanging.subscribe(topics.FUSED, lambda message, names: let_go.wait())
         other.every(0.05, lambda: other.publish(topics.FUSED, pose(), target="forearm"))
     wait_for(
-        lambda: owners(nodes) == [other] * len(STREAMS) and living(other) == {other.instance}, 10, "all streams to be the other one's"
+        lambda: owners(nodes) == [other] * len(STREAMS) and living(other) == {other.instance},
+        10,
+        "all streams to be the other one's",
     )
     (report,) = [report for report in health(other) if report["instance"] == hanging.instance]
     assert not report["ready"] and report["status"] == "degraded"
