@@ -238,18 +238,17 @@ def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.
         since = t - frames // 2
         place = cv2.getRotationMatrix2D((float(middle[1]), float(middle[0])), angle + since * turn, zoom * grow**since)
         place[:, 2] += size / 2.0 - middle[::-1] + since * shift
-        picture, labels = np.ascontiguousarray(frame[..., :3]), np.ascontiguousarray(frame[..., 3])
-        out[t, ..., :3] = cv2.warpAffine(picture, place, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        labels = cv2.extractChannel(frame, 3)
+        out[t] = cv2.warpAffine(frame, place, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         out[t, ..., 3] = cv2.warpAffine(labels, place, (size, size), flags=cv2.INTER_NEAREST, borderValue=float(UNLABELLED))
     return out
 
 
 def _smaller(frame: NDArray[np.uint8], by: int) -> NDArray[np.uint8]:
     height, width = (n // by for n in frame.shape[:2])
-    picture = cv2.resize(
-        np.ascontiguousarray(frame[: height * by, : width * by, :3]), (width, height), interpolation=cv2.INTER_AREA
-    )
-    return np.dstack([picture, frame[by // 2 :: by, by // 2 :: by, 3][:height, :width]])
+    smaller = cv2.resize(frame[: height * by, : width * by], (width, height), interpolation=cv2.INTER_AREA)
+    smaller[..., 3] = frame[by // 2 :: by, by // 2 :: by, 3][:height, :width]
+    return smaller
 
 
 def pasted(film: NDArray[np.uint8], over: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
