@@ -97,10 +97,11 @@ class Fit:
     """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
     `points`: number of independent points of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's
     estimated dilation [px]; `cost`: chi^2 of contour, dilation and prior together, or of the contour alone, in the mask's pixels,
-    where the image shows it; `misfit`: that of the mask per measurement, 1 to 3 where the pose is right; `both`, `free`: see
-    `evidence.compare`; `overlap`: see `overlap_of`; `hand`: how many times as uncertain as the forearm's the hand's contour was
-    taken for (`Problem.bent`); `sharp`: whether the image has edges along the contour (`image_fit.fit_image`); `shape`: standard
-    deviation of the limb's surface from the mesh's [m], where the contour was fitted with one (`shape_fit.fit_shape`)."""
+    where the image shows it, or of the forearm's contour, whose errors are what the pose leaves, where there is a `shape`;
+    `misfit`: that of the mask per measurement, 1 to 3 where the pose is right; `both`, `free`: see `evidence.compare`; `overlap`:
+    see `overlap_of`; `hand`: how many times as uncertain as the forearm's the hand's contour was taken for (`Problem.bent`);
+    `sharp`: whether the image has edges along the contour (`image_fit.fit_image`); `shape`: standard deviation of the limb's
+    surface from the mesh's [m], where the contour was fitted with one (`shape_fit.fit_shape`)."""
 
     T: Array
     covariance: Array

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from penumbra.services.search import contour, detect, evidence, paper_search
 from penumbra.services.search.evidence import TARGET, Evidence
-from penumbra.services.search.image_fit import ImageSettings, fit_image
+from penumbra.services.search.image_fit import ImageSettings, fit_image, straightest
 from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
-from penumbra.services.search.rivals import Rivals
+from penumbra.services.search.rivals import Rivals, with_mirror
 from penumbra.services.search.settings import SearchSettings
 from penumbra.services.search.shape_fit import fit_shape
 from penumbra.services.search.verdict import Findings, explains_mask, is_of_other_shape, least_overlap, verdict
@@ -27,10 +27,6 @@ from penumbra.shared.perception.vision import State, VisionEstimate
 
 METHODS = ("default", "paper")
 """Values of `--method`: least squares on the contour, and the paper's ascent on f_m."""
-STRAIGHT = 1.15
-"""Largest ratio of the offsets left in the image with a straight hand to those with the bent one of the mask, for which the hand
-is straight. Measured on four runs of `arm`: so are 70 % of the poses whose roll is right, and 10 % of those that are more than
-15 degrees off, for which a hand only seems bent."""
 
 
 @dataclass(frozen=True)
@@ -191,15 +187,11 @@ class Search:
             self._rivals.forget()
             return best
 
-        def shown(T: Array, passes: int) -> Fit:
-            start = replace(best, T=T, T_searched=T, hand=1.0)
+        def shown(T: Array, passes: int, hand: float) -> Fit:
+            start = replace(best, T=T, T_searched=T, hand=hand)
             return fit_image(self._model, start, image, seen, T, np.zeros((6, 6)), ImageSettings(passes=passes))
 
-        def surprise(T: Array, covariance: Array) -> float:
-            away = rigid.pose_error(T, T_prior)
-            return float(away @ np.linalg.solve(np.eye(6) + prior @ covariance, prior @ away))
-
-        return self._rivals.contested(best, stamp_ns, shown, surprise)
+        return self._rivals.contested(best, stamp_ns, shown, _surprise(T_prior, prior))
 
     def _behind_unknown(
         self, seen: Evidence, labels: NDArray[np.uint8], T_start: Array, prior: Array, image: NDArray[np.uint8]
@@ -218,8 +210,7 @@ class Search:
             return found
         closer = fit_image(self._model, found, image, seen, T_prior, prior)
         if found.hand > 1.0:
-            straight = fit_image(self._model, replace(found, hand=1.0), image, seen, T_prior, prior)
-            closer = straight if straight.rms < STRAIGHT * closer.rms else closer
+            closer = straightest(fit_image(self._model, replace(found, hand=1.0), image, seen, T_prior, prior), closer)
         away = rigid.pose_error(closer.T, T_prior)
         is_expected = bool(prior.any() and away @ prior @ away < self.settings.expected)
         return closer if closer.sharp and closer.overlap >= least_overlap(is_expected, self.settings) else found
@@ -408,7 +399,14 @@ class Search:
     def _shaped(self, seen: Evidence, found: Fit, T_prior: Array, prior: Array) -> Fit:
         """The fit of a limb whose shape is not quite the mesh's."""
         spread = anatomy.SIZE_SPREAD if self._target.size is None else anatomy.SIZE_MEASURED
-        return fit_shape(self._model, found, seen, T_prior, prior, spread, self._noise, self._limits)
+
+        def near(T: Array, T_prior: Array, prior: Array) -> Fit:
+            start = replace(found, T_searched=T)
+            return fit_shape(self._model, start, seen, T_prior, prior, spread, self._noise, self._limits)
+
+        best, none = near(found.T_searched, T_prior, prior), np.zeros((6, 6))
+        surprise = _surprise(T_prior, prior)
+        return with_mirror(best, lambda T: near(T, T, none), surprise, self.settings.fits_shaped, self._limits)
 
     def _findings(self, seen: Evidence, best: Fit, with_image: bool, is_expected: bool) -> Findings:
         amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
@@ -461,3 +459,13 @@ class Search:
         T_world_camera = self._camera.T_world_camera
         covariance = self._axes @ covariance @ self._axes.T
         return Searched(T_world_camera @ T, (covariance + covariance.T) / 2.0, share, hidden, state, T_world_camera @ T_searched)
+
+
+def _surprise(T_prior: Array, prior: Array) -> Callable[[Fit], float]:
+    """What gives a pose's squared Mahalanobis distance from a prediction T_prior (4 x 4) with its information (6, 6)."""
+
+    def distance(found: Fit) -> float:
+        away = rigid.pose_error(found.T, T_prior)
+        return float(away @ np.linalg.solve(np.eye(6) + prior @ found.covariance, prior @ away))
+
+    return distance

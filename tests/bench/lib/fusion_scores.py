@@ -59,10 +59,12 @@ class Scores:
 
 
 def normalised(truth: Array, T: Array, covariance: NDArray[np.floating[Any]], rolls: bool) -> float:
-    """The squared pose error of T (4, 4) in units of its covariance (6, 6); without `rolls` along the five directions other than
-    the rotation about the limb."""
+    """The squared pose error of T (4, 4) in units of its covariance (6, 6); without `rolls` that of its place and of the limb's
+    axis, five directions."""
     error = rigid.pose_error(truth, T)
     if not rolls:
+        turn = np.cross(T[:3, 0], truth[:3, 0])  # of the axis alone: what a roll of tens of degrees turns is no error of it
+        error[3:] = rigid.axis_angle_error(truth, T) * turn / max(float(np.linalg.norm(turn)), 1e-12)
         axes = np.eye(6)
         axes[3:, 3:] = T[:3, :3]
         seen = np.delete(axes, 3, axis=1)

@@ -188,7 +188,8 @@ def test_a_lost_stream_is_recovered_in_the_frame_of_its_first_right_pose():
     wrong = film([0.0] * 4, ["lost", "tracking", "tracking", "lost"])
     wrong.vision[1] = pose(VisionPose, 1, rigid.transform((0.2, 0.0, 0.0)), "tracking")
     told = lost.scored([wrong, film([0.0] * 4, ["lost"] * 4)])
-    assert told == {"streams": 2, "recovered": 1, "median": 3.0, "frames": [3, None], "wrong": 1}
+    beyond = {"vision": 0.5, "fused": None}
+    assert told == {"streams": 2, "recovered": 1, "median": 3.0, "frames": [3, None], "wrong": 1, "beyond_3_sigma": beyond}
 
 
 def test_an_outline_is_compared_with_the_arms_that_it_touches():

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from penumbra.services.search import detect
+from penumbra.services.search.image_fit import SHARP
 from penumbra.services.search.mask_fit import Fit, Limits
-from penumbra.services.search.rivals import RIVALS, TURNS, Rivals
+from penumbra.services.search.rivals import RIVALS, TURNS, Rivals, with_mirror
 from penumbra.shared.geometry import rigid
 
 PICTURE_NS = 50_000_000
@@ -22,9 +24,9 @@ def turned(radians: float) -> np.ndarray:
     return T
 
 
-def fitted(T: np.ndarray, cost: float) -> Fit:
+def fitted(T: np.ndarray, cost: float, hand: float = 1.0, rms: float = 0.1) -> Fit:
     """A pose of 50 points, with a cost in chi^2."""
-    return Fit(T, 1e-4 * np.eye(6), T, 50.0, 0.1, 0.0, cost, 1.0, 0, 0, 1.0, sharp=True)
+    return Fit(T, 1e-4 * np.eye(6), T, 50.0, rms, 0.0, cost, 1.0, 0, 0, 1.0, hand=hand, sharp=rms < SHARP)
 
 
 def roll(fit: Fit) -> float:
@@ -32,10 +34,10 @@ def roll(fit: Fit) -> float:
     return float(rigid.pose_error(fit.T, HERE)[3:] @ HERE[:3, 0])
 
 
-def costs(preferred: float, by: float) -> Callable[[np.ndarray, int], Fit]:
+def costs(preferred: float, by: float) -> Callable[[np.ndarray, int, float], Fit]:
     """Pictures in which every turn costs 100, but one so much less."""
 
-    def shown(T: np.ndarray, passes: int) -> Fit:
+    def shown(T: np.ndarray, passes: int, hand: float) -> Fit:
         away = float(np.linalg.norm(rigid.pose_error(T, turned(preferred))[3:]))
         return fitted(T, 100.0 - (by if away < 0.1 else 0.0))
 
@@ -45,9 +47,7 @@ def costs(preferred: float, by: float) -> Callable[[np.ndarray, int], Fit]:
 def taken(by: float, pictures: int) -> list[float]:
     """The turns said of so many pictures in which the fit ends at HERE and another turn costs less."""
     rivals, shown = Rivals(Limits()), costs(TURNS[3], by)
-    return [
-        roll(rivals.contested(shown(HERE, 1), PICTURE_NS * i, shown, lambda T, covariance: 0.0)) for i in range(1, pictures + 1)
-    ]
+    return [roll(rivals.contested(shown(HERE, 1, 1.0), PICTURE_NS * i, shown, lambda fit: 0.0)) for i in range(1, pictures + 1)]
 
 
 @pytest.mark.parametrize(("by", "rounds"), [(25.0, 1), (12.0, 2), (8.0, 4)])
@@ -62,7 +62,7 @@ def test_noise_that_prefers_now_the_one_and_now_the_other_changes_nothing():
     rivals = Rivals(Limits())
     for i in range(1, 30 * RIVALS):
         best = fitted(HERE, 100.0 + rng.normal(scale=3.0))
-        estimate = rivals.contested(best, PICTURE_NS * i, lambda T, _: fitted(T, 100.0 + rng.normal(scale=3.0)), lambda T, _: 0.0)
+        estimate = rivals.contested(best, PICTURE_NS * i, lambda T, *_: fitted(T, 100.0 + rng.normal(scale=3.0)), lambda fit: 0.0)
         assert abs(roll(estimate)) < 0.1
 
 
@@ -72,15 +72,49 @@ def test_a_rival_that_took_the_place_keeps_it_where_fits_begin_from_the_turn_bef
     assert (said[first:] > 0.1).all()
 
 
+TILTED = rigid.transform([0.0, 0.0, 1.5], [0.0, np.sin(0.25), 0.0, np.cos(0.25)])
+MIRROR = detect.mirrored(TILTED)[0]
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(rigid.pose_error(a, b)[3:]))
+
+
 def test_a_limb_found_with_the_wrong_tilt_has_the_right_one_at_once():
-    tilted = rigid.transform([0.0, 0.0, 1.5], [0.0, np.sin(0.25), 0.0, np.cos(0.25)])
-    mirror = detect.mirrored(tilted)[0]
+    def shown(T: np.ndarray, passes: int, hand: float) -> Fit:
+        return fitted(T, 80.0 if apart(T, MIRROR) < 0.1 else 100.0)
 
-    def apart(a: np.ndarray, b: np.ndarray) -> float:
-        return float(np.linalg.norm(rigid.pose_error(a, b)[3:]))
+    found = Rivals(Limits()).contested(shown(TILTED, 1, 1.0), PICTURE_NS, shown, lambda fit: 0.0)
+    assert apart(TILTED, MIRROR) > 0.5 and apart(found.T, MIRROR) < 0.1
 
-    def shown(T: np.ndarray, passes: int) -> Fit:
-        return fitted(T, 80.0 if apart(T, mirror) < 0.1 else 100.0)
 
-    found = Rivals(Limits()).contested(shown(tilted, 1), PICTURE_NS, shown, lambda T, covariance: 0.0)
-    assert apart(tilted, mirror) > 0.5 and apart(found.T, mirror) < 0.1
+@pytest.mark.parametrize(("straight_px", "is_taken"), [(0.35, True), (0.1, False)])
+def test_where_the_hand_is_bent_the_forearm_tells_the_tilt_unless_a_straight_hand_fits(straight_px, is_taken):
+    def shown(T: np.ndarray, passes: int, hand: float) -> Fit:
+        is_mirror = apart(T, MIRROR) < 0.1
+        if hand == 1.0:  # believed, the hand that is not the mesh's prefers the wrong tilt
+            return fitted(T, 150.0 if is_mirror else 100.0, rms=straight_px)
+        return fitted(T, 70.0 if is_mirror else 100.0, hand)
+
+    found = Rivals(Limits()).contested(fitted(TILTED, 100.0, 4.0), PICTURE_NS, shown, lambda fit: 0.0)
+    assert (apart(found.T, MIRROR) < 0.1) == is_taken
+
+
+@pytest.mark.parametrize(
+    ("excess", "surprise", "is_taken"), [(4.0, 0.0, False), (-4.0, 0.0, True), (-4.0, 9.0, False), (4.0, -9.0, True)]
+)
+def test_a_limb_that_is_not_quite_the_mesh_is_as_uncertain_as_its_mirror_image_is_apart(excess, surprise, is_taken):
+    def surprising(fit: Fit) -> float:
+        return max(surprise, 0.0) if apart(fit.T, MIRROR) < 0.1 else max(-surprise, 0.0)
+
+    best = replace(fitted(TILTED, 10.0), shape=0.003)
+    found = with_mirror(best, lambda T: fitted(T, 10.0 + excess), surprising, 0.8, Limits())
+    assert (apart(found.T, MIRROR) < 0.1) == is_taken
+    away = rigid.pose_error(MIRROR, TILTED)[3:]
+    assert np.sqrt(away @ found.covariance[3:, 3:] @ away) > 0.5 * away @ away
+
+
+def test_a_mirror_image_that_does_not_explain_the_mask_changes_nothing():
+    best = replace(fitted(TILTED, 10.0), shape=0.003)
+    poor = replace(fitted(MIRROR, -50.0), overlap=0.5)
+    assert with_mirror(best, lambda T: poor, lambda fit: 0.0, 0.8, Limits()) is best
