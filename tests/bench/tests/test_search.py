@@ -186,7 +186,7 @@ def test_tracking_what_is_hidden_is_counted_as_false(monkeypatch):
 
 def test_a_lost_stream_is_recovered_in_the_frame_of_its_first_right_pose():
     wrong = film([0.0] * 4, ["lost", "tracking", "tracking", "lost"])
-    wrong.vision[1] = pose(VisionPose, 1, rigid.transform((0.2, 0.0, 0.0)), "tracking")
+    wrong.vision[1] = pose(VisionPose, 1, rigid.transform((8.0, 0.0, 0.0)), "tracking")
     told = lost.scored([wrong, film([0.0] * 4, ["lost"] * 4)])
     beyond = {"vision": 0.5, "fused": None}
     assert told == {"streams": 2, "recovered": 1, "median": 3.0, "frames": [3, None], "wrong": 1, "beyond_3_sigma": beyond}
