@@ -462,6 +462,6 @@ def main(options: flags.Options) -> int:
         return 2
     print(
         f"{folder.frames} frames: {options.out}. Look at {options.out / 'check'} and remove what is wrong, then\n"
-        f"penumbra segmentation train --data {options.out} --simulated 0.4 --start --rate 1e-3 --minutes 10"
+        f"penumbra segmentation train --data {options.out} --simulated 0.4 --start --with-start --rate 1e-3 --minutes 10"
     )
     return 0

@@ -11,7 +11,8 @@ On a GPU drawing is what takes longest, so that other processes do it, one for e
   OMP_NUM_THREADS=1 penumbra segmentation train --device cuda --workers 15 --times 4 --steps 5000
 
 Weights from the ends of successive trainings, each with its rate down, differ in what they get wrong, and their mean may be
-better than each: --mean (Izmailov et al. 2018, arXiv:1803.05407).
+better than each: --mean (Izmailov et al. 2018, arXiv:1803.05407). The mean with the weights that a training began with knows what
+is new about as well, and forgets less: --with-start (Wortsman et al. 2022, arXiv:2109.01903).
 
 With --priors the network also receives what is known of the robot and of the target, with --encoder what filters that photographs
 have taught find in the picture. A network without, from --start or --resume, is given both, and gives the same masks until it
@@ -371,6 +372,7 @@ def _device(text: str) -> torch.device:
         metavar="FILE ...",
         help="write the mean with these weights, of earlier steps or from the same start",
     ),
+    flags.Option("--with-start", is_flag=True, help="write the mean with the weights of --start: less of other scenes is forgotten"),
     flags.Option(
         "--data",
         type=Path,
@@ -440,11 +442,14 @@ def main(options: flags.Options) -> int:
             file=sys.stderr,
         )
         return 2
+    if options.with_start and not options.start:
+        print("penumbra segmentation train: --with-start: expected --start, got none", file=sys.stderr)
+        return 2
     try:
-        others = [prednet.load(path) for path in options.mean or ()]
+        others = [prednet.load(path) for path in (*(options.mean or ()), *((options.start,) if options.with_start else ()))]
         mean(trainer.average, [other for other, _ in others])
     except (OSError, ValueError) as error:
-        print(f"penumbra segmentation train: --mean: {error}", file=sys.stderr)
+        print(f"penumbra segmentation train: {'--with-start' if options.with_start else '--mean'}: {error}", file=sys.stderr)
         return 2
     simulated = Simulated(trainer.seed, options.held_out)
     data: Data = simulated

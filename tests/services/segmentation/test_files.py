@@ -211,6 +211,25 @@ def test_training_on_one_s_own_frames_keeps_some_apart_and_says_so_in_the_card(t
     assert inference.load_segmenter(out)
 
 
+def test_weights_of_one_s_own_are_written_as_the_mean_with_those_that_they_began_with(tmp_path, scene, weights, capsys):
+    for name in "abcd":
+        write_pairs(tmp_path / "mine", scene, name)
+    found = {}
+    for flags in ((), ("--with-start",)):
+        out = tmp_path / "mine.npz"
+        words = ["--data", str(tmp_path / "mine"), "--steps", "2", "--start", str(weights), "--out", str(out), *flags]
+        assert train.main([*words, "--checkpoint", str(tmp_path / "checkpoint")]) == 0
+        found[flags] = prednet.load(out)
+    (learned, _), (both, card) = found.values()
+    begun, begun_card = prednet.load(weights)
+    for a, b, c in zip(learned.parameters(), begun.parameters(), both.parameters(), strict=True):
+        torch.testing.assert_close((a + b) / 2.0, c, rtol=1e-2, atol=1e-4)  # half precision
+    assert any(not torch.equal(a, c) for a, c in zip(learned.parameters(), both.parameters(), strict=True))
+    assert card["mean_with"] == [{key: begun_card[key] for key in ("seed", "date") if key in begun_card}]
+    assert train.main(["--with-start", "--steps", "1"]) == 2
+    assert "--with-start: expected --start, got none" in capsys.readouterr().err
+
+
 def test_what_is_held_out_is_not_learned_from(tmp_path, scene):
     for name in "abcdefghijklmnopqrstu":
         write_pairs(tmp_path, scene, name, 1)
