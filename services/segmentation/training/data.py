@@ -246,7 +246,7 @@ def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.
 
 def _smaller(frame: NDArray[np.uint8], by: int) -> NDArray[np.uint8]:
     height, width = (n // by for n in frame.shape[:2])
-    smaller = cv2.resize(frame[: height * by, : width * by], (width, height), interpolation=cv2.INTER_AREA)
+    smaller = np.asarray(cv2.resize(frame[: height * by, : width * by], (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     smaller[..., 3] = frame[by // 2 :: by, by // 2 :: by, 3][:height, :width]
     return smaller
 

@@ -372,7 +372,9 @@ def _device(text: str) -> torch.device:
         metavar="FILE ...",
         help="write the mean with these weights, of earlier steps or from the same start",
     ),
-    flags.Option("--with-start", is_flag=True, help="write the mean with the weights of --start: less of other scenes is forgotten"),
+    flags.Option(
+        "--with-start", is_flag=True, help="write the mean with the weights of --start, which forgets less of other scenes"
+    ),
     flags.Option(
         "--data",
         type=Path,
