@@ -15,7 +15,7 @@ forearms are compared alone.
 One is compared in a picture: eight times as many in the first ones would have a limb that was just found wait, and it would be
 elsewhere by then. The mirror image comes first, as it is the farthest away: a limb found again with the wrong tilt is 10 cm off.
 Where all are refuted, pictures go by without: a comparison costs as much as the pose itself. A limb that is not quite the mesh
-has its mirror image as a rival in each picture (`with_mirror`).
+has its mirror image as a rival in each picture (`against_mirror`).
 """
 
 from __future__ import annotations
@@ -135,22 +135,14 @@ class Rivals:
         return True
 
     def _doubt(self, best: Fit, T: Array, covariance: Array, excess: float) -> Array:
-        """What a rival adds (`doubt`), along the limb's axes."""
+        """What a rival adds (`_added`), along the limb's axes."""
         axes = _axes(best)
-        return np.asarray(axes.T @ doubt(best, T, covariance, excess, self._limits) @ axes, np.float64)
+        return np.asarray(axes.T @ _added(best, T, covariance, excess, self._limits) @ axes, np.float64)
 
 
-def doubt(best: Fit, T: Array, covariance: Array, excess: float, limits: Limits) -> Array:
-    """What a rival T (4 x 4) adds to the covariance (6, 6) of the best pose: as much of its own covariance, and of the square of
-    what they are apart, `LASTS` times, as it has of the probability of both. excess: by how much its cost is above the pose's."""
-    apart = rigid.pose_error(T, best.T)
-    apart[3:] /= max(1.0, float(np.linalg.norm(apart[3:])) / limits.rotation)
-    share = 1.0 / (1.0 + math.exp(0.5 * min(excess, 100.0)))
-    lasts = LASTS if best.hand == 1.0 and best.shape is None else LASTS_FOREARM
-    return np.asarray(share * (covariance + lasts * np.outer(apart, apart)), np.float64)
-
-
-def with_mirror(best: Fit, near: Callable[[Array], Fit], surprise: Callable[[Fit], float], overlap: float, limits: Limits) -> Fit:
+def against_mirror(
+    best: Fit, near: Callable[[Array], Fit], surprise: Callable[[Fit], float], overlap: float, limits: Limits
+) -> Fit:
     """The pose of a limb that is not quite the mesh, or its mirror image where that and the prediction are likelier together, as
     uncertain as the two are apart.
 
@@ -166,7 +158,17 @@ def with_mirror(best: Fit, near: Callable[[Array], Fit], surprise: Callable[[Fit
     excess = other.cost - best.cost + min(surprise(other), SURPRISING) - min(surprise(best), SURPRISING)
     if excess < 0.0:
         best, other, excess = other, best, -excess
-    return replace(best, covariance=best.covariance + doubt(best, other.T, other.covariance, excess, limits))
+    return replace(best, covariance=best.covariance + _added(best, other.T, other.covariance, excess, limits))
+
+
+def _added(best: Fit, T: Array, covariance: Array, excess: float, limits: Limits) -> Array:
+    """What a rival T (4 x 4) adds to the covariance (6, 6) of the best pose: as much of its own covariance, and of the square of
+    what they are apart, `LASTS` times, as it has of the probability of both. excess: by how much its cost is above the pose's."""
+    apart = rigid.pose_error(T, best.T)
+    apart[3:] /= max(1.0, float(np.linalg.norm(apart[3:])) / limits.rotation)
+    share = 1.0 / (1.0 + math.exp(0.5 * min(excess, 100.0)))
+    lasts = LASTS if best.hand == 1.0 and best.shape is None else LASTS_FOREARM
+    return np.asarray(share * (covariance + lasts * np.outer(apart, apart)), np.float64)
 
 
 def _start(best: Fit, which: int) -> Array:

@@ -12,7 +12,7 @@ from penumbra.services.search import contour, detect, evidence, paper_search
 from penumbra.services.search.evidence import TARGET, Evidence
 from penumbra.services.search.image_fit import ImageSettings, fit_image, straightest
 from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
-from penumbra.services.search.rivals import Rivals, with_mirror
+from penumbra.services.search.rivals import Rivals, against_mirror
 from penumbra.services.search.settings import SearchSettings
 from penumbra.services.search.shape_fit import fit_shape
 from penumbra.services.search.verdict import Findings, explains_mask, is_of_other_shape, least_overlap, verdict
@@ -406,7 +406,7 @@ class Search:
 
         best, none = near(found.T_searched, T_prior, prior), np.zeros((6, 6))
         surprise = _surprise(T_prior, prior)
-        return with_mirror(best, lambda T: near(T, T, none), surprise, self.settings.fits_shaped, self._limits)
+        return against_mirror(best, lambda T: near(T, T, none), surprise, self.settings.fits_shaped, self._limits)
 
     def _findings(self, seen: Evidence, best: Fit, with_image: bool, is_expected: bool) -> Findings:
         amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)

@@ -447,12 +447,14 @@ def main(options: flags.Options) -> int:
     if options.with_start and not options.start:
         print("penumbra segmentation train: --with-start: expected --start, got none", file=sys.stderr)
         return 2
-    try:
-        others = [prednet.load(path) for path in (*(options.mean or ()), *((options.start,) if options.with_start else ()))]
-        mean(trainer.average, [other for other, _ in others])
-    except (OSError, ValueError) as error:
-        print(f"penumbra segmentation train: {'--with-start' if options.with_start else '--mean'}: {error}", file=sys.stderr)
-        return 2
+    others: list[tuple[PredNet, dict[str, Any]]] = []
+    for flag, paths in (("--mean", options.mean or ()), ("--with-start", (options.start,) if options.with_start else ())):
+        try:
+            others += [prednet.load(path) for path in paths]
+            mean(trainer.average, [other for other, _ in others])
+        except (OSError, ValueError) as error:
+            print(f"penumbra segmentation train: {flag}: {error}", file=sys.stderr)
+            return 2
     simulated = Simulated(trainer.seed, options.held_out)
     data: Data = simulated
     try:

@@ -43,6 +43,10 @@ def test_without_the_roll_a_turn_about_the_limb_is_no_error_and_a_turn_across_it
     assert scores.normalised(TILTED, rolled, covariance, rolls=True) == pytest.approx(25.0)
     across = TILTED @ rigid.from_rpy([0, 0, 0], [0, 0.2, 0])
     assert scores.normalised(TILTED, across, covariance, rolls=False) == pytest.approx(4.0)
+    both = rigid.perturb(rolled, rigid.pose_error(across, TILTED))  # a roll of tens of degrees does not turn the axis's error
+    assert scores.normalised(TILTED, both, 4.0 * np.eye(6), rolls=False) == pytest.approx(
+        scores.normalised(TILTED, across, 4.0 * np.eye(6), rolls=False)
+    )
 
 
 def test_the_band_is_that_of_the_mean_of_independent_chi_square_values() -> None:

@@ -11,7 +11,7 @@ import pytest
 from penumbra.services.search import detect
 from penumbra.services.search.image_fit import SHARP
 from penumbra.services.search.mask_fit import Fit, Limits
-from penumbra.services.search.rivals import RIVALS, TURNS, Rivals, with_mirror
+from penumbra.services.search.rivals import RIVALS, TURNS, Rivals, against_mirror
 from penumbra.shared.geometry import rigid
 
 PICTURE_NS = 50_000_000
@@ -108,7 +108,7 @@ def test_a_limb_that_is_not_quite_the_mesh_is_as_uncertain_as_its_mirror_image_i
         return max(surprise, 0.0) if apart(fit.T, MIRROR) < 0.1 else max(-surprise, 0.0)
 
     best = replace(fitted(TILTED, 10.0), shape=0.003)
-    found = with_mirror(best, lambda T: fitted(T, 10.0 + excess), surprising, 0.8, Limits())
+    found = against_mirror(best, lambda T: fitted(T, 10.0 + excess), surprising, 0.8, Limits())
     assert (apart(found.T, MIRROR) < 0.1) == is_taken
     away = rigid.pose_error(MIRROR, TILTED)[3:]
     assert np.sqrt(away @ found.covariance[3:, 3:] @ away) > 0.5 * away @ away
@@ -117,4 +117,4 @@ def test_a_limb_that_is_not_quite_the_mesh_is_as_uncertain_as_its_mirror_image_i
 def test_a_mirror_image_that_does_not_explain_the_mask_changes_nothing():
     best = replace(fitted(TILTED, 10.0), shape=0.003)
     poor = replace(fitted(MIRROR, -50.0), overlap=0.5)
-    assert with_mirror(best, lambda T: poor, lambda fit: 0.0, 0.8, Limits()) is best
+    assert against_mirror(best, lambda T: poor, lambda fit: 0.0, 0.8, Limits()) is best
