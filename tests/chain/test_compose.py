@@ -28,7 +28,10 @@ SECURE = ("-f", "compose.yaml", "-f", "docker/secure.yaml")
 
 
 def docker(*arguments: str, stdin: str | None = None) -> str:
-    return subprocess.run(["docker", *arguments], input=stdin, check=True, capture_output=True, text=True).stdout
+    done = subprocess.run(["docker", *arguments], input=stdin, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"docker {' '.join(arguments)}: exit status {done.returncode}: {done.stderr.strip()}")
+    return done.stdout
 
 
 def compose(*arguments: str) -> str:
@@ -146,6 +149,12 @@ STACK = "penumbra-stack"
 """Another name than the one of `docker compose`, whose networks a stack of the same name would take."""
 
 
+def stack_is_gone() -> bool:
+    """Asks again each time, as the engine may refuse to remove what a stopping task still holds."""
+    subprocess.run(["docker", "stack", "rm", STACK], capture_output=True)
+    return STACK not in docker("network", "ls") + docker("service", "ls")
+
+
 @pytest.fixture
 def stack():
     """The cell by `docker stack deploy`, on a swarm of this one node."""
@@ -159,8 +168,7 @@ def stack():
         ).stdout
         docker("stack", "deploy", "--resolve-image", "never", "--detach=true", "--compose-file", "-", STACK, stdin=described)
         yield
-        docker("stack", "rm", STACK)
-        wait_for(lambda: STACK not in docker("network", "ls"), 60, "the stack's networks gone")
+        wait_for(stack_is_gone, 60, "the stack gone", 1.0)
     finally:
         docker("swarm", "leave", "--force")
 
