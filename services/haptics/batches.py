@@ -1,7 +1,7 @@
-"""Voltage batches of all pads to one mean per electrode and time window.
+"""Averages the voltage batches of all pads to one mean per electrode and time window.
 
-Windows do not overlap, so that the noise of one estimate is independent of the next one's, as the observer assumes.
-The clock is the samples' own stamps: a replay gives the same windows at any speed.
+Windows do not overlap, so that the noise of successive estimates is independent, as the observer assumes. The clock is the
+samples' own stamps: a replay gives the same windows at any speed.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from penumbra.shared.skin.faults import Watch
 from penumbra.shared.skin.layout import Skin
 
 NEVER = -(1 << 62)
-"""The stamp [ns] of something that has not come yet: before every other stamp."""
+"""Stamp [ns] of something that has not arrived yet; it is smaller than every other stamp."""
 SATURATED = "saturated: it reads the end of its ADC"
-"""`VoltageWindow.faults` of an electrode whose signal is cut off."""
+"""`VoltageWindow.faults` of an electrode whose signal is clipped by its ADC."""
 
 
 @dataclass(frozen=True)
 class VoltageWindow:
-    """The mean voltages of all electrodes over a stretch of time. stamp_ns: the middle of the samples; newest_ns: the last one;
-    amplitude (n,) [V]: means; samples (n,): how many are in each, none for electrodes that are not to be believed; faults: the
-    reasons, by PAD or PAD/ELECTRODE; pressed (n,): electrodes that are left out because they read the end of their ADC that
-    near things drive them to."""
+    """Mean voltages of all electrodes over a time window. stamp_ns: mean of the samples' stamps; newest_ns: the last stamp;
+    amplitude (n,) [V]: means; samples (n,): number of samples per electrode, zero for faulty electrodes; faults: reasons, by PAD
+    or PAD/ELECTRODE; pressed (n,): electrodes that are left out because they read the end of their ADC towards which near objects
+    drive them."""
 
     stamp_ns: int
     newest_ns: int
@@ -39,9 +39,10 @@ class VoltageWindow:
 
 
 class Backlog:
-    """Tells when a reader has fallen behind its samples, so that it can leave out what is overtaken already.
+    """Detects that a reader has fallen behind its samples, so that it can skip outdated windows.
 
-    Clocks may differ and the way here takes time: late is what comes much later than the quickest of the last windows.
+    Clocks may differ and transport takes time: a window is late if its lag exceeds the smallest lag of the last windows by
+    patience_ns.
     """
 
     def __init__(self, patience_ns: int = 100_000_000, memory: int = 200):
@@ -55,7 +56,7 @@ class Backlog:
 
 
 class _Batch(NamedTuple):
-    """Samples (s, e), one every period_ns up to stamp_ns."""
+    """Samples (s, e), one every period_ns; stamp_ns is the last one's stamp."""
 
     stamp_ns: int
     period_ns: int
@@ -63,32 +64,32 @@ class _Batch(NamedTuple):
 
     @property
     def before_ns(self) -> int:
-        """The stamp before the first one."""
+        """The stamp one period before the first sample."""
         return self.stamp_ns - self.period_ns * len(self.volts)
 
     def after(self, stamp_ns: int) -> _Batch:
-        """The samples later than a stamp."""
+        """The samples later than stamp_ns."""
         early = (stamp_ns - self.before_ns) // self.period_ns
         return self if early <= 0 else self._replace(volts=self.volts[early:])
 
     def until(self, stamp_ns: int) -> _Batch:
-        """The samples up to a stamp."""
+        """The samples up to stamp_ns."""
         late = -((stamp_ns - self.stamp_ns) // self.period_ns)
         if late <= 0:
             return self
         return _Batch(self.stamp_ns - late * self.period_ns, self.period_ns, self.volts[: max(len(self.volts) - late, 0)])
 
     def total_ns(self, since_ns: int) -> int:
-        """The sum of all stamps since one."""
+        """The sum of all stamps, counted from since_ns."""
         count = len(self.volts)
         return count * (self.stamp_ns - since_ns) - self.period_ns * (count * (count - 1) // 2)
 
 
 class Collector:
-    """Gathers batches and hands out a window when every living pad has filled it.
+    """Collects batches and returns a window when every live pad has filled it.
 
-    length_ns: window length (one estimate each); patience_ns: a pad this far behind the newest one is called silent and is
-    no longer waited for. Raises ValueError for a length that is not positive.
+    length_ns: window length (one estimate per window); patience_ns: lag behind the newest pad from which a pad counts as silent
+    and is no longer waited for. Raises ValueError for a length that is not positive.
     """
 
     def __init__(self, skin: Skin, length_ns: int, patience_ns: int = 100_000_000):
@@ -99,7 +100,7 @@ class Collector:
         self._own = [skin.of(k) for k in range(len(skin.pads))]
         self._watches = [Watch(skin, k) for k in range(len(skin.pads))]
         self._top, self._bottom = skin.full_scale - 0.5 * skin.lsb, 0.5 * skin.lsb
-        self._waiting: list[list[_Batch]]  # what no window has had, by pad
+        self._waiting: list[list[_Batch]]  # batches by pad that no window has used yet
         self._newest: list[int]
         self._done_ns = self._born_ns = NEVER
         self._forget()
@@ -132,14 +133,14 @@ class Collector:
     def _window(self) -> VoltageWindow | None:
         newest_ns = max(self._newest)
         if min(self._newest) == NEVER and newest_ns - self._born_ns < self.patience_ns:
-            return None  # at the start every pad has a chance to be heard
+            return None  # at the start, wait for the first batch of every pad
         heard = [k for k, stamp_ns in enumerate(self._newest) if stamp_ns >= newest_ns - self.patience_ns]
         end_ns = min(self._newest[k] for k in heard)
         if self._done_ns == NEVER:  # the first window begins where the slowest living pad begins
             self._done_ns = max(self._waiting[k][0].before_ns for k in heard)
         if end_ns - self._done_ns < self.length_ns:
             return None
-        # After a cut only the newest stretch is used: an old one would say little about now.
+        # After a gap only the newest samples are used: older ones would say little about the present.
         begin_ns = max(self._done_ns, end_ns - self.length_ns)
         self._done_ns = end_ns
         taken = [[batch.until(end_ns).after(begin_ns) for batch in waiting] for waiting in self._waiting]
@@ -147,7 +148,7 @@ class Collector:
         return self._means(taken, begin_ns, end_ns)
 
     def _means(self, taken: list[list[_Batch]], begin_ns: int, end_ns: int) -> VoltageWindow:
-        """The window of the samples of each pad, of all pads at once."""
+        """The means, counts and faults of a window, computed for all pads at once."""
         skin = self.skin
         counts = [sum(len(batch.volts) for batch in batches) for batches in taken]
         samples = np.array(counts)[skin.pad_of]

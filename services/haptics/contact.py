@@ -1,8 +1,8 @@
-"""Whether something touches pads, or closes around what carries them, by the points of surfaces before them.
+"""Detects touched pads, and grips around a link, from the nearest surface points.
 
-The field model holds from 3 mm on, and a converter ends where a forearm comes within 5 mm: what is nearer than TOUCH counts as
-touching. A pad that is touched stays so until it is farther than RELEASE, and a grip needs touched pads of one link that look
-in opposite directions.
+The field model holds from 3 mm on, and a converter saturates where a forearm comes within 5 mm: a surface nearer than TOUCH
+counts as touching. A touched pad stays touched until the surface is farther than RELEASE. A grip needs touched pads of one link
+that face in opposite directions.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.skin.layout import Skin
 
 TOUCH, RELEASE = 0.005, 0.010
-"""Gaps [m] of a surface to a pad's board below which the pad is touched, and above which it no longer is. Measured: see
+"""Gaps [m] between a surface and a pad's board: below TOUCH the pad becomes touched, above RELEASE it is released. Measured: see
 `penumbra bench haptics --only-surface`."""
 OPPOSITE = -0.5
-"""Largest cosine of the angle between the normals of two touched pads of one link that are held: 120 degrees apart or more."""
+"""Maximum cosine of the angle between the normals of two touched pads of one link that count as a grip: at least 120 degrees."""
 
 
 class Contact:
-    """The pads of a skin that are touched. touched: their names, in the skin's order."""
+    """Contact state of a skin's pads. touched: names of the touched pads, in the skin's order."""
 
     def __init__(self, skin: Skin):
         self._place = {name: k for k, name in enumerate(skin.pads)}
@@ -32,11 +32,11 @@ class Contact:
         self.forget()
 
     def forget(self) -> None:
-        """Nothing touches."""
+        """Release all pads."""
         self.touched: tuple[str, ...] = ()
 
     def take(self, points: Iterable[SurfacePoint], T_world_pads: Array) -> ContactState:
-        """The state after a window with these points, with the pads at T_world_pads (p, 4, 4)."""
+        """The contact state after a window with these surface points, with the pads at T_world_pads (p, 4, 4)."""
         near = [p.pad for p in points if p.gap < (RELEASE if p.pad in self.touched else TOUCH)]
         self.touched = tuple(sorted(near, key=self._place.__getitem__))
         if not near:

@@ -1,18 +1,19 @@
-"""How the electrodes have drifted since they were calibrated: gain and offset of each, and how well they are known.
+"""Estimates the drift of the electrodes since their calibration: gain and offset of each, with their covariance.
 
-An electrode reads y = (1 + g) (s + l) + o: s the limb's signal and l that of the robot's other links by the field model, g and o
-what its gain and offset have moved by. All of them are one Kalman filter. Each is an Ornstein-Uhlenbeck process: a random walk
-over minutes that is bounded over hours. Gains share a part, since boards warm up together. The filter takes blocks of a second
+An electrode reads y = (1 + g) (s + l) + o, where s is the limb's signal, l that of the robot's other links by the field model,
+and g and o are the changes of its gain and offset. One Kalman filter holds all of them. Each is an Ornstein-Uhlenbeck process: a
+random walk over minutes that is bounded over hours. Gains have a common part, since boards warm up together. The filter learns
+from blocks of one second
 
 - in which nothing is near: s = 0;
-- in which a camera has just seen the limb. The field model is linear about the window's solution. The camera's pose with its
-  covariance and the limb's size with its spread between people are errors that all electrodes have in common, so that nothing is
-  learned of what place or size explain as well. What stays wrong with both for long is a state of the filter too, its bias, and
-  a limb that rests says nothing new.
+- in which a camera has just seen the limb. The field model is linearised about the window's solution. The errors of the camera's
+  pose (with its covariance) and of the limb's size (with its spread between people) are common to all electrodes, so the filter
+  learns nothing that pose or size explain as well. Their lasting part, the bias, is also in the filter's state. A limb at rest
+  adds no information.
 
-Electrodes whose innovation no drift explains are left out. A block whose innovations are too large together is refused: another
-thing is near, or the pose was wrong. Where that goes on, less is known than the covariance says, and the filter starts again as
-after a calibration that is old.
+Electrodes whose innovation cannot be drift are left out. A block is refused if its innovations are too large together: another
+object is near, or the pose was wrong. After REFUSED such blocks in a row the covariance was too small, and the filter starts
+again as after an old calibration.
 """
 
 from __future__ import annotations
@@ -27,47 +28,47 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.skin.layout import Skin
 
 GAIN_SPREAD, GAIN_SHARED = 0.006, 0.02
-"""Standard deviations of gains long after a calibration: of each alone, and of all together. Derived: 10 K at -0.1 to
--0.3 %/K."""
+"""Standard deviations of gains long after a calibration: GAIN_SPREAD of each, GAIN_SHARED of their common part. Derived: 10 K at
+-0.1 to -0.3 %/K."""
 OFFSET_SPREAD = 1e-3
-"""The same of an offset [V]. Derived: 10 K at 0.1 mV/K."""
+"""Standard deviation [V] of an offset long after a calibration. Derived: 10 K at 0.1 mV/K."""
 WALK_S = 1500.0
-"""Time constant [s] of these processes. Chosen: boards warm up within ten minutes, rooms within an hour."""
+"""Time constant [s] of the gains' and offsets' processes. Chosen: boards warm up within ten minutes, rooms within an hour."""
 CALIBRATED = (5e-4, 2e-5)
-"""Standard deviations of gain and offset [V] just after a calibration. Chosen: of the mean of ten thousand samples."""
+"""Standard deviations of gain and offset [V] just after a calibration. Chosen: those of the mean of ten thousand samples."""
 BLOCK_S = 1.0
-"""Length [s] of a block of windows that is learned from as a whole."""
+"""Length [s] of a block of windows; the filter makes one update per block."""
 QUIET_S = 3.0
-"""Time [s] for which nothing may have been in range before a block counts as empty."""
+"""Time [s] for which nothing must have been in range before a block counts as empty."""
 STEADY = 4.0
-"""Change of an electrode from one empty block to the next, in standard deviations, above which it has moved."""
+"""Change of an electrode from one empty block to the next, in standard deviations, above which it counts as moved."""
 STILL = 0.1
-"""Largest share of electrodes that may have moved, or be left out, in a block that is learned from."""
+"""Maximum share of electrodes that may have moved, or be left out, in a block from which the filter learns."""
 FARTHEST = 0.02
-"""Largest offset [V]. A rest that is farther off is a fault and no drift."""
+"""Maximum offset [V]. A larger one is a fault, not drift."""
 MODEL = 2.0
-"""Factor on the field model's error: this filter averages it over places, where it is neither white nor normal. Chosen."""
+"""Factor on the field model's error. The filter averages this error over poses, where it is neither white nor normal. Chosen."""
 OUTLIER = 4.0
-"""Innovation of an electrode, given those of all others, in standard deviations, that its drift does not explain."""
+"""Innovation of an electrode, given those of all others, in standard deviations, above which it cannot be drift."""
 WORST = 4.0
-"""Standard deviations by which the sum of squared innovations may exceed its mean."""
+"""Number of standard deviations by which the sum of squared innovations may exceed its mean."""
 REFUSED = 5
 """Number of refused blocks in a row after which the filter starts again."""
 MOVED = 0.03
-"""Distance [m] by which a limb has moved before a camera's block says something new: the field model's error is another one."""
+"""Distance [m] that a limb must move before a block seen by a camera adds information: the field model's error then differs."""
 AGAIN_S = 30.0
-"""Time [s] after which it says something new all the same. Chosen."""
+"""Time [s] after which such a block is used even if the limb has not moved. Chosen."""
 BIAS = np.repeat([0.01, 0.05], 3)
-"""Standard deviations [m, rad] of what a camera's pose is off by for long. Chosen: of a camera's place beside the robot."""
+"""Standard deviations [m, rad] of the lasting error of a camera's pose. Chosen: that of a camera's mounting beside the robot."""
 BIAS_S = 100.0
-"""Time constant [s] of this bias, and of who is there. Chosen."""
+"""Time constant [s] of this bias, and of the person's size. Chosen."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What a camera predicts of a window, linear about the window's solution. signal (n,) [V]: there; slopes (n, 8): by pose and
-    size; toward (8,): the camera's pose and the usual size beside the solution's; covariance (6, 6): of the camera's pose;
-    position (3,) [m]: the solution's."""
+    """A camera's prediction of a window, linear about the window's solution. signal (n,) [V]: at the solution; slopes (n, 8):
+    derivatives by pose and size; toward (8,): step from the solution to the camera's pose and the usual size; covariance (6, 6):
+    of the camera's pose; position (3,) [m]: of the solution."""
 
     signal: Array
     slopes: Array
@@ -77,20 +78,20 @@ class Seen:
 
 
 class Drift:
-    """error (n,), links_error: standard deviations of the field model's signals and of the links', as shares; size_spread (2,):
-    of log sizes between people.
+    """Kalman filter of gains and offsets. error (n,), links_error: standard deviations of the field model's signals and of the
+    links' signals, as shares; size_spread (2,): standard deviations of log sizes between people.
 
-    sigma: standard deviations (n,) of gains beside the mean of all, and of offsets [V]. What gains have in common looks like
-    another girth, whose spread between people is several times as large.
+    sigma: standard deviations (n,) of the gains about their common mean, and of the offsets [V]. A common change of the gains
+    looks like another girth, whose spread between people is several times as large.
 
-    The state is what gains (n,) and offsets (n,) [V] have moved by, and the bias (8,) of camera and size.
+    The state is the changes of gains (n,) and offsets (n,) [V], and the bias (8,) of camera and size.
     """
 
     def __init__(self, skin: Skin, error: Array, links_error: float, size_spread: Array):
         n = self._n = len(skin)
         self._noise, self._error, self._links_error = skin.noise, error, links_error
         spread = np.concatenate([np.full(n, GAIN_SPREAD), np.full(n, OFFSET_SPREAD), BIAS, size_spread])
-        self._old = np.diag(spread**2)  # of a skin whose calibration is old, and an unknown person
+        self._old = np.diag(spread**2)  # of an old calibration and an unknown person
         self._old[:n, :n] += GAIN_SHARED**2
         self._times = np.concatenate([np.full(2 * n, WALK_S), np.full(len(spread) - 2 * n, BIAS_S)])
         self._mean, self._covariance = np.zeros(len(spread)), self._old.copy()
@@ -100,29 +101,29 @@ class Drift:
         self.forget()
 
     def forget(self) -> None:
-        """Start to watch again; what was learned stays."""
+        """Discard the current block; the learned drift stays."""
         self._block, self._quiet_s = _Block(self._n), 0.0
-        self._before: Array | None = None  # the last empty block's signals
-        self._place, self._here_s = np.full(3, np.inf), 0.0  # where a camera's block was last learned from, and since when
+        self._before: Array | None = None  # signals of the last empty block
+        self._place, self._here_s = np.full(3, np.inf), 0.0  # last block learned with a camera, time since then
 
     @property
     def gain(self) -> Array:
-        """What each gain has moved by (n,), as a share."""
+        """Change of each gain (n,), as a share."""
         return self._mean[: self._n]
 
     @property
     def offset(self) -> Array:
-        """What each offset has moved by (n,) [V]."""
+        """Change of each offset (n,) [V]."""
         return self._mean[self._n : 2 * self._n]
 
     def _deviations(self) -> tuple[Array, Array]:
-        """What is `sigma` until something is learned or becomes old."""
+        """The value of `sigma` for the current covariance."""
         n, own = self._n, self._covariance[: self._n, : self._n]
         gains = np.diag(own) - 2.0 * own.mean(axis=1) + own.mean()
         return np.sqrt(np.maximum(gains, 0.0)), np.sqrt(np.diag(self._covariance)[n : 2 * n])
 
     def predict(self, elapsed_s: float) -> None:
-        """What was learned becomes old, in steps of a block."""
+        """Predict the state, in steps of at least one block."""
         self._unlearned_s += elapsed_s
         if self._unlearned_s < BLOCK_S:
             return
@@ -133,14 +134,15 @@ class Drift:
         self.sigma = self._deviations()
 
     def signal(self, raw: Array, links: Array) -> Array:
-        """The limb's signals (n,) [V] in readings (n,) beside the calibrated offsets, of which links are so much (n,)."""
+        """The limb's signals (n,) [V]: readings raw (n,) (less the calibrated offsets) corrected for drift, less the links'
+        signals (n,)."""
         return np.asarray((raw - self.offset) / (1.0 + self.gain) - links)
 
     def take(
         self, signal: Array, links: Array, samples: NDArray[np.integer], elapsed_s: float, seen: Seen | None, is_near: bool
     ) -> None:
-        """Takes a window: signals (n,) [V] as `signal` gives them, over so many samples (n,), what links add (n,) [V], and what
-        a camera has just seen. is_near: something is, or a camera sees the limb."""
+        """Add a window: signals (n,) [V] as `signal` returns them, their numbers of samples (n,), the links' signals (n,) [V],
+        and the camera's prediction. is_near: something is felt, or a camera sees the limb."""
         if not 0.0 < elapsed_s < BLOCK_S or (seen is None and is_near):
             self._block, self._quiet_s, self._before = _Block(self._n), 0.0, None
             return
@@ -159,7 +161,7 @@ class Drift:
         self.sigma = self._deviations()
 
     def _learn_rest(self, block: _Block) -> None:
-        """From a block in which nothing is near. An electrode whose rest has jumped is learned anew."""
+        """Learn from a block in which nothing is near. The offset of an electrode that has jumped gets a wider covariance."""
         mean, before = block.innovation, self._before
         self._before = mean
         noise = np.sqrt(2.0 * self._noise / np.maximum(block.samples, 1))
@@ -172,7 +174,7 @@ class Drift:
         self._learn(block, block.used & (np.abs(self.offset + mean) < FARTHEST))
 
     def _learn_seen(self, block: _Block) -> None:
-        """From a block in which a camera saw the limb, where that says something new."""
+        """Learn from a block in which a camera saw the limb, if that adds information."""
         if np.linalg.norm(block.position - self._place) < MOVED and self._here_s < AGAIN_S:
             return
         self._place, self._here_s = block.position, 0.0
@@ -182,7 +184,7 @@ class Drift:
             at = np.flatnonzero(used)
             inverse = np.linalg.inv(total[np.ix_(at, at)])
             pulled = inverse @ innovation[at]
-            score = np.abs(pulled) / np.sqrt(np.diag(inverse))  # of each, given all others
+            score = np.abs(pulled) / np.sqrt(np.diag(inverse))  # of each electrode, given all others
             if score.max() < OUTLIER:
                 break
             used[at[score.argmax()]] = False
@@ -194,7 +196,7 @@ class Drift:
             self._refused, self._covariance = 0, self._old.copy()
 
     def _innovation(self, block: _Block) -> tuple[Array, Array, Array]:
-        """Covariance (n, n), the state's slopes (n, m) and innovation (n,) of a block."""
+        """Covariance (n, n), the measurement Jacobian (n, m) and the innovation (n,) of a block."""
         n = self._n
         H = np.concatenate([np.diag(block.signal + block.links), np.eye(n), block.slopes], axis=1)
         share = MODEL * (self._error + NEAR_ERROR * block.signal / NEAR_SIGNAL)
@@ -203,7 +205,7 @@ class Drift:
         return H @ self._covariance @ H.T + pose + np.diag(alone), H, block.innovation - block.slopes @ self._mean[2 * n :]
 
     def _learn(self, block: _Block, used: NDArray[np.bool_]) -> None:
-        """A step of the filter with the electrodes (n,) in use."""
+        """Kalman update with the electrodes in use (n,)."""
         total, H, innovation = self._innovation(block)
         at = np.flatnonzero(used)
         across = H[at] @ self._covariance
@@ -214,8 +216,8 @@ class Drift:
 
 
 class _Block:
-    """Means over windows, weighted by their samples (n,): signals that nothing explains yet, what the limb's and the links'
-    signals are by the field model (n,) [V], slopes (n, 8), a camera's covariance (6, 6) and the limb's position (3,)."""
+    """Means over windows, weighted by their samples (n,): unexplained signals, the signals of limb and links by the field model
+    (n,) [V], slopes (n, 8), the camera's covariance (6, 6) and the limb's position (3,)."""
 
     def __init__(self, n: int, is_seen: bool = False):
         self.is_seen, self.seconds, self.samples = is_seen, 0.0, np.zeros(n)
@@ -239,7 +241,7 @@ class _Block:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Which electrodes (n,) were in use at all."""
+        """Electrodes (n,) that have samples."""
         return self.samples > 0
 
     @property

@@ -1,22 +1,21 @@
-"""One pose per window of voltages, from all pads together.
+"""Estimates one limb pose per window of voltages, from all pads together.
 
-Each window is estimated from its own samples; what is published is its likelihood. Earlier windows enter as the point and spread
-where the solve looks, and through what changes slowly (`size.py`, `drift.py`). A window takes these steps:
+Each window is estimated from its own samples, and its likelihood is published. Earlier windows only set where the solve starts
+and its prior, and the slowly changing states (`size.py`, `drift.py`). The steps of a window:
 
-1. predict: the track decays to its home (`track.py`), or moves to the fused pose where that is known well
-2. solve from there (`solve.py`), with the limb's size as far as it is known
+1. predict: the track decays to its home (`track.py`), or moves to the fused pose if that is known well enough
+2. solve from there (`solve.py`), with the learned size of the limb as a prior
 3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from all of `starts.py`
-4. far from the pads thick and thin parts of a limb feel alike: another place that is possible, from scratch or found beside the
+4. far from the pads, thick and thin parts of a limb feel alike: another possible place, from scratch or found beside the
    track, is kept as its rival and solved as well, until the windows have decided between the two
-5. learn how far each pad is to be believed (`trust.py`), the limb's size close to the pads, the drift of the electrodes while
-   nothing is near or a camera sees the limb
-6. add up the evidence on whether the thing that is felt is a limb (`identity.py`)
+5. learn the trust in each pad (`trust.py`), the limb's size close to the pads, and the drift of the electrodes while nothing is
+   near or a camera sees the limb
+6. add up the evidence on whether the object that is felt is a limb (`identity.py`)
 7. publish the likelihood: size and roll marginalised, the errors of model and drift counted as nearly the same in several
-   windows; where a rival is possible, the likelihood of the two together
-8. beside the pose, and without it: the nearest point of whatever is before each pad (`surface_points.py`), and whether something
-   touches (`contact.py`)
+   windows; if there is a rival, the likelihood of the mixture of the two
+8. independently of the pose: the nearest surface point before each pad (`surface_points.py`), and contact (`contact.py`)
 
-Voltages that no limb explains (a metal part, a block) are reported as an object, and as unidentified while it is not decided.
+Voltages that no limb explains (a metal part, a block) are reported as an object, and as unidentified until that is decided.
 """
 
 from __future__ import annotations
@@ -46,21 +45,20 @@ from penumbra.shared.skin.response import Response
 FOREIGN = "the signals fit no limb: another object is near"
 """`HapticEstimate.why` of voltages that no limb explains."""
 UNIDENTIFIED = "the signals do not show yet whether a limb or another object is near"
-"""`HapticEstimate.why` of voltages that a limb explains as well as other things do."""
+"""`HapticEstimate.why` of voltages that a limb and other objects explain equally well."""
 NOTHING = "nothing near"
-"""`HapticEstimate.why` of voltages that are those of empty space."""
+"""`HapticEstimate.why` of voltages of empty space."""
 WHY = {"in_range": "", "unidentified": UNIDENTIFIED, "object": FOREIGN, "out_of_range": NOTHING}
-"""`HapticEstimate.why` of the states that a solve gives."""
+"""`HapticEstimate.why` by state."""
 
 
 @dataclass(frozen=True)
 class HapticEstimate:
-    """T_world_target (4, 4) and information (6, 6) of the voltages alone, zero along what they do not show, and all zero where
-    they are not a limb's; step (6,): the pose error that leads to T from where the likelihood was linearised; gap [m]: the
-    smallest from an electrode to the skin, at most `HapticSettings.farthest_gap`; state: see `HapticPose`, only what is in range
-    is worth using; why: the reason where it is not; residuals (n,): what the limb leaves unexplained, in standard deviations;
-    surface: the nearest point before each pad that feels something; contact, touched: whether something touches, and which
-    pads."""
+    """T_world_target (4, 4) and information (6, 6) of the voltages alone: zero along unobserved directions, and all zero if the
+    voltages are not a limb's; step (6,): pose error from the point of linearisation to T; gap [m]: smallest one from an electrode
+    to the skin, at most `HapticSettings.farthest_gap`; state: see `HapticPose`, only `in_range` is worth using; why: the reason
+    for any other state; residuals (n,): of the limb's fit, in standard deviations; surface: the nearest point before each pad
+    that feels something; contact, touched: the contact state and the touched pads."""
 
     T: Array
     information: Array
@@ -80,15 +78,15 @@ class HapticEstimate:
 
     @property
     def may_be_limb(self) -> bool:
-        """Whether a limb is felt, or something that may be one."""
+        """Whether a limb is felt, or an object that may be one."""
         return self.state in ("in_range", "unidentified")
 
 
 class Estimator:
-    """home (4, 4), spread (6,): where the target is expected; network: None where none was trained (the solve then starts
-    from home); method: `solve`, or `paper` for the network alone; measured: whether the limb's size is that of the cell file's
-    target, and not any person's; shapes: None where they were not measured for these pads (no points of surfaces then). Raises
-    ValueError for `paper` without a network."""
+    """Haptic pose estimator of one target. home (4, 4), spread (6,): the expected pose; network: None if none was trained (the
+    solve then starts from home); method: `solve`, or `paper` for the network alone; measured: whether the cell file states this
+    person's limb size; shapes: None if they were not measured for these pads (then no surface points). Raises ValueError for
+    `paper` without a network."""
 
     def __init__(
         self,
@@ -122,21 +120,21 @@ class Estimator:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Forget all earlier windows."""
         self._stamp_ns, self._away_s = 0, 0.0
-        self._is_tracking, self._untracked = False, -1  # windows without a track since the last one with it
+        self._is_tracking, self._untracked = False, -1  # number of windows since the track was lost
         self._track_misfit = SmoothedMisfit(self.settings)
         for part in (self._track, self._starts, self._pads, self.size, self.drift, self.identity, self._contact):
             part.forget()
 
     def nothing(self, why: str) -> HapticEstimate:
-        """The estimate when nothing can be felt: home, without information."""
+        """The estimate when nothing can be felt: home, with zero information."""
         return HapticEstimate(
             self._home.T, np.zeros((6, 6)), np.zeros(6), self.settings.farthest_gap, "out_of_range", why, np.zeros(len(self.skin))
         )
 
     def warm_up(self, joints: int) -> None:
-        """Compile and touch everything once, so that the first real window takes no longer than the others."""
+        """Compile and run everything once, so that the first real window takes no longer than the others."""
         pads = np.tile(np.eye(4), (len(self.skin.pads), 1, 1))
         amplitude = self.skin.volts(0.1)
         for stamp_ns in (1, 2, 3):
@@ -145,7 +143,7 @@ class Estimator:
 
     @property
     def pose(self) -> Array:
-        """T_world_target that is most probable after the last window, with what earlier windows said."""
+        """The most probable T_world_target after the last window, including earlier windows."""
         return self._track.place.T
 
     def update(
@@ -158,9 +156,8 @@ class Estimator:
         expected: tuple[Array, Array] | None = None,
         pressed: NDArray[np.bool_] | None = None,
     ) -> HapticEstimate:
-        """The estimate at stamp_ns of mean voltages (n,) over so many samples (n,), none for electrodes to leave out, with the
-        pads at T_world_pads (p, 4, 4); expected: T_world_target (4, 4) and covariance (6, 6) by all senses; pressed (n,): see
-        `VoltageWindow`."""
+        """The estimate at stamp_ns from mean voltages (n,) over samples (n,), zero for electrodes to leave out, with the pads at
+        T_world_pads (p, 4, 4). expected: fused T_world_target (4, 4) and covariance (6, 6); pressed (n,): see `VoltageWindow`."""
         samples = np.asarray(samples)
         if not (samples > 0).any():
             self._contact.forget()
@@ -182,9 +179,9 @@ class Estimator:
     # ---- the steps of a window
 
     def _predict(self, stamp_ns: int) -> float:
-        """Takes everything to a window's stamp; returns the seconds since the last one."""
+        """Predict all states to a window's stamp; returns the seconds since the last window."""
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
-        if self._stamp_ns:  # not the first window of all
+        if self._stamp_ns:  # not the first window
             self.drift.predict(max(elapsed_s, 0.0))
         if not 0.0 <= elapsed_s < self.settings.memory_s:
             self.reset()
@@ -197,7 +194,7 @@ class Estimator:
     def _reading(
         self, amplitude: Array, samples: NDArray[np.integer], T_world_pads: Array, links: Array, joints: ArrayLike
     ) -> Reading:
-        """The signals: voltages less the electrodes' rests, and less the effect (n,) [V] of the robot's other links."""
+        """The signals: voltages less the electrodes' rests and the effect (n,) [V] of the robot's other links."""
         signal = np.where(samples > 0, self.drift.signal(self.skin.signal(amplitude), links), 0.0)
         variance = np.where(samples > 0, self.skin.noise / np.maximum(samples, 1), np.inf)
         gain, offset = self.drift.sigma
@@ -205,7 +202,7 @@ class Estimator:
         return Reading(signal, variance, T_world_pads, self._pads.distrust(), doubt, error, joints)
 
     def _with_surface(self, estimate: HapticEstimate, reading: Reading, pressed: NDArray[np.bool_] | None) -> HapticEstimate:
-        """With the points of surfaces, and what touches."""
+        """The estimate with surface points and contact."""
         assert self._points is not None
         ended = np.zeros(len(self.skin), np.bool_) if pressed is None else pressed
         points = self._points.find(reading.signal, reading.variance + reading.doubt**2, ended, reading.T_world_pads)
@@ -223,7 +220,7 @@ class Estimator:
         return self._estimate(T, information, np.zeros(6), gap, state, np.zeros(len(self.skin)))
 
     def _by_solve(self, reading: Reading, expected: Place | None, elapsed_s: float) -> tuple[HapticEstimate, Seen | None]:
-        """The estimate, and what a camera predicts of the window. expected: where it has just seen the limb."""
+        """The estimate, and the camera's prediction of the window. expected: the limb's place that a camera has just seen."""
         before = self._track.place
         solution = self._solution(reading, expected is not None)
         if self.identity.odds < 0.0 and before.is_apart(self._track.place, self.settings):
@@ -243,7 +240,7 @@ class Estimator:
         return self._estimate(T, information, step, gap, state, solution.residuals), seen
 
     def _watch_absence(self, in_range: bool, elapsed_s: float) -> None:
-        """Forgets the size of a limb that has been away: the next one may be another person's."""
+        """Forget the size of a limb that has been away: the next one may be another person's."""
         self._away_s = 0.0 if in_range else self._away_s + elapsed_s
         if self._away_s > PERSON_S:
             self.size.forget()
@@ -251,8 +248,8 @@ class Estimator:
     # ---- where the limb is
 
     def _solution(self, reading: Reading, is_expected: bool) -> Solution:
-        """The solution at the track, or at its rival where that has become more probable, or the best one from scratch. Moves
-        the track there. is_expected: the fused pose says where the limb is, and no other place is looked for."""
+        """The solution at the track, or at its rival if that has become more probable, or the best one from scratch. Moves the
+        track there. is_expected: the fused pose gives the limb's place, so no other place is searched for."""
         if not self._is_tracking:
             self._untracked += 1
             if self._untracked % self.settings.scratch_every == 0:
@@ -270,25 +267,25 @@ class Estimator:
         return solution
 
     def _compared(self, reading: Reading, solution: Solution, prior: Prior, rival: Place) -> Solution:
-        """The solution at the track, found from this prior, or that at the rival where it has become more probable. Only the
-        voltages are evidence: what was believed before is in the odds already."""
+        """The solution at the track, found from this prior, or at the rival if that has become more probable. Only the voltages
+        count as evidence: the odds already contain the priors."""
         rival_prior = self._prior(rival)
         other = self._solve(reading, rival_prior, rival.T, coarse=0)
         evidence = other.cost - rival_prior.cost(other) - (solution.cost - prior.cost(solution))
         return other if self._track.weigh(self._place(reading, other, rival_prior), evidence) else solution
 
     def _look_elsewhere(self, reading: Reading, solution: Solution) -> None:
-        """Solves from another start than the track, whose solution this is; another place becomes its rival."""
+        """Solve from another start than the tracked solution; a different place becomes its rival."""
         home = self._prior(self._home.place)
         other = self._solve(reading, home, self._starts.elsewhere(reading, self.pose, self.size.mean))
         rival = self._place(reading, other, home)
         if not self._track.place.stands_for(rival, self.settings):
-            # the track is judged with the same freedom: from its pose, but with home's spread
+            # judge the track with the same freedom: from its pose, but with home's spread
             same = self._solver.solve(reading, home, solution.T, solution.size, 0, 2)
             self._track.contest(rival, self.settings.beside_odds + self._track.limited(other.cost - same.cost))
 
     def _from_scratch(self, reading: Reading) -> Solution:
-        """The best solution from all starts and from the track; the next best one at another place becomes the rival."""
+        """The best solution from all starts and from the track; the second best at another place becomes the rival."""
         home, track = self._prior(self._home.place), self._track
         starts = [self.pose, *(self._starts.at(which, reading, self.size.mean) for which in range(len(self._starts)))]
         best, *others = sorted((self._solve(reading, home, start) for start in starts), key=lambda solution: solution.cost)
@@ -306,13 +303,13 @@ class Estimator:
         return Prior(place.T, place.information, self.size.mean, self.size.information)
 
     def _place(self, reading: Reading, solution: Solution, prior: Prior) -> Place:
-        """Where the limb is by a window's solution from a prior."""
+        """The limb's place by a window's solution from a prior."""
         information, gradient = self._solver.likelihood(reading, solution)
         information = self.size.marginalised(information, gradient, solution.size)[0] + prior.information
         return Place(solution.T, np.asarray(np.linalg.inv(information), np.float64))
 
     def _network_pose(self, reading: Reading) -> Array:
-        """The network's pose, home where there is no network."""
+        """The network's pose, or home if there is no network."""
         return self._home.T if self.network is None else self.network.posterior(self._features(reading))
 
     def _features(self, reading: Reading) -> NDArray[np.float32]:
@@ -323,12 +320,12 @@ class Estimator:
     # ---- what a solution tells
 
     def _judge(self, solution: Solution) -> None:
-        """Whether the track still explains the voltages."""
+        """Update whether the track still explains the voltages."""
         self._track_misfit.take(solution.misfit)
         self._is_tracking = self._track_misfit.value <= self.settings.track_misfit
 
     def _learn_size(self, reading: Reading, solution: Solution, gap: float) -> None:
-        """Learns the size where it can be told from the pose: close to the pads, with one place possible."""
+        """Learn the size where it can be separated from the pose: close to the pads, without a rival."""
         if gap < SIZE_GAP and self._is_tracking and self._track.rival is None:
             likelihood = self._solver.likelihood(reading, solution, SIZE_LASTING)
             self.size.learn(solution.size, *likelihood, self._home.place.information)
@@ -336,7 +333,7 @@ class Estimator:
     def _identified(
         self, reading: Reading, solution: Solution, gap: float, expected: Place | None, elapsed_s: float
     ) -> HapticState:
-        """What is felt, after a window so many seconds after the last one, and the limb that explains it best."""
+        """The state after a window and its best limb solution; elapsed_s: time since the last window."""
         free = self._solver.free(reading, solution, self._prior(self._home.place))
         self.identity.take(reading, solution, free, gap, elapsed_s)
         if self.size.strangeness > self.settings.strange_size:
@@ -346,7 +343,7 @@ class Estimator:
             self.identity.see()
         verdict = self.identity.verdict
         if verdict == "object":
-            self.size.forget()  # it was no limb's
+            self.size.forget()  # it was not a limb's size
         return "in_range" if verdict == "limb" else verdict
 
     def _absent(self, elapsed_s: float) -> HapticState:
@@ -354,7 +351,7 @@ class Estimator:
         return "out_of_range"
 
     def _seen(self, solution: Solution, expected: Place) -> Seen | None:
-        """What a camera that saw the limb there predicts; None where the voltages say that it is elsewhere."""
+        """The camera's prediction for a limb at the expected place; None if the voltages say that it is elsewhere."""
         if self._track.place.is_apart(expected, self.settings):
             return None
         toward = np.concatenate([pose_error(expected.T, solution.T), self.size.usual[0] - solution.size])
@@ -362,22 +359,22 @@ class Estimator:
         return Seen(solution.signal, slopes, toward, expected.covariance, solution.T[:3, 3])
 
     def _pose_likelihood(self, reading: Reading, solution: Solution) -> tuple[Array, Array]:
-        """Information (6, 6) and gradient (6,) of the pose by the voltages alone, the size marginalised."""
+        """Information (6, 6) and gradient (6,) of the pose from the voltages alone, with the size marginalised."""
         likelihood = self._solver.likelihood(reading, solution, self.settings.error_lasts)
         return self.size.marginalised(*likelihood, solution.size, self.settings.size_lasts)
 
     def _peak(self, solution: Solution, information: Array, gradient: Array) -> tuple[Array, Array]:
-        """T_world_target (4, 4) where a likelihood at the solution peaks, and its information (6, 6) there. Voltages that are
-        explained badly say less than their noise promises."""
+        """T_world_target (4, 4) where a likelihood at the solution peaks, and its information (6, 6) there. Voltages with a large
+        misfit carry less information than their noise suggests."""
         trust = 1.0 / max(1.0, solution.misfit)
         best, known = peak(solution.T, trust * information, trust * gradient)
-        turn = best[:3, :3] @ solution.T[:3, :3].T  # what is unknown about T's axis is so about the published one
+        turn = best[:3, :3] @ solution.T[:3, :3].T  # the unobserved axis of T is that of the published pose
         known[3:] = turn @ known[3:]
         known[:, 3:] = known[:, 3:] @ turn.T
         return best, 0.5 * (known + known.T)
 
     def _is_felt(self, information: Array, gap: float) -> bool:
-        """Whether something is near: within range, and known well enough along one direction at least."""
+        """Whether something is near: within range, and known well enough along at least one direction."""
         if gap >= self.settings.range_share * float(self.skin.range.max()):
             return False
         return float(np.linalg.eigvalsh(information * SCALES)[-1]) > 1.0 / self.settings.worst_sigma**2

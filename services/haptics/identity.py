@@ -1,12 +1,12 @@
-"""Whether what is felt is a limb: the odds of a limb against anything else, added up over windows.
+"""Decides whether the object that is felt is a limb, from the odds of a limb against anything else over successive windows.
 
-A limb leaves residuals of the size of noise and of the field model's error. Another thing leaves a share of its signal as well,
-which its shape, its size or its missing way to ground decides: 3 to 50 % at 4 cm, and less beyond, where only the largest
-features of a shape are felt. What is left is nearly the same in windows that follow each other, while noise is not. So each
-hypothesis expects of every electrode a share that changes slowly (an Ornstein-Uhlenbeck process, followed by a Kalman filter),
-and each window adds the log likelihoods of its innovations: a sequential probability ratio test (Wald 1945, DOI
-10.1214/aoms/1177731118). Where noise hides the share, the likelihoods are alike: the odds do not move, and what is not decided
-yet stays unidentified. A camera that has just seen the limb where it is felt decides as well.
+A limb leaves residuals of the size of noise and of the field model's error. Another object also leaves a share of its signal,
+which depends on its shape, its size and its grounding: 3 to 50 % at 4 cm, and less beyond, where only the largest features of a
+shape are felt. This share is nearly the same in successive windows, while noise is not. Each hypothesis therefore expects of
+every electrode a share that changes slowly (an Ornstein-Uhlenbeck process in a Kalman filter), and each window adds the log
+likelihoods of its innovations: a sequential probability ratio test (Wald 1945, DOI 10.1214/aoms/1177731118). Where noise hides
+the share, the likelihoods are alike: the odds do not change, and an undecided object stays unidentified. A camera that has just
+seen the limb where it is felt also decides.
 """
 
 from __future__ import annotations
@@ -22,31 +22,32 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.skin.layout import Skin
 
 SHARES = np.array([0.01, 0.03, 0.1, 0.3])
-"""Standard deviations of what another thing leaves unexplained within SHARES_GAP, as shares of the signal, equally probable.
-Measured: residuals of metal and plastic things in the full field model, see `penumbra bench haptics`. The smallest one makes a
-limb certain only where the field model is surer than that: where few pads feel a thing, as on a robot's hull, a tube leaves no
-more than a limb."""
+"""Standard deviations of the share of the signal that another object leaves unexplained within SHARES_GAP; all are equally
+probable. Measured: residuals of metal and plastic objects in the full field model, see `penumbra bench haptics`. The smallest one
+identifies a limb only if the field model's error is smaller: where few pads feel an object, as on a robot's hull, a tube leaves
+no more than a limb."""
 SHARES_GAP = 0.04
-"""Gap [m] beyond which these shares fall with its power SHARES_POWER. Measured on grounded metal, from 4 to 12 cm."""
+"""Gap [m] beyond which these shares fall as its power SHARES_POWER. Measured on grounded metal, from 4 to 12 cm."""
 SHARES_POWER = 1.5
 ERRORS = np.array([1.0, 2.5, 5.0])
-"""The field model's error at a limb, in standard deviations of all its errors, and ERRORS_ODDS: their probabilities. Measured: at
-pads that feel little, and at odd poses, the model errs more."""
+"""The field model's error at a limb, in standard deviations of all its errors; ERRORS_ODDS are the logs of their probabilities.
+Measured: the model errs more at pads that feel little and at unusual poses."""
 ERRORS_ODDS = np.log([0.75, 0.2, 0.05])
 TIMES = np.concatenate([ERRORS, np.ones(1 + len(SHARES))])[:, None]
-"""The field model's error at a limb, a fault and other things, likewise."""
+"""The field model's error, in the same unit, per hypothesis: limbs, a fault, other objects."""
 FAULTY = 0.01
-"""Probability that an electrode is faulty, whatever is felt, and that a pad beside a limb is: their shares are then one."""
+"""Probability that an electrode is faulty, whatever is felt, and that a pad beside a limb is. A fault leaves a share of one."""
 
 SURE = 0.5
-"""Largest mean error of the field model, in smallest SHARES, with which the skin alone calls something a limb. Chosen: on the
-robot's hull, where the model errs by as much as such a thing, a grounded bar was called a limb; there a camera must see it."""
+"""Maximum mean error of the field model, in units of the smallest of SHARES, with which the skin alone may identify a limb.
+Chosen: on the robot's hull, where the model's error is as large as such a share, a grounded bar was called a limb; there a camera
+must see it."""
 
 Verdict = Literal["limb", "object", "unidentified"]
 
 
 class Identity:
-    """odds: the log odds of a limb against anything else. error (n,): standard deviation of the field model's error, as a share
+    """Log odds of a limb against any other object (odds). error (n,): standard deviation of the field model's error, as a share
     of the signal."""
 
     def __init__(self, skin: Skin, error: Array, settings: HapticSettings):
@@ -56,21 +57,21 @@ class Identity:
         self.forget()
 
     def forget(self) -> None:
-        """Something else may come."""
+        """Reset: the next object may be another one."""
         self._absent_s, self._is_limb = 0.0, False
         self._begin(0.0)
 
     def _begin(self, odds: float) -> None:
-        """Starts from log odds."""
+        """Start from the given log odds."""
         rows = len(ERRORS) + 1 + len(SHARES)  # limbs, a fault, other things
-        self._likelihood = np.zeros((rows, self._electrodes))  # log likelihoods, beside the first row's
+        self._likelihood = np.zeros((rows, self._electrodes))  # log likelihoods, less the first row's
         self._mean, self._variance = np.zeros((rows, self._electrodes)), np.ones((rows, self._electrodes))
         self._likelihood[-len(SHARES) :] = -odds / self._electrodes
         self.odds = odds
 
     @property
     def verdict(self) -> Verdict:
-        """What is felt, as far as it is decided. A limb is one until the odds have turned."""
+        """The object's identity, as far as it is decided. A limb stays one until the odds fall below zero."""
         if self._is_limb:
             return "limb"
         return "object" if self.odds <= -self._settings.object_odds else "unidentified"
@@ -82,18 +83,18 @@ class Identity:
             self._begin(self._settings.seen_odds)
 
     def refuse(self) -> None:
-        """No limb has the size that was learnt."""
+        """The learned size is impossible for a limb."""
         self._is_limb = False
         if self.odds > -self._settings.object_odds:
             self._begin(-self._settings.object_odds)
 
     def doubt(self) -> None:
-        """The limb is at another place than was thought: what spoke against a limb there says nothing."""
+        """The limb is at another place than assumed: evidence against a limb at the old place no longer counts."""
         self._begin(0.0)
 
     def take(self, reading: Reading, solution: Solution, free: Array, gap: float, elapsed_s: float) -> None:
-        """Takes a window, the limb that explains it best, the share (n,) of errors that this leaves in the residuals (see
-        `Solver.free`), its gap [m], and the seconds since the last window."""
+        """Add a window, its best limb solution, the share (n,) of errors that stays in the residuals (see `Solver.free`), the gap
+        [m], and the seconds since the last window."""
         settings = self._settings
         self._absent_s = 0.0
         added = self._innovation(reading, solution, free, gap, elapsed_s)
@@ -108,13 +109,13 @@ class Identity:
         self._is_limb = self.odds >= (0.0 if self._is_limb else self._becomes_limb)
 
     def miss(self, elapsed_s: float) -> None:
-        """Nothing was near for so many more seconds."""
+        """Nothing was near for another elapsed_s seconds."""
         self._absent_s += elapsed_s
         if self._absent_s > self._settings.absent_s:
             self.forget()
 
     def _innovation(self, reading: Reading, solution: Solution, free: Array, gap: float, elapsed_s: float) -> Array:
-        """The log likelihoods (rows, n) of a window's residuals, beside those of the first row."""
+        """The log likelihoods (rows, n) of a window's residuals, less those of the first row."""
         signal = np.maximum(np.maximum(reading.signal, solution.signal), 0.0)
         used = np.isfinite(reading.variance)
         noise = np.where(used, reading.variance, 1.0)

@@ -1,5 +1,5 @@
-"""Where the pads are at a moment: the robots' forward kinematics at joint angles interpolated to it, or carried on by the
-last velocity where voltages come before the joint angles of their time."""
+"""Computes the pads' poses at a stamp: forward kinematics at joint angles interpolated to it, or extrapolated with the last
+velocity if voltages arrive before the joint angles of their time."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from penumbra.shared.perception.joint_history import RobotJoints
 from penumbra.shared.skin.layout import Skin, link_names
 
 STALE_NS = 100_000_000
-"""Largest distance [ns] of a moment from the joint angles that are used for it. Chosen: at 1 rad/s a
-joint moves a pad that is half a metre away by 5 cm in this time."""
+"""Maximum distance [ns] between a stamp and the joint angles used for it. Chosen: at 1 rad/s a joint moves a pad that is half a
+metre away by 5 cm in this time."""
 
 
 class PadPoses:
-    """Poses of a cell's pads. Joint angles may come from another thread than the questions.
+    """Poses of a cell's pads. Joint angles may be added from another thread than the one that calls `at`.
 
     models: of all robots of the cell, by name; their joints in this order are the network's joint angles.
     """
@@ -29,11 +29,11 @@ class PadPoses:
         self._joints = RobotJoints(counts, STALE_NS, is_carried_on=True)
 
     def add(self, robot: str, stamp_ns: int, joints: Array) -> None:
-        """Take joint angles (j,) [rad]. Raises ValueError for an unknown robot or another number of joints than it has."""
+        """Add joint angles (j,) [rad]. Raises ValueError for an unknown robot or a wrong number of joints."""
         self._joints.add(robot, stamp_ns, joints)
 
     def at(self, stamp_ns: int) -> tuple[Array, Array] | None:
-        """T_world_pads (p, 4, 4) and all joint angles (j,) at stamp_ns; None where a robot that carries pads sent none near that
+        """T_world_pads (p, 4, 4) and all joint angles (j,) at stamp_ns; None if a robot that carries pads has sent none near that
         time."""
         links: dict[str, dict[str, Array]] = {}
         joints, known = [], self._joints.at(stamp_ns)

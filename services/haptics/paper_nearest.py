@@ -22,9 +22,10 @@ from penumbra.shared.skin.layout import Skin
 LIMB_RADIUS = 0.045
 """r [m]: halfway between a wrist and an elbow."""
 EXPECTED_GAP = 0.15
-"""Where a pad that feels nothing puts the skin [m], with a factor of e either way: the end of the paper's range."""
+"""Expected distance [m] of the skin from a pad that feels nothing, with a factor of e either way: the end of the paper's
+range."""
 EXPECTED_TILT = 0.4
-"""Standard deviation of each part of g before anything is measured."""
+"""Standard deviation of each component of g before any measurement."""
 ITERATIONS = 6
 """Number of Gauss-Newton steps of the fit."""
 
@@ -33,8 +34,7 @@ def nearest_points(skin: Skin, signal: Array, variance: Array) -> tuple[Array, A
     """The nearest surface point per pad, in the pad's frame.
 
     signal, variance: mean voltage less its rest [V] and its variance [V^2] per electrode (..., n), infinite for electrodes to
-    leave out. Returns points (..., p, 3) [m] and their covariances (..., p, 3, 3) [m^2]; a pad without electrodes has the
-    expectation.
+    leave out. Returns points (..., p, 3) [m] and their covariances (..., p, 3, 3) [m^2]; a pad without electrodes gets the prior.
     """
     shape, pads = np.shape(signal)[:-1], len(skin.pads)
     signal = np.ascontiguousarray(signal, dtype=np.float64).reshape(-1, len(skin))
@@ -65,7 +65,7 @@ def _fit(signal, precision, first, centroids, peak, a2, points, covariances):  #
     x, b, row, step = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for s in range(len(signal)):
         for k in range(len(first) - 1):
-            # Start at the gap that the strongest electrode has by itself.
+            # Start at the gap given by the strongest electrode alone.
             d = EXPECTED_GAP
             for e in range(first[k], first[k + 1]):
                 if precision[s, e] > 0.0 and signal[s, e] * math.sqrt(precision[s, e]) > 3.0:

@@ -1,10 +1,10 @@
 """The paper's network (section "Haptic-based Pose Estimation"): joint angles and the pads' measures in, four fully connected
-layers of 256 ReLU units, the target's pose out. Inference on numpy alone.
+layers of 256 ReLU units, the target's pose out. Inference uses numpy alone.
 
-How far the pose is off is a function of the pose itself, as in the paper: R_c = f_c(x, theta), found by Gaussian-process
-regression over the limb's pose relative to the nearest pad. The network answers for the poses it was trained on, a known broad
-Gaussian over the cell. What is published is the evidence of the voltages alone: that prior's information is subtracted again,
-and directions where nothing remains are unknown.
+The pose error is a function of the pose itself, as in the paper: R_c = f_c(x, theta), found by Gaussian-process regression over
+the limb's pose relative to the nearest pad. The network's answer includes its training prior, a known broad Gaussian over the
+cell. Only the evidence of the voltages is published: the prior's information is subtracted, and directions without remaining
+information are unknown.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from penumbra.shared.skin import response
 from penumbra.shared.skin.layout import Skin
 
 HEAD_ON = 1e-6
-"""Sine of the angle between a limb's axis and the direction to the nearest pad, below which no side of the limb is the nearer."""
+"""Sine of the angle between a limb's axis and the direction to the nearest pad, below which no side of the limb counts as
+nearer."""
 
 
 def features(
@@ -49,9 +50,9 @@ def features(
 
 @dataclass(frozen=True)
 class Relative:
-    """Where a limb is, seen from the nearest pad. pose (4,): log gap [m], place along the limb [m], how far beside the electrode
-    the limb is (zero straight above it, one sideways), and the slope of its axis against the pad; frame (3, 3): unit vectors
-    along the limb, across it, and away from the pad, one a row, in the world."""
+    """Pose of a limb relative to the nearest pad. pose (4,): log gap [m], position along the limb [m], lateral offset of the limb
+    from the electrode (0 straight above it, 1 sideways), and the slope of its axis against the pad; frame (3, 3): rows are unit
+    vectors along the limb, across it, and away from the pad, in the world."""
 
     pose: Array
     frame: Array
@@ -77,7 +78,7 @@ class Relative:
 
 @dataclass(frozen=True)
 class Regression:
-    """A Gaussian process for each part of R_c: logs of the variances along, across, away [m^2], and about across and away
+    """A Gaussian process for each component of R_c: logs of the variances along, across, away [m^2], and about across and away
     [rad^2]. points (k, 4): the training's relative poses; lengths (5, 4) and amplitudes (5,) of the kernels; weights (k, 5);
     means (5,)."""
 
@@ -96,8 +97,8 @@ class Regression:
 
 @dataclass(frozen=True)
 class PoseNetwork:
-    """Weights and biases of five layers (four hidden), the prior that it was trained with: home (4, 4), spread (6,) of the pose
-    error about it; and R_c."""
+    """Weights and biases of five layers (four hidden); the training prior: home (4, 4) and spread (6,) of the pose error about
+    it; and R_c."""
 
     weights: tuple[NDArray[np.float32], ...]
     biases: tuple[NDArray[np.float32], ...]
@@ -112,11 +113,11 @@ class PoseNetwork:
         return np.asarray(x @ self.weights[-1] + self.biases[-1], dtype=np.float64)
 
     def posterior(self, x: NDArray[np.float32]) -> Array:
-        """T_world_target that the network thinks most probable, prior included: where a solve may start."""
+        """The network's most probable T_world_target, prior included: a start for a solve."""
         return perturb(self.home, self.spread * self.mean(x))
 
     def covariance(self, relative: Relative) -> Array:
-        """R_c (6, 6) of the pose error of that, about `geometry.perturb`: the roll as the prior has it."""
+        """R_c (6, 6) of the pose error of `posterior`, about `geometry.perturb`; the roll's variance is the prior's."""
         frame = np.zeros((6, 6))
         frame[:3, :3] = frame[3:, 3:] = relative.frame
         along, across, away, pitch, yaw = self.regression.variances(relative.pose)
@@ -147,8 +148,8 @@ def _left_jacobian(rotation: Array) -> Array:
 
 
 def fingerprint(cell: cells.Cell, target: str) -> str:
-    """What a network was trained for: what the pads respond with, where they are, robots and body. Another cell needs another
-    training; a calibration or another source of joints does not."""
+    """Hash of everything that a network depends on: the pads' responses and poses, robots and body. Another cell needs another
+    training; a new calibration or another source of joint angles does not."""
     parts = {
         "pads": {
             name: [response.fingerprint(cell, name, target), pad.link, pad.position, pad.rpy] for name, pad in cell.pads.items()
@@ -159,8 +160,8 @@ def fingerprint(cell: cells.Cell, target: str) -> str:
 
 
 def load(path: Path, cell: cells.Cell, target: str) -> PoseNetwork:
-    """The network in an .npz that `penumbra haptics train` wrote. Raises ValueError where it was trained for another cell,
-    FileNotFoundError where there is none."""
+    """Load the network from an .npz of `penumbra haptics train`. Raises ValueError if it was trained for another cell,
+    FileNotFoundError if there is none."""
     with np.load(path) as data:
         trained_for = str(data["fingerprint"])
         if trained_for != fingerprint(cell, target):

@@ -1,4 +1,4 @@
-"""Voltages, joint angles and the fused pose in, haptic poses out: one for each window of the skin's own samples, 50 a second."""
+"""Haptics service: estimates haptic poses from voltages, joint angles and the fused pose, one per window (50 per second)."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from penumbra.shared.skin.response import Response, fingerprint
 NAME = "haptics"
 WEIGHTS = Path(__file__).parent / "weights"
 SHARE = 0.01
-"""Weight of the newest window in a pad's mean misfit: two seconds are remembered."""
+"""Weight of the newest window in a pad's mean misfit: an average over about two seconds."""
 WORST = 10.0
-"""Largest residual, in standard deviations, that an electrode contributes to its pad's mean misfit."""
+"""Maximum residual, in standard deviations, that an electrode contributes to its pad's mean misfit."""
 LASTING_NS = 1_000_000_000
 """Time [ns] that a fault, or its end, must last before it is logged."""
 
@@ -51,10 +51,10 @@ EXAMPLE = "penumbra haptics --cell table --method paper"
 
 
 def start(node: ServiceNode, options: flags.Options) -> None:
-    """Subscribes; every window of voltages is solved for every target that this replica owns.
+    """Subscribe; solve every window of voltages for every target that this replica owns.
 
-    Threads: the collector, the estimators and what they report belong to the reader of voltages; `poses` has a lock of its own,
-    because the reader of joints adds to it.
+    Threads: the thread that reads voltages owns the collector, the estimators and their reports; `poses` has its own lock,
+    because the thread that reads joints adds to it.
     """
     cell = node.cell
     skin = Skin(cell)
@@ -112,7 +112,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
 
 
 def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str) -> Estimator:
-    """Ready to run on the pads of a cell: weights loaded where they fit it, code compiled."""
+    """An estimator ready to run on a cell's pads: weights loaded if they fit it, code compiled."""
     path = options.weights / f"{cell.name}-{target}.npz"
     weights = None
     try:
@@ -142,8 +142,8 @@ def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str
 
 
 def shapes_of(cell: Cell, target: str, weights: Path) -> Shapes:
-    """What unknown shapes do to the pads of a cell. Raises FileNotFoundError where it was not measured for their design, and
-    ValueError where they are of several designs."""
+    """Statistics of unknown shapes for the pads of a cell. Raises FileNotFoundError if they were not measured for the pads'
+    design, and ValueError if the pads have several designs."""
     designs = {fingerprint(cell, pad, target, bare=True) for pad in cell.pads}
     if len(designs) > 1:
         raise ValueError(f"expected pads of one design, got {len(designs)}; points of surfaces need equal pads")
@@ -151,12 +151,12 @@ def shapes_of(cell: Cell, target: str, weights: Path) -> Shapes:
 
 
 def is_by_touch(name: str, why: str, estimate: HapticEstimate) -> bool:
-    """Whether a fault of PAD/ELECTRODE is that something touches the pad."""
+    """Whether a fault of PAD/ELECTRODE is caused by something that touches the pad."""
     return why.startswith(SATURATED.partition(":")[0]) and name.partition("/")[0] in estimate.touched
 
 
 class Contacts:
-    """What touches, in the health's report as `contact`, by target: state and pads; logged when it begins and ends."""
+    """Reports the contact state and touched pads by target as `contact` in the health report; logs changes of the state."""
 
     def __init__(self, node: ServiceNode):
         self._node = node
@@ -164,7 +164,7 @@ class Contacts:
         node.add_report("contact", self._told)
 
     def update(self, target: str, estimate: HapticEstimate) -> None:
-        """Takes the estimate of a window."""
+        """Add the estimate of a window."""
         before = self._now.get(target)
         self._now[target] = estimate
         if (before.contact if before else "none") != estimate.contact:
@@ -175,15 +175,15 @@ class Contacts:
 
 
 class Misfits:
-    """Per pad, what the limb leaves unexplained, in the health's report as misfit/PAD: mean squared residual in variances, of
-    windows in which what is in range may be a limb. A pad that is turned, or has another pad's calibration, stands out."""
+    """Reports per pad, as misfit/PAD in the health report, the mean squared residual of the limb's fit in variances, over windows
+    in which the object in range may be a limb. A pad that is turned, or has another pad's calibration, stands out."""
 
     def __init__(self, node: ServiceNode):
         self._node = node
         self._means: dict[str, float] = {}
 
     def update(self, estimate: HapticEstimate, skin: Skin, samples: NDArray[np.int64]) -> None:
-        """Takes the residuals (n,) of a window on a skin, with so many samples (n,) each."""
+        """Add the residuals (n,) of a window on a skin, with their numbers of samples (n,)."""
         if not estimate.may_be_limb:
             return
         used = (samples > 0).astype(np.float64)
@@ -201,7 +201,7 @@ class Misfits:
 
 
 class Faults:
-    """Tells what is left out and what is back: only what lasts, so that a hiccup of the machine does not fill the log."""
+    """Logs faults that begin or end, once they have lasted, so that short hiccups do not fill the log."""
 
     def __init__(self, node: ServiceNode):
         self._node = node
@@ -209,7 +209,7 @@ class Faults:
         self._since_ns: dict[str, int] = {}
 
     def update(self, faults: dict[str, str], stamp_ns: int) -> None:
-        """Reasons by what is left out of the window at stamp_ns."""
+        """Update with the faults of the window at stamp_ns: reasons by name."""
         for name in set(self._told) | set(faults) | set(self._since_ns):
             if faults.get(name) == self._told.get(name):
                 self._since_ns.pop(name, None)
@@ -224,8 +224,8 @@ class Faults:
 
 
 def seen(fused: FusedPose | None, stamp_ns: int) -> FusedPose | None:
-    """The fused pose, where a camera had a part in it a moment before a stamp: one that rests on the skin alone, fed back, would
-    confirm itself."""
+    """The fused pose, if a camera contributed to it shortly before a stamp. Feeding back a pose from the skin alone would make
+    the skin confirm itself."""
     if fused is None or (camera := fused.sources.get("vision")) is None:
         return None
     return fused if camera.age_s + (stamp_ns - fused.stamp_ns) * 1e-9 < LONGEST_S else None

@@ -1,8 +1,9 @@
 """Makes `weights/shapes-TYPE.npz` again from a seed: `penumbra haptics shapes --cell table`.
 
-What an unknown thing does to a pad's signals, beside what a forearm across the pad does (see `surface_points.py`): its mean and
-covariance over random superellipsoids (Barr 1981, DOI 10.1109/MCG.1981.1673799: from rods, plates and blocks to balls and
-lenses), grounded as a person is, in all places before the pad, with the full boundary-element field of the pad alone.
+The file states the effect of unknown objects on a pad's signals, relative to that of a forearm across the pad (see
+`surface_points.py`): mean and covariance over random superellipsoids (Barr 1981, DOI 10.1109/MCG.1981.1673799: from rods, plates
+and blocks to balls and lenses), grounded as a person is, at random poses before the pad, with the full boundary-element field of
+the pad alone.
 """
 
 from __future__ import annotations
@@ -32,31 +33,32 @@ from penumbra.sim.skin import field
 
 WEIGHTS = Path(__file__).parent / "weights"
 HALF, POWERS = (0.01, 0.25), (0.2, 1.0)
-"""Bounds of the half axes [m], drawn by their logs, and of the superellipsoid's two exponents: a block's edges to a ball."""
+"""Bounds of the half axes [m], log-uniform, and of the superellipsoid's two exponents, from a block's edges to a ball."""
 LONGEST = 0.04
-"""Least longest half axis [m]. Chosen: what is smaller, as a finger, comes with something larger, and with it in the statistics
-all things would seem a tenth too near from 10 cm on."""
+"""Minimum of the longest half axis [m]. Chosen: a smaller object, such as a finger, comes with a larger one; including it in the
+statistics would make every object seem a tenth too near from 10 cm on."""
 DISTANCES = (0.004, 0.35)
-"""Bounds of the distance from the pad's middle [m], drawn by its log."""
+"""Bounds of the distance from the pad's middle [m], log-uniform."""
 STEEPEST = math.radians(65.0)
-"""Largest angle between the pad's normal and the direction of the nearest point."""
+"""Maximum angle [rad] between the pad's normal and the direction of the nearest point."""
 CLEAR = 0.003
-"""Nothing comes nearer [m] to the pad's plane."""
+"""Minimum distance [m] of an object from the pad's plane."""
 EACH = 24
-"""Distances of one thing."""
+"""Number of poses drawn per object."""
 PANELS = (30, 20)
-"""Rows and columns of a thing's panels."""
+"""Rows and columns of panels on an object's surface."""
 TABLE: Array = np.geomspace(0.005, 0.3, 24)
 """Gaps [m] of the forearm at which the statistics are tabulated."""
 WIDTH = 0.2
-"""Standard deviation, in the log of this gap, of the kernel by which scenes count at one of them."""
+"""Width, in log gap, of the Gaussian kernel that weights the scenes at each of these gaps."""
 HELD_OUT = 4
-"""Of so many things, one is left out for the card's score."""
+"""One object in HELD_OUT is left out of the fit and used for the card's score."""
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """Things before a pad: which one (n,), x (n, 4) with d0 = 1 m, see `surface_points.py`, and changes (n, e) [fF]."""
+    """Objects before a pad. thing (n,): the object's index; x (n, 4): with d0 = 1 m, see `surface_points.py`; change (n, e)
+    [fF]."""
 
     thing: Array
     x: Array
@@ -64,7 +66,7 @@ class Scenes:
 
 
 def superellipsoid(rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (v, 3) [m] and faces (f, 3) of a random one's convex hull."""
+    """Vertices (v, 3) [m] and faces (f, 3) of a random superellipsoid's convex hull."""
     half = np.zeros(3)
     while half.max() < LONGEST:
         half = np.exp(rng.uniform(math.log(HALF[0]), math.log(HALF[1]), 3))
@@ -89,7 +91,7 @@ def superellipsoid(rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
 
 
 def drawn(kind: PadType, things: int, seed: int, progress: Progress | None = None) -> Scenes:
-    """So many things, EACH times before a pad of this type."""
+    """Random objects, each at up to EACH poses before a pad of this type."""
     pad, rng = field.PadField(kind), np.random.default_rng([seed, 60])
     task = progress.add_task("things before a pad", total=things) if progress else None
     rows: list[tuple[int, Array, Array]] = []
@@ -108,7 +110,7 @@ def drawn(kind: PadType, things: int, seed: int, progress: Progress | None = Non
 
 
 def _placed(surface: Surface, vertices: Array, board: Array, rng: np.random.Generator) -> tuple[Array, Array] | None:
-    """x (4,) of a thing whose nearest point is at a random distance and direction, and T_pad_thing (4, 4); None where no place
+    """x (4,) of an object whose nearest point is at a random distance and direction, and T_pad_thing (4, 4); None if no pose
     before the pad was found. board (b, 3): points of the pad's board."""
     for _ in range(20):
         wanted = math.exp(rng.uniform(math.log(DISTANCES[0]), math.log(DISTANCES[1])))
@@ -137,13 +139,14 @@ def _placed(surface: Surface, vertices: Array, board: Array, rng: np.random.Gene
 
 
 def _most(kind: PadType) -> float:
-    """The largest change [fF] that the converter shows."""
+    """Largest change [fF] that the converter can measure."""
     span = kind.chain.adc_reference / 2.0 - kind.rest.a3 if kind.rest.polarity > 0 else kind.rest.a3
     return span / kind.chain.sensitivity
 
 
 def beside_forearm(kind: PadType, cell: cells.Cell, target: str, scenes: Scenes) -> tuple[Array, Array]:
-    """The forearm's log gap (n,) that gives the total of each scene, and x and r of the scene beside it (n, 4 + e)."""
+    """The log gap (n,) of the forearm that gives each scene's total signal, and x and r of the scene relative to it (n, 4 +
+    e)."""
     mesh = target_mesh(cell.targets[target], cell)
     pad, body = field.PadField(kind), field.limb(mesh)
     solved = np.log([np.minimum(pad.change(body, T), _most(kind)) for T in across(Surface(mesh.vertices, mesh.faces))])
@@ -173,8 +176,8 @@ def statistics(gap: Array, y: Array) -> tuple[Array, Array]:
 
 
 def score(shapes: Shapes, gap: Array, y: Array) -> dict[str, float]:
-    """Root mean square errors of log distance, direction and log gap, and the point's squared error over its covariance a degree
-    of freedom, of scenes without noise."""
+    """Root mean square errors of log distance, direction and log gap, and the NEES of the point per degree of freedom, on scenes
+    without noise."""
     mean, C = shapes.at(np.exp(gap))
     gain = np.linalg.solve(C[:, X:, X:] + MODEL_ERROR**2 * np.eye(y.shape[1] - X), C[:, X:, :X]).transpose(0, 2, 1)
     error = (y - mean)[:, :X] - np.einsum("nij,nj->ni", gain, (y - mean)[:, X:])
@@ -192,7 +195,7 @@ def score(shapes: Shapes, gap: Array, y: Array) -> dict[str, float]:
 def export(
     kind: PadType, cell: cells.Cell, target: str, own: str, path: Path, options: Any, progress: Progress
 ) -> dict[str, Any]:
-    """Fits one pad type and writes its file and card."""
+    """Fit one pad type; write its file and card."""
     scenes = drawn(kind, options.things, options.seed, progress)
     gap, y = beside_forearm(kind, cell, target, scenes)
     unseen = scenes.thing % HELD_OUT == 0
@@ -229,7 +232,7 @@ def export(
     example="penumbra haptics shapes --cell mine.yaml",
 )
 def main(options: flags.Options) -> int:
-    """Fits every design of pads in the cell."""
+    """Fit every pad design of the cell."""
     cell = cells.load(options.cell)
     target = cell.one("targets", options.target)
     kinds = {fingerprint(cell, name, target, bare=True): pad.type for name, pad in cell.pads.items()}

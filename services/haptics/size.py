@@ -1,7 +1,7 @@
-"""The size of the limb, which changes only with the person.
+"""Estimates the size of the limb, which changes only with the person.
 
-It is learnt close to the pads, where it can be told from the pose, and only considered farther away (a Schmidt filter), where it
-would drift with what the model gets wrong.
+It is learned close to the pads, where it can be separated from the pose. Farther away, where it would drift with the field
+model's errors, its uncertainty is only considered (a Schmidt filter).
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from penumbra.shared.body.anatomy import SIZE, SIZE_MEASURED, SIZE_SPREAD
 from penumbra.shared.geometry.rigid import Array
 
 SIZE_GAP = 0.06
-"""Largest gap [m] at which the size is learnt. Farther away the size is only considered (see above)."""
+"""Maximum gap [m] at which the size is learned. Farther away it is only considered (see above)."""
 SIZE_MEMORY_S = 20.0
-"""Time constant [s] with which the learnt size decays to the average one."""
+"""Time constant [s] with which the learned size decays to the average one."""
 SIZE_LASTING = 200.0
-"""Number of windows in which the field model makes about the same error while a limb rests: for the size, its variance is
-multiplied by it."""
+"""Number of windows in which the field model makes about the same error while a limb rests. When the size is learned, the error's
+variance is multiplied by it."""
 PERSON_S = 5.0
-"""Time [s] without a limb in range after which the next one may be another person's."""
+"""Time [s] without a limb in range after which the next limb may be another person's."""
 
 
 class Size:
-    """mean (2,): log length and log girth; information (2, 2). measured: whether the cell file states this person's size."""
+    """Size of the limb. mean (2,): log length and log girth; information (2, 2). measured: whether the cell file states this
+    person's size."""
 
     def __init__(self, measured: bool = False) -> None:
         self._usual: Array = np.zeros(2) if measured else SIZE
@@ -34,7 +35,7 @@ class Size:
         self.forget()
 
     def forget(self) -> None:
-        """Another person may come."""
+        """Forget the learned size: the next limb may be another person's."""
         self.mean, self.information = self._usual.copy(), np.diag(1.0 / self._spread**2)
 
     @property
@@ -44,19 +45,19 @@ class Size:
 
     @property
     def strangeness(self) -> float:
-        """How far the mean is from a usual one, in standard deviations between people."""
+        """Distance of the mean from the usual size, in standard deviations between people."""
         return float(np.linalg.norm((self.mean - self._usual) / SIZE_SPREAD))
 
     def predict(self, elapsed_s: float) -> None:
-        """What was learnt fades."""
+        """Decay the learned size towards the usual one."""
         keep = math.exp(-elapsed_s / SIZE_MEMORY_S)
         covariance = keep**2 * _inverse(self.information) + (1.0 - keep**2) * np.diag(self._spread**2)
         self.mean = self._usual + keep * (self.mean - self._usual)
         self.information = _inverse(covariance)
 
     def learn(self, size: Array, information: Array, gradient: Array, pose_information: Array) -> None:
-        """Takes a window's likelihood (8, 8), (8,) by pose and size at a solution of this size (2,); pose_information (6, 6):
-        what is known of the pose without it."""
+        """Add a window's likelihood (8, 8), (8,) by pose and size at a solution of this size (2,); pose_information (6, 6): prior
+        information on the pose."""
         information = information.copy()
         information[:6, :6] += pose_information
         left, pull = marginal(information, gradient, np.eye(8)[:, :6])
@@ -66,8 +67,8 @@ class Size:
 
     def marginalised(self, information: Array, gradient: Array, size: Array, lasting: float = 1.0) -> tuple[Array, Array]:
         """Information (6, 6) and gradient (6,) of the pose, from a likelihood (8, 8), (8,) by pose and size at a solution of this
-        size (2,), after the size was marginalised. lasting: the factor on the covariance of what is known of the size, whose
-        error is the same in many windows."""
+        size (2,), with the size marginalised. lasting: factor on the size's covariance, because its error is the same in many
+        windows."""
         known, across = self.information / lasting, information[:6, 6:]
         share = across @ _inverse(information[6:, 6:] + known)
         pull = gradient[6:] + known @ (self.mean - size)
@@ -75,6 +76,6 @@ class Size:
 
 
 def _inverse(matrix: Array) -> Array:
-    """Of a symmetric positive definite one (2, 2)."""
+    """Inverse of a symmetric positive definite matrix (2, 2)."""
     (a, b), (_, c) = matrix.tolist()
     return np.array([[c, -b], [-b, a]]) / (a * c - b * b)

@@ -1,16 +1,15 @@
-"""Least squares of limb pose and size on the voltages of all electrodes, through the field model's derivatives.
+"""Solves limb pose and size by least squares on the voltages of all electrodes, with the field model's derivatives.
 
 The unknowns are a pose error (6,) and the limb's size (2,): the logs of its length and girth. Residuals in volts keep the noise
-white and Gaussian also where an electrode feels nothing. What keeps it honest and sure:
+white and Gaussian even where an electrode feels nothing. Consistency and convergence rest on these measures:
 
-- the first steps compare logs of the signals where these stand out of the noise (an inverse hyperbolic sine does that): the log
-  of a signal is smooth in the pose over centimetres, the signal itself is not;
-- a step that makes the fit worse is halved;
-- what the field model gets wrong counts as noise, a share of the signal;
-- an electrode that feels something else, or is faulty, loses its weight as its residual grows.
+- the first steps compare the signals' logs where they exceed the noise (an inverse hyperbolic sine does that): a signal's log is
+  smooth in the pose over centimetres, the signal itself is not;
+- a step that worsens the fit is shortened;
+- the field model's error counts as noise, a share of the signal;
+- an electrode that feels something else, or is faulty, loses weight as its residual grows.
 
-A prior is inside the solve only to hold what the skin does not feel. What is handed on is the likelihood: J^T R^-1 J, and where
-it peaks.
+The prior only holds the directions that the skin does not observe. The result is the likelihood: J^T R^-1 J, and its peak.
 """
 
 from __future__ import annotations
@@ -28,41 +27,42 @@ from penumbra.shared.skin.layout import Skin
 from penumbra.shared.skin.response import ARRAYS, Response, derivatives, values
 
 NEAR_ERROR = 0.06
-"""What the response gets wrong grows, where an electrode is nearly touched, by this share with the signal over NEAR_SIGNAL."""
+"""Growth of the response's error near touch: this share of the signal per NEAR_SIGNAL is added to the error."""
 NEAR_SIGNAL = 1.0
-"""[V]: a gap of half a centimetre."""
+"""Signal [V] at a gap of half a centimetre."""
 COARSE_ERROR = 0.3
-"""The same share in the first steps: so long each step moves all electrodes alike, near and far."""
+"""Error share in the first steps: it makes near and far electrodes weigh alike."""
 OUTLIER = 3.0
-"""Residual, in standard deviations, from which an electrode loses weight as its square."""
+"""Residual, in standard deviations, above which an electrode's weight falls as its square."""
 FARTHEST_STEP = (0.06, 0.5, 0.25)
-"""Longest step: position [m], rotation [rad], log size."""
+"""Maximum step: position [m], rotation [rad], log size."""
 SAME_SLOPE = 0.3
-"""After a step that changes no signal by a larger share the derivatives of the logs are still good for the next one."""
+"""Change of the log signals below which a step keeps the derivatives of the previous one."""
 CONVERGED = 0.05
-"""A step with a smaller expected gain in the log probability is the last one, and is taken on trust."""
+"""Expected gain in log probability below which a step is the last one, taken without evaluating the cost."""
 AVERAGED = 25.0
-"""Number of windows after which an error that lasts is told from noise, see `Solver.free`."""
+"""Number of windows over which noise is averaged to separate it from lasting errors, see `Solver.free`."""
 FELT = 3.0
-"""Standard deviations from which an electrode feels something."""
+"""Signal, in standard deviations, above which an electrode feels something."""
 KNOWN = 4
-"""Unknowns that the voltages usually decide on."""
+"""Number of unknowns that the voltages usually determine."""
 LEVER = 0.1
-"""Distance [m] at which a rotation counts like a displacement, where the two are compared."""
+"""Distance [m] by which rotations are scaled where they are compared with displacements."""
 SCALE = np.repeat([1.0, 1.0 / LEVER], 3)
 SCALES = np.outer(SCALE, SCALE)
-"""Factors on a pose error's gradient (6,) and information (6, 6) that make them comparable."""
+"""Factors on a pose error's gradient (6,) and information (6, 6) that give rotations and displacements the same unit."""
 WORTHLESS = 0.15
-"""A direction known no better than this [m, or rad times LEVER] is published as unknown: beyond, the linearisation that a
-covariance stands for has no meaning."""
+"""Standard deviation [m, or rad times LEVER] above which a direction is published as unknown: beyond it, the linearisation behind
+a covariance does not hold."""
 TOO_FAR = 0.1
-"""The same for a direction along which the likelihood peaks this far [m, or rad times LEVER] from where it was linearised."""
+"""Distance [m, or rad times LEVER] from the point of linearisation to the peak above which a direction is published as
+unknown."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed beforehand: T_world_target (4, 4) with its information (6, 6) about `geometry.perturb`, and the size (2,)
-    with its information (2, 2)."""
+    """Prior of a solve: T_world_target (4, 4) with its information (6, 6) about `geometry.perturb`, and the size (2,) with its
+    information (2, 2)."""
 
     T: Array
     information: Array
@@ -70,18 +70,17 @@ class Prior:
     size_information: Array
 
     def cost(self, solution: Solution) -> float:
-        """Its share of a solution's cost: the rest is the voltages'."""
+        """The prior's part of a solution's cost; the rest is the voltages' part."""
         toward, toward_size = pose_error(self.T, solution.T), self.size - solution.size
         return 0.5 * float(toward @ self.information @ toward) + 0.5 * float(toward_size @ self.size_information @ toward_size)
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What is measured in one window: signal, variance (n,): mean voltage less its rest [V], positive near a person, and its
-    variance, infinite for an electrode to leave out; T_world_pads (p, 4, 4); distrust (n,): a factor of at least one on all
-    variances of an electrode, whose pad has not fitted lately; doubt (n,) [V]: standard deviation of the rest, which was only
-    predicted; error (n,): of what field model and gain get wrong, as a share of the signal; joints (j,) [rad]: of the robots,
-    which only the network reads."""
+    """Measurements of one window. signal, variance (n,): mean voltage less its rest [V], positive near a person, and its
+    variance, infinite for an electrode to leave out; T_world_pads (p, 4, 4); distrust (n,): factor >= 1 on an electrode's
+    variances, for a pad that has not fitted lately; doubt (n,) [V]: standard deviation of the predicted rest; error (n,): error
+    of field model and gain, as a share of the signal; joints (j,) [rad]: of the robots, which only the network reads."""
 
     signal: Array
     variance: Array
@@ -94,7 +93,8 @@ class Reading:
 
 @dataclass(frozen=True)
 class Point:
-    """T_world_target (4, 4), size (2,), the log signals (n,) [V] there and their derivatives (n, 8) by pose and size."""
+    """Linearisation point: T_world_target (4, 4), size (2,), the log signals (n,) [V] there and their derivatives (n, 8) by pose
+    and size."""
 
     T: Array
     size: Array
@@ -105,8 +105,8 @@ class Point:
 @dataclass(frozen=True)
 class Solution:
     """The most probable T_world_target (4, 4) and size (2,). cost: the robust negative log posterior, up to a constant; misfit:
-    mean squared residual of what is felt [variances]; residuals (n,): in standard deviations, zero for electrodes left out;
-    signal (n,) [V]: the predicted one; point: all that again for `Solver.likelihood`."""
+    mean squared residual of the electrodes that feel something [variances]; residuals (n,): in standard deviations, zero for
+    electrodes left out; signal (n,) [V]: predicted; point: the linearisation for `Solver.likelihood`."""
 
     T: Array
     size: Array
@@ -118,7 +118,7 @@ class Solution:
 
 
 class Solver:
-    """The solve for the pads of one cell. skin, response: of the same cell."""
+    """Solver for the pads of one cell. skin, response: of the same cell."""
 
     def __init__(self, skin: Skin, response: Response):
         self.response = response
@@ -126,7 +126,8 @@ class Solver:
         self._scale = np.log(skin.gain * skin.sensitivity)
 
     def solve(self, window: Reading, prior: Prior, T: Array, size: Array, coarse: int = 12, fine: int = 8) -> Solution:
-        """The most probable pose and size near a start T (4, 4), size (2,), by at most so many steps on logs and on volts."""
+        """The most probable pose and size near a start T (4, 4), size (2,). coarse, fine: maximum numbers of steps on logs and on
+        volts."""
         n = len(self._scale)
         at = Point(np.array(T, order="C"), np.array(size), np.empty(n), np.empty((n, 8)))
         z = np.empty(n)
@@ -138,16 +139,16 @@ class Solver:
         return Solution(at.T, at.size, cost, _misfit(window, predicted, z), z, predicted, at)
 
     def likelihood(self, window: Reading, solution: Solution, lasting: float = 1.0) -> tuple[Array, Array]:
-        """Information (8, 8) and gradient (8,) of the voltages alone at a solution, by pose and size. lasting: what is wrong for
-        longer than a window counts with so many times its variance."""
+        """Information (8, 8) and gradient (8,) of the voltages alone at a solution, by pose and size. lasting: factor on the
+        variance of errors that last longer than a window."""
         H, g = np.zeros((8, 8)), np.zeros(8)
         at, z = solution.point, np.zeros(len(self._scale))
         _normal_equations(*self._given(window), at.logs, at.rows, False, lasting, H, g, z)
         return H, g
 
     def free(self, window: Reading, solution: Solution, prior: Prior) -> Array:
-        """The share (n,) of an electrode's error that a solve with this prior leaves in its residual, when noise is averaged out:
-        one less its leverage. Next to nothing where few electrodes feel anything and pose and size fit them."""
+        """The share (n,) of an electrode's error that stays in its residual after a solve with this prior, with noise averaged
+        out: one less its leverage. Close to zero where few electrodes feel anything and pose and size fit them."""
         J = solution.signal[:, None] * solution.point.rows
         weight = 1.0 / (window.variance / AVERAGED + (window.error * solution.signal) ** 2)
         A = J.T @ (weight[:, None] * J)
@@ -160,8 +161,7 @@ class Solver:
 
 
 def _misfit(window: Reading, predicted: Array, z: Array) -> float:
-    """Mean squared residual [variances] of the electrodes that feel something, or should; one faulty electrode counts no more
-    than OUTLIER."""
+    """Mean squared residual [variances] of the electrodes that feel something, or should; each is capped at OUTLIER."""
     used = np.isfinite(window.variance)
     felt = used & (np.maximum(window.signal, predicted) > FELT * np.sqrt(window.variance))
     if np.count_nonzero(felt) < 2 * KNOWN:
@@ -179,8 +179,8 @@ def _descend(  # type: ignore[no-untyped-def]
     signal, variance, distrust, doubt, error, T_prior, information, size_prior, size_information, coarse, fine,
     T, size, logs, rows, z,
 ):  # fmt: skip
-    """The steps of `Solver.solve`, from the pose T and size that are given to those that are found, with the logs, derivatives
-    and residuals there; returns the cost."""
+    """Run the steps of `Solver.solve` from the given pose T and size; writes the final ones with their logs, derivatives and
+    residuals, and returns the cost."""
     network = (index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip)
     pads, given = (own_size, scale, pad_of, T_world_pads), (signal, variance, distrust, doubt, error)
     prior = (T_prior, information, size_prior, size_information)
@@ -199,7 +199,7 @@ def _descend(  # type: ignore[no-untyped-def]
                 for j in range(8):
                     gain -= 0.5 * step[i] * H[i, j] * step[j]
             if gain < CONVERGED:
-                if not is_coarse:  # to first order
+                if not is_coarse:  # first-order update
                     for e in range(n):
                         for i in range(8):
                             logs[e] += rows[e, i] * step[i]
@@ -234,8 +234,8 @@ def _descend(  # type: ignore[no-untyped-def]
 
 @inner
 def _predict(network, pads, T, size, has_rows, logs, rows):  # type: ignore[no-untyped-def]
-    """The logs (n,) of the signals at a pose (4, 4) and size (2,), and with has_rows their derivatives (n, 8) along the world's
-    axes, which cost four times as much."""
+    """Write the logs (n,) of the signals at a pose (4, 4) and size (2,); with has_rows also their derivatives (n, 8) along the
+    world's axes, which cost four times as much."""
     index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip = network
     own_size, scale, pad_of, T_world_pads = pads
     T_pads_target = np.zeros((len(T_world_pads), 4, 4))
@@ -265,7 +265,7 @@ def _predict(network, pads, T, size, has_rows, logs, rows):  # type: ignore[no-u
 
 @inner
 def _move(T, size, step, T_there, size_there):  # type: ignore[no-untyped-def]
-    """Writes the pose (4, 4) and size (2,) a step (8,) away, as `geometry.perturb` moves a pose."""
+    """Write the pose (4, 4) and size (2,) after a step (8,), as `geometry.perturb` moves a pose."""
     turn = np.empty((3, 3))
     so3.exp(step[3:6], turn)
     T_there[:] = T
@@ -277,7 +277,7 @@ def _move(T, size, step, T_there, size_there):  # type: ignore[no-untyped-def]
 
 @inner
 def _step(H, g, step):  # type: ignore[no-untyped-def]
-    """Writes the step (8,) with H step = g, for a symmetric positive definite H (Cholesky without square roots), no longer than
+    """Write the step (8,) with H step = g, for a symmetric positive definite H (Cholesky without square roots), limited to
     FARTHEST_STEP."""
     L, d = np.empty((8, 8)), np.empty(8)
     for j in range(8):
@@ -308,7 +308,7 @@ def _step(H, g, step):  # type: ignore[no-untyped-def]
 
 @inner
 def _posterior(given, prior, T, size, logs, rows, is_coarse, H, g, z):  # type: ignore[no-untyped-def]
-    """Writes the information (8, 8) and gradient (8,) of voltages and prior, and the residuals (n,); returns the cost."""
+    """Write the information (8, 8) and gradient (8,) of voltages and prior, and the residuals (n,); returns the cost."""
     signal, variance, distrust, doubt, error = given
     T_prior, information, size_prior, size_information = prior
     H[:], g[:] = 0.0, 0.0
@@ -330,8 +330,8 @@ def _posterior(given, prior, T, size, logs, rows, is_coarse, H, g, z):  # type: 
 
 @kernel("f8[n], f8[n], f8[n], f8[n], f8[n], f8[n], f8[n, 8], b1, f8, out f8[8, 8], out f8[8], out f8[n] -> f8")
 def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coarse, lasting, H, g, z):  # type: ignore[no-untyped-def]
-    """Adds the information (8, 8) and gradient (8,) about the target's pose error in the world and its size, writes residuals
-    (n,) and returns the robust cost."""
+    """Add the information (8, 8) and gradient (8,) by the target's pose error in the world and its size, write the residuals (n,)
+    and return the robust cost."""
     cost = 0.0
     for e in range(len(signal)):
         if not math.isfinite(variance[e]):
@@ -353,7 +353,7 @@ def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coar
         total *= distrust[e]
         square = residual * residual / total
         trust = 1.0
-        if square > OUTLIER * OUTLIER and coarse:  # Huber's, which has no minima of its own
+        if square > OUTLIER * OUTLIER and coarse:  # Huber's cost, which is convex
             cost += OUTLIER * (math.sqrt(square) - 0.5 * OUTLIER)
             trust = OUTLIER / math.sqrt(square)
         elif square > OUTLIER * OUTLIER:
@@ -370,8 +370,8 @@ def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coar
 
 
 def marginal(information: Array, gradient: Array, nuisance: Array) -> tuple[Array, Array]:
-    """Information and gradient of a quadratic likelihood after a parameter's directions (m, k) were marginalised: zero along
-    them. Directions that it says nothing about change nothing."""
+    """Marginalise a parameter with directions (m, k) out of a quadratic likelihood: returns information and gradient, zero along
+    these directions. Directions without information change nothing."""
     along = information @ nuisance
     strength = nuisance.T @ along
     strength += (1e-9 + 1e-12 * np.trace(strength)) * np.eye(len(strength))
@@ -380,8 +380,8 @@ def marginal(information: Array, gradient: Array, nuisance: Array) -> tuple[Arra
 
 
 def peak(T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
-    """The pose where a quadratic log-likelihood with this information (6, 6) and gradient (6,) at T is largest, and its
-    information; negative and worthless directions (see WORTHLESS, TOO_FAR) carry none and are left as they are in T."""
+    """The pose at the peak of a quadratic log-likelihood with this information (6, 6) and gradient (6,) at T, and its
+    information. Negative and worthless directions (see WORTHLESS, TOO_FAR) get zero information and keep T's values."""
     eigenvalues, directions = np.linalg.eigh(information * SCALES)
     steps = (directions.T @ (SCALE * gradient)) / np.maximum(eigenvalues, 1e-12)
     known = (eigenvalues > 1.0 / WORTHLESS**2) & (np.abs(steps) < TOO_FAR)

@@ -1,18 +1,19 @@
-"""Where the nearest surface is before each pad, whatever it belongs to: from the pad's electrodes alone, without a limb's shape.
+"""Estimates the nearest surface point before each pad, for objects of any shape, from the pad's electrodes alone.
 
-The paper names this as future work ("interpreting the surface points measured by individual sensors as a point cloud"). Beside a
-forearm that lies across the pad, another shape changes the electrodes by other factors. These factors are treated as noise whose
-mean and covariance were measured on things of random shapes in the full field model (`shapes.py`). With d0 the gap at which such
-a forearm gives the pad's total signal, x = (log(d / d0), u_x, u_y, log(g / d0)) the nearest point's distance from the pad's
-middle, its direction, and the surface's gap to the pad's board, and r the logs of the electrodes' signals over the forearm's at
-d0, the estimate is the linear one of least mean square error (Kay, Estimation Theory, 1993, section 12.3):
+The paper names this as future work ("interpreting the surface points measured by individual sensors as a point cloud"). Relative
+to a forearm that lies across the pad, another shape changes the electrodes' signals by other factors. These factors are treated
+as noise whose mean and covariance were measured on objects of random shapes in the full field model (`shapes.py`). Let d0 be the
+gap at which such a forearm gives the pad's total signal. Let x = (log(d / d0), u_x, u_y, log(g / d0)) with the nearest point's
+distance d from the pad's middle, its direction u, and the gap g of the surface to the pad's board. Let r be the logs of the
+electrodes' signals over the forearm's at d0. The estimate is the linear one of minimum mean square error (Kay, Estimation Theory,
+1993, section 12.3):
 
     x = m_x + C_xr (C_rr + N)^-1 (r - m_r),     covariance C_xx - C_xr (C_rr + N)^-1 C_rx,
 
-with m and C by d0, and N the voltages' noise. Where an electrode feels less than noise, an inverse hyperbolic sine stands for the
-log. What a link behind a pad takes of its signals it takes of the forearm's too, which the pad's own field model gives.
+with m and C by d0, and N the voltages' noise. Where an electrode feels less than noise, an inverse hyperbolic sine replaces the
+log. A link behind a pad reduces the pad's signals and the forearm's alike, so the pad's own field model accounts for it.
 
-The points of all pads are one cloud: no pad's distance is larger than that to another pad's point (`fused`).
+The points of all pads form one cloud: no pad's distance is larger than that to another pad's point (`fused`).
 """
 
 from __future__ import annotations
@@ -31,36 +32,36 @@ from penumbra.shared.skin.layout import Skin
 from penumbra.shared.skin.response import Response
 
 GAPS: Array = np.geomspace(0.003, 0.4, 48)
-"""Gaps [m] of the forearm that signals are compared with."""
+"""Gaps [m] of the reference forearm at which its signals are tabulated."""
 NEAREST = 0.004
-"""Smallest gap [m] for which the field models are fitted: nearer, the forearm's signals are those of this gap, growing on."""
+"""Smallest gap [m] for which the field models are fitted. Below it, the forearm's signals are extrapolated."""
 ACROSS = (np.eye(3), np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
-"""How this forearm lies: along the pad's x and y. Its signals are the geometric mean of the two."""
+"""Orientations of the reference forearm: along the pad's x and y. Its signals are the geometric mean of the two."""
 MODEL_ERROR = 0.02
-"""Standard deviation of what field model and calibration get wrong at an electrode, as a share of its signal."""
+"""Standard deviation of the error of field model and calibration at an electrode, as a share of its signal."""
 DOUBT = np.square([0.05, 0.1, 0.1, 0.05])
-"""Variances of x beyond those of the statistics: links behind pads, pads beside each other, things unlike all that were drawn.
+"""Variances added to those of the statistics, for x: links behind pads, neighbouring pads, objects unlike all that were drawn.
 Chosen by the squared errors over their variances on scenes of another seed than the results'."""
 FAR_DOUBT, FAR = 0.1, 0.1
-"""Standard deviation of the log distance beyond these at FAR [m], which grows with the power 3/2 of the distance: a faint signal
-tells least of the shape. Chosen likewise."""
+"""Standard deviation added to the log distance: FAR_DOUBT at FAR [m], growing with the power 3/2 of the distance, because a faint
+signal says little about the shape. Chosen likewise."""
 FELT = 6.0
-"""Total signal of a pad, in standard deviations, from which it has a point. Chosen: where less counts, only windows in which
-noise adds to the signal have one, whose distance is too small."""
+"""Total signal of a pad, in standard deviations, above which it has a point. Chosen: with a lower threshold, only windows in
+which noise adds to the signal have a point, and its distance is too small."""
 STEEPEST = 0.95
-"""Largest sine of the angle between a pad's normal and the direction of its point."""
+"""Maximum sine of the angle between a pad's normal and the direction of its point."""
 CONTRADICTION = 8.0
-"""Root mean square of an electrode's deviation, in standard deviations of all shapes, above which its pad has no point: an
+"""Root mean square of an electrode's deviation, in standard deviations of all shapes, above which its pad has no point because an
 electrode is faulty. Chosen: no shape of `penumbra bench haptics --only-surface` reaches half of it."""
 PRESSED_SHARE = 0.05
-"""An electrode at the near end of its converter counts only where another one of its pad reads this share of what the forearm
-gives it at NEAREST. Measured: a rod of 3 cm that touches the middle gives 15 %; an electrode that is stuck there gives none."""
+"""An electrode at the near end of its converter counts only if another one of its pad reads at least this share of the forearm's
+signal at NEAREST. Measured: a rod of 3 cm that touches the middle gives 15 %; an electrode that is stuck there gives none."""
 
 
 class SurfacePoint(NamedTuple):
-    """The point of the nearest surface before a pad: its position (3,) in the world and distance from the pad's middle [m];
-    toward (3,): unit vector from there to it, against the surface's normal; along, across: standard deviations in this direction
-    and in each one across it [m]; gap: of the surface to the pad's board [m]."""
+    """The nearest surface point before a pad. position (3,): in the world; toward (3,): unit vector from the pad's middle to it,
+    against the surface's normal; distance: from the pad's middle [m]; along, across: standard deviations in this direction and in
+    each one across it [m]; gap: between the surface and the pad's board [m]."""
 
     pad: str
     position: Array
@@ -72,14 +73,15 @@ class SurfacePoint(NamedTuple):
 
     @property
     def covariance(self) -> Array:
-        """Of the position (3, 3) [m^2]."""
+        """Covariance (3, 3) [m^2] of the position."""
         return self.across**2 * np.eye(3) + (self.along**2 - self.across**2) * np.outer(self.toward, self.toward)
 
 
 @dataclass(frozen=True)
 class Shapes:
-    """What things of unknown shape do to a pad's signals, by the gap d0 (m,) [m] of a forearm across that gives its total: mean
-    (m, 4 + e) and covariance (m, 4 + e, 4 + e) of x and r (see above). error: root mean square of log(d) on held-out shapes."""
+    """Statistics of objects of unknown shape on a pad's signals, by the gap d0 (m,) [m] of the forearm with the same total
+    signal: mean (m, 4 + e) and covariance (m, 4 + e, 4 + e) of x and r (see above). error: root mean square error of log(d) on
+    held-out shapes."""
 
     gaps: Array
     mean: Array
@@ -88,8 +90,8 @@ class Shapes:
 
     @staticmethod
     def load(folder: Path, fingerprint: str) -> Shapes:
-        """The ones of a pad's design and target, as `shared.skin.response.fingerprint` names them without a link. Raises
-        FileNotFoundError where the folder has none."""
+        """Load the statistics of a pad's design and target, as `shared.skin.response.fingerprint` names them without a link.
+        Raises FileNotFoundError if the folder has none."""
         for path in sorted(folder.glob("shapes-*.npz")):
             with np.load(path) as data:
                 if str(data["fingerprint"]) == fingerprint:
@@ -98,7 +100,7 @@ class Shapes:
         raise FileNotFoundError(f"{folder}: expected a file shapes-*.npz of this pad's design; run `penumbra haptics shapes`")
 
     def at(self, gaps: Array) -> tuple[Array, Array]:
-        """Mean (k, 4 + e) and covariance (k, 4 + e, 4 + e) at gaps (k,), between the tabulated ones by the gap's log."""
+        """Mean (k, 4 + e) and covariance (k, 4 + e, 4 + e) at gaps (k,), interpolated in the log of the gap."""
         place = np.interp(np.log(gaps), np.log(self.gaps), np.arange(len(self.gaps)))
         low = np.minimum(place.astype(np.int64), len(self.gaps) - 2)
         share = place - low
@@ -107,7 +109,7 @@ class Shapes:
 
 
 def across(surface: Surface) -> list[Array]:
-    """T_pad_target (4, 4) at each of GAPS of the target's part around its origin, for each direction of ACROSS in turn."""
+    """T_pad_target (4, 4) of the target's part around its origin, at each of GAPS, for each direction of ACROSS in turn."""
     poses = []
     for R in ACROSS:
         T = np.eye(4)
@@ -120,7 +122,7 @@ def across(surface: Surface) -> list[Array]:
 
 
 def extended(logs: Array) -> Array:
-    """Log signals (m, ...) at GAPS, those nearer than NEAREST on the line through the next ones."""
+    """Log signals (m, ...) at GAPS; those nearer than NEAREST are extrapolated linearly from the next ones."""
     known = int(np.searchsorted(GAPS, NEAREST * 1.001))
     slope = (logs[known + 2] - logs[known]) / math.log(GAPS[known + 2] / GAPS[known])
     near = np.log(GAPS[:known] / GAPS[known])
@@ -128,14 +130,14 @@ def extended(logs: Array) -> Array:
 
 
 def forearm(skin: Skin, response: Response, surface: Surface) -> Array:
-    """Log changes (m, p, e) [fF] of a target's own size that lies across each pad, at GAPS."""
+    """Log changes (m, p, e) [fF] of the target, at its own size, lying across each pad, at GAPS."""
     p = len(skin.pads)
     logs = np.log([response.change(np.tile(T, (p, 1, 1))) for T in across(surface)])
     return extended(logs.reshape(len(ACROSS), len(GAPS), p, -1).mean(axis=0))
 
 
 class SurfacePoints:
-    """Finds the points. skin, response: of one cell; surface: of its target; shapes: of its pads' design."""
+    """Finds the surface points. skin, response: of one cell; surface: of its target; shapes: of its pads' design."""
 
     def __init__(self, skin: Skin, response: Response, surface: Surface, shapes: Shapes):
         self._pads, self._scale = skin.pads, skin.gain * skin.sensitivity
@@ -150,7 +152,7 @@ class SurfacePoints:
         self._eye = np.eye(self._logs.shape[2])
 
     def find(self, signal: Array, variance: Array, pressed: NDArray[np.bool_], T_world_pads: Array) -> list[SurfacePoint]:
-        """The point of each pad that feels something, fused.
+        """The fused points of the pads that feel something.
 
         signal, variance (n,): mean voltage less its rest [V] and its variance [V^2], infinite for electrodes to leave out;
         pressed (n,): electrodes at the near end of their converter, which feel that or more; T_world_pads (p, 4, 4).
@@ -177,21 +179,21 @@ class SurfacePoints:
     def _estimated(
         self, own: NDArray[np.intp], change: Array, sigma: Array, used: NDArray[np.bool_], total: Array
     ) -> tuple[NDArray[np.intp], Array, Array]:
-        """Which pads (k,) have a point, x (k, 4) of it in the pad's frame with d0 = 1 m, and the covariance."""
+        """The pads (k,) that have a point, its x (k, 4) in the pad's frame with d0 = 1 m, and the covariance."""
         place, logs, slopes = self._forearm_at(own, used, total)
         nearest = (place + 0.5).astype(np.int64)
         mean, C = self._mean[nearest], self._covariance[nearest]
-        # r, and its derivatives by the log of the change where that is the forearm's
+        # r, and the derivatives of r by the log of the change, at the forearm's change
         model, twice = np.exp(logs), 2.0 * np.where(used, sigma, 1.0)
         r = np.arcsinh(change / twice) - np.arcsinh(model / twice)
         by_change = used / np.sqrt(model * model + twice * twice)
         slope = by_change * model
-        # noise of log d0, by the total's slope, and of r, which has it too
+        # noise of log d0, by the total's slope, and of r, which contains it too
         by_total = used / (used * model * slopes).sum(axis=1)[:, None]
         A = self._eye * by_change[:, :, None] - (slope * slopes)[:, :, None] * by_total[:, None]
         noise = sigma * sigma
         noisy = A * noise[:, None]
-        # an electrode that is left out has an error of its own and no part in x
+        # an electrode that is left out has its own error and no effect on x
         own_error = self._eye * np.where(used, MODEL_ERROR**2, 1.0)[:, None]
         Crr = slope[:, :, None] * C[:, X:, X:] * slope[:, None] + noisy @ A.transpose(0, 2, 1) + own_error
         Cxr = C[:, :X, X:] * slope[:, None]
@@ -208,8 +210,8 @@ class SurfacePoints:
         return (own, x, covariance) if keep.all() else (own[keep], x[keep], covariance[keep])
 
     def _forearm_at(self, own: NDArray[np.intp], used: NDArray[np.bool_], total: Array) -> tuple[Array, Array, Array]:
-        """Where among GAPS (k,) the forearm gives pads (k,) their totals [fF] on the electrodes in use (k, e), the logs (k, e) of
-        its changes there and their slopes (k, e) by the gap's log."""
+        """For pads (k,): the position (k,) among GAPS where the forearm gives their totals [fF] on the electrodes in use (k, e),
+        the logs (k, e) of its changes there and their slopes (k, e) by the gap's log."""
         totals = self._totals[:, own] if used.all() else (self._changes[:, own] * used).sum(axis=2)
         low = np.minimum(np.maximum((totals > total).sum(axis=0) - 1, 0), len(GAPS) - 2)
         at = totals[low, np.arange(len(own))]
@@ -220,14 +222,14 @@ class SurfacePoints:
 
 
 STEP = float(np.log(GAPS[1] / GAPS[0]))
-"""Between the logs of neighbouring GAPS."""
+"""Spacing of GAPS in log gap."""
 DOUBTS = np.diag(DOUBT)
 LOG_NEAREST = float(np.log(GAPS[0]))
 X, SCALES = 4, np.array([0, 3])
 SCALES_2 = np.ix_(SCALES, SCALES)
-"""Length of x, which of it are logs of distances, and these in a covariance."""
+"""Length of x, its components that are logs of distances, and their indices in a covariance."""
 FARTHEST_RANGES = 4.0 / 3.0
-"""Points are reported up to this share of the pads' range: 20 cm for a range of 15 cm."""
+"""Maximum distance of reported points, as a share of the pads' range: 20 cm for a range of 15 cm."""
 
 
 def fused(
@@ -235,9 +237,9 @@ def fused(
 ) -> list[SurfacePoint]:
     """The points of pads `own` (k,) as one cloud, from their x (k, 4) with d0 = 1 m and its covariances (k, 4, 4).
 
-    The surface that a pad's point is nearest on also holds the other pads' points: its distance is at most that to each of them.
-    A normal distribution that is cut off by such a bound, itself normal, has the moments of Azzalini (1985), section 2.
-    Points beyond `farthest` [m] are left out.
+    A pad's point is the nearest on a surface that also holds the other pads' points, so its distance is at most that to each of
+    them. A normal distribution truncated by such a bound, itself normal, has the moments of Azzalini (1985), section 2. Points
+    beyond `farthest` [m] are left out.
     """
     distance = np.exp(x[:, 0])
     u, C = x[:, 1:3], covariance[:, 1:3, 1:3]
@@ -252,7 +254,7 @@ def fused(
     turned = C[:, 0, 0] + C[:, 1, 1] + (u * (C @ u[:, :, None])[:, :, 0]).sum(axis=1) / rise2
     across2 = 0.5 * distance * distance * turned
     factor, narrower = _bounded(middles, toward, distance, along2, across2)
-    # the distance alone changes: the line to the point stays
+    # only the distance changes; the direction stays
     nearer = factor * distance
     points = middles + nearer[:, None] * toward
     gaps = np.minimum(factor * np.exp(x[:, 3]), nearer)
@@ -263,12 +265,10 @@ def fused(
 
 
 def _bounded(middles: Array, toward: Array, distance: Array, along2: Array, across2: Array) -> tuple[Array, Array]:
-    """By what factors (k,) distances (k,) [m] and their standard deviations change, where they are no larger than those to the
-    others' points.
+    """Factors (k,) on distances (k,) [m] and on their standard deviations, when no distance exceeds that to another pad's point.
 
     middles, toward (k, 3): of pads, and unit vectors from there to their points; along2, across2 (k,) [m^2]: variances of the
-    points. What is known of all points has errors of its kind in common (the shape): only the surest bound counts, a standard
-    deviation farther away.
+    points. The points have common errors (the shape), so only the tightest bound counts, widened by a standard deviation.
     """
     if len(distance) < 2:
         return np.ones(len(distance)), np.ones(len(distance))

@@ -1,7 +1,7 @@
-"""Where the limb is followed: a place, a rival where a second one is possible, and the odds between the two.
+"""Tracks the limb: a place, a rival if a second place is possible, and the odds between the two.
 
-Far from the pads thick and thin parts of a limb feel alike, so one window may be explained at two places. Both are then kept and
-solved in every window; the evidence of the windows adds up in the odds until it has decided.
+Far from the pads, thick and thin parts of a limb feel alike, so two places may explain one window. Both are then kept and solved
+in every window; the evidence of the windows adds up in the odds until it has decided.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from penumbra.shared.geometry.rigid import Array, perturb, pose_error
 
 @dataclass(frozen=True)
 class Place:
-    """Where the limb may be: T_world_target (4, 4) and its covariance (6, 6)."""
+    """A possible place of the limb: T_world_target (4, 4) and its covariance (6, 6)."""
 
     T: Array
     covariance: Array
@@ -31,21 +31,21 @@ class Place:
         return np.asarray(np.linalg.inv(self.covariance), np.float64)
 
     def is_apart(self, other: Place, settings: HapticSettings) -> bool:
-        """Whether the distance of two places is more than their covariances explain."""
+        """Whether the distance between two places exceeds their covariances."""
         offset = self.T[:3, 3] - other.T[:3, 3]
         spread = (self.covariance + other.covariance)[:3, :3] + settings.same_place**2 * np.eye(3)
         return float(offset @ np.linalg.solve(spread, offset)) > settings.apart
 
     def stands_for(self, other: Place, settings: HapticSettings) -> bool:
-        """Whether another place is one that this one, with its covariance, allows: not so of a sharp place beside a vague one."""
+        """Whether this place, with its covariance, includes another one; a sharp place does not include a vague one beside it."""
         offset = other.T[:3, 3] - self.T[:3, 3]
         spread = self.covariance[:3, :3] + settings.same_place**2 * np.eye(3)
         return float(offset @ np.linalg.solve(spread, offset)) < settings.apart
 
 
 class Home:
-    """Where the limb is expected while nothing is felt, and how a place decays towards it. T (4, 4): T_world_target; spread (6,):
-    standard deviations [m, rad] of the pose about it; place: both together."""
+    """The expected pose of the limb while nothing is felt, and the decay of a place towards it. T (4, 4): T_world_target; spread
+    (6,): standard deviations [m, rad] of the pose about it; place: both together."""
 
     def __init__(self, T: Array, spread: ArrayLike, settings: HapticSettings):
         self.T = T
@@ -53,20 +53,20 @@ class Home:
         self._settings = settings
 
     def decayed(self, place: Place, elapsed_s: float) -> Place:
-        """A place after so many seconds in which nothing was felt: an Ornstein-Uhlenbeck process about home, whose spread never
-        exceeds home's. The roll about the limb's axis decays with a time constant of its own."""
+        """A place after elapsed_s seconds in which nothing was felt: an Ornstein-Uhlenbeck process about home, whose spread never
+        exceeds home's. The roll about the limb's axis has its own time constant."""
         keep = math.exp(-elapsed_s / self._settings.memory_s)
         T = perturb(self.T, keep * pose_error(place.T, self.T))
         covariance = keep**2 * place.covariance + (1.0 - keep**2) * self.place.covariance
         kept, axis = math.exp(-elapsed_s / self._settings.roll_memory_s), roll_axis(T)
-        T = perturb(T, (kept - 1.0) * self._roll(T) * axis)  # about the axis, which stays
+        T = perturb(T, (kept - 1.0) * self._roll(T) * axis)  # about the axis, which does not change
         spread = float(axis @ (self.place.covariance - covariance) @ axis)
         return Place(T, covariance + max(0.0, (1.0 - kept**2) * spread) * (axis[:, None] * axis))
 
     def without_roll(self, T: Array, information: Array, gradient: Array) -> tuple[Array, Array]:
-        """Information (6, 6) and gradient (6,) at a pose T (4, 4) after the roll about the limb's axis was marginalised, which is
-        known as well as at home. The voltages would decide on it by the flatness of wrist and hand alone, with several solutions
-        that look equally certain."""
+        """Information (6, 6) and gradient (6,) at a pose T (4, 4) after marginalising the roll about the limb's axis, with home's
+        prior on it. The voltages would determine the roll only by the flatness of wrist and hand, with several solutions that
+        look equally certain."""
         axis = roll_axis(T)
         known = float(axis @ self.place.information @ axis)
         gradient = gradient + axis * (known * float(axis @ pose_error(self.T, T)))
@@ -79,8 +79,8 @@ class Home:
 
 
 class Track:
-    """The place that is followed, its rival (None where one place alone is possible) and odds: the log odds of the place to the
-    rival, never negative."""
+    """The tracked place, its rival (None if only one place is possible) and odds: the log odds of the place to the rival, never
+    negative."""
 
     def __init__(self, home: Home, settings: HapticSettings):
         self._home, self._settings = home, settings
@@ -88,18 +88,18 @@ class Track:
         self.forget()
 
     def forget(self) -> None:
-        """Starts again at home."""
+        """Restart at home."""
         self.place, self.odds = self._home.place, 0.0
         self.rival: Place | None = None
 
     def decay(self, elapsed_s: float) -> None:
-        """Takes both places over so many seconds in which nothing is felt."""
+        """Decay both places over elapsed_s seconds in which nothing is felt."""
         self.place = self._home.decayed(self.place, elapsed_s)
         self.rival = None if self.rival is None else self._home.decayed(self.rival, elapsed_s)
 
     def expect(self, T: Array, covariance: Array) -> bool:
-        """Moves the track to a fused pose (4, 4) with its covariance (6, 6) where that is known well enough, and returns whether
-        it was. The track then has no rival."""
+        """Move the track to a fused pose (4, 4) with covariance (6, 6) if that is known well enough; returns whether it was. The
+        track then has no rival."""
         settings = self._settings
         known = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < settings.expected_sigma**2
         if known:
@@ -107,13 +107,13 @@ class Track:
         return known
 
     def contest(self, rival: Place, odds: float) -> None:
-        """Keeps a rival with these log odds of the track to it, where it is another place and still possible."""
+        """Keep a rival with these log odds of the track to it, if it is a distinct place and still possible."""
         possible = odds < self._settings.odds_decided and not self.place.stands_for(rival, self._settings)
         self.rival, self.odds = rival if possible else None, max(odds, 0.0)
 
     def weigh(self, rival: Place, evidence: float) -> bool:
-        """Adds a window's evidence, the log likelihood of the track less that of its rival, to the odds. The rival is given as
-        the window left it. Returns whether the two changed places."""
+        """Add a window's evidence (log likelihood of the track less that of its rival) to the odds. rival: the place after this
+        window. Returns whether the two changed places."""
         self.odds += self.limited(evidence)
         is_overtaken = self.odds < 0.0
         if is_overtaken:
@@ -122,12 +122,12 @@ class Track:
         return is_overtaken
 
     def limited(self, evidence: float) -> float:
-        """The evidence of one window, limited to what one window may change."""
+        """The evidence of one window, limited to the maximum change by one window."""
         return min(max(evidence, -self._settings.odds_step), self._settings.odds_step)
 
     def mixed(self, information: Array, gradient: Array) -> tuple[Array, Array]:
-        """A likelihood at the track, as information (6, 6) and gradient (6,), widened to the mixture of the track and its
-        rival. The scatter between the two lasts for as long as it is not decided."""
+        """Widen a likelihood at the track, as information (6, 6) and gradient (6,), to the mixture of the track and its rival.
+        The scatter between the two lasts until one of them is dropped."""
         if self.rival is None:
             return information, gradient
         offset, share = pose_error(self.rival.T, self.place.T), 1.0 / (1.0 + np.exp(self.odds))

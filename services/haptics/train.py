@@ -1,9 +1,9 @@
 """Makes `weights/CELL-TARGET.npz` again from a seed: `penumbra haptics train --cell table`.
 
-Scenes are drawn from a Gaussian somewhat wider than the region of the cell's motion (which the published estimate subtracts
-again), robots anywhere between the joint limits of the cell's `sim` section, limbs of all sizes; voltages come from the fitted
-field model with noise, a model error and now and then a dead pad. R_c is regressed on scenes that the network was not trained on.
-An interrupted run goes on with --resume, from a new pool of scenes.
+Poses are drawn from a Gaussian somewhat wider than the region of the cell's motion (the published estimate subtracts it again),
+robots anywhere between the joint limits of the cell's `sim` section, limbs of all sizes. Voltages come from the fitted field
+model with noise, a model error and an occasional dead pad. R_c is regressed on scenes outside the training set. An interrupted
+run continues with --resume, from a new pool of scenes.
 """
 
 from __future__ import annotations
@@ -36,37 +36,38 @@ from penumbra.shared.skin.response import Response
 
 WEIGHTS = Path(__file__).parent / "weights"
 VALIDATION_SEED, REGRESSION_SEED = 1_000_000, 2_000_000
-"""Added to the seed for the scenes of the card's score, and for those of R_c: the network was trained on neither."""
+"""Offsets to the seed for the scenes of the card's score and of R_c: the network was trained on neither."""
 HIDDEN = (256, 256, 256, 256)
-"""Widths of the hidden layers: the paper's."""
+"""Widths of the hidden layers, from the paper."""
 SAMPLES = 10
-"""Voltage samples in the mean of one window (10 ms at 1 kHz)."""
+"""Number of voltage samples in the mean of one window (10 ms at 1 kHz)."""
 CLOSEST = 0.005
-"""Scenes in which an electrode comes nearer to the skin than this [m] are drawn again: the limb would be inside the pad."""
+"""Minimum gap [m] of an electrode to the skin. Scenes with a smaller one are drawn again: the limb would be inside the pad."""
 ENLARGED = 1.5
 """Spread of the training's poses, in standard deviations of a pose uniform in the region of the cell's motion."""
 OUTPUTS = 6 + 21
-"""Outputs while it is trained: the pose and the Cholesky factor of its precision, so that what cannot be known does not count."""
+"""Number of outputs in training: the pose and the Cholesky factor of its precision, so that unobservable directions do not
+count."""
 LOG_LIMIT = 8.0
-"""Largest log of a precision factor in units of the prior: 3000 times better than beforehand."""
+"""Maximum log of a precision factor in units of the prior: 3000 times more precise than the prior."""
 REGRESSED = 3000
 """Number of scenes for R_c."""
 KERNELS = 500
-"""Number of means of neighbouring ones among these scenes that the Gaussian processes keep."""
+"""Number of points that the Gaussian processes keep: each is a mean over neighbouring scenes."""
 LOG_CHI2 = -1.2704
-"""Mean of the log of a squared standard normal number: a log squared error is so far below the log variance. Derived:
--(Euler's constant + log 2)."""
+"""Mean of the log of a squared standard normal number: the log of a squared error is on average this much below the log variance.
+Derived: -(Euler's constant + log 2)."""
 DEAD = 0.02
 """Share of pads that are dead in training."""
 START, POOL = 2000, 400_000
-"""Number of scenes in the pool at first and at most."""
+"""Initial and maximum number of scenes in the pool."""
 BANDS = (0.0, 0.04, 0.075, 0.125, 0.175)
 """Limits of the gap bands [m] of the held-out errors."""
 
 
 class Scenes:
-    """Random scenes of a cell. home (4, 4), spread (6,): the training's Gaussian; expected: home and spread that the cell
-    gives for the target. Raises CellError where the cell says nothing about how things move."""
+    """Random scenes of a cell. home (4, 4), spread (6,): the training's Gaussian; expected: home and spread of the target in the
+    cell. Raises CellError if the cell has no `sim` section."""
 
     def __init__(self, cell: cells.Cell, target: str):
         if cell.sim is None:
@@ -95,7 +96,7 @@ class Scenes:
         return {name: np.concatenate([k[name] for k in kept])[:count] for name in kept[0]}
 
     def inputs(self, scene: dict[str, Any]) -> NDArray[np.float32]:
-        """The network's input for scenes: as `estimator.py` forms it."""
+        """The network's input for scenes, computed as in `estimator.py`."""
         skin = self.skin
         signal = skin.signal(scene["amplitude"])
         variance = skin.noise / SAMPLES + (self.response.error * np.maximum(signal, 0.0)) ** 2
@@ -103,7 +104,7 @@ class Scenes:
         return features(skin, self.home, signal, variance, scene["pads"], scene["joints"])
 
     def labels(self, scene: dict[str, Array]) -> NDArray[np.float32]:
-        """What the network answers: the pose error about home in units of the spread (count, 6)."""
+        """The network's labels: the pose error about home in units of the spread (count, 6)."""
         rotation = Rotation.from_matrix(scene["T"][:, :3, :3] @ self.home[:3, :3].T).as_rotvec()
         error = np.concatenate([scene["T"][:, :3, 3] - self.home[:3, 3], rotation], axis=1)
         return (error / self.spread).astype(np.float32)
@@ -145,8 +146,8 @@ class Scenes:
 
 @kernel("""f8[s, n, 3], f8[s, n, 3], f8[s, 4, 4], f8[s, 2], f8[m, 3, 3], f8[3, m], f8[m], f8[m, 7, 3], out f8[s], out b1[s]""")
 def _gaps(electrodes, normals_out, T, factors, corners, centers, radii, normals, out, ahead):  # type: ignore[no-untyped-def]
-    """Writes the smallest gaps (s,) of electrodes (s, n, 3) to a surface at poses (s, 4, 4), stretched by factors (s, 2) along x
-    and across (about, where it is stretched), and whether the nearest point lies in front of its electrode, whose pad looks along
+    """Write the smallest gaps (s,) of electrodes (s, n, 3) to a surface at poses (s, 4, 4), stretched by factors (s, 2) along x
+    and across (approximate if stretched), and whether the nearest point lies in front of its electrode, whose pad has the normal
     normals_out (s, n, 3)."""
     n = electrodes.shape[1]
     distance, local, nearest, gradient = np.empty(n), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
@@ -173,7 +174,7 @@ def build(inputs: int) -> torch.nn.Sequential:
         inputs = width
     last = torch.nn.Linear(inputs, OUTPUTS)
     torch.nn.init.zeros_(last.weight)
-    torch.nn.init.zeros_(last.bias)  # begin at the prior: mean zero, precision one
+    torch.nn.init.zeros_(last.bias)  # start at the prior: mean zero, precision one
     return torch.nn.Sequential(*layers, last)
 
 
@@ -189,7 +190,7 @@ def loss(out: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
 
 
 def to_numpy(model: torch.nn.Sequential, mean: Array, scale: Array, scenes: Scenes, regression: Regression) -> PoseNetwork:
-    """The trained network with the inputs' normalisation folded into its first layer, and its pose alone of what it learnt."""
+    """The trained network with the inputs' normalisation folded into its first layer; of the outputs only the pose is kept."""
     linear = [layer for layer in model if isinstance(layer, torch.nn.Linear)]
     W = [layer.weight.detach().numpy().T.astype(np.float64) for layer in linear]
     b = [layer.bias.detach().numpy().astype(np.float64) for layer in linear]
@@ -204,7 +205,7 @@ NOTHING_KNOWN = Regression(np.zeros((1, 4)), np.ones((5, 4)), np.ones(5), np.zer
 
 
 def regress(scenes: Scenes, network: PoseNetwork, seed: int, count: int = REGRESSED) -> Regression:
-    """R_c over the relative pose, from the network's errors in so many scenes of the cell's motion."""
+    """R_c over the relative pose, from the network's errors in `count` scenes of the cell's motion."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
@@ -217,7 +218,7 @@ def regress(scenes: Scenes, network: PoseNetwork, seed: int, count: int = REGRES
         error = pose_error(scene["T"][i], T)
         parts = np.concatenate([relative.frame @ error[:3], relative.frame[1:] @ error[3:]])
         poses[i], logs[i] = relative.pose, np.log(parts**2 + 1e-12) - LOG_CHI2
-    # Means over neighbours: single logs of squared errors scatter by two, and a process of thousands of points is slow.
+    # Means over neighbours: logs of single squared errors scatter by about two, and thousands of points are slow.
     order = np.argsort(poses[:, 0])
     groups = [
         cell for part in np.array_split(order, KERNELS // 10) for cell in np.array_split(part[np.argsort(poses[part, 1])], 10)
@@ -244,7 +245,7 @@ def regress(scenes: Scenes, network: PoseNetwork, seed: int, count: int = REGRES
 def evaluate(scenes: Scenes, network: PoseNetwork, seed: int, count: int = 4000) -> dict[str, dict[str, Any]]:
     """Errors of single windows of unseen scenes by gap band: root mean squares across, away and along the limb [mm], of its
     direction [deg], and the normalised squared error per direction of the network's pose by R_c, or of the published one per
-    known direction; network alone, and solve from its start without a past. The scenes are uniform in the region of the cell's
+    known direction; for the network alone, and for the solve from scratch. The scenes are uniform in the region of the cell's
     motion."""
     results: dict[str, dict[str, Any]] = {}
     home, spread = scenes.expected
@@ -292,7 +293,7 @@ def evaluate(scenes: Scenes, network: PoseNetwork, seed: int, count: int = 4000)
 
 
 def save(network: PoseNetwork, path: Path, key: str) -> None:
-    """The weights as half-precision arrays: their rounding changes a pose by less than a tenth of its error."""
+    """Save the weights as half-precision arrays: rounding changes a pose by less than a tenth of its error."""
     arrays: dict[str, Any] = {"home": network.home, "spread": network.spread, "fingerprint": np.array(key)}
     for i, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         arrays[f"weight{i}"], arrays[f"bias{i}"] = W.astype(np.float16), b.astype(np.float32)
@@ -304,8 +305,8 @@ def save(network: PoseNetwork, path: Path, key: str) -> None:
 
 
 class Pool:
-    """What is learned from: a pool of scenes that every step adds new ones to, for drawing a whole batch would take longer than
-    learning from it. mean, scale (f,): of the inputs of its first scenes, which normalise all others."""
+    """Pool of training scenes, to which every step adds new ones: drawing a whole batch would take longer than learning from it.
+    mean, scale (f,): of the inputs of its first scenes, which normalise all others."""
 
     def __init__(self, scenes: Scenes, seed: int):
         self.scenes = scenes
@@ -316,7 +317,7 @@ class Pool:
         self._x[:START], self._y[:START], self._drawn = x, y, START
 
     def batch(self, rng: np.random.Generator, schedule: Schedule) -> tuple[torch.Tensor, torch.Tensor]:
-        """Normalised inputs (b, f) and labels (b, 6) of scenes of the pool, after new ones have joined it."""
+        """Normalised inputs (b, f) and labels (b, 6) from the pool, after new scenes have joined it."""
         new = self.scenes.draw(rng, schedule.fresh)
         place = np.arange(self._drawn, self._drawn + schedule.fresh) % POOL
         self._x[place], self._y[place] = self.scenes.inputs(new), self.scenes.labels(new)
@@ -326,12 +327,12 @@ class Pool:
         return torch.from_numpy(x), torch.from_numpy(self._y[rows])
 
     def close(self) -> None:
-        """Nothing to end: scenes are drawn when they are asked for."""
+        """Nothing to stop: scenes are drawn on demand."""
 
 
 @dataclass(frozen=True)
 class NetworkSettings:
-    """inputs: how many numbers the network reads; trained_for: the fingerprint of the cell and target."""
+    """inputs: the network's input size; trained_for: the fingerprint of the cell and target."""
 
     inputs: int
     trained_for: str
@@ -339,20 +340,20 @@ class NetworkSettings:
 
 @dataclass(frozen=True)
 class Schedule:
-    """How training goes."""
+    """Training schedule."""
 
     peak_rate: float = 1e-3
-    """Adam's largest learning rate, of one cycle. Adam's usual value (Kingma and Ba 2015, arXiv:1412.6980)."""
+    """Adam's maximum learning rate, of one cycle. Adam's usual value (Kingma and Ba 2015, arXiv:1412.6980)."""
     rise: float = 0.02
     """Share of the training in which the rate rises to its peak. Chosen."""
     batch: int = 1024
-    """Scenes in a step. Chosen."""
+    """Number of scenes per step. Chosen."""
     fresh: int = 128
-    """Scenes that each step draws anew; they join the pool. Chosen for time: an eighth of a batch."""
+    """Number of new scenes per step; they join the pool. Chosen for time: an eighth of a batch."""
     clip: float = 20.0
-    """Largest norm of a gradient. Chosen."""
+    """Maximum norm of a gradient. Chosen."""
     averaging: float = 0.998
-    """Share of the averaged weights, which are exported, that a step keeps. Chosen: five hundred steps are averaged."""
+    """Share of the averaged (exported) weights that a step keeps. Chosen: an average over about five hundred steps."""
 
 
 class Trainer(training.Trainer[torch.nn.Sequential, Pool]):
@@ -376,7 +377,7 @@ class Trainer(training.Trainer[torch.nn.Sequential, Pool]):
 
 
 def export(trainer: Trainer, pool: Pool, out: Path, held_out: int) -> dict[str, Any]:
-    """Regresses R_c, scores the averaged weights on held-out scenes, and writes them with their card; returns the card."""
+    """Regress R_c, score the averaged weights on held-out scenes, and write them with their card; returns the card."""
     scenes, seed = pool.scenes, trainer.seed
     network = to_numpy(trainer.average, pool.mean, pool.scale, scenes, NOTHING_KNOWN)
     network = replace(network, regression=regress(scenes, network, seed + REGRESSION_SEED))
@@ -409,7 +410,7 @@ def export(trainer: Trainer, pool: Pool, out: Path, held_out: int) -> dict[str, 
     example="penumbra haptics train --cell mine.yaml --minutes 15",
 )
 def main(options: flags.Options) -> int:
-    """Trains, then writes weights and card."""
+    """Train, then write weights and card."""
     cell = cells.load(options.cell)
     target = cell.one("targets", options.target)
     out = options.out or WEIGHTS / f"{cell.name}-{target}.npz"
