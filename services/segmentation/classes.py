@@ -1,4 +1,4 @@
-"""The class of each pixel, from the logits of all."""
+"""Computes the class of each pixel from the logits of all classes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from penumbra.shared.native import kernel
 
 
 def classes(logits: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """The index (h, w) of the greatest of logits (classes, h, w), of equal ones the first; in a sixth of the time of argmax,
-    which does not like to count across planes."""
+    """Index (h, w) of the maximum of logits (classes, h, w), the first one of equal maxima; takes a sixth of the time of argmax,
+    which is slow across planes."""
     index = np.empty(logits.shape[1:], np.uint8)
     _greatest(np.ascontiguousarray(logits), index)
     return index

@@ -1,16 +1,16 @@
-"""What the colours of a picture say of the target, learned from the network's own masks while it runs.
+"""Colour model of the target, learned online from the network's own masks.
 
-A network is surest along edges, and least sure inside a smooth, evenly lit arm that looks like none of its training. There the
-picture itself helps: a pixel whose colour surely recognised parts of the target have, and their surroundings do not, is
-probably the target's, too. Histograms over colour, of the target, of the rest of the body (often in the same sleeve), of the
-robot and of all else, are gathered from the network's probabilities; the logarithms of their ratios (Jones and Rehg,
-doi:10.1023/A:1013200319198) are added to the network's logits. As in GrabCut (doi:10.1145/1015706.1015720), they are estimated
-a second time from what the first estimate says. Nothing else is fed back: the histograms of a frame begin with the network's
-masks, so that they cannot walk away from them.
+The network is most certain along edges, and least certain inside a smooth, evenly lit arm unlike its training data. There the
+picture itself helps: a pixel is probably the target's if clearly recognised parts of the target have its colour and their
+surroundings do not. Colour histograms of the target, of the rest of the body (often in the same sleeve), of the robot and of
+everything else are accumulated from the network's probabilities; the logarithms of their ratios (Jones and Rehg,
+doi:10.1023/A:1013200319198) are added to the network's logits. As in GrabCut (doi:10.1145/1015706.1015720), the histograms are
+estimated a second time from the first estimate. There is no other feedback: each frame's histograms start from the network's
+masks, so that they cannot drift away from them.
 
-The constants were chosen by the IoU of photographs of training/photographs, of which the network had seen none, and of simulated
-sequences of seeds 424242 and 424243. With two groups, target and rest, photographs are as good, and simulated targets that are
-a third to two thirds hidden worse; with one for each class, photographs are worse.
+The constants were chosen by the IoU on photographs of training/photographs, none of which the network had seen, and on simulated
+sequences of seeds 424242 and 424243. With two groups, target and rest, photographs are as good, and simulated targets that are a
+third to two thirds hidden are worse; with one group per class, photographs are worse.
 """
 
 from __future__ import annotations
@@ -24,44 +24,45 @@ from penumbra.shared.contract.labels import TARGET_LABELS, Label
 
 SHAPE = (16, 16, 16)
 """Bins of L*, a* and b*: 16, 8 and 8 levels wide; a* and b* beyond 64 of 128 either way, which are rare, count as 64. L* in 8
-bins was worse, a* and b* in narrower ones no better."""
+bins was worse, narrower bins of a* and b* no better."""
 GROUPS = (tuple(TARGET_LABELS), (Label.TORSO, Label.UPPER_ARM), (Label.ROBOT,), (Label.BACKGROUND, Label.OCCLUDER))
 """Classes that share a histogram, the target's first."""
 HALF_LIFE_S = 1.0
-"""Age at which a frame counts half. 0.2 and 4 s are as good where looks do not change."""
+"""Age [s] at which a frame's weight is half. 0.2 and 4 s are as good where looks do not change."""
 WEIGHT = 2.5
-"""Of a colour's log-likelihood ratio beside the network's logits, which say too little where a look is new."""
+"""Weight of a colour's log-likelihood ratio relative to the network's logits, which are too weak for an unfamiliar look."""
 GREATEST = 2.0
-"""Largest log-likelihood ratio of a colour, either way: without it, the colours of few pixels decide."""
+"""Maximum log-likelihood ratio of a colour, either way: without it, the colours of few pixels decide."""
 ENOUGH_PX = 1000.0
-"""Pixels of a group, over the time that counts, with which its colours count half: of a target that is nearly hidden few are
-known, some of these wrongly."""
+"""Weighted number of pixels of a group at which its colours have half weight: of a nearly hidden target few pixels are known, and
+some of these wrongly."""
 EVERY = 2
-"""Histograms are made of every second pixel of every second row: as good, and a quarter of the time."""
+"""Histograms use every second pixel of every second row: as good, in a quarter of the time."""
 FEW_PX = 1.0
-"""Pixels of a colour with which it counts half."""
+"""Number of pixels of a colour at which it has half weight."""
 UNSURE = 0.5
-"""Pixels in doubt, as a share of the target's, from which on colours count wholly: to sure masks they add little but blur."""
+"""Uncertain pixels, as a share of the target's, above which colours have full weight: on certain masks they mostly add blur."""
 SMOOTH_PX = 1.0
-"""Standard deviation of the filter over the picture: a pixel's own colour is noisy."""
+"""Standard deviation [px] of the spatial filter: single pixels' colours are noisy."""
 OWN_SHARE = 0.05
-"""Share of a connected region that the network itself calls the target, at least: others are things of the same colours."""
+"""Minimum share of a connected region that the network itself must call the target; other regions are objects of the same
+colours."""
 
 
 class Colours:
-    """The colours of the target and of what surrounds it, before one camera."""
+    """Colour model of the target and its surroundings for one camera."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Start anew, as before another scene."""
+        """Reset, as for another scene."""
         self._seen = np.zeros((len(GROUPS), *SHAPE), np.float32)
 
     def classes(self, picture: NDArray[np.uint8], logits: NDArray[np.float32], elapsed_s: float) -> NDArray[np.uint8]:
-        """The class of each pixel (h, w), of the network's logits (classes, h, w) with what the colours say.
+        """The class of each pixel (h, w), from the network's logits (classes, h, w) and the colours.
 
-        picture: RGB (h, w, 3). elapsed_s: since the frame before.
+        picture: RGB (h, w, 3). elapsed_s: time since the previous frame.
         """
         index = _bins(picture)
         some, of_some = np.ascontiguousarray(logits[:, ::EVERY, ::EVERY]), np.ascontiguousarray(index[::EVERY, ::EVERY])
@@ -77,21 +78,21 @@ class Colours:
 
 
 def _bins(picture: NDArray[np.uint8]) -> NDArray[np.intp]:
-    """The bin of each pixel (h, w) in a flattened histogram."""
+    """Index of each pixel's bin (h, w) in a flattened histogram."""
     lab = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB), np.uint8)
     light, a, b = lab[..., 0] >> 4, *(np.clip(lab[..., k] >> 3, 8, 23) - 8 for k in (1, 2))
     return np.asarray((light.astype(np.intp) << 8) | (a.astype(np.intp) << 4) | b)
 
 
 def _probability(logits: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Of each group (groups, h, w)."""
+    """Probability of each group (groups, h, w)."""
     each = np.exp(logits - logits.max(0))
     of_groups = np.stack([each[list(group)].sum(0) for group in GROUPS])
     return of_groups / of_groups.sum(0)
 
 
 def _histograms(index: NDArray[np.intp], probability: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Pixels of each colour in each group (groups, *SHAPE), of which index and probability have one in EVERY squared."""
+    """Number of pixels per colour and group (groups, *SHAPE); index and probability hold one pixel in EVERY squared."""
     flat, size = index.ravel(), int(np.prod(SHAPE))
     counts = np.stack([np.bincount(flat, of.ravel(), size).reshape(SHAPE) for of in probability])
     return (EVERY**2 * counts).astype(np.float32)
@@ -111,7 +112,7 @@ def _evidence(seen: NDArray[np.float32], index: NDArray[np.intp]) -> list[NDArra
 
 
 def _smoothed(seen: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Histograms with half of each bin given to its neighbours along every axis in turn; the sums stay."""
+    """Histograms smoothed along each axis in turn: half of each bin goes to its neighbours; the sums are kept."""
     for axis in range(1, 4):
         old = np.moveaxis(seen, axis, 0)
         new = 0.5 * old
@@ -136,7 +137,7 @@ def _is_target(index: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _strays(target: NDArray[np.bool_], own: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The connected regions (h, w) of the target of which hardly anything is the network's own."""
+    """Connected regions (h, w) of the target that the network's own mask hardly contains."""
     count, region = cv2.connectedComponents(target.astype(np.uint8), connectivity=4)
     pixels, seen = (np.bincount(region[chosen], minlength=count) for chosen in (target, own & target))
     return (seen < OWN_SHARE * pixels)[region]

@@ -1,7 +1,7 @@
 """`penumbra segmentation infer`: masks and overlays of picture and film files.
 
-A film's frames, and with --sequence the pictures given, are looked at in order, and what the network remembers goes from one to
-the next. Other pictures stand for themselves: each is shown SETTLE times, as the network needs some frames to make up its mind.
+A film's frames, and with --sequence the given pictures, are processed in order, and the network's state is passed on. Other
+pictures are independent: each is shown SETTLE times, as the network needs some frames to settle.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from penumbra.shared.perception.lookout import STEP, Window, reduced, whole_fram
 SETTLE = 4
 """Number of times that a picture without a predecessor is shown to the network. Chosen, not measured."""
 PERIOD_NS = 50_000_000
-"""Time [ns] between pictures that have no stamps: that of the cameras which the network is trained on."""
+"""Time [ns] between pictures without stamps: that of the cameras for which the network is trained."""
 
 
 class FileError(ValueError):
@@ -48,7 +48,7 @@ class FileError(ValueError):
     example="penumbra segmentation infer arm.png film.mp4 --out masks",
 )
 def main(options: flags.Options) -> int:
-    """Writes the masks; returns 2 where a file cannot be read."""
+    """Write the masks; returns 2 if a file cannot be read."""
     scale = int(options.scale) if options.scale else None
     try:
         check_names(options.files)
@@ -59,7 +59,7 @@ def main(options: flags.Options) -> int:
             if is_picture(path):
                 image = read(path)
                 if not options.sequence:
-                    stamp_ns += 2 * round(inference.MAX_GAP_S * 1e9)  # so long that the last picture is forgotten
+                    stamp_ns += 2 * round(inference.MAX_GAP_S * 1e9)  # long enough that the previous picture is forgotten
                 for _ in range(1 if options.sequence else SETTLE):
                     stamp_ns += PERIOD_NS
                     mask = whole_mask(segmenter, image, scale, stamp_ns)
@@ -76,7 +76,7 @@ def main(options: flags.Options) -> int:
 
 
 def check_names(paths: Sequence[Path]) -> None:
-    """Raises FileError where what is written for one file would overwrite another's."""
+    """Raise FileError if one file's output would overwrite another's."""
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -86,7 +86,7 @@ def check_names(paths: Sequence[Path]) -> None:
 
 
 def is_picture(path: Path) -> bool:
-    """Whether a file is a picture; else it may be a film. Raises FileNotFoundError."""
+    """Whether a file is a picture; otherwise it may be a film. Raises FileNotFoundError."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a picture or a film, found no file")
     return bool(cv2.haveImageReader(str(path)))
@@ -101,7 +101,7 @@ def read(path: Path) -> NDArray[np.uint8]:
 
 
 def film(segmenter: inference.Segmenter, path: Path, out: Path, scale: int | None, stamp_ns: int) -> int:
-    """Masks and overlay of a film; returns the stamp of its last frame. Raises FileError."""
+    """Write masks and overlay of a film; returns the stamp of its last frame. Raises FileError."""
     source = cv2.VideoCapture(str(path))
     rate = source.get(cv2.CAP_PROP_FPS) or 1e9 / PERIOD_NS
     count = max(int(source.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
@@ -134,8 +134,8 @@ def frames(source: cv2.VideoCapture) -> Iterator[NDArray[np.uint8]]:
 
 
 def whole_mask(segmenter: inference.Segmenter, image: NDArray[np.uint8], scale: int | None, stamp_ns: int) -> NDArray[np.uint8]:
-    """Classes (h, w) of a whole image (h, w, 3), looked at as the service does where it knows of no pose; pixels left over at the
-    edges, less than the scale, are background. Raises FileError where the image is too small for the network."""
+    """Classes (h, w) of a whole image (h, w, 3), as the service computes them without a known pose; remaining pixels at the
+    edges, fewer than the scale, are background. Raises FileError if the image is too small for the network."""
     height, width = image.shape[:2]
     picture = Window(0, 0, width, height)
     window = whole_frame(picture) if scale is None else reduced(picture, scale)
@@ -148,7 +148,7 @@ def whole_mask(segmenter: inference.Segmenter, image: NDArray[np.uint8], scale: 
 
 
 def overlay(image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image (h, w, 3) with every class but background in its colour, and the target's contour in white."""
+    """The image (h, w, 3) with every class except background in its colour, and the target's contour in white."""
     colours = image.copy()
     for label, colour in COLOURS.items():
         colours[mask == label] = colour
@@ -160,6 +160,6 @@ def overlay(image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.uin
 
 
 def write(path: Path, image: NDArray[np.uint8]) -> None:
-    """A picture's file: one channel, or blue, green, red. Raises FileError."""
+    """Write a picture file of one channel, or of blue, green, red. Raises FileError."""
     if not cv2.imwrite(str(path), image):
         raise FileError(f"{path}: cannot be written")

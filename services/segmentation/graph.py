@@ -1,10 +1,10 @@
-"""PredNet in OpenVINO's operations, from stored weights: one time step, line by line that of `prednet.PredNet.forward`.
+"""PredNet in OpenVINO's operations, from stored weights: one time step, corresponding line by line to `prednet.PredNet.forward`.
 
-Tensors are (1, channels, h, w), as in torch. Only the image, which comes in, and the state, which comes in and goes out, have
-their channels innermost: so they lie in memory, and the convolutions on a CPU want them so too, hence nothing is reordered.
+Tensors are (1, channels, h, w), as in torch. Only the input image and the state (input and output) have their channels innermost:
+this is their layout in memory and the one that CPU convolutions use, so nothing is reordered.
 
-It is built without torch, in some milliseconds. OpenVINO starts a thread when it is imported, so a process that will be forked
-imports this module only afterwards.
+The graph is built without torch, in some milliseconds. OpenVINO starts a thread when it is imported, so a process that will be
+forked imports this module only afterwards.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def step(model: Model, height: int, width: int, precision: str) -> Any:
     """OpenVINO's model of a time step for images of one size. precision: OpenVINO's name of the state's type, f32 or bf16.
 
     Inputs: the image (1, h, w, channels) float32 in [0, 1], the tensors of the state (1, h / stride, w / stride, channels), and,
-    where the network has any, priors (1, h, w, priors) float32 in [-1, 1].
-    Outputs: the class logits (1, classes, h, w) float32, then the new state. Raises ValueError where the size does not fit.
+    if the network has any, priors (1, h, w, priors) float32 in [-1, 1]. Outputs: the class logits (1, classes, h, w) float32,
+    then the new state. Raises ValueError if the size does not fit.
     """
     inputs, sizes = model.inputs, model.settings.state_sizes(height, width)
     state_type = getattr(openvino.Type, precision)
@@ -44,15 +44,15 @@ def _channels_first(parameter: Any) -> Any:
 
 
 class _Step:
-    """The operations of a time step; names of layers are those of the weights."""
+    """The operations of a time step; layers are named as in the weights."""
 
     def __init__(self, model: Model):
         self._settings, self._weights = model.settings, model.weights
 
     def forward(self, image: Any, state: list[Any], priors: Any = None) -> tuple[Any, list[Any]]:
-        """(class logits, new state) of an image, the old state and, where the network has any, priors."""
+        """(class logits, new state) of an image, the old state and, if the network has any, priors."""
         n = len(self._settings.channels)
-        old, delayed = state[:n], state[n:]  # with delays: E_l of the step before
+        old, delayed = state[:n], state[n:]  # with delays: E_l of the previous step
         errors: list[Any] = []
         arriving = _shrunk(image)
         known = None if priors is None else _shrunk(priors)
@@ -79,7 +79,7 @@ class _Step:
         return self._decoded(image, new, context), [*new, *(errors if delayed else ())]
 
     def _context(self, image: Any) -> dict[int, Any]:
-        """What the encoder adds, as in `prednet.PredNet.look`."""
+        """The encoder's contribution, as in `prednet.PredNet.look`."""
         x = op.divide(op.subtract(image, np.float32(encoder.MEAN)), np.float32(encoder.SPREAD))
         x = op.clamp(self._filtered("encoder.stem", x, 2), 0.0, 6.0)
         seen: list[Any] = []
@@ -135,14 +135,14 @@ class _Step:
         return op.tanh(op.add(self._convolution(f"{name}.recurrent", state), self._convolution(f"{name}.input", drive)))
 
     def _convolution(self, name: str, x: Any) -> Any:
-        """A convolution of stride 1 that keeps the size."""
+        """A convolution of stride 1 with padding that keeps the size."""
         kernel, bias = self._weights[f"{name}.weight"], self._weights.get(f"{name}.bias")
         padding = [kernel.shape[-1] // 2] * 2
         found = op.convolution(x, op.constant(kernel), [1, 1], padding, padding, [1, 1])
         return found if bias is None else op.add(found, op.constant(bias.reshape(1, -1, 1, 1)))
 
     def _filtered(self, name: str, x: Any, stride: int) -> Any:
-        """A convolution of the encoder: its zeros around the picture, and each channel by itself where its weights say so."""
+        """A convolution of the encoder, with its zero padding; depthwise if its weights say so."""
         kernel, bias = self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
         before, behind = encoder.padding(kernel.shape[-1], stride)
         form = [stride] * 2, [before] * 2, [behind] * 2, [1, 1]
@@ -162,18 +162,18 @@ class _Step:
 
 
 def _shrunk(x: Any) -> Any:
-    """What the first layer sees of a picture, or of priors."""
+    """Input of the first layer from a picture or from priors."""
     side = [SHRINK, SHRINK]
     return op.space_to_depth(op.avg_pool(x, side, [0, 0], [0, 0], side, False), "depth_first", FOLD)
 
 
 def _pooled(x: Any) -> Any:
-    """The greatest of each 2 x 2 positions."""
+    """Maximum over each 2 x 2 positions."""
     return op.max_pool(x, [2, 2], [1, 1], [0, 0], [0, 0], [2, 2]).output(0)
 
 
 def _enlarged(x: Any, factor: int, mode: str) -> Any:
-    """torch's `interpolate` with corners not aligned."""
+    """torch's `interpolate` without aligned corners."""
     if factor == 1:
         return x
     scales, axes = np.array([factor, factor], np.float32), np.array([2, 3])

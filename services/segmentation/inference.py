@@ -1,4 +1,4 @@
-"""Inference: frames and windows in, masks out; the recurrent state kept between them."""
+"""Inference: masks from frames and windows, with the recurrent state kept between frames."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from penumbra.shared.perception.lookout import MAX_PIXELS, Window
 
 WEIGHTS = Path(__file__).parent / "weights" / "prednet.npz"
 MAX_GAP_S = 0.5
-"""Longest gap [s] between frames after which the recurrent state is kept: after a longer one it has little to do with the
+"""Maximum gap [s] between frames across which the recurrent state is kept: after a longer one it has little to do with the
 picture. Chosen, not measured."""
 FEWEST_PIXELS = 112 * 112
-"""A machine too slow for a window of so many pixels gets it nevertheless: of a smaller one an arm fills too few."""
+"""Minimum size of a window [px], even on a slower machine: an arm fills too few pixels of a smaller one."""
 
 
 class Segmenter:
     """Masks of one camera's frames, in order. `offset`: added to the logits of forearm and hand, calibrated so that their masks
-    are on average as large as they should be (the search would take a mask too large for an arm too near). `precision`: that of
-    the computation, by default the fastest of this processor; masks differ by rounding only. `has_colours`: whether the
-    colours of the picture count beside the network (`colours.py`)."""
+    have the right size on average (the search would mistake a too large mask for a closer arm). `precision`: of the computation,
+    by default the fastest of this processor; masks differ by rounding only. `has_colours`: whether the picture's colours are used
+    beside the network (`colours.py`)."""
 
     def __init__(self, network: Model, offset: float = 0.0, precision: Precision | None = None, has_colours: bool = True):
         self._compiled = Compiled(network, precision or ("bf16" if processor.has_bfloat16() else "f32"))
@@ -46,24 +46,23 @@ class Segmenter:
 
     @property
     def has_priors(self) -> bool:
-        """Whether the network makes use of what is known beside the picture."""
+        """Whether the network uses priors."""
         return self._has_priors
 
     def __call__(
         self, image: NDArray[np.uint8], window: Window, stamp_ns: int, priors: NDArray[np.float32] | None = None
     ) -> NDArray[np.uint8]:
         """Class indices (window.height, window.width) uint8 of a window of an RGB image (h, w, 3) uint8, exposed at `stamp_ns`.
-        priors (window.height, window.width, 2): what is known of the window beside the picture (`model.PRIORS`), None where
-        nothing is.
+        priors (window.height, window.width, 2): see `model.PRIORS`, None if there are none.
 
-        The network sees what it can take: a window of another size is continued at the right and lower edge. The state is
-        forgotten where the scale changes, and with the colours where time stands, goes back or jumps by more than MAX_GAP_S.
-        Raises ValueError where the window does not lie in the image.
+        A window whose size does not fit the network is padded at the right and lower edge. The state is reset if the scale
+        changes; the state and the colours are reset if time stands still, goes back or jumps by more than MAX_GAP_S. Raises
+        ValueError if the window does not lie in the image.
         """
         picture, elapsed_s = cut(image, window), (stamp_ns - self._stamp_ns) * 1e-9
         if not 0.0 < elapsed_s <= MAX_GAP_S:
             self._forget()
-            elapsed_s = 0.0  # of what is remembered, nothing
+            elapsed_s = 0.0  # nothing is remembered
         seen = self._seen(window)
         known = None if priors is None else _continued(priors, seen)
         logits, self._state = self._compiled(_continued(picture, seen), self._remembered(seen), known)
@@ -77,7 +76,7 @@ class Segmenter:
         return self._colours.classes(np.rint(255.0 * picture).astype(np.uint8), logits, elapsed_s)
 
     def twin(self) -> Segmenter:
-        """Another one of the same network, for another camera: what one has compiled the other need not."""
+        """Another segmenter of the same network, for another camera; the two share compiled models."""
         twin = copy.copy(self)
         twin._stamp_ns, twin._colours = 0, Colours() if self._colours is not None else None
         twin._forget()
@@ -85,16 +84,16 @@ class Segmenter:
         return twin
 
     def prepare(self, *windows: Window) -> None:
-        """Make ready, in the background, for windows of these sizes, one after another."""
+        """Compile for windows of these sizes in the background, in order."""
         self._compiled.prepare([(seen.height, seen.width) for seen in map(self._seen, windows)])
 
     def is_prepared(self, window: Window) -> bool:
-        """Whether a window of this size waits for nothing."""
+        """Whether the model for a window of this size is compiled."""
         seen = self._seen(window)
         return self._compiled.is_prepared((seen.height, seen.width))
 
     def _seen(self, window: Window) -> Window:
-        """What the network is shown for a window: one of a size that it can take."""
+        """The window padded to a size that fits the network."""
         height, width = (-(-n // self._multiple) * self._multiple for n in (window.height, window.width))
         return replace(window, height=height, width=width)
 
@@ -112,13 +111,13 @@ class Segmenter:
 
 
 def _continued(picture: NDArray[np.float32], window: Window) -> NDArray[np.float32]:
-    """A picture (h, w, channels) as large as a window that begins where it does, its last pixels repeated."""
+    """A picture (h, w, channels) padded to a window with the same origin by repeating its last pixels."""
     below, beside = window.height - picture.shape[0], window.width - picture.shape[1]
     return np.pad(picture, ((0, below), (0, beside), (0, 0)), "edge") if below or beside else picture
 
 
 def cut(image: NDArray[np.uint8], window: Window) -> NDArray[np.float32]:
-    """The window (height, width, 3) in [0, 1] of an RGB image (h, w, 3) uint8; at scales above 1 their means."""
+    """The window (height, width, 3) in [0, 1] of an RGB image (h, w, 3) uint8; at scales above 1, means of pixels."""
     if min(window.x0, window.y0) < 0 or window.bottom > image.shape[0] or window.right > image.shape[1]:
         raise ValueError(f"expected a window inside the image of {image.shape[1]} x {image.shape[0]}, got {window}")
     part = image[window.y0 : window.bottom, window.x0 : window.right]
@@ -134,7 +133,7 @@ def cut(image: NDArray[np.uint8], window: Window) -> NDArray[np.float32]:
 
 
 def load_segmenter(path: Path = WEIGHTS, precision: Precision | None = None) -> Segmenter:
-    """A segmenter of a weights file with its card. Raises FileNotFoundError that says how to make one."""
+    """A segmenter from a weights file and its card. Raises FileNotFoundError that says how to make one."""
     if not path.is_file():
         raise FileNotFoundError(f"no weights {path}: make them with `penumbra segmentation train --out {path}`")
     return _loaded(path, path.stat().st_mtime_ns, precision).twin()
@@ -147,16 +146,18 @@ def _loaded(path: Path, changed_ns: int, precision: Precision | None) -> Segment
 
 
 def affordable(segmenter: Segmenter, tried: Window, step_s: float) -> int:
-    """The pixels of a window that takes step_s of one thread of this processor, within FEWEST_PIXELS and lookout.MAX_PIXELS.
-    tried: the window by which that is judged, best one that will be looked at first, since it is compiled here."""
+    """Number of pixels of a window that takes step_s on one thread of this processor, within FEWEST_PIXELS and
+    lookout.MAX_PIXELS. tried: the window used for the measurement, preferably the first one to be segmented, since it is compiled
+    here."""
     ms = speed(segmenter, tried.width, tried.height, frames=3, unused=1)["cpu_ms"]
     pixels = tried.width * tried.height * 1e3 * step_s / ms
     return round(min(max(pixels, FEWEST_PIXELS), MAX_PIXELS))
 
 
 def speed(segmenter: Segmenter, width: int, height: int, frames: int = 30, unused: int = 5) -> dict[str, float]:
-    """Milliseconds a frame of a window of this size on random pixels, on one thread: median of the processor's time and of the
-    clock's, which is longer where others want the processor too. unused: frames before these, of which the first one compiles."""
+    """Milliseconds per frame of a window of this size on random pixels, on one thread: median of the processor's time and of the
+    wall time, which is longer if other processes use the processor. unused: number of frames before these, the first of which
+    compiles."""
     image = np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8)
     window = Window(0, 0, width, height)
     times = []

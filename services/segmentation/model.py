@@ -1,6 +1,6 @@
-"""The network's shape and weights, as they are stored: what the running service, which knows no torch, has of it.
+"""Shape and weights of the network, as stored and as the running service uses them, without torch.
 
-`prednet.py` is the same network in torch, to be trained; `openvino_step.py` runs it in OpenVINO.
+`prednet.py` is the same network in torch, for training; `openvino_step.py` runs it in OpenVINO.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from numpy.typing import NDArray
 from penumbra.services.segmentation import encoder
 
 SHRINK = 2
-"""The layers see means of so many pixels a side of the picture."""
+"""Side [px] of the blocks of picture pixels whose means the layers see."""
 FOLD = 2
-"""Width and height of what one position sees: the first layer's of these means, and that of the mask's decoder of the picture."""
+"""Side of the block of pixels folded into one position: of these means for the first layer, of the picture for the mask's
+decoder."""
 CELLS = ("hgru", "convlstm", "conv")
-"""What may update a layer's representation; `prednet.py` describes them."""
+"""Cells that may update a layer's representation; `prednet.py` describes them."""
 PRIORS = ("robot", "target")
-"""What may be known before a picture is looked at, a channel each: where the robots are, and where the targets should be. Values
-are 2 p - 1 of a pixel's probability p to lie in the silhouette, whatever covers it: 1 inside, -1 outside, 0 where nothing is
-known."""
+"""Prior knowledge of a picture, one channel each: where the robots are, and where the targets are expected. Values are 2 p - 1 of
+a pixel's probability p to lie in the silhouette, even if occluded: 1 inside, -1 outside, 0 where unknown."""
 
 
 def kernels_of(layers: int) -> tuple[int, ...]:
-    """The width of the cell's kernel in each of so many layers: 3 where they are finest, 5 above."""
+    """Width of the cell's kernel in each of `layers` layers: 3 in the two finest, 5 above."""
     return tuple(3 if i < 2 else 5 for i in range(layers))
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Size of the network. channels, kernels: of the cell of each layer. The authors have 64-128-256-512 and kernels of 5;
-    kernels of 5 in the coarse layers alone (`kernels_of`) cost a tenth of the time of 5 everywhere and reach as far. `delay`:
-    axonal delays. `cell`: one of CELLS, all of nearly the same number of parameters. `priors`: channels of what is known beside
-    the picture, those of PRIORS or none. `encoder`: whether what an encoder says of the picture drives the cells, too."""
+    """Size of the network. channels, kernels: of each layer's cell. The authors have 64-128-256-512 and kernels of 5; kernels of
+    5 in the coarse layers alone (`kernels_of`) cost a tenth of the time of 5 everywhere and reach as far. `delay`: axonal delays.
+    `cell`: one of CELLS, all with nearly the same number of parameters. `priors`: number of prior channels, those of PRIORS or
+    none. `encoder`: whether an encoder's output also drives the cells."""
 
     channels: tuple[int, ...] = (16, 16, 32, 64)
     kernels: tuple[int, ...] = (3, 3, 5, 5)
@@ -59,22 +59,22 @@ class Settings:
 
     @property
     def layer_strides(self) -> tuple[int, ...]:
-        """Image pixels a side of one position of each layer."""
+        """Image pixels per position and axis of each layer."""
         return tuple(SHRINK * FOLD * 2 ** max(i - 1, 0) for i in range(len(self.channels)))
 
     @property
     def strides(self) -> tuple[int, ...]:
-        """The same for each tensor of the state."""
+        """Image pixels per position and axis of each tensor of the state."""
         return self.layer_strides * (2 if self.delay else 1)
 
     @property
     def multiple(self) -> int:
-        """Images have a multiple of this many pixels a side, and the state can be shifted by multiples of it."""
+        """Number of pixels of which image sides must be a multiple; the state can be shifted by multiples of it."""
         return max(self.layer_strides[-1], encoder.STRIDES[-1] if self.encoder else 1)
 
     @property
     def driven(self) -> tuple[int, ...]:
-        """The layer that each of the encoder's results but the first drives: the last one whose positions are no larger."""
+        """Index of the layer that each encoder output except the first drives: the coarsest layer no coarser than the output."""
         return tuple(max(i for i, own in enumerate(self.layer_strides) if own <= stride) for stride in encoder.STRIDES[1:])
 
     def state_sizes(self, height: int, width: int) -> tuple[tuple[int, int], ...]:
@@ -86,19 +86,19 @@ class Settings:
 
 @dataclass(frozen=True)
 class Model:
-    """A network: its settings, and its parameters (float32) by the names that they have in `prednet.PredNet`."""
+    """A network: its settings, and its parameters (float32) by their names in `prednet.PredNet`."""
 
     settings: Settings
     weights: dict[str, NDArray[np.float32]]
 
     @property
     def inputs(self) -> tuple[int, ...]:
-        """Channels of the input A_l of each layer, which layer l predicts."""
+        """Number of channels of each layer's input A_l, which layer l predicts."""
         return tuple(len(self.weights[f"predict.{i}.bias"]) for i in range(len(self.settings.channels)))
 
     @property
     def state_channels(self) -> tuple[int, ...]:
-        """Channels of each tensor of the state: R_l of every layer and, with axonal delays, E_l after them."""
+        """Number of channels of each tensor of the state: R_l of every layer and, with axonal delays, E_l after them."""
         errors = tuple(2 * n for n in self.inputs) if self.settings.delay else ()
         return self.settings.channels + errors
 
@@ -112,7 +112,7 @@ def save(path: Path, model: Model, card: dict[str, Any]) -> None:
 
 
 def load(path: Path) -> tuple[Model, dict[str, Any]]:
-    """The network of a weights file and its card. Raises ValueError for a card of something else."""
+    """Load the network of a weights file and its card. Raises ValueError for a card of something else."""
     card = json.loads(path.with_suffix(".json").read_text())
     try:
         network = {key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"]["network"].items()}

@@ -1,8 +1,8 @@
-"""The network as OpenVINO runs it: compiled from stored weights, without torch and without a file in between.
+"""The network in OpenVINO, compiled from stored weights without torch or intermediate files.
 
-It is compiled for each size of the picture: for all sizes at once a step takes three quarters longer, as little can be
-fused. A size costs some 0.13 s of the processor's time and 22 MB, so sizes that will soon be needed are compiled ahead, in a
-thread. A size that is not there yet is waited for: what comes out depends on pictures alone and not on time.
+It is compiled per picture size: a model for all sizes takes three quarters longer per step, as little can be fused. A size costs
+some 0.13 s of the processor's time and 22 MB, so sizes that will soon be needed are compiled ahead, in a thread. A call waits for
+a size that is not compiled yet, so that the output depends on pictures alone and not on timing.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from penumbra.services.segmentation.model import Model
 
 Precision = Literal["f32", "bf16"]
 State = tuple[NDArray[Any], ...]
-"""What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (1, h, w, channels), float32,
-or bfloat16, of which numpy knows nothing and sees the bits as uint16: zero is zero in both."""
+"""State of the network: R_l of every layer and, with axonal delays, E_l after them. Each is (1, h, w, channels), float32 or
+bfloat16. numpy has no bfloat16 and holds its bits as uint16; zero is zero in both."""
 
 MOST = 12
 """Maximum number of compiled sizes; a minute of a moving arm needs seven to ten."""
@@ -28,8 +28,8 @@ MOST = 12
 class Compiled:
     """One time step of a network for pictures of any size. `precision`: of the state and of the computation.
 
-    Not for two threads at once: see `twin`. Raises ImportError where OpenVINO is not installed, ValueError
-    where the weights are not those of a network of such settings.
+    Not thread-safe: see `twin`. Raises ImportError if OpenVINO is not installed, ValueError if the weights do not match the
+    settings.
     """
 
     def __init__(self, model: Model, precision: Precision):
@@ -54,22 +54,21 @@ class Compiled:
         self._lock = threading.Lock()
 
     def twin(self) -> Compiled:
-        """Another one of the same network, for another stream of pictures: what one compiles the other has."""
+        """Another instance of the same network, for another stream of pictures; the two share compiled models."""
         twin = copy.copy(self)
         twin._requests = {}
         return twin
 
     def initial_state(self, height: int, width: int) -> State:
-        """The state that has seen nothing, for pictures of this size. Raises ValueError where the size does not fit."""
+        """The zero state, for pictures of this size. Raises ValueError if the size does not fit."""
         sizes, channels = self._model.settings.state_sizes(height, width), self._model.state_channels
         return tuple(np.zeros((1, *size, c), self._dtype) for size, c in zip(sizes, channels, strict=True))
 
     def __call__(
         self, image: NDArray[np.float32], state: State, priors: NDArray[np.float32] | None = None
     ) -> tuple[NDArray[np.float32], State]:
-        """(class logits (classes, h, w), new state) of an image (h, w, channels) in [0, 1], the old state and the priors
-        (h, w, priors) in [-1, 1] of a network that has any, None where nothing is known. The logits are OpenVINO's memory: the
-        next call writes over them."""
+        """(class logits (classes, h, w), new state) of an image (h, w, channels) in [0, 1], the old state and, for a network with
+        priors, the priors (h, w, priors) in [-1, 1] or None. The logits are OpenVINO's memory, which the next call overwrites."""
         request = self._request(*image.shape[:2])
         new = tuple(np.empty_like(tensor) for tensor in state)
         request.set_input_tensor(0, self._ov.Tensor(image[None]))
@@ -93,7 +92,7 @@ class Compiled:
             threading.Thread(target=self._compile_ahead, args=(fresh,), name="compile").start()
 
     def is_prepared(self, size: tuple[int, int]) -> bool:
-        """Whether a picture of this size (height, width) waits for nothing."""
+        """Whether the model for pictures of this size (height, width) is compiled."""
         return size in self._compiled
 
     def _compile_ahead(self, sizes: list[tuple[int, int]]) -> None:
@@ -107,7 +106,7 @@ class Compiled:
             request = self._model_of(size).create_infer_request()
             while len(self._requests) >= MOST:
                 self._requests.pop(next(iter(self._requests)), None)
-        self._requests[size] = request  # the last one used is the last to go
+        self._requests[size] = request  # dictionary order: the least recently used one goes first
         return request
 
     def _model_of(self, size: tuple[int, int]) -> Any:
@@ -124,8 +123,8 @@ class Compiled:
     def _compile(self, height: int, width: int) -> Any:
         settings = {
             "INFERENCE_NUM_THREADS": 1,
-            "NUM_STREAMS": 0,  # the caller's thread computes: not two more threads per size, which would only wait
-            "ENABLE_CPU_PINNING": False,  # two processes would be tied to the same core
+            "NUM_STREAMS": 0,  # compute in the caller's thread: two more threads per size would only wait
+            "ENABLE_CPU_PINNING": False,  # pinning would tie two processes to the same core
             "INFERENCE_PRECISION_HINT": self._precision,
         }
         return self._core.compile_model(self._graph.step(self._model, height, width, self._precision), "CPU", settings)

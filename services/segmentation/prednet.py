@@ -2,22 +2,22 @@
 
 One time step (section "PredNet Model"):
 
-1. Bottom-up. Layer l predicts its input A_l from its representation R_l of the last step. What the prediction missed is the
-   error E_l, split into what was too little and what too much; convolved and pooled it is the input A_{l+1} of the next layer.
+1. Bottom-up. Layer l predicts its input A_l from its representation R_l of the previous step. The prediction error E_l is split
+   into its positive and negative parts; convolved and pooled it is the input A_{l+1} of the next layer.
 2. Top-down. From the last layer to the first, R_l is updated by a cell (hGRU; others for comparison) driven by E_l and R_{l+1}.
 3. The mask is decoded from all R_l but the first and from the picture: brought to one resolution, summed, convolved.
 
-Priors, where the network has any (`model.PRIORS`), enter beside the picture and are not predicted: convolved they are added to
-what the second layer receives from below, from which all layers above learn of them, and to the drive of its cell. Where nothing
-is known they are zero and add nothing.
+Priors, if the network has any (`model.PRIORS`), enter beside the picture and are not predicted: convolved they are added to the
+second layer's input from below, through which all layers above receive them, and to the drive of its cell. Unknown priors are
+zero and add nothing.
 
-An encoder (`encoder.py`), where the network has one, looks at each picture by itself. What it says is added to the drive of the
-cells of all layers but the first and, at its finest resolution, to the sum that the mask is read from; it is not predicted.
+An encoder (`encoder.py`), if the network has one, processes each picture separately. Its outputs are added to the drive of the
+cells of all layers but the first and, at its finest resolution, to the sum from which the mask is read; they are not predicted.
 
 The layers see the picture at half its resolution and folded: 2 x 2 means become 12 channels (space to depth). The first layer
-therefore works at a quarter of the picture's resolution where the authors' works at full; the pooling that would follow it is
-this folding, which, unlike it, throws nothing away. The second layer keeps that resolution, each one above halves it. The mask's
-decoder works at half resolution, where contours come from the picture, folded likewise, and from the encoder.
+therefore works at a quarter of the picture's resolution, the authors' at full resolution; the folding replaces the pooling that
+would follow it, and loses no information. The second layer keeps that resolution, each layer above halves it. The mask's decoder
+works at half resolution; its contours come from the picture, folded likewise, and from the encoder.
 
 References: Lotter, Kreiman, Cox 2017 (arXiv:1605.08104); Linsley, Kim, Veerabadran, Windolf, Serre 2018 (arXiv:1805.08315).
 """
@@ -38,17 +38,17 @@ from penumbra.services.segmentation.model import FOLD, SHRINK, Model, Settings
 from penumbra.shared.contract.labels import Label
 
 State = tuple[Tensor, ...]
-"""What the network remembers: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""
+"""State of the network: R_l of every layer and, with axonal delays, E_l after them. Each is (batch, channels, h, w)."""
 Context = dict[int, Tensor]
-"""What an encoder adds to the drive of layers' cells (batch, channels, h, w), by layer, and, in place of the first one's, to what
-the mask is read from."""
+"""The encoder's additions (batch, channels, h, w) to the drive of layers' cells, by layer; entry 0 is added to the sum from which
+the mask is read."""
 
 
 class HGRU(nn.Module):
-    """Horizontal gated recurrent unit (Linsley et al. 2018, eq. 4-7) without the time-step gains of its endless use here.
+    """Horizontal gated recurrent unit (Linsley et al. 2018, eq. 4-7), without time-step gains because it runs indefinitely.
 
     One horizontal kernel W serves both stages: C1 inhibits, C2 excites. Per channel: alpha, mu scale and shift the inhibition,
-    kappa, beta, omega weigh the input, the excitation and their product.
+    kappa, beta, omega weight the input, the excitation and their product.
     """
 
     def __init__(self, channels: int, kernel: int):
@@ -71,14 +71,14 @@ class HGRU(nn.Module):
 
 
 def _scale(x: Tensor, gain: Tensor, offset: Tensor | None = None) -> Tensor:
-    """gain * x + offset per channel. As a 1 x 1 convolution: with channels innermost in memory torch's broadcasting is 4 times
+    """gain * x + offset per channel. It is a 1 x 1 convolution: with channels innermost in memory torch's broadcasting is 4 times
     slower."""
     return F.conv2d(x, torch.diag(gain)[:, :, None, None], offset)
 
 
 class ConvLSTM(nn.Module):
-    """Convolutional long short-term memory (Shi et al. 2015, arXiv:1506.04214, without peepholes). Its state holds output and
-    memory, one behind the other, with half of the channels each: as many parameters and as large a state as the hGRU's."""
+    """Convolutional long short-term memory (Shi et al. 2015, arXiv:1506.04214, without peepholes). Its state concatenates output
+    and memory, with half of the channels each: as many parameters and as large a state as the hGRU's."""
 
     def __init__(self, channels: int, kernel: int):
         super().__init__()
@@ -108,11 +108,11 @@ class Convolution(nn.Module):
 
 
 CELLS: dict[str, type[nn.Module]] = {"hgru": HGRU, "convlstm": ConvLSTM, "conv": Convolution}
-"""What updates a layer's representation, by the name that the settings give."""
+"""Cells that update a layer's representation, by their name in the settings."""
 
 
 class EncoderBlock(nn.Module):
-    """A block of the encoder, of the form that `encoder.Block` says."""
+    """A block of the encoder, with the form of `encoder.Block`."""
 
     def __init__(self, form: encoder.Block):
         super().__init__()
@@ -137,7 +137,7 @@ class Encoder(nn.Module):
         self.blocks = nn.ModuleList(EncoderBlock(form) for form in encoder.BLOCKS)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """What it says of images (batch, 3, h, w) in [0, 1]: a tensor (batch, channels, h / stride, w / stride) for each of
+        """Outputs for images (batch, 3, h, w) in [0, 1]: a tensor (batch, channels, h / stride, w / stride) for each of
         `encoder.STRIDES`."""
         x = F.relu6(self.stem(_padded((image - encoder.MEAN) / encoder.SPREAD, encoder.STEM_KERNEL, 2)))
         found = []
@@ -149,7 +149,7 @@ class Encoder(nn.Module):
 
 
 class Gathering(nn.Module):
-    """What the encoder found, decoded from the coarsest resolution to the finest."""
+    """Decoder of the encoder's outputs, from the coarsest resolution to the finest."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -161,7 +161,7 @@ class Gathering(nn.Module):
         )
 
     def forward(self, found: list[Tensor]) -> list[Tensor]:
-        """A tensor (batch, width, h / stride, w / stride) for each of `encoder.STRIDES`, of the encoder's results."""
+        """A tensor (batch, width, h / stride, w / stride) for each of `encoder.STRIDES`, from the encoder's outputs."""
         gathered = [F.relu(self.merge[-1](found[-1]))]
         for k in reversed(range(len(self.narrow))):
             coarser = _enlarged(self.narrow[k](gathered[0]), 2)
@@ -175,8 +175,8 @@ def _padded(x: Tensor, kernel: int, stride: int) -> Tensor:
 
 
 class PredNet(nn.Module):
-    """The network of the module's description. Images are (batch, 3, h, w) in [0, 1], h and w multiples of `multiple`; priors
-    (batch, priors, h, w) in [-1, 1], None where nothing is known."""
+    """The network described above. Images are (batch, 3, h, w) in [0, 1], h and w multiples of `multiple`; priors (batch, priors,
+    h, w) in [-1, 1], or None."""
 
     def __init__(self, settings: Settings | None = None):
         super().__init__()
@@ -200,12 +200,12 @@ class PredNet(nn.Module):
         receiving = (settings.decoder_channels, *(c[i] for i in settings.driven))
         levels = zip(encoder.WIDTHS, receiving, strict=True) if settings.encoder else ()
         self.context = nn.ModuleList(nn.Conv2d(width, channels, 1, bias=False) for width, channels in levels)
-        for module in self.modules():  # channels innermost: what convolutions on a CPU are fastest with
+        for module in self.modules():  # channels innermost: fastest for convolutions on a CPU
             if isinstance(module, nn.Conv2d):
                 module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)
 
     def initial_state(self, batch: int, height: int, width: int) -> State:
-        """The state that has seen nothing, for images of this size. Raises ValueError where the size does not fit."""
+        """The zero state, for images of this size. Raises ValueError if the size does not fit."""
         channels = list(self.settings.channels)
         if self.settings.delay:
             channels += [2 * n for n in self._inputs]
@@ -216,7 +216,7 @@ class PredNet(nn.Module):
         )
 
     def look(self, image: Tensor) -> Context:
-        """What the encoder of a network that has one adds."""
+        """The encoder's additions; empty for a network without an encoder."""
         found: Context = {}
         if self.encoder is not None and self.gather is not None:
             gathered = self.gather(self.encoder(image))
@@ -227,20 +227,21 @@ class PredNet(nn.Module):
         return found
 
     def glimpsed(self, image: Tensor) -> Tensor:
-        """Class logits (batch, classes, h, w) without the layers, of a network that has an encoder."""
+        """Class logits (batch, classes, h, w) of a network with an encoder, computed without the layers."""
         return self._mask(self.outline(F.pixel_unshuffle(image, FOLD)), self.look(image))
 
     def forward(
         self, image: Tensor, state: State, priors: Tensor | None = None, context: Context | None = None
     ) -> tuple[Tensor, list[Tensor], State]:
-        """One time step: (class logits (batch, classes, h, w), mean absolute prediction error of each layer, new state). context:
-        what `look` says of the image, where that is known already.
+        """Run one time step; returns (class logits (batch, classes, h, w), mean absolute prediction error of each layer, new
+        state). context: result of `look` for the image, if already computed.
 
-        With axonal delays a layer receives its neighbours' activity of the step before: layer l learns of a picture l steps late.
+        With axonal delays a layer receives its neighbours' activity of the previous step: layer l receives a picture l steps
+        late.
         """
         n = len(self.settings.channels)
         old = state[:n]
-        delayed = state[n:]  # with delays: E_l of the step before
+        delayed = state[n:]  # with delays: E_l of the previous step
         errors: list[Tensor] = []
         missed: list[Tensor] = []
         arriving = _shrunk(image)
@@ -254,7 +255,7 @@ class PredNet(nn.Module):
                 up = self.ascend[i](delayed[i] if delayed else errors[i])
                 if i == 0 and known is not None and self.prior_input is not None:
                     up = up + self.prior_input(known)
-                arriving = F.relu(F.max_pool2d(up, 2) if i > 0 else up)  # the folding is the first layer's pooling
+                arriving = F.relu(F.max_pool2d(up, 2) if i > 0 else up)  # the folding acts as the first layer's pooling
         new: list[Tensor] = []
         for i in reversed(range(n)):
             drive = self.drive[i](errors[i])
@@ -277,7 +278,7 @@ class PredNet(nn.Module):
 
 
 def _shrunk(x: Tensor) -> Tensor:
-    """What the first layer sees of a picture, or of priors."""
+    """Input of the first layer from a picture or from priors."""
     return F.pixel_unshuffle(F.avg_pool2d(x, SHRINK), FOLD)
 
 
@@ -286,14 +287,14 @@ def _enlarged(x: Tensor, factor: int) -> Tensor:
 
 
 def stored(net: PredNet) -> Model:
-    """The network as it is stored and run."""
+    """The network in the form in which it is stored and run."""
     return Model(net.settings, {name: value.detach().float().numpy().copy() for name, value in net.state_dict().items()})
 
 
 def grown(net: PredNet, settings: Settings) -> PredNet:
-    """A network with more channels, layers or priors, or with an encoder, that gives the masks of `net`: its own channels come
-    first and receive nothing from the new ones, which begin at random (Net2Net, Chen et al. 2016, arXiv:1511.05641), and priors
-    and encoder add nothing yet. Raises ValueError where it would not be larger."""
+    """A network with more channels, layers or priors, or with an encoder, that gives the masks of `net`: its old channels come
+    first and receive nothing from the new ones, which are initialised at random (Net2Net, Chen et al. 2016, arXiv:1511.05641),
+    and priors and encoder add nothing yet. Raises ValueError if it would not be larger."""
     old, layers = net.settings, len(net.settings.channels)
     same = (
         replace(settings, channels=old.channels, kernels=settings.kernels[:layers], priors=old.priors, encoder=old.encoder) == old
@@ -305,7 +306,7 @@ def grown(net: PredNet, settings: Settings) -> PredNet:
             f"otherwise the same, got {settings}"
         )
     larger, own = PredNet(settings), dict(net.named_parameters())
-    ignored = (f"descend.{layers - 1}.", "decode.", "prior_", "context.")  # what the old layers and the mask get of what is new
+    ignored = (f"descend.{layers - 1}.", "decode.", "prior_", "context.")  # inputs of old layers and of the mask from new parts
     with torch.no_grad():
         for name, value in larger.named_parameters():
             before = own.get(name)
@@ -318,7 +319,7 @@ def grown(net: PredNet, settings: Settings) -> PredNet:
                 value[rows] = before
                 continue
             columns = torch.arange(before.shape[1])
-            if name.startswith(("ascend.", "drive.")):  # errors: what was too little, behind it what was too much
+            if name.startswith(("ascend.", "drive.")):  # errors: the positive part, then the negative part
                 half = before.shape[1] // 2
                 columns[half:] += value.shape[1] // 2 - half
             value[rows] = 0.0
@@ -332,7 +333,7 @@ def save(path: Path, net: PredNet, card: dict[str, Any]) -> None:
 
 
 def load(path: Path) -> tuple[PredNet, dict[str, Any]]:
-    """The network of a weights file and its card. Raises ValueError where the two do not fit together."""
+    """Load the network of a weights file and its card. Raises ValueError if the two do not fit together."""
     network, card = model.load(path)
     net = PredNet(network.settings)
     try:

@@ -1,5 +1,5 @@
-"""What is known of a window before its picture is looked at: silhouettes of the robots, from their joints, and of the targets,
-from their predicted poses. `model.PRIORS` says what the values mean."""
+"""Priors of a window: silhouettes of the robots from their joints, and of the targets from their predicted poses. `model.PRIORS`
+defines the values."""
 
 from __future__ import annotations
 
@@ -20,15 +20,14 @@ from penumbra.shared.perception.lookout import NEAR_M, Window
 from penumbra.shared.perception.robot_depth import RobotDepth
 
 SHARP_PX = 4.0
-"""A blur of more than this standard deviation [px] is made on a coarser grid, where it has between half of it and all of it: in a
-small part of the time, and the same within some hundredths."""
+"""Standard deviation [px] above which a blur runs on a coarser grid, on which it is between half of this and this: much faster,
+with a difference of some hundredths."""
 LEAST_PX = 0.5
-"""A blur of less than this standard deviation [px] is none."""
+"""Standard deviation [px] below which a blur is skipped."""
 
 
 class Priors:
-    """Draws the priors of windows of one camera's pictures; targets: names of those that it can see. Not for two threads at
-    once."""
+    """Draws the priors of windows of one camera's pictures; targets: names of those that it can see. Not thread-safe."""
 
     def __init__(self, cell: Cell, camera: str, targets: Iterable[str]):
         self._camera, self._targets = cell.cameras[camera], cell.targets
@@ -38,7 +37,7 @@ class Priors:
         self._meshes = {name: anatomy.target_mesh(cell.targets[name], cell) for name in targets}
 
     def prepare(self, window: Window) -> None:
-        """Compiles what a call needs, so that the first frame does not wait for it."""
+        """Compile the code of a call, so that the first frame does not wait for it."""
         homes = {name: (self._targets[name].home.transform, np.eye(6)) for name in self._meshes}
         self(window, homes, {name: np.zeros(len(robot.joints)) for name, robot in self._robots.robots.items()})
 
@@ -46,7 +45,7 @@ class Priors:
         self, window: Window, poses: Mapping[str, tuple[Array, Array]], joints: Mapping[str, Array]
     ) -> NDArray[np.float32]:
         """Priors (window.height, window.width, 2) in [-1, 1]. poses: T_world_target and its covariance (6, 6) along the world's
-        axes, of the targets that are not lost; joints (n,) [rad] of the robots of which they are known."""
+        axes, of the targets that are not lost; joints (n,) [rad]: of the robots whose joints are known."""
         shape, k = (window.height, window.width), Intrinsics.of_window(self._camera, window.x0, window.y0, window.scale)
         robots = np.isfinite(self._robots.render(joints, k, shape)).astype(np.float32)
         expected = {}
@@ -62,8 +61,8 @@ class Priors:
 
 
 def combined(shares: Iterable[NDArray[np.float32]], is_all: bool, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """A prior (h, w) in [-1, 1] from the probabilities (h, w) of things to cover a pixel. is_all: whether there are no others;
-    if there are, nothing is known where none of these is."""
+    """A prior (h, w) in [-1, 1] from the probabilities (h, w) that objects cover a pixel. is_all: whether there are no other
+    objects; otherwise pixels outside of these are unknown."""
     free = np.ones(shape, np.float32)
     for share in shares:
         free *= 1.0 - share
@@ -74,9 +73,9 @@ def combined(shares: Iterable[NDArray[np.float32]], is_all: bool, shape: tuple[i
 def silhouette(
     mesh: Mesh, T_camera_target: Array, covariance: Array, k: Intrinsics, shape: tuple[int, int]
 ) -> NDArray[np.float32] | None:
-    """The probability (h, w) of each pixel to lie in the silhouette of a mesh whose pose has a covariance (6, 6) along the
-    camera's axes: the silhouette at that pose, blurred by the standard deviation of its points in the picture, the mean over the
-    mesh. None where the mesh is too near to the camera to say."""
+    """Probability (h, w) of each pixel to lie in the silhouette of a mesh whose pose has a covariance (6, 6) along the camera's
+    axes: the silhouette at that pose, blurred by the root mean square of its points' standard deviations in the picture. None if
+    the mesh is too near to the camera."""
     points = rigid.apply(T_camera_target, mesh.vertices)
     if points[:, 2].min() < NEAR_M:
         return None
@@ -86,8 +85,8 @@ def silhouette(
 
 
 def deviation(points: Array, origin: Array, covariance: Array, k: Intrinsics) -> tuple[float, float]:
-    """Standard deviations [px] in x and y of points (n, 3) [m] of a body in the camera's frame, the root of their mean square, by
-    the covariance (6, 6) of its pose, turned about its origin (3,), along the camera's axes."""
+    """Standard deviations [px] in x and y, as root mean squares over points (n, 3) [m] of a body in the camera's frame, from the
+    covariance (6, 6) of its pose (rotations about its origin (3,)) along the camera's axes."""
     X, Y, Z = points.T
     zero = np.zeros_like(Z)
     out = []
@@ -98,7 +97,7 @@ def deviation(points: Array, origin: Array, covariance: Array, k: Intrinsics) ->
 
 
 def blurred(shares: NDArray[np.float32], sigma: tuple[float, float]) -> NDArray[np.float32]:
-    """Shares (h, w) in [0, 1] blurred by standard deviations [px] in x and y, at most by the picture's size."""
+    """Shares (h, w) in [0, 1] blurred by standard deviations [px] in x and y, limited to the picture's size."""
     height, width = shares.shape
     x, y = min(sigma[0], width), min(sigma[1], height)
     if max(x, y) < LEAST_PX:
@@ -108,7 +107,7 @@ def blurred(shares: NDArray[np.float32], sigma: tuple[float, float]) -> NDArray[
         coarse *= 2
     size = (max(width // coarse, 1), max(height // coarse, 1))
     small = cv2.resize(shares, size, interpolation=cv2.INTER_AREA) if coarse > 1 else shares
-    least = 0.1  # OpenCV takes zero for a value that it shall choose
+    least = 0.1  # OpenCV treats zero as "choose automatically"
     small = cv2.GaussianBlur(
         small, (0, 0), max(x / coarse, least), sigmaY=max(y / coarse, least), borderType=cv2.BORDER_REPLICATE
     )

@@ -1,4 +1,4 @@
-"""Wiring: camera frames, joints and fused poses in, masks out."""
+"""Segmentation service: publishes masks from camera frames, joints and fused poses."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from penumbra.shared.runtime.node import ServiceNode
 
 NAME = "segmentation"
 FOLLOW_S = 0.2
-"""Period [s] of the prediction of the next windows, also of those that are another replica's."""
+"""Period [s] of the prediction of the next windows, including those of other replicas' cameras."""
 AHEAD_S = 0.4
-"""Time [s] ahead of that prediction: in it the network is compiled for a window's size."""
+"""Time [s] by which this prediction looks ahead: meanwhile the network is compiled for the window's size."""
 SHARE = 0.4
-"""Of a core's time, the part that the frames of all cameras may take, where `--pixels` does not say otherwise: two cores are the
-whole chain's, the emulator's with it."""
+"""Share of a core's time for the frames of all cameras, unless `--pixels` is given: the whole chain has two cores, including the
+emulator."""
 JOINTS_NEAR_NS = 100_000_000
-"""Largest distance [ns] of a frame from the joint angles with which robots are drawn into it: a frame does not wait for those of
-its stamp, and before they come the last velocity goes on. Chosen: the age after which joints are stale."""
+"""Maximum distance [ns] between a frame and the joint angles with which robots are drawn into it: a frame does not wait for the
+angles of its stamp, and until they arrive the last velocity is extrapolated. Chosen: the age after which joints are stale."""
 
 
 FLAGS = (
@@ -53,11 +53,10 @@ EXAMPLE = "penumbra segmentation --cell table --camera front"
 def start(node: ServiceNode, options: flags.Options) -> None:
     """Segment the frames of the cell's cameras that this replica owns.
 
-    A network with priors is also given where robots and targets should be; one without reads no joints.
+    A network with priors also receives the expected silhouettes of robots and targets; one without reads no joints.
 
-    Threads: the reader of a camera's frames and the timer `follow` share its lookout, under a lock, and its segmenter, of which
-    the timer only prepares windows, and only while another replica owns the camera. The joints of a robot are written by their
-    reader.
+    Threads: the reader of a camera's frames and the timer `follow` share its lookout, under a lock, and its segmenter. The timer
+    only prepares windows, and only while another replica owns the camera. The joints of a robot are written by their reader.
     """
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
@@ -68,7 +67,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
     most = options.pixels or affordable(load_segmenter(options.weights), first, SHARE / rate_hz)
     node.add_report("largest_window_px", lambda: most)
     lookouts = {name: Lookout(cell, name, most) for name in cameras}
-    looking = {name: threading.Lock() for name in cameras}  # a camera's frames and `follow` look by turns
+    looking = {name: threading.Lock() for name in cameras}  # a camera's frames and `follow` take turns
     for name, segmenter in segmenters.items():
         segmenter.prepare(lookouts[name].window, lookouts[name].at_home)  # while the process joins the others
 
@@ -80,15 +79,15 @@ def start(node: ServiceNode, options: flags.Options) -> None:
     fused = {target: node.latest(FUSED, target=target) for lookout in lookouts.values() for target in lookout.targets}
 
     def informed(name: str) -> Lookout:
-        """A camera's lookout that knows the newest poses; to be called with its lock held."""
+        """A camera's lookout, updated with the newest poses; to be called with its lock held."""
         for target in lookouts[name].targets:
             if (pose := fused[target].get(target=target)) is not None:
                 lookouts[name].add(pose)
         return lookouts[name]
 
     def is_ready(names: Iterable[str]) -> bool:
-        """Whether frames of these cameras would wait for nothing; compiles ahead where they would, once it is known where to
-        look."""
+        """Whether frames of these cameras would wait for no compilation; compiles ahead if they would, once a fused pose has
+        arrived."""
         if not any(each.drain() for each in fused.values()):
             return False
         now_ns, ready = node.now_ns(), True
@@ -101,7 +100,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
         return ready
 
     def follow() -> None:
-        """What another replica works on may be this one's next, and the other replica does not say how it looks at it."""
+        """Follow the cameras of other replicas, which may become this one's: the other replica does not publish its windows."""
         for name in lookouts:
             if not node.owns(f"camera/{name}"):
                 with looking[name]:
@@ -121,7 +120,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
             known = priors[name](window, poses, joints.at(frame.stamp_ns)) if name in priors else None
             image = undistort(frame.image, (window.x0, window.y0, window.right, window.bottom))
             labels = segmenter(image, window, frame.stamp_ns, known)
-            if undistort.unseen is not None:  # nothing is known there, as behind an occluder
+            if undistort.unseen is not None:  # these pixels are unknown, as behind an occluder
                 unseen = undistort.unseen[window.y0 : window.bottom : window.scale, window.x0 : window.right : window.scale]
                 labels[unseen] = Label.OCCLUDER
             mask = Mask(stamp_ns=frame.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=window.scale)

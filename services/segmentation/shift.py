@@ -1,4 +1,4 @@
-"""The recurrent state that moves along with the window."""
+"""Moves the recurrent state along with the window."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from penumbra.shared.perception.lookout import Window
 
 
 def shift_state(state: State, strides: Sequence[int], old: Window, new: Window) -> State:
-    """The recurrent state of `old` as that of `new` (same scale): what both see is kept, the rest has seen nothing (zero).
+    """The recurrent state of `old`, shifted to `new` (same scale): the overlap is kept, the rest is zero.
 
-    Raises ValueError where the windows are not a whole number of the coarsest layer's positions apart.
+    Raises ValueError if the windows are not a whole number of the coarsest layer's positions apart.
     """
     unit = max(strides) * old.scale
     if old.scale != new.scale or (new.x0 - old.x0) % unit or (new.y0 - old.y0) % unit:

@@ -1,7 +1,7 @@
-"""Sleeves and gloves for the bare arms of photographs.
+"""Draws sleeves and gloves on the bare arms of photographs.
 
-Few photographs show sleeved forearms or gloves, and a network that has seen few takes colour for what makes an arm. The
-shading of the photograph stays, its colour becomes that of a drawn cloth.
+Few photographs show sleeved forearms or gloves, and a network that has seen few takes skin colour for an arm. The shading of the
+photograph is kept; its colour becomes that of a drawn cloth.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from penumbra.sim.picture import looks
 from penumbra.sim.picture.appearance import BLOTCHES, CHECKS, STRIPES, Texture
 
 RIM_PX = 3
-"""Unlabelled pixels this close to what is clothed are clothed, too: contours that are labelled coarsely."""
+"""Unlabelled pixels this close [px] to clothed ones are clothed, too: for coarsely labelled contours."""
 BRIGHT = 0.8
-"""Quantile of a limb's brightness that shows the cloth's colour: brighter pixels are highlights."""
+"""Quantile of a limb's brightness at which the cloth's colour is shown: brighter pixels are highlights."""
 PERIOD_PX = 3.0, 25.0
-"""Bounds of the period of a cloth's pattern."""
+"""Bounds [px] of the period of a cloth's pattern."""
 
 
 def worn(film: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A film (frames, h, w, 4 or more) of red, green, blue and class in which forearms have sleeves, long ones or rolled up, or
-    hands have gloves, or both."""
+    """A film (frames, h, w, 4 or more) of red, green, blue and class whose forearms get sleeves (long or rolled up), whose hands
+    get gloves, or both."""
     labels = film[len(film) // 2, ..., 3]
     if not np.isin(labels, TARGET_LABELS).any():
         return film
@@ -47,7 +47,7 @@ def worn(film: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]
 
 
 def _toward_elbow(labels: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float64]:
-    """The direction (2,) row, column from hands to forearms; any where the picture does not show both."""
+    """Direction (2,) row, column from hands to forearms; random if the picture does not show both."""
     hand, forearm = (np.argwhere(labels == part) for part in (Label.HAND, Label.FOREARM))
     if len(hand) and len(forearm):
         away = forearm.mean(0) - hand.mean(0)
@@ -62,7 +62,7 @@ def _along(direction: NDArray[np.float64], rows: NDArray[np.intp], columns: NDAr
 
 
 def _pattern(cloth: Texture, size: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
-    """How much of the cloth's second colour each pixel (h, w) has, in [0, 1]."""
+    """Share in [0, 1] of the cloth's second colour at each pixel (h, w)."""
     period, angle = float(np.exp(rng.uniform(*np.log(PERIOD_PX)))), rng.uniform(0.0, np.pi)
     rows, columns = np.indices(size, np.float32) * np.float32(2.0 * np.pi / period)
     across = np.sin(np.cos(angle) * rows + np.sin(angle) * columns)

@@ -1,4 +1,4 @@
-"""What the segmentation network learns from: simulated sequences, recordings, and both mixed."""
+"""Training data of the segmentation network: simulated sequences, recordings, and both mixed."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ from penumbra.sim.picture import looks
 from penumbra.sim.sets import sequences
 
 VALIDATION_SEED = 1_000_000
-"""Added to the seed for held-out data: nothing there was ever trained on."""
+"""Offset to the seed for held-out data: the network is never trained on these seeds."""
 VARIETY = sequences.Variety(frames=3, size=176, real=0.7)
 """Variety of the training sequences."""
 ARM_PX = (12.0, float(WIDEST_ARM_PX))
-"""Width [px] that arms of recordings get."""
+"""Bounds of the width [px] to which arms of recordings are scaled."""
 ARM_SHARE = 0.08
-"""Width of an arm that a recording without any might show, as a share of its longer side."""
+"""Assumed arm width in a recording without arms, as a share of its longer side."""
 CLOTHED = 0.15
 """Share of the sequences of recordings whose arms get other sleeves or gloves."""
 BORROWED = 0.15
-"""Share of the sequences of recordings before which the people of another recording are put."""
+"""Share of the sequences of recordings in front of which the people of another recording are pasted."""
 COVERED = 0.2
 """Share of the sequences of recordings that have simulated robots, occluders and people in front."""
 PERSON = (Label.TORSO, Label.UPPER_ARM, Label.FOREARM, Label.HAND)
 """The classes of people."""
 AROUND = {"target": 0.55, "rest": 0.25}
-"""Shares of the pieces of pictures that lie around a pixel of the target, and of the rest of a person (faces look like hands, and
-sleeves like what is worn above them); the others lie anywhere."""
+"""Shares of the patches that lie around a pixel of the target, and of the rest of a person (faces look like hands, and sleeves
+like the clothes above them); the others lie anywhere."""
 ENDLESS = 2**31
-"""Number of sequences of a set that has no end."""
+"""Number of sequences of an endless set."""
 
 
 class Data(Protocol):
-    """Sequences to learn from, and others for the calibration and the score. The first are red, green, blue and class
-    (frames, h, w, 4), and, where more is known than what the labels say, priors beside them (frames, h, w, 6), packed.
-    jitter: how much their colours are changed; side: the largest patch [px] that fits in all; sources: what a card says of the
-    calibration's and the score's; origins: what it says of those to learn from."""
+    """Training sequences, and held-out ones for the calibration and the score. The training sequences are red, green, blue and
+    class (frames, h, w, 4); if more is known than the labels say, also priors (frames, h, w, 6), packed. jitter: amount of colour
+    augmentation; side: the largest patch [px] that fits in all; sources: the card's description of the held-out data; origins:
+    its description of the training data."""
 
     jitter: float
     side: int
@@ -63,14 +63,14 @@ class Data(Protocol):
     def held_out(self) -> Iterable[Labelled]: ...
     @property
     def count(self) -> int:
-        """How many sequences there are to choose from."""
+        """Number of training sequences."""
 
     def __getitem__(self, index: int, /) -> Any: ...
     def plain(self, index: int, /) -> Any:
-        """A sequence without anything put before it, which the encoder learns from while it is alone."""
+        """A sequence with nothing pasted in front, from which the encoder learns while it is trained alone."""
 
     def close(self) -> None:
-        """Make no more."""
+        """Stop making sequences."""
 
 
 Render = Callable[[int, int], sequences.Sequence]
@@ -81,11 +81,12 @@ def _varied(seed: int, index: int) -> sequences.Sequence:
 
 
 class Simulated:
-    """Sequences rendered when they are asked for. `each`: for the calibration, and for the score; `learned`, `scored`: sequence
-    of a seed and an index, to learn from, and for calibration and score; `most`: how many to learn from, kept in memory then."""
+    """Sequences rendered on demand. `each`: number for the calibration, and for the score; `learned`, `scored`: render a sequence
+    from a seed and an index, for training, and for calibration and score; `most`: number of training sequences, which are then
+    kept in memory."""
 
     jitter = 0.2
-    """Less than the authors' of photographs: our renderer varies the light itself."""
+    """Amount of colour augmentation: less than the authors' for photographs, because our renderer varies the light itself."""
     side = VARIETY.size
 
     def __init__(
@@ -105,7 +106,7 @@ class Simulated:
         return self._kept(index)
 
     def plain(self, index: int) -> NDArray[np.uint8]:
-        """The same one: it is whole as it is."""
+        """The same sequence: nothing is pasted in front of it."""
         return self[index]
 
     def _rendered(self, index: int) -> NDArray[np.uint8]:
@@ -115,17 +116,17 @@ class Simulated:
 
     @property
     def origins(self) -> list[dict[str, Any]]:
-        """The seed."""
+        """The card's description of the training data: the seed."""
         return [{"simulated": "sim.sets.sequences", "seed": self._seed}]
 
     @property
     def sources(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Seeds that nothing else is made of."""
+        """Seeds that are used for nothing else."""
         return {"seed": VALIDATION_SEED + self._seed}, {"seed": VALIDATION_SEED + self._seed + 1}
 
     @property
     def calibration(self) -> Iterator[sequences.Sequence]:
-        """Sequences for the calibration, rendered as they are asked for."""
+        """Sequences for the calibration, rendered on demand."""
         return (self._scored(VALIDATION_SEED + self._seed, index) for index in range(self.each))
 
     @property
@@ -134,16 +135,16 @@ class Simulated:
         return (self._scored(VALIDATION_SEED + self._seed + 1, index) for index in range(self.each))
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Nothing to close."""
 
 
 class Mixed:
-    """Recordings and simulated sequences. `share`: how many of those that are learned from are simulated; before some recordings
-    are the people of others, with what they hold (Ghiasi et al. 2021, arXiv:2012.07177); some have simulated robots and
-    occluders in front, half of these an arm, too. Calibrated and scored on as many of both."""
+    """Mix of recordings and simulated sequences. `share`: share of simulated training sequences. In front of some recordings are
+    the people of others, with the objects that they hold (Ghiasi et al. 2021, arXiv:2012.07177); some have simulated robots and
+    occluders in front, half of these also an arm. Calibration and score use equal numbers of both kinds."""
 
     jitter = 0.15
-    """Jitter of the colours: photographs are many, and differ themselves."""
+    """Amount of colour augmentation: photographs are many, and differ themselves."""
     side = VARIETY.size
     count = ENDLESS
 
@@ -161,7 +162,7 @@ class Mixed:
 
     @property
     def held_out(self) -> Iterator[Labelled]:
-        """Others of both."""
+        """Other simulated sequences and patches."""
         yield from self._simulated.held_out
         yield from patches(self._recorded.held_out, self._simulated.each, VALIDATION_SEED + self._seed + 1)
 
@@ -184,7 +185,7 @@ class Mixed:
         return self._shown(np.random.default_rng([self._seed, 9, index]), 1)
 
     def _filmed(self, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """A drawn recording as a camera shows it (frames, h, w, 4), some with other clothes."""
+        """A random recording as seen by a camera (frames, h, w, 4), some with other clothes."""
         film = self._shown(rng, VARIETY.frames)
         return clothes.worn(film, rng) if rng.random() < CLOTHED else film
 
@@ -192,12 +193,12 @@ class Mixed:
         return moved(self._recorded[int(rng.integers(self._recorded.count))], frames, VARIETY.size, rng)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Nothing to close."""
 
 
 @dataclass(frozen=True)
 class Patch:
-    """A piece of a recording as a window shows it; `evaluate.Labelled`."""
+    """A patch of a recording as a window shows it; `evaluate.Labelled`."""
 
     images: NDArray[np.uint8]
     labels: NDArray[np.uint8]
@@ -208,7 +209,7 @@ class Patch:
 
 
 def patches(films: Sequence[recordings.Recorded], count: int, seed: int) -> Iterator[Patch]:
-    """So many pieces of films, each as often as the others, as windows show their arms."""
+    """Patches (`count` of them) of films, each film equally often, at the scale at which windows show arms."""
     order = np.random.default_rng([seed, 7]).permutation(len(films))
     for index in range(count):
         rng = np.random.default_rng([seed, 8, index])
@@ -217,8 +218,8 @@ def patches(films: Sequence[recordings.Recorded], count: int, seed: int) -> Iter
 
 
 def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """So many frames of a recording as a camera of `size` pixels a side that is turned and moves shows them, from where its arms
-    are as wide as windows show them: (frames, size, size, 4); what lies outside of the picture is UNLABELLED."""
+    """A recording's frames (`frames`, size, size, 4) as seen by a camera that is turned and moves, at a scale at which its arms
+    are as wide as in windows; pixels outside of the picture are UNLABELLED."""
     start = int(rng.integers(0, len(recorded) - frames + 1))
     film = recorded[start : start + frames]
     arms = np.isin(film[frames // 2, ..., 3], inference.TARGET_LABELS)
@@ -226,7 +227,7 @@ def moved(recorded: recordings.Recorded, frames: int, size: int, rng: np.random.
         2.0 * cv2.distanceTransform(arms.astype(np.uint8), cv2.DIST_L2, 5).max() if arms.any() else ARM_SHARE * max(arms.shape)
     )
     zoom = np.exp(rng.uniform(*np.log(ARM_PX))) / arm_px
-    if (shrink := int(1.0 / zoom)) > 1:  # no detail finer than a pixel is left to be sampled
+    if (shrink := int(1.0 / zoom)) > 1:  # avoid aliasing: average details finer than a pixel
         film = np.stack([_smaller(frame, shrink) for frame in film])
         arms, zoom = arms[::shrink, ::shrink], zoom * shrink
     middle = _middle(film[frames // 2, ..., 3], size // 6, rng)
@@ -252,8 +253,8 @@ def _smaller(frame: NDArray[np.uint8], by: int) -> NDArray[np.uint8]:
 
 
 def pasted(film: NDArray[np.uint8], over: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A film (frames, h, w, 6) with the robot and the occluders of another in front, and what is known of this robot; half of the
-    time its person, too, and then of its arms the one or the others are known."""
+    """A film (frames, h, w, 6) with the robot and the occluders of another in front, and the prior of this robot; half of the
+    time also its person, and half of these with the prior of the pasted arms instead of the film's own."""
     front, out = [Label.ROBOT, Label.OCCLUDER], film.copy()
     out[..., 4] = over[..., 4]
     if rng.random() < 0.5:
@@ -264,7 +265,7 @@ def pasted(film: NDArray[np.uint8], over: NDArray[np.uint8], rng: np.random.Gene
 
 
 def covered(film: NDArray[np.uint8], over: NDArray[np.uint8], classes: Sequence[Label]) -> NDArray[np.uint8]:
-    """A film (frames, h, w, 4 or more) with what is of these classes in another one in front."""
+    """A film (frames, h, w, 4 or more) with the pixels of these classes in another film pasted in front."""
     out = film.copy()
     for below, above in zip(out, over, strict=True):
         cover = np.isin(above[..., 3], classes)
@@ -277,10 +278,9 @@ def covered(film: NDArray[np.uint8], over: NDArray[np.uint8], classes: Sequence[
 def draw_batch(
     chosen: Iterable[Any], frames: int, size: int, rng: np.random.Generator, amount: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Patches of so many frames of sequences (n, h, w, 4 or 6): images (batch, frames, 3, size, size) in [0, 1], labels
-    (batch, frames, size, size) and priors (batch, frames, 2, size, size), made of the labels where a sequence has none. They lie
-    where AROUND says; mirrored, played backwards and coloured anew at random, by `amount`.
-    """
+    """Random patches of `frames` frames of sequences (n, h, w, 4 or 6): images (batch, frames, 3, size, size) in [0, 1], labels
+    (batch, frames, size, size) and priors (batch, frames, 2, size, size), made from the labels if a sequence has none. Patches
+    are placed by AROUND; mirrored, played backwards and recoloured at random, by `amount`."""
     images, labels, known = [], [], []
     for sequence in chosen:
         start = rng.integers(0, len(sequence) - frames + 1)
@@ -302,8 +302,8 @@ def draw_batch(
 
 
 def _middle(labels: NDArray[np.uint8], beside: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Row and column of the middle of a piece of a picture with these classes (h, w): up to `beside` pixels off a pixel that is
-    chosen as AROUND says, anywhere where there is none."""
+    """Row and column of the centre of a patch of a picture with these classes (h, w): up to `beside` pixels from a pixel chosen
+    by AROUND, or anywhere if there is none."""
     chosen = rng.random()
     if chosen < sum(AROUND.values()):
         which = inference.TARGET_LABELS if chosen < AROUND["target"] else (Label.TORSO, Label.UPPER_ARM)

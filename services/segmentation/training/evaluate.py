@@ -1,4 +1,4 @@
-"""How good masks are on labelled sequences, and the calibration of their size. Cards and `penumbra bench segmentation` alike."""
+"""Scores masks on labelled sequences and calibrates their size, for cards and for `penumbra bench segmentation`."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from penumbra.shared.contract.labels import UNLABELLED, Label
 from penumbra.sim.sets import sequences
 
 WARM_UP = 3
-"""Frames at the start of a sequence that do not count: the recurrent state is still empty."""
+"""Number of frames at the start of a sequence that are not scored: the recurrent state is still empty."""
 HIDDEN = (0.0, 0.33, 0.66, 0.95)
-"""Borders of the classes of hidden share in the score."""
+"""Limits of the bins of hidden share in the score."""
 FEWEST = 50
-"""Least number of pixels of the target in a frame that counts."""
+"""Minimum number of pixels of the target in a frame that is scored."""
 NEAR_PX = 6.0
-"""A boundary farther away than this belongs to something else: it is wrong, but not a contour's error."""
+"""Maximum distance [px] of a boundary: a farther one belongs to something else, which is an error but not a contour error."""
 OWN = (Label.BACKGROUND, Label.TORSO)
-"""Where one of these is the neighbour, the boundary is the target's own; anything else may be in front of it."""
+"""Neighbouring classes at which the boundary is the target's own; any other class may be in front of it."""
 
 
 class Labelled(Protocol):
-    """A sequence: images (frames, h, w, 3) uint8, labels (frames, h, w) uint8, hidden: share of the target covered (frames,), NaN
-    where nobody knows."""
+    """A labelled sequence: images (frames, h, w, 3) uint8, labels (frames, h, w) uint8, hidden: share of the target covered
+    (frames,), NaN if unknown."""
 
     @property
     def images(self) -> NDArray[np.uint8]: ...
@@ -45,8 +45,8 @@ class Labelled(Protocol):
 
 @dataclass(frozen=True)
 class FrameScore:
-    """A frame's mask of the target beside the truth, visible pixels: hidden share, IoU, masked over true area, and the boundary's
-    offsets [px] at the points of the true one, positive where the mask is too large."""
+    """Score of a frame's mask of the target against its true visible pixels: hidden share, IoU, masked over true area, and the
+    boundary's offsets [px] at the points of the true one, positive where the mask is too large."""
 
     hidden: float
     iou: float
@@ -55,8 +55,8 @@ class FrameScore:
 
 
 def priors_of(sequence: Labelled, seed: int, kind: priors.Kind | None = None) -> NDArray[np.float32]:
-    """Priors (frames, h, w, 2) of a sequence, drawn from a seed as for the training, or all of one kind: of a simulated one from
-    what is known of it, of others from their labels."""
+    """Priors (frames, h, w, 2) of a sequence, drawn from a seed as in training, or all of one kind: from the scene of a simulated
+    sequence, from the labels of others."""
     rng = np.random.default_rng(seed)
     if isinstance(sequence, sequences.Sequence):
         return priors.of_sequence(sequence, rng, kind)
@@ -65,7 +65,7 @@ def priors_of(sequence: Labelled, seed: int, kind: priors.Kind | None = None) ->
 
 def run(net: PredNet, images: NDArray[np.uint8], known: NDArray[np.float32] | None = None) -> Iterator[torch.Tensor]:
     """Logits (classes, h, w) float32 of each frame of a sequence (frames, h, w, 3) uint8, from an empty state; known: its priors
-    (frames, h, w, 2), None where nothing is known."""
+    (frames, h, w, 2), or None."""
     state = net.initial_state(1, *images.shape[1:3])
     dtype = net.head.weight.dtype
     for t, image in enumerate(images):
@@ -77,8 +77,8 @@ def run(net: PredNet, images: NDArray[np.uint8], known: NDArray[np.float32] | No
 
 
 def calibrate(net: PredNet, data: Iterable[Labelled]) -> tuple[float, dict[str, Any]]:
-    """The offset of the target classes' logits with which the mean IoU is greatest, and that IoU without it and with it. A
-    network that has priors gets them as in the training."""
+    """The offset of the target classes' logits that maximises the mean IoU, and that IoU without it and with it. A network with
+    priors gets them as in training."""
     offsets = np.linspace(-3.0, 3.0, 241)
     target, other = list(TARGET_LABELS), [i for i in Label if i not in TARGET_LABELS]
     scores = []
@@ -100,8 +100,8 @@ def calibrate(net: PredNet, data: Iterable[Labelled]) -> tuple[float, dict[str, 
 
 
 def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str, Any]:
-    """The card's score: `summary` by hidden share, and the IoU of every class. Of a network that has priors these are without
-    any; beside them stand the scores with right and with wrong ones, of simulated sequences, whose truth they are not made of."""
+    """The card's score: `summary` by hidden share, and the IoU of every class. A network with priors is scored without them; its
+    scores with right and with wrong priors are added for simulated sequences, whose priors are not made from their labels."""
     kinds: dict[str, priors.Kind] = {"without": "missing"}
     if net.settings.priors:
         kinds |= {"with_priors": "right", "with_wrong_priors": "wrong"}
@@ -120,22 +120,22 @@ def held_out(net: PredNet, offset: float, data: Iterable[Labelled]) -> dict[str,
 
 
 class _Score:
-    """Scores of frames as they are added."""
+    """Accumulates scores of frames."""
 
     def __init__(self) -> None:
         self._frames: list[FrameScore] = []
         self._both, self._either = np.zeros(len(Label)), np.zeros(len(Label))
 
     def add(self, found: NDArray[np.uint8], labels: NDArray[np.uint8], hidden: NDArray[np.float64]) -> None:
-        """Adds classes found and true (frames, h, w)."""
-        found[labels == UNLABELLED] = UNLABELLED  # which is no class
+        """Add frames with found and true classes (frames, h, w)."""
+        found[labels == UNLABELLED] = UNLABELLED  # exclude unlabelled pixels from every class
         for label in Label:
             self._both[label] += np.sum((found == label) & (labels == label))
             self._either[label] += np.sum((found == label) | (labels == label))
         self._frames += frame_scores(found, labels, hidden)
 
     def result(self) -> dict[str, Any]:
-        """What the card says."""
+        """The scores in the card's form."""
         score: dict[str, Any] = {}
         for (low, high), part in by_hidden(self._frames).items():
             if part:
@@ -148,7 +148,7 @@ class _Score:
 
 
 def frame_scores(found: NDArray[np.uint8], labels: NDArray[np.uint8], hidden: NDArray[np.float64]) -> Iterator[FrameScore]:
-    """Scores of frames of which at least FEWEST pixels of the target are visible: classes found and true (frames, h, w)."""
+    """Scores of frames with at least FEWEST visible pixels of the target, from found and true classes (frames, h, w)."""
     for mask, truth, share in zip(found, labels, hidden, strict=True):
         f, t = np.isin(mask, TARGET_LABELS), np.isin(truth, TARGET_LABELS)
         if t.sum() > FEWEST:
@@ -157,12 +157,12 @@ def frame_scores(found: NDArray[np.uint8], labels: NDArray[np.uint8], hidden: ND
 
 
 def contour_offsets(found: NDArray[np.bool_], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """How far [px] the boundary of a mask (h, w) lies outside the target's own boundary in the true classes (h, w), at every
-    edge between a pixel of the target and one that it hides.
+    """Offsets [px] of a mask's (h, w) boundary outside the target's own boundary in the true classes (h, w), at every edge
+    between a pixel of the target and one that it hides.
 
-    What is measured is the published mask: the signed distance of the boundary between its pixels. A mask that is right has
-    offsets of zero; the truth too is made of whole pixels, so a boundary t off is one pixel off at a share t of the points.
-    Points with no boundary within NEAR_PX are left out.
+    The published mask is measured: the signed distance of the boundary between its pixels. A correct mask has offsets of zero;
+    the truth also consists of whole pixels, so a boundary that is off by t is off by one pixel at a share t of the points. Points
+    with no boundary within NEAR_PX are left out.
     """
     target, own = np.isin(truth, TARGET_LABELS), np.isin(truth, OWN)
     rows, columns = np.flatnonzero(target.any(1)), np.flatnonzero(target.any(0))
@@ -174,7 +174,7 @@ def contour_offsets(found: NDArray[np.bool_], truth: NDArray[np.uint8]) -> NDArr
     if found.all() or not found.any():
         return np.empty(0)
     inside, outside = distance_transform_edt(found), distance_transform_edt(~found)
-    depth = np.where(found, inside - 0.5, 0.5 - outside)  # of the pixels' middles below the mask's boundary
+    depth = np.where(found, inside - 0.5, 0.5 - outside)  # depth of the pixels' centres below the mask's boundary
     offsets = []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         edges = (target[a] & own[b]) | (own[a] & target[b])
@@ -184,13 +184,13 @@ def contour_offsets(found: NDArray[np.bool_], truth: NDArray[np.uint8]) -> NDArr
 
 
 def by_hidden(scores: Iterable[FrameScore]) -> dict[tuple[float, float], list[FrameScore]]:
-    """Frames' scores by the class of hidden share, (from, to)."""
+    """Frames' scores by the bin of hidden share, (from, to)."""
     every = list(scores)
     return {(low, high): [s for s in every if low <= s.hidden < high] for low, high in itertools.pairwise(HIDDEN)}
 
 
 def summary(scores: Sequence[FrameScore]) -> dict[str, Any]:
-    """What cards say of at least one frame's scores: IoU, area bias (relative), contour error [px]."""
+    """The card's summary of at least one frame's scores: IoU, area bias (relative), contour error [px]."""
     iou, area = np.array([s.iou for s in scores]), np.array([s.area for s in scores])
     offsets = np.concatenate([s.offsets for s in scores])
     known = len(offsets) > 0

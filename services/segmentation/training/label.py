@@ -35,33 +35,34 @@ from penumbra.shared.perception.limbs import FOREARM, Limb, find, limb_of
 from penumbra.shared.perception.lookout import ARM_M, MARGIN_M, Window, window_of
 
 RATE_HZ = 15.0
-"""Frames a second that are labelled: about the cameras' that the network is trained on."""
+"""Frame rate [1/s] at which films are labelled: about that of the cameras for which the network is trained."""
 GAP_S = 0.4
-"""Time [s] for which a hand that is not found, or its elbow, may be taken to move evenly."""
+"""Maximum time [s] over which a missing hand, or its elbow, is interpolated linearly."""
 FASTEST = 12.0
-"""Speed of a hand [sizes of the hand a second] up to which it is the same: 1 m/s."""
+"""Maximum speed of a hand [hand sizes/s] at which two detections are the same hand: 1 m/s."""
 SAME = 0.7
-"""How far [sizes of the hand] an elbow may be from where it is at other times, as seen from the wrist, to be confirmed by it."""
+"""Maximum distance [hand sizes] between an elbow's positions relative to the wrist, at different times, at which they confirm
+each other."""
 LONGEST = 3.1
-"""Length in sizes of the hand that a forearm has at most: bare skin that goes on is the upper arm."""
+"""Maximum length of a forearm [hand sizes]: bare skin beyond it is the upper arm."""
 SURE = 1.3
-"""Length of the forearm, in sizes of the hand, that is labelled where no elbow is known: it may be foreshortened."""
+"""Length of the forearm [hand sizes] that is labelled if no elbow is known: it may be foreshortened."""
 BINS = 32
-"""Steps of each of the three colour channels (L*a*b*)."""
+"""Number of bins of each of the three colour channels (L*a*b*)."""
 BLUR = 1.2
-"""Standard deviation [steps] by which histograms of colours are smoothed."""
+"""Standard deviation [bins] with which colour histograms are smoothed."""
 MOST = 4.0
-"""Largest log-likelihood ratio of a pixel's colour: what one is worth against its place."""
+"""Maximum log-likelihood ratio of a pixel's colour, which limits its weight against the pixel's place."""
 DOUBT = 1.0
-"""Log-odds up to which a pixel is unlabelled."""
+"""Log odds up to which a pixel is unlabelled."""
 LEARN = 24
-"""Frames from which the colours of the film are learned."""
+"""Number of frames from which the film's colours are learned."""
 HAND_M = 0.09
 """Size of a hand [m], from the wrist to the knuckles."""
 TILE, COLUMNS = 240, 5
-"""Width [px] of a frame on a sheet, and how many lie side by side."""
+"""Width [px] of a frame on a sheet, and number of frames per row."""
 VIOLET = (200, 0, 200)
-"""The colour [RGB] of what is unlabelled."""
+"""Colour [RGB] of unlabelled pixels."""
 
 Bool = NDArray[np.bool_]
 Field = NDArray[np.float32]
@@ -71,8 +72,8 @@ Field = NDArray[np.float32]
 
 
 def follow(seen: Sequence[Sequence[Limb]], period_s: float) -> list[list[Limb]]:
-    """The limbs of each frame of a film with so much time between frames: a hand that is missing for up to GAP_S is where it must
-    have been, one that appears once is none, and an elbow that is known up to GAP_S before or after is known."""
+    """Track the limbs of a film with a frame period period_s; returns the limbs of each frame. A hand that is missing for up to
+    GAP_S is interpolated, one that appears once is dropped, and an elbow known up to GAP_S before or after is interpolated."""
     gap = int(GAP_S / period_s)
     tracks: list[dict[int, Limb]] = []
     for t, limbs in enumerate(seen):
@@ -94,7 +95,7 @@ def follow(seen: Sequence[Sequence[Limb]], period_s: float) -> list[list[Limb]]:
 
 def filled(found: dict[int, Limb], gap: int) -> dict[int, Limb]:
     """A limb in all frames from its first to its last, by frame. An elbow that no other one within `gap` frames confirms is
-    forgotten."""
+    dropped."""
     times = np.array(sorted(found))
     every = np.arange(times[0], times[-1] + 1)
     points = _evenly(every, times, np.stack([found[t].points for t in times]))
@@ -115,7 +116,7 @@ def filled(found: dict[int, Limb], gap: int) -> dict[int, Limb]:
 
 
 def _evenly(every: NDArray[np.int64], times: NDArray[np.int64], values: Points) -> Points:
-    """Values (n, ...) known at n times at every one: linear between them."""
+    """Values (n, ...) known at n times, interpolated linearly at `every` time."""
     flat = values.reshape(len(times), -1)
     return np.asarray(np.stack([np.interp(every, times, column) for column in flat.T], 1).reshape(len(every), *values.shape[1:]))
 
@@ -125,7 +126,7 @@ def _evenly(every: NDArray[np.int64], times: NDArray[np.int64], values: Points) 
 
 @dataclass
 class Colours:
-    """How often each colour was seen in hands, forearms and around them: (3, BINS, BINS, BINS), each with sum 1 or 0."""
+    """Colour histograms of hands, of forearms and of their surroundings: (3, BINS, BINS, BINS), each with sum 1 or 0."""
 
     seen: NDArray[np.float32]
 
@@ -135,12 +136,12 @@ class Colours:
 
     @classmethod
     def of(cls, bins: NDArray[np.int64], parts: Sequence[Bool]) -> Colours:
-        """Of the pixels of hands, forearms and surroundings in a picture, given as bins (h, w)."""
+        """Histograms of the pixels of hands, forearms and surroundings in a picture, given as bins (h, w)."""
         counts = [np.bincount(bins[part], minlength=BINS**3).reshape(BINS, BINS, BINS).astype(np.float32) for part in parts]
         return cls(np.stack([gaussian_filter(c, BLUR) / max(float(c.sum()), 1.0) for c in counts]))
 
     def and_(self, other: Colours) -> Colours:
-        """Both together, where both know something equally."""
+        """Combine two models, with equal weight where both have data."""
         total = self.seen + other.seen
         return Colours(total / np.maximum(total.sum((1, 2, 3), keepdims=True), 1e-9))
 
@@ -156,8 +157,8 @@ class Colours:
 
 @dataclass(frozen=True)
 class Place:
-    """What the place of each pixel (h, w) says of a limb, in sizes of its hand: how far it lies outside the hand and the forearm,
-    how far it is along the forearm from the wrist on (1: the elbow), and the log-odds of hand and forearm by place alone."""
+    """Geometry of each pixel (h, w) relative to a limb, in hand sizes: distance outside the hand and the forearm, position along
+    the forearm from the wrist (1: the elbow), and the log odds of hand and forearm by place alone."""
 
     limb: Limb
     hand: Field
@@ -177,7 +178,7 @@ class Place:
                 cv2.line(shape, a.tolist(), b.tolist(), 1, max(round(0.16 * size), 1))
         hand = _outside(shape.astype(bool)) / size
         is_known = limb.elbow is not None
-        # where the elbow is not known, a wedge that widens from the wrist on
+        # if the elbow is unknown, a wedge that widens from the wrist
         end = limb.elbow if limb.elbow is not None else points[0] + FOREARM * size * limb.back
         length = max(float(np.linalg.norm(end - points[0])), 1e-6)
         way = (end - points[0]) / length
@@ -194,7 +195,7 @@ class Place:
 
     @property
     def core(self) -> Bool:
-        """Pixels (h, w) of the forearm that lie in its middle."""
+        """Pixels (h, w) in the middle of the forearm."""
         if self.limb.elbow is not None:
             return (self.forearm < -0.15) & (self.along > 0.0) & (self.along < 0.9)
         return (self.forearm < -0.15) & (self.along > 0.0) & (self.along * FOREARM < 0.5)
@@ -209,14 +210,14 @@ def _outside(shape: Bool) -> Field:
 
 
 def bins_of(image: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """The bin (h, w) of the colour of each pixel of an RGB image (h, w, 3)."""
+    """Index of the colour bin (h, w) of each pixel of an RGB image (h, w, 3)."""
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.int64) * BINS // 256
     return np.asarray((lab[..., 0] * BINS + lab[..., 1]) * BINS + lab[..., 2])
 
 
 @dataclass(frozen=True)
 class Found:
-    """A limb by place and colours: log-odds (h, w) of hand and forearm, and the colours that it has."""
+    """A limb by place and colours: log odds (h, w) of hand and forearm, and its colours."""
 
     place: Place
     hand: Field
@@ -225,19 +226,19 @@ class Found:
 
     @property
     def odds(self) -> Field:
-        """Log-odds (h, w) of either."""
+        """Log odds (h, w) of hand or forearm."""
         return np.maximum(self.hand, self.forearm)
 
     @property
     def doubts_elbow(self) -> bool:
-        """Whether there is nothing on the way to the elbow that looks otherwise than the surroundings."""
+        """Whether nothing on the way to the elbow differs from the surroundings."""
         core = self.place.core
         return not core.any() or float(np.median((self.forearm - self.place.forearm_odds)[core])) < 0.5
 
 
 def fit(place: Place, bins: NDArray[np.int64], near: Field, film: Colours) -> Found:
-    """Alternates between which pixels a limb has and which colours they have, those of the film among them. `near`: how far each
-    pixel (h, w) is from any limb of the frame."""
+    """Alternate between estimating a limb's pixels and their colours, with the film's colours as a prior. `near`: distance of
+    each pixel (h, w) from any limb of the frame."""
     y, x = np.mgrid[: near.shape[0], : near.shape[1]]
     around = np.hypot(x - place.limb.points[0, 0], y - place.limb.points[0, 1]) < 4.5 * place.limb.size
     hand, forearm, rest = place.hand < -0.03, place.core, around & (near > 0.25)
@@ -252,7 +253,7 @@ def fit(place: Place, bins: NDArray[np.int64], near: Field, film: Colours) -> Fo
 
 
 def label(image: NDArray[np.uint8], limbs: Sequence[Limb], film: Colours) -> tuple[NDArray[np.uint8], Colours]:
-    """Classes (h, w) of an RGB image (h, w, 3) in which these limbs are, and the colours seen; those of the film are known."""
+    """Classes (h, w) of an RGB image (h, w, 3) with these limbs, given the film's colours, and the colours seen in it."""
     height, width = image.shape[:2]
     bins = bins_of(image)
     places = [Place.of(limb, height, width) for limb in limbs]
@@ -275,7 +276,7 @@ def label(image: NDArray[np.uint8], limbs: Sequence[Limb], film: Colours) -> tup
             wedge = (place.forearm < 0.0) & (place.hand > 0.05) & (beyond > 0.0)
             unknown |= (mine & (beyond > SURE) & (place.hand > 0.1)) | (wedge & ~mine)
             edge = wedge & (place.forearm > -0.1) & (beyond > 0.4) & (beyond < SURE)
-            if (mine & edge).sum() > 0.3 * edge.sum():  # wider than an arm: there is nothing to tell it from, unless it is bare
+            if (mine & edge).sum() > 0.3 * edge.sum():  # wider than an arm: no edge separates it, unless it is bare
                 unknown |= mine & (beyond > 0.0) & (place.hand > 0.05) & (one.hand - place.hand_odds < DOUBT)
         else:
             unknown |= (place.forearm < 0.0) & (place.hand > 0.05) & ~mine  # a sleeve, or something in front
@@ -328,14 +329,14 @@ def pictures(path: Path, every: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
 
 
 def rate(path: Path) -> float:
-    """Frames a second of a film, RATE_HZ where it does not tell; one of a picture."""
+    """Frame rate [1/s] of a film, RATE_HZ if the file does not state it; 1 for a picture."""
     return 1.0 if files.is_picture(path) else cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS) or RATE_HZ
 
 
 def arms(
     models: Landmarks, frames: Iterable[tuple[int, NDArray[np.uint8]]], period_s: float
 ) -> tuple[dict[int, list[Limb]], int]:
-    """The limbs in each frame that shows any, by its number, and the scale at which the service would look at most of these."""
+    """The limbs in each frame that shows any, by its number, and the scale that the service would use for most of them."""
     numbers, seen, size, hands, pose = [], [], Window(0, 0, 0, 0), list[Hand](), None
     for number, image in frames:
         hands, pose = find(models, image, hands, pose)
@@ -348,7 +349,7 @@ def arms(
 
 
 def scale(picture: Window, limbs: Iterable[Limb]) -> int:
-    """At which scale the service would look at limbs in a picture of this size."""
+    """Scale that the service would use for limbs in a picture of this size."""
     low, high, arm_px = np.array([np.inf, np.inf]), np.array([-np.inf, -np.inf]), 0.0
     for limb in limbs:
         end = limb.elbow if limb.elbow is not None else limb.points[0] + SURE * limb.size * limb.back
@@ -367,7 +368,7 @@ def reduced(image: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
 
 
 def labelled(models: Landmarks, path: Path, every: int) -> Iterator[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]]:
-    """Number, picture (h, w, 3) and classes (h, w) of the frames of a film in which there are arms, at the service's scale."""
+    """Number, picture (h, w, 3) and classes (h, w) of the frames of a film that show arms, at the service's scale."""
     limbs, scale = arms(models, track(pictures(path, every), f"{path.stem}: arms", transient=True), every / rate(path))
 
     def frames(every: int) -> Iterator[tuple[int, NDArray[np.uint8], list[Limb]]]:
@@ -385,7 +386,7 @@ def labelled(models: Landmarks, path: Path, every: int) -> Iterator[tuple[int, N
 
 
 def seen(image: NDArray[np.uint8], labels: NDArray[np.uint8], title: str) -> NDArray[np.uint8]:
-    """A tile of a sheet (h, TILE, 3) RGB: the picture under its classes, violet where there is none."""
+    """A tile of a sheet (h, TILE, 3) RGB: the picture under its classes, violet where unlabelled."""
     shown = files.overlay(image, np.where(labels == UNLABELLED, np.uint8(Label.BACKGROUND), labels))
     shown[labels == UNLABELLED] = shown[labels == UNLABELLED] // 2 + np.array(VIOLET, np.uint8) // 2
     size = (TILE, round(TILE * image.shape[0] / image.shape[1]))
@@ -396,7 +397,7 @@ def seen(image: NDArray[np.uint8], labels: NDArray[np.uint8], title: str) -> NDA
 
 
 class Folder:
-    """What is written: images/ and masks/ as `recordings` reads them, and check/, the sheets."""
+    """The output folder: images/ and masks/ as `recordings` reads them, and the sheets in check/."""
 
     def __init__(self, out: Path):
         self._out = out
@@ -405,12 +406,12 @@ class Folder:
             (out / name).mkdir(parents=True, exist_ok=True)
 
     def check(self, film: str) -> None:
-        """Raises FileError where there are frames of a film of this name."""
+        """Raise FileError if there are already frames of a film of this name."""
         if there := sorted((self._out / "images").glob(f"{film}_{'[0-9]' * 6}")):
             raise files.FileError(f"{there[0]}: expected no frames of {film} yet, got some; remove them, or choose another --out")
 
     def add(self, sequence: str, frames: Sequence[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]]) -> None:
-        """Write the frames of a sequence that follow one another. Raises FileError."""
+        """Write consecutive frames of a sequence. Raises FileError."""
         tiles = []
         for number, image, labels in frames:
             name = f"{number:06d}"
@@ -438,7 +439,7 @@ class Folder:
     example="penumbra segmentation label arm.mp4 --out labels",
 )
 def main(options: flags.Options) -> int:
-    """Writes frames and masks; returns 2 where a file cannot be read, or no hand is found."""
+    """Write frames and masks; returns 2 if a file cannot be read, or no hand is found."""
     try:
         models = Landmarks(options.models)
         files.check_names(options.films)

@@ -1,5 +1,5 @@
-"""The training loss: sum of the layers' prediction errors + Dice + focal (section "PredNet Model"), and once more
-Dice of the target's classes as one, which is what the search looks at. Pixels that are UNLABELLED count nowhere."""
+"""The training loss: sum of the layers' prediction errors + Dice + focal (section "PredNet Model"), plus the Dice loss of the
+target's classes as one, which the search uses. UNLABELLED pixels are ignored."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from penumbra.services.segmentation.inference import TARGET_LABELS
 from penumbra.shared.contract.labels import UNLABELLED
 
 ERROR_WEIGHTS = (1.0, 0.1)
-"""Weights of the first layer's prediction error and of every other's, as in Lotter et al. 2017 (L_all): an upper layer can also
-lower its error by sending nothing, so it must not weigh as much as the picture's."""
+"""Weights of the prediction error of the first layer and of every other layer, as in Lotter et al. 2017 (L_all): an upper layer
+can also lower its error by sending nothing, so it must not weigh as much as the picture's."""
 
 
 def dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
@@ -31,8 +31,8 @@ def dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
 
 
 def target_dice(logits: Tensor, labels: Tensor, smooth: float = 20.0) -> Tensor:
-    """1 - the mean over the pictures that show the target of 2 |P and T| / (|P| + |T|), its classes taken as one: a picture of
-    which little is visible weighs as much as another. Shapes as for `dice`."""
+    """1 - the mean over the pictures that show the target of 2 |P and T| / (|P| + |T|), with its classes taken as one: a picture
+    with a small visible part weighs as much as another. Shapes as for `dice`."""
     target = list(TARGET_LABELS)
     probability = logits.softmax(1)[:, target].sum(1) * (labels != UNLABELLED)
     truth = torch.isin(labels, labels.new_tensor(target)).to(probability.dtype)

