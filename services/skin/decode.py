@@ -18,7 +18,7 @@ from penumbra.shared.skin import board
     example="penumbra skin decode < packet.hex",
 )
 def main(options: flags.Options) -> int:
-    """Prints the reply's contents: 0, or 2 for a text that is no reply."""
+    """Print the reply's contents; returns 0, or 2 for a text that is no reply."""
     try:
         print(json.dumps(describe(from_hex(sys.stdin.buffer.read()))))
     except board.PacketError as error:
@@ -28,7 +28,7 @@ def main(options: flags.Options) -> int:
 
 
 def from_hex(text: bytes) -> bytes:
-    """The bytes that hex digits stand for. Raises PacketError with the first character that is none."""
+    """Bytes from hex digits. Raises PacketError with the first character that is no hex digit."""
     digits = b"".join(text.split())
     stranger = next((at for at, digit in enumerate(digits) if digit not in b"0123456789abcdefABCDEF"), None)
     if stranger is not None:

@@ -1,7 +1,7 @@
-"""`penumbra doctor --skin`: listens to the pads of a running cell and says what is wrong with them, and how to repair it.
+"""`penumbra doctor --skin`: listens to the pads of a running cell, reports faults, and says how to repair them.
 
-Faults of an electrode show in its voltages (`shared.skin.faults.Watch`). A pad that is mounted wrongly, or calibrated as another
-one, reads what a limb gives, only not what this limb gives: that shows beside the field model's signals at the fused pose.
+Faults of an electrode show in its voltages (`shared.skin.faults.Watch`). A pad that is mounted wrongly, or has another pad's
+calibration, reads plausible signals, but not those of this limb: they differ from the field model's signals at the fused pose.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from penumbra.shared.skin.faults import MENDS, MISFIT, Fault, Look, Watch, likel
 from penumbra.shared.skin.layout import Skin, link_names
 
 PATIENCE_S = 1.0
-"""Longest wait for the router [s]."""
+"""Maximum time [s] to wait for the router."""
 NEAR_NS = 15_000_000
-"""Pose and joints belong to a batch of voltages when their stamps are no farther apart."""
+"""Maximum difference [ns] between the stamps of voltages and of the pose and joints that are used for them."""
 IN_REACH_V = (0.005, 0.4)
-"""A pad's largest predicted signal [V] at which it is compared with the pose: less says little, more is too close for its
-errors."""
+"""Range of a pad's largest predicted signal [V] in which it is compared with the pose: less says little, and more means a gap too
+small for the model's errors."""
 SLOPE = 3.0
-"""A signal falls at most with this power of the gap: so many times the pose's relative error is the signal's."""
+"""Maximum power of the gap with which a signal falls: the signal's relative error is this factor times the gap's."""
 TOGETHER = 25
-"""Moments whose mean is compared: half a second, so that noise hides no contrast."""
+"""Number of moments per compared mean: half a second, so that noise hides no contrast."""
 LEAST = 4
-"""Such means in reach that a comparison takes."""
+"""Minimum number of such means in reach for a comparison."""
 LEAST_EMPTY = 25
-"""Moments with nothing near from which an offset is estimated."""
+"""Minimum number of moments with nothing near for an estimate of the offsets."""
 NOTHING_V = 5e-4
 """Predicted signal [V] below which a scene counts as empty."""
 OFFSET_V = 3e-3
-"""Largest signal [V] that a healthy electrode reads in an empty scene."""
+"""Maximum signal [V] of a healthy electrode in an empty scene."""
 
 
 @dataclass
 class Pad:
-    """What was received of one pad: its watch, its looks, faults that were seen, and moments: predicted and measured signals (e,)
-    [V], the latter's variance (e,) [V^2], and the former's error for the pose's, as a share."""
+    """Data received from one pad: its watch, its looks, the faults seen, and moments: predicted and measured signals (e,) [V],
+    the variance of the measured ones (e,) [V^2], and the relative error of the predicted ones due to the pose."""
 
     watch: Watch
     looks: list[Look] = field(default_factory=list)
@@ -61,7 +61,7 @@ class Pad:
 
 
 class Examination:
-    """Takes what the bus brings, from several threads, and judges it."""
+    """Collects messages from the bus, in several threads, and judges the pads."""
 
     def __init__(self, cell: cells.Cell):
         self.cell, self.skin = cell, Skin(cell)
@@ -81,7 +81,7 @@ class Examination:
             self.notes.append(f"no comparison with the pose: {error}")
 
     def voltages(self, message: Voltages, names: dict[str, str]) -> None:
-        """A batch of a pad."""
+        """Add a batch of a pad."""
         with self._lock:
             pad = self.pads[names["pad"]]
             if message.volts.shape[1] != len(pad.watch.names):
@@ -105,7 +105,7 @@ class Examination:
             self._joints[names["robot"]].append(message)
 
     def _compare(self, name: str, pad: Pad, stamp_ns: int, volts: Array) -> None:
-        """Keeps what a pad reads beside what the field model says for the fused pose of the time; the newest pose is a little
+        """Store a pad's reading with the field model's prediction at the fused pose of that time; the newest pose is slightly
         older than the voltages."""
         pose = _nearest(self._poses, stamp_ns)
         joints = {robot: _nearest(known, stamp_ns) for robot, known in self._joints.items()}
@@ -124,11 +124,11 @@ class Examination:
         pad.moments.append((predicted, measured, self.skin.noise[own] / len(volts), float(error)))
 
     def judge(self, misfits: dict[str, float], touched: frozenset[str] = frozenset()) -> dict[str, Any]:
-        """Everything that was found, as JSON; misfits: of the haptic estimate by pad, mean squared residuals in variances;
-        touched: pads that something touches, whose electrodes may read the end of their scale."""
+        """The findings as JSON; misfits: mean squared residuals of the haptic estimate by pad, in variances; touched: touched
+        pads, whose electrodes may read the end of their scale."""
         with self._lock:
             gains = {name: found.gain for name, pad in self.pads.items() if (found := self._suspect(name, pad, 1.0)) is not None}
-            # a limb of another size changes every pad's signals alike: only a pad that differs from the others is suspected
+            # a limb of another size scales all pads' signals alike: only a pad that differs from the others is suspect
             common = float(np.median(list(gains.values()))) if len(gains) >= 3 else 1.0
             pads = {name: self._verdict(name, pad, common, misfits.get(name), name in touched) for name, pad in self.pads.items()}
         wrong = sum(bool(pad["wrong"]) + sum(e["fault"] is not None for e in pad["electrodes"].values()) for pad in pads.values())
@@ -183,7 +183,7 @@ class Examination:
         return out
 
     def _offsets(self, pad: Pad) -> dict[str, Fault]:
-        """Electrodes that read something while the pose says that nothing is near."""
+        """Electrodes that read a signal while nothing is near by the pose."""
         empty = [moment for moment in pad.moments if moment[0].max() < NOTHING_V]
         if len(empty) < LEAST_EMPTY:
             return {}
@@ -196,7 +196,7 @@ class Examination:
 
 
 def examine(cell: cells.Cell, connection: bus.Connection, seconds: float, progress: Progress | None = None) -> dict[str, Any]:
-    """Listens to a running cell and judges its pads, as JSON. Raises CellError for a cell without pads, BusError where nothing
+    """Listen to a running cell and judge its pads, as JSON. Raises CellError for a cell without pads, BusError if nothing
     runs."""
     if not cell.pads:
         raise cells.CellError(f"cell {cell.name} has no pads: there is no skin to look at")
@@ -232,19 +232,19 @@ def _misfits(answers: list[bytes]) -> dict[str, float]:
 
 
 def _touched(answers: list[bytes]) -> frozenset[str]:
-    """The pads that something touches, as the haptics service reports them in its health."""
+    """Touched pads, as the haptics service reports them in its health."""
     contacts = [contact for answer in answers for contact in report.read(answer).report.get("contact", {}).values()]
     return frozenset(pad for contact in contacts for pad in contact["touched"])
 
 
 def _nearest(known: deque[Any], stamp_ns: int) -> Any:
-    """The message nearest to a time, or None where none is near."""
+    """The message nearest to a stamp, or None if none is within NEAR_NS."""
     found = min(known, key=lambda message: abs(message.stamp_ns - stamp_ns), default=None)
     return found if found is not None and abs(found.stamp_ns - stamp_ns) <= NEAR_NS else None
 
 
 def main(cell: cells.Cell, connection: bus.Connection, seconds: float, as_json: bool) -> int:
-    """Prints what `examine` finds: 1 if anything is wrong."""
+    """Print the findings of `examine`; returns 1 if anything is wrong."""
     with Progress(console=Console(stderr=True), transient=True) as progress:
         found = examine(cell, connection, seconds, progress)
     if as_json:

@@ -1,16 +1,16 @@
-"""The boards of one pad, asked at the same time, decoded, and brought back where they lost their place.
+"""Reads the boards of one pad simultaneously, decodes their replies, and recovers boards that lost synchronisation.
 
 A row of a pad, about 230 times a second:
 
-1. ask all boards one right after the other, so that they measure at the same time
-2. read every reply; it counts if it has its size, the cycles that were asked for, sums that are possible, and the phase it had
+1. request a measurement from all boards in quick succession, so that they measure at the same time
+2. read every reply; it is valid if it has its size, the requested cycles, possible sums, and the expected phase
 3. amplitude of an electrode: mean over its channels of the first Fourier component's length; stamp: the middle of the integration
-4. a board that failed is brought back, and the row is left out
+4. a board that failed is recovered, and the row is left out
 
-Bringing back, the cheapest first: a damaged reply shows that the board receives commands: wait until the line is quiet. One that
-did not come, or in which the phase has jumped: end the command that the board is reading, and find out by a stream of probes
-where its commands begin and at which frequency it is (`shared.skin.board.realign_probes`). No answer: a BREAK, and the probes
-again. Still none: `BoardSilent`.
+Recovery tries the cheapest step first. A damaged reply shows that the board receives commands: wait until the line is quiet.
+After a missing reply, or a jump of the phase: end the command that the board is reading, and send a stream of probes to find
+where its commands begin and which frequency it has (`shared.skin.board.realign_probes`). If there is no answer: a BREAK, and the
+probes again. If there is still none: `BoardSilent`.
 """
 
 from __future__ import annotations
@@ -30,58 +30,58 @@ from penumbra.shared.skin.board import Command, Kind, PacketError
 Components = NDArray[np.complex128]
 
 SWEEP_HZ = (80e3, 115e3, 1e3)
-"""First, last and step of the frequencies among which the resonance is looked for."""
+"""First, last and step [Hz] of the frequency sweep for the resonance."""
 OVERHEAD_S = 0.5e-3
-"""What a board takes for an answer beside cycles and line."""
+"""Time [s] that a board needs for an answer besides cycles and line."""
 PATIENCE_S = 14e-3
-"""How much later than possible an answer may come: a USB converter and the machine hold it up."""
+"""Maximum delay [s] of an answer beyond its minimum time, caused by a USB converter and the machine."""
 PACE_S = 0.7e-3
-"""Between probes: a board starts on a command half a millisecond after it arrived, if no other has arrived until then."""
+"""Time [s] between probes: a board starts on a command half a millisecond after it arrived, unless another one arrives."""
 PROBE_S = 3e-3
-"""Time [s] for which the answer to the last probe of a round is waited for."""
+"""Time [s] to wait for the answer to the last probe of a round."""
 LAST_PACE_S = 0.015
-"""Time [s] between probes, and for their answers, in the round before a board is given up."""
+"""Time [s] between probes, and for their answers, in the last round before a board is given up."""
 QUIET_S = 2e-3
-"""A line without bytes for so long is quiet: USB delivers once a millisecond."""
+"""Time [s] without bytes after which a line is quiet: USB delivers once per millisecond."""
 TURN = np.radians(2.0)
-"""A phase that jumps by more, and by more than six times its noise, has slipped."""
+"""Phase jump [rad] that counts as a slip, if it also exceeds six times the phase's noise."""
 FOLLOW = 0.1
-"""Weight of the newest reply in the phase that is expected next: it drifts with temperature."""
+"""Weight of the newest reply in the expected phase, which drifts with temperature."""
 BATCH_NS = 20_000_000
-"""Rows are handed on together, as the emulator does."""
+"""Length [ns] of a published batch of rows, as in the emulator."""
 UNEVEN = 0.5
-"""Rows of a batch are evenly spaced, up to this share of their period."""
+"""Maximum deviation of a row's spacing within a batch, as a share of the period."""
 
 
 class Port(Protocol):
-    """A serial line to a board. Raises OSError where it is gone."""
+    """A serial line to a board. Raises OSError if it is gone."""
 
     name: str
 
     def now_ns(self) -> int:
-        """A clock that never goes back."""
+        """Time [ns] of a monotonic clock."""
 
     def write(self, data: bytes) -> None:
-        """Hands bytes to the line and returns at once."""
+        """Pass bytes to the line and return at once."""
 
     def read(self, timeout_s: float) -> bytes:
-        """What has come, at least one byte; nothing if none comes within the time."""
+        """Received bytes, at least one; nothing if none arrives within the time."""
 
     def send_break(self) -> None:
-        """Forgets what was not sent yet, and holds the line low for longer than a byte."""
+        """Discard unsent bytes, and hold the line low for longer than a byte."""
 
     def close(self) -> None:
-        """Gives the line back."""
+        """Close the line."""
 
 
 class BoardSilent(OSError):
-    """What is on this port is no board that measures, or is one no more: it has to be opened and tuned again."""
+    """No measuring board answers on this port, or no longer: it has to be opened and tuned again."""
 
 
 @dataclass
 class Count:
-    """What happened on a line: replies, faults by kind, times that it was brought back, BREAKs that this took, and the longest
-    time [s] between two replies with a fault between them."""
+    """Statistics of a line: replies, faults by kind, recoveries, BREAKs needed for them, and the longest time [s] between two
+    replies with a fault in between."""
 
     replies: int = 0
     faults: Counter[str] = field(default_factory=Counter)
@@ -91,8 +91,8 @@ class Count:
 
 
 class Line:
-    """One board on its port. measures: cycles of a reply; noise: standard deviation of an amplitude over 100 cycles, in steps of
-    the converter. `electrode_hz` is what the board was last set to, `resonance_hz` what `tune` found."""
+    """One board on its port. measures: cycles per reply; noise: standard deviation of an amplitude over 100 cycles, in steps of
+    the converter. `electrode_hz` is the frequency last set, `resonance_hz` the result of `tune`."""
 
     def __init__(self, port: Port, channels: Sequence[int], measures: int = 128, samples_per_cycle: int = 4, noise: float = 3.1):
         self.port, self.channels, self.count = port, list(channels), Count()
@@ -106,12 +106,12 @@ class Line:
         self._slack: deque[int] = deque(maxlen=200)
         self._asked_ns = self._answered_ns = port.now_ns()
         self._fault, self._is_cut, self._is_tuned = "", False, False
-        self._attempt = 0  # an answer to an earlier one may come late
+        self._attempt = 0  # an answer to an earlier attempt may arrive late
 
     # ---- replies
 
     def ask(self) -> None:
-        """Begin a measurement."""
+        """Request a measurement."""
         stray = self.port.read(0.0)
         if stray:
             self.count.faults["overrun" if board.OVERRUN in stray else "garbled"] += 1
@@ -119,8 +119,8 @@ class Line:
         self._asked_ns = self.port.now_ns()
 
     def answer(self) -> tuple[int, Components] | None:
-        """The middle of the integration on the port's clock [ns] and the Fourier components (6,) [steps] of what was asked for;
-        None after a fault, and then `recover` comes first."""
+        """The middle of the integration on the port's clock [ns] and the Fourier components (6,) [steps] of the requested
+        measurement; None after a fault, and then `recover` must be called first."""
         data = self._read(self._size, self._asked_ns, self._least_s() + PATIENCE_S)
         received_ns = self.port.now_ns()
         components, self._fault = self._judge(data)
@@ -135,9 +135,9 @@ class Line:
         return self._middle_ns(received_ns), components
 
     def _judge(self, data: bytes) -> tuple[Components, str]:
-        """What a reply says, and which fault it has, if any."""
+        """The components of a reply, and its fault, if any."""
         nothing = np.empty(0, complex)
-        if board.OVERRUN in data:  # samples are missing as well: nothing in this reply is sure
+        if board.OVERRUN in data:  # samples are missing as well: the whole reply is invalid
             return nothing, "overrun"
         if len(data) != self._size:
             return nothing, "silent" if not data else "short" if len(data) < self._size else "garbled"
@@ -151,19 +151,19 @@ class Line:
         return components, "slip" if self._has_slipped(components) else ""
 
     def recover(self) -> None:
-        """Makes the board answer again after a fault. Raises BoardSilent where nothing helps."""
+        """Make the board answer again after a fault. Raises BoardSilent if nothing helps."""
         fault, self._fault = self._fault, ""
         if not fault:
             return
-        if fault in ("silent", "slip"):  # a phase also jumps where the board began anew, at another frequency
+        if fault in ("silent", "slip"):  # a reset board also shows a phase jump: it has another frequency
             self._realign()
         else:
             self._wait_until_quiet(QUIET_S)
         self.count.resyncs += 1
 
     def _read(self, size: int, since_ns: int, within_s: float) -> bytes:
-        """So many bytes, and what came with them; fewer where they do not come within a time. The text of an overrun does not
-        count. What came while the machine did other things is not late."""
+        """Read `size` bytes and any that come with them; fewer if they do not arrive in time. The text of an overrun does not
+        count. Bytes that arrived while the machine did other things are not late."""
         data = b""
         while len(data) < size + (len(board.OVERRUN) if board.OVERRUN in data else 0):
             left_s = within_s - (self.port.now_ns() - since_ns) * 1e-9
@@ -177,15 +177,15 @@ class Line:
         return board.reply_s(self.cycles, self.electrode_hz, self.samples_per_cycle) + OVERHEAD_S
 
     def _middle_ns(self, received_ns: int) -> int:
-        """The middle of the integration: half of what is least left over beside line and cycles comes before it. What a reply
-        takes longer it waited here, or on its way."""
+        """The middle of the integration. Half of the minimum slack beyond line and cycles lies before it; any further slack of a
+        reply was a delay in this machine or on the line."""
         slack = received_ns - self._asked_ns - round(1e9 * board.reply_s(self.cycles, self.electrode_hz, self.samples_per_cycle))
         self._slack.append(max(0, slack))
         before_s = board.COMMAND_BYTES * board.BYTE_S + 0.5 * self.cycles / self.electrode_hz
         return self._asked_ns + round(1e9 * before_s) + min(self._slack) // 2
 
     def _has_slipped(self, components: Components) -> bool:
-        """Whether all channels have turned against the replies before: samples were lost, and the amplitude with them."""
+        """Whether all channels have turned relative to earlier replies: samples were lost, and the amplitude is wrong."""
         used = components[self.channels]
         now = used / np.maximum(np.abs(used), 1e-9)
         if self._phase is None:
@@ -203,8 +203,8 @@ class Line:
     # ---- frequency
 
     def tune(self) -> None:
-        """Sets the excitation to where the amplitude is largest: the board's resonance. Where there is none, to the standard
-        frequency, and resonance_hz is 0. Raises BoardSilent."""
+        """Set the excitation to the frequency of maximum amplitude: the board's resonance. If there is none, set the standard
+        frequency and resonance_hz to 0. Raises BoardSilent."""
         self._is_tuned = False
         asked = np.arange(SWEEP_HZ[0], SWEEP_HZ[1] + 1.0, SWEEP_HZ[2])
         found = np.array([self._amplitude_at(hz) for hz in asked])
@@ -213,7 +213,7 @@ class Line:
         self._is_tuned = True
 
     def _amplitude_at(self, hz: float) -> float:
-        """Mean over the channels [steps]; zero where no reply can be had."""
+        """Mean amplitude over the channels [steps]; zero if no reply can be obtained."""
         self.set_frequency(hz)
         for _ in range(3):
             self.ask()
@@ -224,7 +224,7 @@ class Line:
         return 0.0
 
     def set_frequency(self, hz: float) -> None:
-        """Sets the excitation, and the converter with it. Raises BoardSilent."""
+        """Set the frequencies of excitation and converter. Raises BoardSilent."""
         command = board.set_frequency(hz, self.samples_per_cycle)
         for _ in range(3):
             self.port.write(command)
@@ -243,7 +243,7 @@ class Line:
             f"expected a board that accepts {hz:g} Hz, got wrong answers; check whether {self.port.name} is another device"
         )
 
-    # ---- place in the stream of commands
+    # ---- synchronisation with the stream of commands
 
     def _realign(self) -> None:
         self.port.write(board.COMMAND_BYTES * board.FILLER)
@@ -263,7 +263,7 @@ class Line:
             raise BoardSilent(f"the board on {self.port.name} has lost its frequency: was its power off?")
 
     def _probe(self, pace_s: float, patience_s: float) -> Command | None:
-        """Finds where the board's commands begin, sets it right, and returns what it says of its frequencies."""
+        """Find where the board's commands begin, align it, and return the frequencies that it reports."""
         data, sent = b"", 0
         self._attempt += 1
         for probe in board.realign_probes(self._attempt):
@@ -281,7 +281,7 @@ class Line:
         return answer
 
     def _await_probe(self, data: bytes, within_s: float) -> tuple[bytes, tuple[int, Command] | None]:
-        """What has come of an answer, beside `data` from before, and the answer when it is whole."""
+        """Received bytes appended to `data`, and the answer once it is complete."""
         ends_ns = self.port.now_ns() + round(1e9 * within_s)
         while (found := board.realign_answer(data, self._attempt)) is None and (left_ns := ends_ns - self.port.now_ns()) > 0:
             data += self.port.read(left_ns * 1e-9)
@@ -294,16 +294,17 @@ class Line:
 
 
 def _is_near(answer: Command, electrode_hz: float, samples_per_cycle: int, tolerance: float) -> bool:
-    """Whether a board's answer says that it has these frequencies, up to a share of them."""
+    """Whether a board's answer states these frequencies, up to a relative tolerance."""
     samples_hz = electrode_hz * samples_per_cycle
     return abs(answer.electrode_hz / electrode_hz - 1.0) < tolerance and abs(answer.sample_hz / samples_hz - 1.0) < tolerance
 
 
 def resonance(hz: Array, amplitude: Array, least: float) -> float:
-    """The frequency [Hz] at which amplitudes (n,) over frequencies (n,) are largest; 0 where they have no such place.
+    """Frequency [Hz] of the maximum of amplitudes (n,) over frequencies (n,); 0 if there is none inside the range.
 
-    Near a resonance 1 / amplitude^2 = a + b f^2 + c / f^2 with its minimum at (c / b)^(1/4): a linear least squares over what
-    is above half of the largest, weighted by how well the reciprocal squares are known. least: amplitudes below it are noise.
+    Near a resonance 1 / amplitude^2 = a + b f^2 + c / f^2 with its minimum at (c / b)^(1/4): a linear least squares over the
+    amplitudes above half of the maximum, weighted by the accuracy of the reciprocal squares. least: amplitudes below it are
+    noise.
     """
     top = int(np.argmax(amplitude))
     if not 0 < top < len(hz) - 1 or amplitude[top] < least:
@@ -323,8 +324,8 @@ def resonance(hz: Array, amplitude: Array, least: float) -> float:
 
 @dataclass(frozen=True)
 class Row:
-    """stamp_ns: the middle of the integration, on the ports' clock, in the mean over the boards; volts (e,) in the order of the
-    pad type; skew_ns: how far the boards' middles lie apart."""
+    """A measurement of all electrodes. stamp_ns: the middle of the integration, on the ports' clock, averaged over the boards;
+    volts (e,) in the order of the pad type; skew_ns: spread of the boards' middles."""
 
     stamp_ns: int
     volts: Array
@@ -332,9 +333,9 @@ class Row:
 
 
 class PadReader:
-    """The boards of a pad together. channels: by board, which channels measure which electrode; electrodes: their order in a row;
-    lsb [V]: a step of the converter. An electrode that no board measures reads 0 V, as a dead one does. Raises ValueError for
-    one that several measure."""
+    """The boards of a pad together. channels: by board, the channels that measure each electrode; electrodes: their order in a
+    row; lsb [V]: a step of the converter. An electrode that no board measures reads 0 V, as a dead one does. Raises ValueError
+    for an electrode that several boards measure."""
 
     def __init__(
         self, lines: Sequence[Line], channels: Sequence[Mapping[str, Sequence[int]]], electrodes: Sequence[str], lsb: float
@@ -348,7 +349,7 @@ class PadReader:
             self._sources.append(found[0] if found else None)
 
     def read(self) -> Row | None:
-        """The next row; None where a board failed and was brought back. Raises BoardSilent, OSError for a port that is gone."""
+        """The next row; None if a board failed and was recovered. Raises BoardSilent, OSError for a port that is gone."""
         for line in self.lines:
             line.ask()
         answers = [line.answer() for line in self.lines]
@@ -364,7 +365,7 @@ class PadReader:
 
 
 class Batches:
-    """Gathers rows that are evenly spaced. A row that comes late ends the batch before it, so no stamp is made up."""
+    """Collects evenly spaced rows into batches. A late row ends the batch before it, so no stamp is invented."""
 
     def __init__(self, length_ns: int = BATCH_NS):
         self._length_ns = length_ns
@@ -386,7 +387,7 @@ class Batches:
         return out
 
     def flush(self) -> list[tuple[int, int, Array]]:
-        """What is there, as a batch; none where there is nothing. A single row has the period of the batch before."""
+        """The collected rows as a batch; empty if there are none. A single row gets the period of the previous batch."""
         rows, self._rows = self._rows, []
         if len(rows) > 1:
             self.period_ns = round((rows[-1].stamp_ns - rows[0].stamp_ns) / (len(rows) - 1))
@@ -395,7 +396,7 @@ class Batches:
         return [(rows[-1].stamp_ns, self.period_ns, np.array([row.volts for row in rows]))]
 
     def _spacing_ns(self) -> int:
-        """Between the rows that are there; of a single one, as in the batch before."""
+        """Spacing [ns] of the collected rows; for a single one that of the previous batch."""
         if len(self._rows) < 2:
             return self.period_ns
         return (self._rows[-1].stamp_ns - self._rows[0].stamp_ns) // (len(self._rows) - 1)

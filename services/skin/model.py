@@ -1,9 +1,9 @@
 """`penumbra skin model`: fits the networks of `shared.skin.response` to the boundary-element field of a cell's pads.
 
-For every mounting of a cell (a pad type, and for a backed pad its robot link) the field is solved for limbs of random size at
+For every mounting in a cell (a pad type, and for a backed pad its robot link) the field is solved for limbs of random size at
 random poses, from contact to where nothing is felt, and a network learns the logarithms. Mountings that already have a network
-are left alone. The network of a bare pad is learned from nothing; for a pad before a link only what is missing to the bare one,
-which needs fewer poses.
+are left alone. The network of a bare pad is trained from scratch; for a pad before a link only the difference from the bare one
+is trained, which needs fewer poses.
 """
 
 from __future__ import annotations
@@ -34,46 +34,47 @@ from penumbra.sim.skin.field import Body, PadField, Panels, limb, shell
 Array = np.ndarray
 
 POSES, POSES_BACKED = 45_000, 3_000
-"""Fields solved for a bare pad, and for one more mounting."""
+"""Number of fields solved for a bare pad, and for each backed mounting."""
 POSTURES = 80
-"""Number of the robot's postures in which the effect of its other links on a pad is computed."""
+"""Number of robot postures for which the effect of its other links on a pad is computed."""
 LINK_PANELS = (8, 8)
-"""Rows and columns of panels into which each of these links is cut."""
+"""Rows and columns of panels on each of these links."""
 JOINED = 0.005
-"""Least distance from the pad [m] of such panels. What is nearer, or in the pad's own link, is part of its mounting."""
+"""Minimum distance [m] of such panels from the link behind the pad; nearer panels are left out."""
 LIMBS = 32
-"""Sizes of limbs: each must be prepared, so poses share them."""
+"""Number of limb sizes: each must be prepared, so poses share them."""
 LENGTH, GIRTH = (-0.12, 0.10), (-0.31, 0.15)
-"""Bounds of the log factors: from the 5th percentile of women to the 95th of men (ANSUR II), and a little beyond."""
+"""Bounds of the log factors: from the 5th percentile of women to the 95th of men (ANSUR II), and slightly beyond."""
 GAPS = (0.004, 0.04, 0.12, 0.5)
-"""A third of the limbs is within the first two gaps [m] of the pad, a third within the first and the third, and so on."""
+"""Bounds of the gaps [m]: a third of the limbs lies between the first and the second, a third between the first and the third,
+and a third between the first and the last."""
 CLEAR = 0.003
-"""No limb comes nearer [m] to the board or the link."""
+"""Minimum distance [m] of a limb from the board or the link."""
 BEHIND = -0.15
-"""A limb may be as far behind the pad's plane as this cosine of its direction."""
+"""Minimum cosine between the pad's normal and the limb's direction: limbs may be slightly behind the pad's plane."""
 TILT = 0.6
-"""Largest angle [rad] between the limb's axis and the plane across the direction in which it is."""
+"""Maximum angle [rad] between the limb's axis and the plane across the direction to the limb."""
 OVERHANG = 0.05
-"""How far [m] beside the limb's ends a pad may be."""
+"""Maximum distance [m] of a pad beyond the limb's ends."""
 PIECES = (40, 18)
 """Rows and columns of the limb's pieces."""
 HIDDEN, HIDDEN_BACKED = 128, 32
 STEPS, STEPS_BACKED, BATCH = 250_000, 10_000, 512
-"""Units of the hidden layers and steps of the training, of a pad alone and of what a link behind it changes; samples per step."""
+"""Units of the hidden layers and training steps, of a bare pad and of the effect of a link behind it; samples per step."""
 NEAR_GAP = 0.05
-"""Gap [m] below which the networks err more."""
+"""Gap [m] below which the networks have larger errors."""
 FAINTEST = 1e-5
-"""Changes below this [fF] are numerical errors: a limb behind the link."""
+"""Change [fF] below which a result is a numerical error, as for a limb behind the link."""
 HELD_OUT_SEED = 1_000_003
-"""Seed of the limbs on which a network is scored, and which it is not trained on."""
+"""Seed of the limbs on which a network is scored; it is not trained on them."""
 BANDS = (0.005, 0.015, 0.03, 0.06, 0.12, 0.17, 0.25, 0.5)
-"""Gaps [m] between which errors are reported apart."""
+"""Limits of the gap bands [m] of the reported errors."""
 
 
 @dataclass(frozen=True)
 class Mounting:
-    """What a network is fitted for: a pad that has it, name of its file, its fingerprint and that of the same pad without
-    a link, the pad type and the link behind it."""
+    """A mounting for which a network is fitted: a pad that has it, the file's name, its fingerprint and that of the same pad
+    without a link, the pad type and the link behind it."""
 
     pad: str
     name: str
@@ -104,7 +105,7 @@ def mountings(cell: cells.Cell, target: str) -> list[Mounting]:
 
 
 class Poses:
-    """Random limbs before a pad: where they are, how they lie, how large they are; none that touches the board or the link."""
+    """Random limbs before a pad, with position, direction and size; none touches the board or the link."""
 
     def __init__(self, mesh: Mesh, backing: Panels | None, seed: int):
         self.rng = np.random.default_rng([seed, 41])
@@ -117,7 +118,7 @@ class Poses:
         self.sizes = np.array([LENGTH[0], GIRTH[0]]) + sizes * (LENGTH[1] - LENGTH[0], GIRTH[1] - GIRTH[0])
 
     def draw(self, gap: float | None = None) -> tuple[Array, int, float]:
-        """T_pad_limb (4, 4), the number of the limb, and its gap [m]: this one within 2 %, or any."""
+        """T_pad_limb (4, 4), the index of the limb, and its gap [m]: within 2 % of `gap`, or random."""
         rng = self.rng
         while True:
             which = int(rng.integers(LIMBS))
@@ -132,7 +133,7 @@ class Poses:
             y /= np.linalg.norm(y)
             R = np.column_stack([x, y, np.cross(x, y)])
             along = rng.uniform(self.ends[0] - OVERHANG, self.ends[1] + OVERHANG) * factors[0]
-            # slide it away along `toward` until the pad's middle has the wanted gap
+            # move the limb away along `toward` until the pad's middle has the wanted gap
             wanted = gap or float(np.exp(rng.uniform(np.log(GAPS[0]), np.log(GAPS[rng.integers(1, 4)]))))
             far = wanted + 0.05
             for _ in range(12):
@@ -147,7 +148,7 @@ class Poses:
                 return T, which, wanted - short
 
     def _gap(self, points: Array, R: Array, t: Array, factors: Array) -> float:
-        """About the distance [m] of points (n, 3) to the limb: exact in the mesh's own size."""
+        """Approximate smallest distance [m] of points (n, 3) to the limb: exact at the mesh's own size."""
         local = (points - t) @ R
         distance, nearest, _ = self.surface.nearest(local / factors)
         return float((np.sign(distance) * np.linalg.norm(nearest * factors - local, axis=1)).min())
@@ -155,7 +156,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Solved:
-    """Fields: poses (n, 4, 4) of the limb in the pad's frame, its sizes (n, 2) and gaps (n,) [m], changes (n, e) [fF]."""
+    """Solved fields: poses (n, 4, 4) of the limb in the pad's frame, its sizes (n, 2) and gaps (n,) [m], changes (n, e) [fF]."""
 
     T: Array
     size: Array
@@ -172,7 +173,8 @@ def solve(
     gaps: Sequence[float] = (),
     limbs: dict[tuple[float, ...], Body] | None = None,
 ) -> Solved:
-    """So many random fields, at these gaps [m] in turn or at all. limbs: those prepared so far, by size: preparing takes time."""
+    """Solve `count` random fields, at these gaps [m] in turn, or at random ones. limbs: those prepared so far, by size; preparing
+    takes time."""
     field, poses = PadField(mounting.kind, mounting.backing), Poses(mesh, mounting.backing, seed)
     limbs = {} if limbs is None else limbs
     T, size, gap = np.empty((count, 4, 4)), np.empty((count, 2)), np.empty(count)
@@ -193,13 +195,13 @@ def solve(
 
 
 def pieces(mesh: Mesh) -> Array:
-    """The limb's skin in pieces (7, k): see `shared.skin.response.Network`."""
+    """The limb's surface in pieces (7, k): see `shared.skin.response.Network`."""
     panels = limb(mesh, stations=PIECES[0], around=PIECES[1]).panels
     return np.ascontiguousarray(np.column_stack([panels.centroids, panels.normals, panels.areas]).T, dtype=np.float32)
 
 
 def links(cell: cells.Cell, mounting: Mounting, joints: Array) -> Array:
-    """What all links but the pad's own change (k, e) [fF] at joint angles (k, j) of the cell's robots."""
+    """Changes (k, e) [fF] by all links but the pad's own, at joint angles (k, j) of the cell's robots."""
     models, own = robot_models(cell), cell.pads[mounting.pad]
     field = PadField(mounting.kind, mounting.backing)
     robot, _, carrier = own.link.partition("/")
@@ -232,7 +234,7 @@ def joint_range(cell: cells.Cell) -> tuple[Array, Array]:
 
 
 def fit_rest(cell: cells.Cell, mounting: Mounting, seed: int) -> tuple[Rest, float]:
-    """The polynomial for the other links of a pad's robot, and the 95th percentile of its relative error on others."""
+    """The polynomial for the other links of a pad's robot, and the 95th percentile of its relative error on held-out postures."""
     low, high = joint_range(cell)
     postures = np.random.default_rng([seed, 44]).uniform(low, high, (POSTURES, len(low)))
     others = np.random.default_rng([HELD_OUT_SEED, 44]).uniform(low, high, (POSTURES // 5, len(low)))
@@ -250,7 +252,7 @@ class _Fit(torch.nn.Module):
 
     @property
     def layers(self) -> tuple[torch.nn.Linear, ...]:
-        """Those with biases, from input to output."""
+        """The layers with biases, from input to output."""
         return self.first, self.second, self.last
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -261,8 +263,8 @@ class _Fit(torch.nn.Module):
 def fit(
     points: Array, data: Solved, seed: int, steps: int, start: Network | None = None, progress: Progress | None = None
 ) -> Network:
-    """The network that has the logarithms of the changes, robust against the few poses that it cannot follow. With a start, only
-    what is missing to it is learned, by a small network beside it."""
+    """Train a network of the changes' logarithms, robust against the few poses that it cannot fit. With a start, only the
+    difference from it is trained, by a small network beside it."""
     torch.manual_seed(seed)
     rng = np.random.default_rng([seed, 43])
     usable = (data.change > FAINTEST).all(axis=1)
@@ -299,7 +301,7 @@ def fit(
 
 
 def beside(one: Network, other: Network) -> Network:
-    """One network that gives the sum of the outputs of two with the same input."""
+    """One network whose outputs are the sums of those of two networks with the same input."""
     (a0, a1, a2), (b0, b1, b2) = one.weights, other.weights
     (a3, a4, a5), (b3, b4, b5) = one.biases, other.biases
     weights = np.concatenate([a0, b0]), block_diag(a1, b1), np.concatenate([a2, b2], axis=1)
@@ -316,7 +318,8 @@ def predict(network: Network, data: Solved) -> Array:
 
 
 def error(network: Network, data: Solved) -> float:
-    """Standard deviation of the relative error beyond NEAR_GAP, as the median has it: its tails are the estimator's outliers."""
+    """Standard deviation of the relative error beyond NEAR_GAP, estimated from the median; the tails are left to the estimator's
+    outlier handling."""
     far = data.gap > NEAR_GAP
     return float(1.4826 * np.median(np.abs(np.log(predict(network, data)[far] / np.maximum(data.change[far], FAINTEST)))))
 
@@ -353,7 +356,7 @@ def main(options: flags.Options) -> int:
         raise cells.CellError(f"cell {cell.name} has no pads: nothing to fit")
     torch.set_num_threads(1)
     target = cell.one("targets", options.target)
-    mesh = target_mesh(cell.targets[target].model_copy(update={"size": None}), cell)  # the networks know of sizes
+    mesh = target_mesh(cell.targets[target].model_copy(update={"size": None}), cell)  # the networks take the size as input
     points = pieces(mesh)
     with Progress() as progress:
         for mounting in mountings(cell, target):

@@ -15,13 +15,13 @@ import serial
 from penumbra.shared.skin import board
 
 BREAK_S = 1e-3
-"""Fifty bytes long: a receiver takes a low line for a BREAK from one byte on."""
+"""Length [s] of a BREAK, fifty bytes: a receiver detects a BREAK from one byte on."""
 CHUNK = 4096
-"""Largest number of bytes read at once."""
+"""Maximum number of bytes read at once."""
 
 
 class SerialPort:
-    """`driver.Port` on a device such as /dev/ttyUSB0, held by this process alone. Raises OSError with what to do about it."""
+    """`driver.Port` on a device such as /dev/ttyUSB0, opened exclusively. Raises OSError with what to do about it."""
 
     def __init__(self, device: str):
         self.name = device
@@ -29,13 +29,13 @@ class SerialPort:
             self._serial = serial.Serial(device, board.BAUD, exclusive=True)
         except OSError as error:
             raise OSError(_why(device, error)) from None
-        with suppress(OSError, ValueError, NotImplementedError):  # other converters have no such mode and no need of it
-            self._serial.set_low_latency_mode(True)  # an FTDI converter holds bytes back for 16 ms otherwise
+        with suppress(OSError, ValueError, NotImplementedError):  # other converters have no such mode and do not need it
+            self._serial.set_low_latency_mode(True)  # otherwise an FTDI converter delays bytes by 16 ms
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
 
-    # pyserial's own reading and writing take three times as long, hundreds of times a second.
+    # pyserial's own read and write take three times as long, hundreds of times a second.
 
     def write(self, data: bytes) -> None:
         try:
@@ -49,12 +49,12 @@ class SerialPort:
         if timeout_s > 0.0 and not select.select([self._serial.fileno()], [], [], timeout_s)[0]:
             return b""
         data = os.read(self._serial.fileno(), CHUNK)
-        if not data and timeout_s > 0.0:  # ready to be read, and nothing there
+        if not data and timeout_s > 0.0:  # readable but empty: the device is gone
             raise OSError(f"{self.name} is gone; check that the board is connected")
         return data
 
     def send_break(self) -> None:
-        """A pseudo-terminal carries no BREAK: there the emptying of its queue, which comes first, stands for one."""
+        """Send a BREAK. A pseudo-terminal carries none; there the flush of its queue, which comes first, replaces it."""
         try:
             self._serial.reset_output_buffer()
             self._serial.break_condition = True
@@ -69,7 +69,7 @@ class SerialPort:
 
 
 def _why(device: str, error: OSError) -> str:
-    """What keeps a device from being opened, and what to do."""
+    """Reason why a device cannot be opened, and what to do."""
     if not Path(device).exists():
         there = sorted(str(path) for pattern in ("ttyUSB*", "ttyACM*") for path in Path("/dev").glob(pattern))
         return f"no device {device}: is the board plugged in? Serial devices now: {', '.join(there) or 'none'}"

@@ -1,8 +1,8 @@
 """Reads the sensing boards of pads on serial ports and publishes the amplitudes of their electrodes.
 
 Three boards make one pad of five electrodes: give their ports in order with --device, or in the cell file under `boards:` of the
-pad. The cell file also says which channels measure which electrode; without it two electrodes a board in the order of the pad
-type, on channels 0 to 2 and 3 to 5: c and r on the first board, l and t on the second, b on the third.
+pad. The cell file also says which channels measure which electrode; by default each board measures two electrodes in the order of
+the pad type, on channels 0 to 2 and 3 to 5: c and r on the first board, l and t on the second, b on the third.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from penumbra.shared.skin import board
 
 NAME = "skin"
 BACKOFF_S = (0.2, 5.0)
-"""Waiting before a board is opened again: at first, and at most."""
+"""Initial and maximum delay [s] before a board is opened again."""
 TOLD_EVERY = 20
-"""Attempts after which a board that is still missing is logged again."""
+"""Number of attempts after which a missing board is logged again."""
 
 
 FLAGS = (
@@ -51,8 +51,8 @@ EXAMPLE = "penumbra skin --pad p0 --device /dev/ttyUSB0 --device /dev/ttyUSB1 --
 
 
 def start(node: Node, options: flags.Options) -> None:
-    """Each pad has a thread of its own, to which its `Session` belongs: its boards are asked together. The health report, in
-    another thread, only reads counters."""
+    """Start one thread per pad, which owns the pad's `Session`: its boards are read together. The health report, in another
+    thread, only reads counters."""
     if not 0 < options.cycles <= 60_000:
         raise cells.CellError(f"--cycles: expected 1 to 60000, got {options.cycles}")
     for pad, readers in pads(node.cell, options.device, options.pad).items():
@@ -62,7 +62,7 @@ def start(node: Node, options: flags.Options) -> None:
 
 
 def pads(cell: cells.Cell, ports: Sequence[str], pad: str | None) -> dict[str, tuple[SensingBoard, ...]]:
-    """The pads to be read, each with its boards on their ports. Raises CellError where the two do not fit."""
+    """The pads to read, each with its boards and their ports. Raises CellError if pads and ports do not match."""
     if not ports:
         named = {name: found for name, found in cell.pads.items() if pad in (None, name) and found.boards}
         if pad is not None:
@@ -91,7 +91,7 @@ def pads(cell: cells.Cell, ports: Sequence[str], pad: str | None) -> dict[str, t
 
 
 class Session:
-    """One pad from opening its boards to losing them, again and again."""
+    """Reads one pad from opening its boards until they are lost, repeatedly."""
 
     def __init__(self, node: Node, pad: str, readers: tuple[SensingBoard, ...], cycles: int):
         self._node, self._pad, self._readers, self._cycles = node, pad, readers, cycles
@@ -113,7 +113,7 @@ class Session:
             raise cells.CellError(f"pad {pad}: {error}") from None
 
     def run(self) -> None:
-        """Until the node stops, or the boards are gone: then it returns after a while, to be called again."""
+        """Read until the node stops, or until the boards are gone; then wait and return, to be called again."""
         with ExitStack() as stack:
             try:
                 reader = self._open(stack)
@@ -163,7 +163,7 @@ class Session:
         self._failures = 0
 
     def describe(self) -> dict[str, Any]:
-        """For the health report: the pad's rate and skew, and each board's resonance and what happened on its line."""
+        """The pad's entry in the health report: rate and skew, and each board's resonance and line statistics."""
         return {
             "state": self._state,
             "opened": self._opened,

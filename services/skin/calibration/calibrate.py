@@ -31,11 +31,11 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.runtime import bus
 
 GAPS_M = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08, 0.12, 0.16, 0.20)
-"""Asked for by default: even steps of the signal's logarithm."""
+"""Default gaps [m]: even steps of the signal's logarithm."""
 SHOWN_M = (0.01, 0.02, 0.03, 0.05, 0.08, 0.10, 0.12, 0.15, 0.20)
-"""Rows of the table of signal-to-noise ratios."""
+"""Gaps [m] in the table of signal-to-noise ratios."""
 PATIENCE_S = 3.0
-"""How long to wait for voltages before saying that none come."""
+"""Time [s] to wait for voltages before an error is reported."""
 BY_HAND = 2e-3
 """Standard deviation [m] of a gap that is held by hand with a ruler."""
 
@@ -84,7 +84,7 @@ def _gap(text: str) -> float:
     example="penumbra skin calibrate --cell mine.yaml --pad p0 --csv recording.csv",
 )
 def main(options: flags.Options) -> int:
-    """0, or 2 for readings or a cell file that are wrong."""
+    """Run the command; returns 0, or 2 for wrong readings or a wrong cell file."""
     if options.csv is not None and (options.distances or options.record):
         flags.refuse("--distances and --record belong to the guided procedure: leave --csv out, or them")
     try:
@@ -124,7 +124,7 @@ def _calibrate(options: flags.Options) -> None:
 
 
 def _recorded(cell: cells.Cell, options: flags.Options) -> dict[str, Recording]:
-    """What a CSV file holds of each pad, on axis: rows at an angle or from a plane scan belong to `characterise`."""
+    """On-axis rows of each pad in a CSV file; rows at an angle or from a plane scan are for `characterise`."""
     pad = cell.one("pads", options.pad)
     kind = cell.pad_types[cell.pads[pad].type]
     found = recording.read(options.csv, list(kind.electrodes))
@@ -157,8 +157,8 @@ def _recorded(cell: cells.Cell, options: flags.Options) -> dict[str, Recording]:
 def guided(
     cell: cells.Cell, pad: str, connection: bus.Connection, gaps: Sequence[float], seconds: float, console: Console
 ) -> Recording:
-    """Asks for the empty scene and each gap on the terminal (or a pipe of Enters) and records each. Raises RecordingError where
-    the answers end early, BusError where no voltages come."""
+    """Prompt for the empty scene and each gap on the terminal (or a pipe of Enters) and record each. Raises RecordingError if the
+    input ends early, BusError if no voltages arrive."""
     from penumbra.shared.runtime.node import Node
 
     electrodes = tuple(cell.pad_types[cell.pads[pad].type].electrodes)
@@ -206,7 +206,7 @@ def _answer() -> str:
 
 
 class _Ear:
-    """Keeps a pad's batches while asked to."""
+    """Collects a pad's batches during a measurement."""
 
     def __init__(self) -> None:
         self._heard: list[Array] = []
@@ -224,7 +224,7 @@ class _Ear:
                 self._full.set()
 
     def listen(self, seconds: float) -> Array | None:
-        """Samples (s, e) of the next `seconds`, or None where too few arrive."""
+        """Samples (s, e) of the next `seconds`, or None if too few arrive."""
         with self._lock:
             self._heard, self._wanted_s = [], seconds
             self._full.clear()
@@ -237,7 +237,7 @@ class _Ear:
 
 
 def calibrate(cell: cells.Cell, pad: str, recorded: Recording, placing: float = law.PLACING) -> dict[str, Fit]:
-    """The fit of every electrode of a pad. Raises RecordingError that names all electrodes that cannot be fitted."""
+    """Fit every electrode of a pad. Raises RecordingError that names all electrodes that cannot be fitted."""
     kind = cell.pad_types[cell.pads[pad].type]
     chain = kind.chain
     full_scale, lsb = chain.adc_reference / 2.0, chain.adc_reference / (2.0**chain.adc_bits - 1.0)
@@ -262,7 +262,8 @@ def calibrate(cell: cells.Cell, pad: str, recorded: Recording, placing: float = 
 
 
 def describe(fit: Fit) -> dict[str, Any]:
-    """A fit as JSON: the law, relative standard deviations of a1 and a2, that of a3 [V], gain, and where SNR is 1 dB [m]."""
+    """A fit as JSON: the law, relative standard deviations of a1 and a2, that of a3 [V], gain, and the gap [m] at which the SNR
+    is 1 dB."""
     return {
         **fit.law.model_dump(),
         "deviation": dict(zip(("a1", "a2", "a3"), map(float, fit.deviation), strict=True)),
@@ -304,8 +305,8 @@ def _show(console: Console, pad: str, fits: dict[str, Fit], notes: Sequence[str]
 
 
 def write(source: Path, path: Path, laws: dict[str, dict[str, Law]]) -> None:
-    """The cell file at `source` with the laws of these pads, at `path`; its comments and layout stay. The file is replaced
-    only by one that loads. Raises RecordingError where it cannot be read, CellError where it cannot be written."""
+    """Write the cell file at `source` with the laws of these pads to `path`; comments and layout are kept. The file is replaced
+    only by one that loads. Raises RecordingError if it cannot be read, CellError if it cannot be written."""
     editor = YAML()
     editor.preserve_quotes = True
     editor.width = 1 << 20  # breaks no line
@@ -329,7 +330,7 @@ def _block(entries: dict[str, CommentedMap]) -> CommentedMap:
 
 
 def _row(found: Law) -> CommentedMap:
-    """One line; five digits are far below the uncertainty."""
+    """A law as one line of YAML; five digits are far below the uncertainty."""
     values = {name: float(f"{getattr(found, name):.5g}") for name in ("a1", "a2", "a3")}
     out = CommentedMap(**values, polarity=found.polarity, noise=float(f"{found.noise:.4g}"))
     out.fa.set_flow_style()

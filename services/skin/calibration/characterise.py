@@ -1,7 +1,7 @@
 """`penumbra skin characterise`: the paper's characterisation of a pad, on the emulated skin or on a recording of a real one.
 
-Distances, angles and plane scans go through Gaussian-process regression (Rasmussen and Williams 2006), as in the paper; noise and
-signal-to-noise ratio as in its section "Sensor Model". Tables as CSV, and pictures.
+Distances, angles and plane scans are fitted by Gaussian-process regression (Rasmussen and Williams 2006), as in the paper; noise
+and signal-to-noise ratio as in its section "Sensor Model". The results are CSV tables and pictures.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from matplotlib import pyplot as plt
 from penumbra.shared.geometry.rigid import Array
 
 HELD_OUT = 5
-"""Every fifth place of the distances and angles is kept from a second regression, which is judged by it."""
+"""One place in HELD_OUT of the distances and angles is left out of a second regression, which is scored on it."""
 TABLE = ("gap_m", "angle_deg", "electrode", "signal_V", "deviation_V", "regression_V", "low_V", "high_V", "snr_dB")
 """Columns of distances.csv; low and high: one standard deviation around the regression."""
 COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5aa8", "#b8860b", "#4f6d7a", "#a23b72", "#2f4b7c")
@@ -45,8 +45,8 @@ COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5aa8", "#b8860b", "#4f6d7a", "#a
 
 @dataclass(frozen=True)
 class Places:
-    """k places where the pad was held: gap (k,) [m], angle (k,) [degrees], x, y (k,) [m]; signal (k, e) [V], means without their
-    sign; deviation (k, e) [V] of these means."""
+    """k places at which the pad was held: gap (k,) [m], angle (k,) [degrees], x, y (k,) [m]; signal (k, e) [V], absolute means;
+    deviation (k, e) [V]: standard deviations of these means."""
 
     gap: Array
     angle: Array
@@ -92,7 +92,7 @@ def _step(text: str) -> float:
     example="penumbra skin characterise --cell mine.yaml --pad p0 --data recording.csv --out p0",
 )
 def main(options: flags.Options) -> int:
-    """0, or 2 for a recording or a cell that cannot be used."""
+    """Run the command; returns 0, or 2 for an unusable recording or cell."""
     try:
         _characterise(options)
     except (RecordingError, cells.CellError) as error:
@@ -130,7 +130,7 @@ def _characterise(options: flags.Options) -> None:
 
 
 def emulated(cell: cells.Cell, pad: str, target: str, samples: int, step: float, seed: int, sparse: int = 1) -> Recording:
-    """A recording of the emulated skin (`sim.skin.characterisation`); sparse: only every so many poses."""
+    """A recording of the emulated skin (`sim.skin.characterisation`); sparse: only one in `sparse` poses is measured."""
     from penumbra.sim.skin import characterisation
 
     kind = cell.pads[pad].type
@@ -159,8 +159,8 @@ def emulated(cell: cells.Cell, pad: str, target: str, samples: int, step: float,
 
 
 def characterise(cell: cells.Cell, pad: str, recorded: Recording, out: Path) -> dict[str, Any]:
-    """Writes tables and pictures of a recording into a folder; what it found, as JSON. Raises RecordingError
-    where it lacks distances."""
+    """Write tables and pictures of a recording to a folder; returns the results as JSON. Raises RecordingError if there are too
+    few distances."""
     plane = recorded.labels["scan"] == "plane"
     distances = recorded.where(~plane)
     fits = calibrate.calibrate(cell, pad, distances.where(distances.numbers["angle_deg"] == 0.0))
@@ -208,8 +208,8 @@ def places(recorded: Recording, a3: Array, polarity: Array, noise: Array) -> Pla
 
 
 class Regression:
-    """A Gaussian process of an electrode's signal over places (k, d): of asinh(v / 2s), s the noise of a mean. Far out that is
-    the signal itself, with even noise; close in its logarithm, whose changes are as smooth there as anywhere."""
+    """A Gaussian process of an electrode's signal over places (k, d), on asinh(v / 2s) with s the noise of a mean. Far away this
+    is the signal itself, with even noise; close to the pad its logarithm, which is equally smooth everywhere."""
 
     def __init__(self, points: Array, signal: Array, deviation: Array, kernel: Any = None):
         self._unit = 2.0 * float(np.median(deviation))
@@ -223,7 +223,7 @@ class Regression:
         optimiser = "fmin_l_bfgs_b" if kernel is None else None
         self._process = GaussianProcessRegressor(start, alpha=alpha, optimizer=optimiser)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # a length scale at its bound says that nothing changes along it
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a length scale at its bound means that nothing changes along it
             self._process.fit(points, y - self._mean)
         self.kernel = self._process.kernel_
 
@@ -233,19 +233,20 @@ class Regression:
         return tuple(self._unit * np.sinh(mean + self._mean + sign * deviation) for sign in (0.0, -1.0, 1.0))  # type: ignore[return-value]
 
     def misfit(self, points: Array, signal: Array, deviation: Array) -> float:
-        """Root mean square of what other places read less the prediction, in standard deviations of both."""
+        """Root mean square of the differences between readings and predictions at other places, in standard deviations of
+        both."""
         mean, spread = self._process.predict(points, return_std=True)
         left = np.arcsinh(signal / self._unit) - mean - self._mean
         return float(np.sqrt(np.mean(left**2 / (spread**2 + (deviation / np.hypot(signal, self._unit)) ** 2))))
 
 
 def _points(gap: Array, angle: Array) -> Array:
-    """What the regression of distances and angles is over (k, 2): both of about one."""
+    """Inputs (k, 2) of the regression of distances and angles, both of order one."""
     return np.stack([np.log(np.maximum(gap, 1e-3)), angle / 45.0], axis=1)
 
 
 def _grid(near: Places) -> Places:
-    """Even places over the gaps and angles of a recording, for pictures."""
+    """An even grid over the gaps and angles of a recording, for pictures."""
     gaps = np.geomspace(max(near.gap.min(), 1e-3), near.gap.max(), 60)
     angles = np.linspace(near.angle.min(), near.angle.max(), 46 if np.ptp(near.angle) else 1)
     gap, angle = (grid.ravel() for grid in np.meshgrid(gaps, angles))
@@ -254,7 +255,7 @@ def _grid(near: Places) -> Places:
 
 
 def _snr(signal: Array, noise: float) -> Array:
-    """[dB] of one sample; far below zero where nothing is felt."""
+    """Signal-to-noise ratio [dB] of one sample; far below zero where nothing is felt."""
     return 10.0 * np.log10(np.maximum(signal, 1e-7) ** 2 / (2.0 * noise))
 
 
@@ -270,7 +271,7 @@ def _table(path: Path, near: Places, fits: dict[str, law.Fit], noise: Array, fou
 
 
 def _plane(out: Path, part: str, scan: Places, names: list[str], noise: Array) -> dict[str, Any]:
-    """Table and picture of a plane scan, as it was read and by regression; what it found."""
+    """Write table and picture of a plane scan, as measured and by regression; returns its results."""
     points = np.stack([scan.x, scan.y], axis=1)
     xs, ys = (np.linspace(axis.min(), axis.max(), 80) for axis in (scan.x, scan.y))
     fine = np.stack([grid.ravel() for grid in np.meshgrid(xs, ys)], axis=1)
@@ -363,7 +364,7 @@ def _angle_picture(path: Path, grid: Places, names: list[str], noise: Array, sig
 
 
 def _snr_picture(path: Path, near: Places, fits: dict[str, law.Fit]) -> None:
-    """Signal-to-noise ratio against distance at angle zero, and where it sinks to 1 dB."""
+    """Signal-to-noise ratio against distance at angle zero, and the distance at which it falls to 1 dB."""
     figure, axes = plt.subplots(figsize=(6.4, 4.6))
     flat = near.angle == near.angle.min()
     fine = np.geomspace(near.gap[flat].min(), near.gap[flat].max(), 200)

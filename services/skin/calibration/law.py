@@ -1,9 +1,10 @@
-"""The paper's response law fitted to what one electrode read at known gaps: v = a3 + polarity * a1 / (1 + a2 d^2).
+"""Fits the paper's response law to one electrode's readings at known gaps: v = a3 + polarity * a1 / (1 + a2 d^2).
 
-Close in the law itself and the placing of the limb are what is wrong, far out the noise is. A fit in volts sees only the first
-and hides errors of 30 % at 15 cm; a fit of logarithms sees noise as signal there. So every gap weighs by all three: the standard
-error of its mean [V], a share of the signal that the law cannot say (LAW_ERROR), and the slope times the placing's error. The
-loss is robust (soft L1, Triggs et al. 2000, doi:10.1007/3-540-44480-7_21): one gap that was held wrongly counts little.
+At small gaps the errors come from the law itself and from the placing of the limb, at large gaps from noise. A fit in volts sees
+only the first and hides errors of 30 % at 15 cm; a fit of logarithms treats noise as signal there. So every gap is weighted by
+all three: the standard error of its mean [V], a share of the signal that the law cannot represent (LAW_ERROR), and the slope
+times the placing's error. The loss is robust (soft L1, Triggs et al. 2000, doi:10.1007/3-540-44480-7_21): a single wrong gap has
+little weight.
 """
 
 from __future__ import annotations
@@ -19,34 +20,34 @@ from penumbra.shared.cell.pads import Law, Nominal
 from penumbra.shared.geometry.rigid import Array
 
 LAW_ERROR = 0.04
-"""What the law is wrong by, as a share of the signal: that of the field model's responses around it, 1 to 20 cm."""
+"""Error of the law as a share of the signal: that of the field model's responses around it, 1 to 20 cm."""
 PLACING = 5e-4
-"""Standard deviation [m] of a gap that a robot or a rig holds; by hand it is more."""
+"""Standard deviation [m] of a gap held by a robot or a rig; it is larger by hand."""
 SHAPE_SPREAD = 0.2
-"""How far log a2 may lie from the designed one: it belongs to the board's and the limb's shapes. Where the nearest gap leaves a1
-and a2 open (beyond 2 cm only their ratio is seen), this decides."""
+"""Prior standard deviation of log a2 about the designed value, which depends on the shapes of board and limb. The prior decides
+where the nearest gap does not separate a1 and a2 (beyond 2 cm only their ratio is observed)."""
 SNR_DB = 1.0
-"""The paper's end of the range (section "Sensor Model")."""
+"""Signal-to-noise ratio [dB] at the end of the paper's range (section "Sensor Model")."""
 FEWEST = 4
-"""Gaps, an empty scene among them: three parameters and one to check them by."""
+"""Minimum number of gaps, including an empty scene: three parameters and one to check them."""
 SAME_GAP = 1e-4
-"""Gaps that differ by at most this [m] are one."""
+"""Maximum difference [m] between gaps that count as the same."""
 CLIPPED = 0.1
 """Share of the samples at an end of the converter above which a gap is left out."""
 SURE = 6.0
-"""Difference, in standard errors, from which it is significant."""
+"""Number of standard errors above which a difference is significant."""
 MIXED = 0.25
-"""Share of the way there that the signal may go back with the gap before its polarity is unclear."""
+"""Maximum share by which the signal may reverse over the gaps before its polarity counts as unclear."""
 
 
 class RecordingError(ValueError):
-    """Readings that no law can be fitted to; the text says what was expected, what was received and what to do."""
+    """Readings to which no law can be fitted; the text says what was expected, what was received and what to do."""
 
 
 @dataclass(frozen=True)
 class Readings:
-    """What an electrode read at k gaps, rising: gap (k,) [m], infinite where nothing was near; mean (k,) [V] and its standard
-    error (k,); noise [V^2], the variance of one sample, or None where too few samples say; notes: what was left out."""
+    """An electrode's readings at k increasing gaps: gap (k,) [m], infinite where nothing was near; mean (k,) [V] and its standard
+    error (k,); noise [V^2], the variance of one sample, or None if there are too few samples; notes: what was left out."""
 
     gap: Array
     mean: Array
@@ -58,8 +59,8 @@ class Readings:
 @dataclass(frozen=True)
 class Fit:
     """A fitted law. deviation (3,): standard deviations of log a1, log a2 and a3 [V]; covariance (3, 3): of the same; residual
-    (k,): what was read less the law, in standard deviations of all three errors; gain: the signal as a share of the designed
-    law's, over the gaps that were read (a1 alone trades with a2 and says less)."""
+    (k,): readings less the law, in standard deviations of all three errors; gain: the signal as a share of the designed law's,
+    over the measured gaps (a1 alone correlates with a2 and says less)."""
 
     law: Law
     covariance: Array
@@ -73,7 +74,7 @@ class Fit:
 
 
 def signal(law: Law | Nominal, gap: ArrayLike) -> Array:
-    """What something at gaps [m] adds to the amplitude [V], without its sign; nothing at an infinite gap."""
+    """Change of the amplitude [V] by a limb at gaps [m], without its sign; zero at an infinite gap."""
     return law.a1 / (1.0 + law.a2 * np.asarray(gap, np.float64) ** 2)
 
 
@@ -83,14 +84,14 @@ def snr_db(law: Law, gap: ArrayLike) -> Array:
 
 
 def reach(law: Law, snr: float = SNR_DB) -> float:
-    """The gap [m] at which the ratio sinks to `snr` [dB]; zero where it never reaches that."""
+    """The gap [m] at which the ratio falls to `snr` [dB]; zero if it never reaches that."""
     least = np.sqrt(2.0 * law.noise * 10.0 ** (snr / 10.0))
     return float(np.sqrt(max(law.a1 / least - 1.0, 0.0) / law.a2))
 
 
 def white_noise(volts: Array) -> float:
-    """Variance [V^2] of one sample from differences of successive ones (von Neumann 1941, doi:10.1214/aoms/1177731677): a limb
-    that sways or an offset that drifts does not count. Single spikes are left out. volts (s,), s >= 3."""
+    """Variance [V^2] of one sample from differences of successive ones (von Neumann 1941, doi:10.1214/aoms/1177731677), so that a
+    swaying limb or a drifting offset does not count. Single spikes are left out. volts (s,), s >= 3."""
     steps = np.diff(volts)
     typical = 1.4826 * np.median(np.abs(steps))
     kept = steps[np.abs(steps) <= 5.0 * typical] if typical > 0.0 else steps
@@ -98,10 +99,10 @@ def white_noise(volts: Array) -> float:
 
 
 def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str) -> Readings:
-    """The samples of an electrode, brought together by gap.
+    """Group the samples of an electrode by gap.
 
-    gaps (s,) [m], infinite for an empty scene; volts (s,) in the order of time, NaN where a sample is missing; full_scale, lsb
-    [V]: the converter's. Raises RecordingError where too little is left.
+    gaps (s,) [m], infinite for an empty scene; volts (s,) in order of time, NaN where a sample is missing; full_scale, lsb [V]:
+    the converter's. Raises RecordingError if too little is left.
     """
     notes = []
     missing = ~np.isfinite(volts)
@@ -136,10 +137,10 @@ def readings(gaps: Array, volts: Array, full_scale: float, lsb: float, name: str
 
 
 def fit(read: Readings, nominal: Law, name: str, placing: float = PLACING) -> Fit:
-    """The law that an electrode follows.
+    """Fit an electrode's law.
 
-    nominal: its law as designed (the start, and for a2 a weak prior); placing [m]: standard deviation of the gaps.
-    Raises RecordingError where the readings have no contrast, mixed polarity or too short a range.
+    nominal: its law as designed (the start, and for a2 a weak prior); placing [m]: standard deviation of the gaps. Raises
+    RecordingError if the readings have no contrast, mixed polarity or too short a range.
     """
     notes = list(read.notes)
     near = np.isfinite(read.gap)
@@ -158,7 +159,7 @@ def fit(read: Readings, nominal: Law, name: str, placing: float = PLACING) -> Fi
     x = _start(read, polarity, prior)
 
     def parts(x: Array) -> tuple[Array, Array]:
-        """Signal, and its derivative by the gap over it."""
+        """Signal, and the magnitude of its relative derivative by the gap."""
         d = np.where(near, read.gap, 0.0)
         fall = 1.0 + np.exp(x[1]) * d**2
         return np.where(near, np.exp(x[0]) / fall, 0.0), 2.0 * np.exp(x[1]) * d / fall
@@ -167,7 +168,7 @@ def fit(read: Readings, nominal: Law, name: str, placing: float = PLACING) -> Fi
         s = parts(x)[0]
         return np.append((read.mean - x[2] - polarity * s) / deviation, (x[1] - prior) / SHAPE_SPREAD)
 
-    for _ in range(20):  # the errors are shares of the signal, so they follow it
+    for _ in range(20):  # the errors are shares of the signal, so they are updated with it
         s, slope = parts(x)
         deviation = np.sqrt(read.error**2 + s**2 * (LAW_ERROR**2 + (slope * placing) ** 2))
         found = least_squares(standard, x, args=(deviation,), loss="soft_l1", x_scale=(1.0, 1.0, 0.01))
@@ -189,7 +190,7 @@ def fit(read: Readings, nominal: Law, name: str, placing: float = PLACING) -> Fi
 
 
 def _distinct(gaps: Array) -> list[float]:
-    """Gaps that differ by more than SAME_GAP, rising."""
+    """Gaps that differ by more than SAME_GAP, increasing."""
     out: list[float] = []
     for gap in np.unique(gaps):
         if not out or gap - out[-1] > SAME_GAP:
@@ -198,8 +199,8 @@ def _distinct(gaps: Array) -> list[float]:
 
 
 def _mean(volts: Array, lsb: float) -> tuple[float, float]:
-    """Mean without spikes, and its standard error: that of white noise, or of the means of ten stretches where the noise is not
-    white, and at least what rounding may leave of a signal without noise."""
+    """Mean without spikes, and its standard error: that of white noise, or of the means of ten sections if the noise is not
+    white, plus a minimum for rounding of a signal without noise."""
     middle = np.median(volts)
     spread = max(1.4826 * float(np.median(np.abs(volts - middle))), lsb)
     kept = volts[np.abs(volts - middle) <= 6.0 * spread]
@@ -211,13 +212,14 @@ def _mean(volts: Array, lsb: float) -> tuple[float, float]:
 
 
 def _pooled(variances: Array) -> float:
-    """One variance from those of k gaps, (k, 2) with their numbers of samples; gaps with twice the usual one are left out."""
+    """One variance from those of k gaps, (k, 2) with their numbers of samples; gaps with more than twice the median variance are
+    left out."""
     kept = variances[variances[:, 0] <= 2.0 * np.median(variances[:, 0])]
     return float(np.average(kept[:, 0], weights=kept[:, 1]))
 
 
 def _polarity(read: Readings, name: str) -> Literal[-1, 1]:
-    """1 where the amplitude rises as something comes near, -1 where it falls."""
+    """1 if the amplitude rises as a limb approaches, -1 if it falls."""
     low, high = int(np.argmin(read.mean)), int(np.argmax(read.mean))
     span = read.mean[high] - read.mean[low]
     if span < SURE * np.hypot(read.error[low], read.error[high]):
@@ -240,7 +242,7 @@ def _polarity(read: Readings, name: str) -> Literal[-1, 1]:
 
 
 def _start(read: Readings, polarity: int, prior: float) -> Array:
-    """The best of many a2, with a1 and a3 by linear least squares: (log a1, log a2, a3)."""
+    """The best of many values of a2, with a1 and a3 by linear least squares: (log a1, log a2, a3)."""
     best: tuple[float, Array] | None = None
     near = np.isfinite(read.gap)
     for log_a2 in prior + np.linspace(-3.0, 3.0, 25):
@@ -251,7 +253,7 @@ def _start(read: Readings, polarity: int, prior: float) -> Array:
         cost = float(np.sum((design @ (a1, a3) - read.mean * weight) ** 2))
         if a1 > 0.0 and (best is None or cost < best[0]):
             best = (cost, np.array([np.log(a1), log_a2, a3]))
-    if best is None:  # steps against the polarity outweigh: the robust fit starts from the design
+    if best is None:  # most steps contradict the polarity: start the robust fit from the design
         return np.array([np.log(np.ptp(read.mean)), prior, read.mean[-1]])
     return best[1]
 

@@ -1,8 +1,8 @@
-"""Recordings of electrodes at known gaps as CSV: what `penumbra skin calibrate` and `characterise` read and write.
+"""Recordings of electrodes at known gaps as CSV, read and written by `penumbra skin calibrate` and `characterise`.
 
-One row a sample: `distance_m` (empty, `inf` or `empty` where nothing is near) and one column per electrode in volts. More may
-stand beside them: `pad`, `object`, `scan`, and `angle_deg`, `x_m`, `y_m` of the pad. Comma, semicolon or tab; lines that begin
-with # are skipped.
+One row per sample: `distance_m` (empty, `inf` or `empty` if nothing is near) and one column per electrode in volts. Optional
+columns: `pad`, `object`, `scan`, and `angle_deg`, `x_m`, `y_m` of the pad. Separators are comma, semicolon or tab; lines that
+begin with # are skipped.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from penumbra.shared.geometry.rigid import Array
 UNITS = {"distance_m": 1.0, "distance_cm": 0.01, "distance_mm": 0.001}
 EMPTY = ("", "inf", "infinity", "empty", "rest", "none")
 FARTHEST = 2.0
-"""A gap above this [m] is in other units: nothing is felt from there."""
+"""Maximum plausible gap [m]. A larger number is in other units: nothing is felt from there."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """s samples in the order of time. gap (s,) [m], infinite where nothing was near; volts (s, e), NaN where a cell is empty or
-    not a number; labels: the texts by column (s,), "" where a file has no such column; numbers: by column (s,), zero likewise;
-    notes: what was passed over."""
+    """s samples in order of time. gap (s,) [m], infinite where nothing was near; volts (s, e), NaN where a cell is empty or not a
+    number; labels: texts by column (s,), "" if a file has no such column; numbers: by column (s,), zero likewise; notes: what was
+    skipped."""
 
     gap: Array
     volts: Array
@@ -38,7 +38,7 @@ class Recording:
     notes: tuple[str, ...] = ()
 
     def where(self, rows: NDArray[np.bool_]) -> Recording:
-        """Some of its samples."""
+        """The samples with these rows (s,)."""
         labels = {name: column[rows] for name, column in self.labels.items()}
         numbers = {name: column[rows] for name, column in self.numbers.items()}
         return Recording(self.gap[rows], self.volts[rows], self.electrodes, labels, numbers, self.notes)
@@ -49,7 +49,7 @@ NUMBERS = ("angle_deg", "x_m", "y_m")
 
 
 def read(path: Path, electrodes: Sequence[str]) -> Recording:
-    """The recording in a file, with these electrodes. Raises RecordingError with the line of what cannot be read."""
+    """Read a recording of these electrodes from a file. Raises RecordingError with the line that cannot be read."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -111,7 +111,7 @@ def read(path: Path, electrodes: Sequence[str]) -> Recording:
 
 
 def write(path: Path, recording: Recording, about: str) -> None:
-    """A recording as `read` reads it; columns that say nothing are left out. about: the file's first line."""
+    """Write a recording in the form that `read` reads; columns without data are left out. about: the file's first line."""
     labels = [name for name, column in recording.labels.items() if (column != "").any()]
     numbers = [name for name, column in recording.numbers.items() if column.any()]
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
-"""Where a pad may sit: on the surface of robot links, or in the plane of a cell's pads that sit on the world.
+"""Candidate poses of pads: on the surface of robot links, or in the plane of a cell's pads that sit on the world.
 
-A pad is a flat board. On a link it lies on the collision mesh, its normal outwards: every part of it has the link within SAG
-behind it, so that it does not stand out over an edge, and no other link comes into the room before it.
+A pad is a flat board. On a link it lies on the collision mesh, its normal outwards: the link is within SAG behind every part of
+it, so that it does not stand out over an edge, and no other link enters the room before it.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from penumbra.shared.geometry.rigid import Array
 STEP = 0.03
 """Distance [m] between neighbouring candidates: half a pad."""
 SAG = 0.02
-"""Largest depth [m] of a link's surface behind any part of a board that touches it. A board of 6 cm on a tube of 8 cm in diameter
+"""Maximum depth [m] of a link's surface behind any part of a board that touches it. A board of 6 cm on a tube of 8 cm in diameter
 has 1.5 cm at its corners."""
 STANDOFF = 0.0005
 """Distance [m] between the back of a board and the highest point of the surface behind it."""
 APART = 0.002
-"""Least distance [m] between two boards."""
+"""Minimum distance [m] between two boards."""
 ROOM = 0.03
-"""Room [m] before a board into which no other link may come."""
+"""Room [m] before a board which no other link may enter."""
 FLAT = (0.005, np.radians(2.0))
-"""Pads on the world are in one plane where they are within this height [m] and angle [rad] of the first one."""
+"""Maximum height [m] and angle [rad] relative to the first pad with which pads on the world are in one plane."""
 SAMPLES = 6000
-"""Points drawn on a link's surface, of which candidates are every STEP."""
+"""Number of points drawn on a link's surface, from which candidates are thinned to every STEP."""
 GRID = 7
-"""A board is tested at so many points along each side."""
+"""Number of test points along each side of a board."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane for pads on the world. T_world_plane (4, 4): z outwards; low, high (2,) [m]: where boards may lie, in its frame."""
+    """A plane for pads on the world. T_world_plane (4, 4): z outwards; low, high (2,) [m]: bounds of the boards, in its frame."""
 
     T_world_plane: Array
     low: Array
@@ -49,8 +49,8 @@ class Plane:
 
 
 def surface_points(mesh: Mesh, step: float, count: int = SAMPLES) -> tuple[Array, Array]:
-    """Points (n, 3) on a mesh, no two nearer than `step` [m], and the outward normals (n, 3) of their faces: the same ones
-    every time."""
+    """Points (n, 3) on a mesh, no two nearer than `step` [m], and the outward normals (n, 3) of their faces; the result is
+    deterministic."""
     rng = np.random.default_rng(0)
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -70,7 +70,7 @@ def surface_points(mesh: Mesh, step: float, count: int = SAMPLES) -> tuple[Array
 
 
 def on_link(mesh: Mesh, board: Board, step: float) -> list[Array]:
-    """T_link_pad (4, 4) of candidates on a link, at most one in `step` [m]."""
+    """T_link_pad (4, 4) of candidates on a link, at least `step` [m] apart."""
     dense, normals = surface_points(mesh, step / 3.0)
     axes = np.linalg.svd(dense - dense.mean(axis=0), full_matrices=False)[2]
     found: list[Array] = []
@@ -97,8 +97,8 @@ def _frame(point: Array, z: Array, axes: Array) -> Array:
 
 
 def footprint(mesh: Mesh, T_link_pad: Array, board: Board) -> Array:
-    """Heights (GRID * GRID,) [m] over the pad's plane of the link's outermost surface behind a board, of what is at most 5 cm
-    above that plane; minus infinity where there is none."""
+    """Heights (GRID * GRID,) [m] of the link's outermost surface behind a board, relative to the pad's plane and at most 5 cm
+    above it; minus infinity where there is none."""
     corners = rigid.apply(rigid.inverse(T_link_pad), mesh.vertices)[mesh.faces]
     half = 0.5 * np.asarray(board.size)
     near = ((corners[..., :2].min(axis=1) <= half) & (corners[..., :2].max(axis=1) >= -half)).all(axis=1)
@@ -106,18 +106,18 @@ def footprint(mesh: Mesh, T_link_pad: Array, board: Board) -> Array:
 
 
 def _grid(board: Board) -> Array:
-    """Points (GRID * GRID, 2) [m] all over a board, its corners among them."""
+    """Points (GRID * GRID, 2) [m] all over a board, including its corners."""
     x, y = (np.linspace(-0.5, 0.5, GRID) * side for side in board.size)
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def _heights(corners: Array, points: Array, most: float = 0.05) -> Array:
-    """The largest z (k,), up to `most`, where lines along z through points (k, 2) cut triangles (m, 3, 3); minus infinity where
-    they cut none."""
+    """The largest z (k,), up to `most`, at which lines along z through points (k, 2) intersect triangles (m, 3, 3); minus
+    infinity where they intersect none."""
     a, b, c = np.moveaxis(corners, 1, 0)
     one, two = b[:, :2] - a[:, :2], c[:, :2] - a[:, :2]
     twice = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
-    flat = np.abs(twice) > 1e-12  # seen from above, not from the side
+    flat = np.abs(twice) > 1e-12  # skip triangles seen edge-on
     a, b, c, one, two, twice = (each[flat] for each in (a, b, c, one, two, twice))
     to = points[:, None, :] - a[None, :, :2]
     u = (to[..., 0] * two[:, 1] - to[..., 1] * two[:, 0]) / twice
@@ -128,7 +128,7 @@ def _heights(corners: Array, points: Array, most: float = 0.05) -> Array:
 
 
 def in_plane(plane: Plane, board: Board, step: float) -> list[Array]:
-    """T_world_pad (4, 4) of candidates every `step` [m] in a plane, boards within its bounds."""
+    """T_world_pad (4, 4) of candidates every `step` [m] in a plane, with boards within its bounds."""
     half = 0.5 * np.asarray(board.size)
     axes = []
     for low, high, inset in zip(plane.low, plane.high, half, strict=True):
@@ -139,8 +139,8 @@ def in_plane(plane: Plane, board: Board, step: float) -> list[Array]:
 
 
 def plane_of(cell: cells.Cell, reach: float) -> Plane | None:
-    """The plane of the pads on the world, None where there are none: over the table of the emulator where the cell has one,
-    otherwise so far [m] around these pads. Raises CellError where they are in several planes."""
+    """The plane of the pads on the world, None if there are none: bounded by the emulator's table if the cell has one at this
+    plane, otherwise by `reach` [m] around these pads. Raises CellError if they are in several planes."""
     pads = {name: pad for name, pad in cell.pads.items() if pad.link == "world"}
     if not pads:
         return None
@@ -164,7 +164,7 @@ def plane_of(cell: cells.Cell, reach: float) -> Plane | None:
 def clear_of_links(
     pads: Sequence[Pad], board: Board, links: Mapping[str, Array], points: Mapping[str, Array]
 ) -> NDArray[np.bool_]:
-    """Whether (c,) no other link comes into the room before a pad, for poses (k, 4, 4) of links and points (m, 3) on them."""
+    """Whether (c,) no other link enters the room before a pad, for poses (k, 4, 4) of links and points (m, 3) on them."""
     half = 0.5 * np.asarray(board.size)
     clear = np.ones(len(pads), bool)
     for k in range(len(next(iter(links.values())))):
@@ -179,7 +179,7 @@ def clear_of_links(
 
 
 def overlaps(T_world_pads: Array, board: Board) -> NDArray[np.bool_]:
-    """Which pairs (c, c) of boards at T_world_pads (c, 4, 4) lie in each other; none with itself."""
+    """Pairs (c, c) of boards at T_world_pads (c, 4, 4) that overlap; none with itself."""
     half = np.append(0.5 * np.asarray(board.size) + APART, ROOM)
     grid = np.column_stack([_grid(board), np.zeros(GRID * GRID)])
     T = np.asarray(T_world_pads)
@@ -195,8 +195,8 @@ def overlaps(T_world_pads: Array, board: Board) -> NDArray[np.bool_]:
 
 
 def carriers(cell: cells.Cell, models: Mapping[str, RobotModel], wanted: Iterable[str]) -> tuple[str, ...]:
-    """The links to place pads on, as in `link` of a pad: those that are wanted (ROBOT/LINK, LINK or world), otherwise those that
-    carry pads now, otherwise all that have a mesh. Raises CellError."""
+    """The links to place pads on, as in `link` of a pad: the wanted ones (ROBOT/LINK, LINK or world), otherwise those that carry
+    pads now, otherwise all that have a mesh. Raises CellError."""
     known = [f"{robot}/{link}" for robot, model in models.items() for link in model.links]
     solid = [f"{robot}/{link}" for robot, model in models.items() for link in model.meshes]
     if not known and not cell.pads:

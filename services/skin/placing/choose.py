@@ -1,9 +1,9 @@
-"""Which of many candidates to take: greedily, then exchanged one for another until no exchange helps.
+"""Selects pads from many candidates: greedily, then by exchanges until no exchange helps.
 
 The cost of a choice is the expected error of the position, by the Cramér-Rao bound with a prior, averaged over scenes: A-optimal
 design. Greedy choice comes within 1 - 1/e of the best one where gains diminish (Nemhauser, Wolsey, Fisher 1978, DOI
-10.1007/BF01588971; for placing sensors Krause, Singh, Guestrin 2008, JMLR 9:235). A-optimal costs have that property nearly
-(Chamon, Ribeiro 2017, Approximate supermodularity bounds for experimental design, NeurIPS); exchanges make up for the rest.
+10.1007/BF01588971; for placing sensors Krause, Singh, Guestrin 2008, JMLR 9:235). A-optimal costs have nearly this property
+(Chamon, Ribeiro 2017, Approximate supermodularity bounds for experimental design, NeurIPS); exchanges improve on the rest.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.skin import bound
 
 GAIN = 1e-3
-"""Least relative gain of the cost for which a pad is exchanged."""
+"""Minimum relative gain of the cost for which a pad is exchanged."""
 SWEEPS = 10
-"""Largest number of times that every pad is tried to be exchanged; few are needed."""
+"""Maximum number of rounds of exchanges over all pads; few are needed."""
 
 
 class Choice:
-    """information (n, c, 8, 8): of each candidate in each scene; prior (8, 8); overlaps (c, c): which pairs cannot be taken
-    together."""
+    """A selection problem. information (n, c, 8, 8): of each candidate in each scene; prior (8, 8); overlaps (c, c): pairs that
+    cannot be chosen together."""
 
     def __init__(self, information: Array, prior: Array, overlaps: NDArray[np.bool_]):
         self._information, self._prior, self._overlaps = information, prior, overlaps
@@ -34,7 +34,7 @@ class Choice:
         return bound.position_error(self._total(chosen))
 
     def more(self, chosen: Sequence[int], number: int) -> list[int]:
-        """These candidates and others, greedily, up to so many or as many as there is room for."""
+        """Add candidates greedily, up to `number` in all or as many as there is room for."""
         out = list(chosen)
         while len(out) < number and (free := self._free(out)).any():
             costs = self._costs(out, free)
@@ -42,7 +42,7 @@ class Choice:
         return out
 
     def exchanged(self, chosen: Sequence[int]) -> list[int]:
-        """As many candidates, none of which can be exchanged for another one that is better."""
+        """Exchange candidates until no single exchange improves the cost."""
         out = list(chosen)
         best = float(self.errors(out).mean())
         for _ in range(SWEEPS):
@@ -61,13 +61,13 @@ class Choice:
         return self._prior + self._information[:, list(chosen)].sum(axis=1)
 
     def _free(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
-        """Which candidates (c,) can be added."""
+        """Candidates (c,) that can be added."""
         free = np.asarray(~self._overlaps[:, list(chosen)].any(axis=1))
         free[list(chosen)] = False
         return free
 
     def _costs(self, chosen: Sequence[int], free: NDArray[np.bool_]) -> Array:
-        """The cost (c,) with one more candidate; infinite for one that is not free."""
+        """The cost (c,) with one more candidate; infinite for one that cannot be added."""
         costs, total = np.full(len(free), np.inf), self._total(chosen)
         for candidate in np.flatnonzero(free):
             costs[candidate] = bound.position_error(total + self._information[:, candidate]).mean()

@@ -1,4 +1,4 @@
-"""Finds pads for a workspace, and says what they and the present ones can tell."""
+"""Finds pads for a workspace, and evaluates them and the present ones."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 SCENES, FRESH = 160, 300
-"""Number of scenes that pads are chosen for, and of others that the result is reported for."""
+"""Number of scenes for which pads are chosen, and of other scenes on which the result is reported."""
 POSTURES = 8
-"""Number of the robots' postures in which a place must be clear of other links."""
+"""Number of robot postures in which a place must be clear of other links."""
 SOLID = 0.03
-"""Distance [m] between the points that stand for a link where a limb keeps clear of it."""
+"""Distance [m] between the points that represent a link from which a limb keeps clear."""
 MORE = 4
-"""Number of pads beyond those that are wanted whose gain is reported."""
+"""Number of pads beyond the wanted ones whose gain is reported."""
 FINE_M = 0.02
-"""An error up to which a limb counts as felt well."""
+"""Error [m] up to which a limb counts as felt well."""
 DIGITS = 4
-"""Of positions [m] and angles [rad] of proposed pads."""
+"""Number of decimals of positions [m] and angles [rad] of proposed pads."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What is asked for. links: as in `candidates.carriers`; number: of pads, as many as now if None; box (2, 3) [m]: bounds of
+    """The user's request. links: as in `candidates.carriers`; number: of pads, as many as now if None; box (2, 3) [m]: bounds of
     the target's position; reach [m]: as in `Room`; joints: of all robots, those of the emulator if None."""
 
     target: str | None = None
@@ -50,7 +50,7 @@ class Wish:
 
 @dataclass(frozen=True)
 class Step:
-    """What so many pads can tell: `errors` (n,) [m] of fresh scenes."""
+    """Result for a number of pads: `errors` (n,) [m] of fresh scenes."""
 
     pads: int
     errors: Array
@@ -60,7 +60,8 @@ class Step:
 
 
 def summary(errors: Array) -> dict[str, float]:
-    """Median, 95th percentile and mean [cm] of expected errors (n,) [m], and the share that is felt well."""
+    """Median, 95th percentile and mean [cm] of expected errors (n,) [m], and the share of scenes in which the limb is felt
+    well."""
     median, p95 = np.percentile(100.0 * errors, [50.0, 95.0])
     return {
         "median_cm": round(float(median), 2),
@@ -71,7 +72,7 @@ def summary(errors: Array) -> dict[str, float]:
 
 
 class Placing:
-    """A cell and a wish, with all that follows from them. Raises CellError for a wish that cannot be met."""
+    """A cell and a wish, with everything derived from them. Raises CellError for a wish that cannot be met."""
 
     def __init__(self, cell: cells.Cell, wish: Wish):
         self.cell, self.wish = cell, wish
@@ -91,18 +92,18 @@ class Placing:
 
     @property
     def present(self) -> dict[str, Pad]:
-        """The pads of the cell file, as designed: what they would be like anywhere."""
+        """The pads of the cell file with their designed laws, for comparison at any place."""
         designed: dict[str, Any] = {"calibration": {}, "boards": ()}
         return {name: pad.model_copy(update=designed) for name, pad in self.cell.pads.items() if pad.type == self.kind}
 
     @property
     def number(self) -> int:
-        """How many pads are wanted."""
+        """Number of wanted pads."""
         return self.wish.number or len(self.present) or 8
 
     @cached_property
     def room(self) -> Room:
-        """Where a limb may be, around all places that a pad could have."""
+        """The region of the limb, around all possible places of pads."""
         solids = {
             f"{robot}/{link}": candidates.surface_points(mesh, SOLID)[0]
             for robot, model in self.models.items()
@@ -113,17 +114,17 @@ class Placing:
 
     @cached_property
     def scenes(self) -> Scenes:
-        """Those that pads are chosen for."""
+        """The scenes for which pads are chosen."""
         return self.drawing.draw(self.room, SCENES, self.wish.seed)
 
     @cached_property
     def fresh(self) -> Scenes:
-        """Others, which nothing was chosen for."""
+        """Other scenes, for which nothing was chosen."""
         return self.drawing.draw(self.room, FRESH, self.wish.seed + 1)
 
     def possible(self) -> Sensing:
-        """All places from which the limb is felt in some of the scenes, with their field models; those of the present pads on the
-        same links come first."""
+        """All places from which the limb is felt in enough scenes, with their field models. The present pads on the same links
+        come first and are always included."""
         kept = [pad for pad in self.present.values() if pad.link in self.links]
         pads = (*kept, *(self.pad(link, T) for link, own in self.room.places.items() for T in own))
         gaps, before = sensing.meeting(self.drawing, self.scenes, pads)
@@ -140,11 +141,11 @@ class Placing:
         return self.fields.sensing(self.drawing, tuple(pads), self.scenes)
 
     def taken(self, layout: Sensing) -> float | None:
-        """The share of a layout's signals that links beside those behind the pads take, see `FieldModels.taken`."""
+        """The share of a layout's signals that links other than those behind the pads take, see `FieldModels.taken`."""
         return self.fields.taken(self.drawing, layout.pads, self.fresh, self.room)
 
     def pad(self, link: str, T_link_pad: Array) -> Pad:
-        """A pad at a place. Before a link it has the link behind it, unless the pads on links of this cell have not."""
+        """A pad at a place. On a link it is backed by it, unless the pads on links of this cell are not."""
         position, orientation = rigid.position_orientation(T_link_pad)
         on_links = [pad.backed for pad in self.present.values() if pad.link != "world"]
         return Pad(
@@ -156,7 +157,7 @@ class Placing:
         )
 
     def choose(self) -> tuple[Sensing, list[Step]]:
-        """The proposed pads, and what each number of pads can tell, up to MORE than wanted. Raises CellError where there is no
+        """The proposed pads, and the result for each number of pads, up to MORE than wanted. Raises CellError if there is no
         room."""
         possible = self.possible()
         T = self.drawing.middle
@@ -206,7 +207,7 @@ class Placing:
         return np.array([sim.joints_low, sim.joints_high]) if names and sim is not None else np.zeros((2, 0))
 
     def _places(self, solids: Mapping[str, Array]) -> dict[str, list[Array]]:
-        """T_link_pad of all places by link, clear of other links in several postures."""
+        """T_link_pad of all places by link that are clear of other links in several postures."""
         links = self.drawing.links(self.drawing.postures(np.random.default_rng([self.wish.seed, 52]), POSTURES))
         out = {}
         for link in track(self.links, "places on links"):

@@ -20,18 +20,18 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 CELLS = 28
-"""Squares along the longer side of a map."""
+"""Number of squares along the longer side of a map."""
 MARGIN = 0.10
-"""How far [m] a map goes beyond the workspace."""
+"""Margin [m] of a map around the workspace."""
 RANGE_CM = (0.1, 20.0)
-"""Ends of the colour scale."""
+"""Limits [cm] of the colour scale."""
 AXES = "xyz"
 
 
 @dataclass(frozen=True)
 class Slice:
-    """A plane through the workspace. across: the axis of the world that it is across; at: where on that axis [m]; errors
-    (rows, columns) [m]: by the two other axes, nan where the limb would touch something; extent: of these axes."""
+    """A plane through the workspace. across: the axis of the world normal to it; at: its position on that axis [m]; errors (rows,
+    columns) [m]: by the two other axes, nan where the limb would touch something; extent: of these axes."""
 
     across: int
     at: float
@@ -46,7 +46,7 @@ class Slice:
 
 
 def write(path: Path, placing: Placing, layouts: Mapping[str, Sensing]) -> None:
-    """Maps of these layouts beside one another, as PNG. Raises OSError."""
+    """Write maps of these layouts side by side, as PNG. Raises OSError."""
     figure = Figure(figsize=(4.6 * len(layouts) + 1.2, 7.4), layout="constrained")
     grid = figure.subplots(2, len(layouts), squeeze=False)
     picture, bounds = None, _bounds(placing, layouts)
@@ -78,7 +78,7 @@ def write(path: Path, placing: Placing, layouts: Mapping[str, Sensing]) -> None:
 
 
 def _bounds(placing: Placing, layouts: Mapping[str, Sensing]) -> Array:
-    """Corners (2, 3) [m] in the world of what maps show: the workspace, and the pads."""
+    """Corners (2, 3) [m] in the world of the mapped region: the workspace and the pads."""
     low, high = np.percentile(placing.fresh.targets[:, :3, 3], [2.0, 98.0], axis=0)
     middle = placing.drawing.middle
     pads = np.array([(middle[pad.link][0] @ pad.T_link_pad)[:3, 3] for each in layouts.values() for pad in each.pads])
@@ -87,8 +87,8 @@ def _bounds(placing: Placing, layouts: Mapping[str, Sensing]) -> Array:
 
 
 def slice_of(placing: Placing, sensing: Sensing, across: int, bounds: Array) -> Slice:
-    """The map of a layout across an axis of the world, through the middle of the workspace, within bounds (2, 3) [m]: the limb
-    lies as at home, robots are in the middle of their joints' bounds."""
+    """The map of a layout normal to an axis of the world, through the middle of the workspace, within bounds (2, 3) [m]. The limb
+    has its home orientation, and the robots are in the middle of their joints' bounds."""
     low, high = bounds
     at = float(np.median(placing.fresh.targets[:, across, 3]))
     right, up = (axis for axis in range(3) if axis != across)

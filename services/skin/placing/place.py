@@ -72,7 +72,7 @@ LEFT_OUT = (
     example="penumbra skin place --cell arm --links panda_link5 panda_link6 panda_hand -o pads.png",
 )
 def main(options: flags.Options) -> int:
-    """0, or 2 for a cell or a wish that cannot be used."""
+    """Run the command; returns 0, or 2 for an unusable cell or wish."""
     try:
         _place(options)
     except (cells.CellError, OSError) as error:
@@ -103,7 +103,7 @@ def _place(options: flags.Options) -> None:
         _show(console, placing, errors, steps, named)
         _warn(console, taken, named)
     if options.out is not None:
-        from penumbra.services.skin.placing import picture  # matplotlib takes a second to import
+        from penumbra.services.skin.placing import picture  # importing matplotlib takes a second
 
         picture.write(options.out, placing, {f"{len(each.pads)} pads, {name}": each for name, each in layouts.items()})
         print(f"{options.out}: maps of the expected error", file=sys.stderr)
@@ -136,13 +136,13 @@ def _refuse_fewer(cell: cells.Cell, number: int) -> None:
 
 
 def names(old: Sequence[str], pads: Sequence[Pad]) -> dict[str, Pad]:
-    """Pads under the names of old ones, and further names where these are more."""
+    """Name pads by the old names, and by new names if there are more pads."""
     fresh = (name for k in range(len(old) + len(pads)) if (name := f"p{k}") not in old)
     return {(old[k] if k < len(old) else next(fresh)): pad for k, pad in enumerate(pads)}
 
 
 def line(pad: Pad, before: Pad | None = None) -> str:
-    """A pad as YAML in one line, with the boards that read the one that it replaces."""
+    """A pad as YAML in one line, with the boards of the pad that it replaces."""
     values: dict[str, Any] = {"type": pad.type, "link": pad.link, "position": list(pad.position), "rpy": list(pad.rpy)}
     if pad.link == "world":
         del values["link"]
@@ -208,7 +208,7 @@ def _show(
 
 
 def _warn(console: Console, taken: Mapping[str, float | None], named: Mapping[str, Pad]) -> None:
-    """What the numbers leave out, and what is to be done with new pads."""
+    """Print what the numbers leave out, and what to do with new pads."""
     known = [f"{100 * share:.0f} % of the signals of the {name} pads" for name, share in taken.items() if share is not None]
     if known:
         console.print(f"Not counted: other links than the one behind a pad take {', '.join(known)} (median).")

@@ -1,4 +1,4 @@
-"""The scenes for which pads are judged: a limb somewhere in its workspace, each with a posture of the robots."""
+"""Scenes on which pads are judged: a limb somewhere in its workspace, each with a posture of the robots."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import HOME_SIGMAS, link_names
 
 GAP = 0.01
-"""No limb is nearer [m] to a link or to the pads' plane."""
+"""Minimum distance [m] of a limb from a link or from the pads' plane."""
 BATCH, BATCHES = 300, 100
-"""Number of poses drawn at once, and how often. A workspace with no free pose in the first batch, or with too few in all, is
-called too small."""
+"""Number of poses drawn per batch, and maximum number of batches. A workspace with no free pose in the first batch, or with too
+few in all, counts as too small."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,8 @@ class Scenes:
 
 @dataclass(frozen=True)
 class Room:
-    """What a limb must keep clear of, and what it must be near. solids: points (m, 3) on each link, by ROBOT/LINK; plane (4, 4):
-    T_world_plane of a table top, z outwards; places: T_link_pad (4, 4) where pads may sit, by link; reach [m]: largest gap to the
-    nearest one."""
+    """Constraints on the limb's place. solids: points (m, 3) on each link, by ROBOT/LINK; plane (4, 4): T_world_plane of a table
+    top, z outwards; places: T_link_pad (4, 4) where pads may sit, by link; reach [m]: maximum gap to the nearest place."""
 
     solids: Mapping[str, Array]
     plane: Array | None
@@ -52,7 +51,7 @@ class Room:
 
 class Drawing:
     """Draws scenes of a cell's target. box (2, 3) [m]: bounds of its position in the world, uniformly drawn; without one the
-    target is around its home, as the cell file says. joints: bounds (2, j) of all robots' joints."""
+    target is drawn around its home in the cell file. joints: bounds (2, j) of all robots' joints."""
 
     def __init__(self, cell: cells.Cell, target: str, models: Mapping[str, RobotModel], box: Array | None, joints: Array):
         self.target, self.mesh = cell.targets[target], target_mesh(cell.targets[target], cell)
@@ -79,7 +78,7 @@ class Drawing:
         return self.links(self._joints.mean(axis=0)[None])
 
     def pose(self, rng: np.random.Generator) -> Array:
-        """A random T_world_target (4, 4), whatever is in its way."""
+        """A random T_world_target (4, 4), without regard to obstacles."""
         home, spread = self.target.home.transform, self.target.home_spread
         turn = _cut(rng, 3) * spread.rotation
         T = rigid.perturb(home, np.concatenate([_cut(rng, 3) * spread.position, turn]))
@@ -88,8 +87,8 @@ class Drawing:
         return T
 
     def gaps(self, T: Array, links: Mapping[str, Array], room: Room, k: int = 0) -> tuple[float, float]:
-        """Of a limb at T (4, 4), with links as in scene k: the smallest distance [m] to links and plane, and to a place of a pad;
-        infinite where they are more than GAP, and than the room's reach."""
+        """For a limb at T (4, 4), with links as in scene k: the smallest distance [m] to links and plane, and to a place of a
+        pad. They may be infinite beyond GAP and beyond the room's reach; the second is infinite if the first is below GAP."""
         solids = [rigid.apply(links[name][k], points) for name, points in room.solids.items()]
         clear = self._distance(T, solids, GAP)
         if room.plane is not None:
@@ -101,13 +100,13 @@ class Drawing:
         return clear, self._distance(T, places, room.reach)
 
     def _distance(self, T: Array, points: Sequence[Array], most: float) -> float:
-        """The smallest distance [m] from a limb at T (4, 4) to points (n, 3); infinite where it is certainly more than `most`."""
+        """The smallest distance [m] from a limb at T (4, 4) to points (n, 3); infinite if it certainly exceeds `most`."""
         local = (np.concatenate([*points, np.empty((0, 3))]) - T[:3, 3]) @ T[:3, :3]
         local = local[(local**2).sum(axis=1) < (self._radius + most) ** 2]
         return float(self.surface.nearest(local)[0].min(initial=np.inf))
 
     def draw(self, room: Room, count: int, seed: int) -> Scenes:
-        """So many scenes in which the limb keeps clear and is within reach. Raises CellError where there are hardly any."""
+        """Draw `count` scenes in which the limb keeps clear and is within reach. Raises CellError if there are hardly any."""
         rng = np.random.default_rng([seed, 51])
         poses: list[Array] = []
         postures: list[Array] = []
@@ -133,7 +132,7 @@ class Drawing:
 
 
 def _cut(rng: np.random.Generator, count: int) -> Array:
-    """Standard normal numbers (count,), drawn again where they exceed HOME_SIGMAS."""
+    """Standard normal numbers (count,), redrawn if they exceed HOME_SIGMAS."""
     out = rng.standard_normal(count)
     while (far := np.abs(out) > HOME_SIGMAS).any():
         out[far] = rng.standard_normal(int(far.sum()))

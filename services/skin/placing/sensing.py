@@ -1,4 +1,4 @@
-"""What pads at given places would tell about a limb, scene by scene."""
+"""Computes the information of pads at given places about a limb, per scene."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ from penumbra.shared.skin.layout import Skin
 from penumbra.shared.skin.response import Network, Response, fingerprint, networks
 
 SAMPLES = 20
-"""Number of samples of a millisecond in a window of `penumbra haptics`, whose poses the expected errors are for."""
+"""Number of samples (one per millisecond) in a window of `penumbra haptics`, for whose poses the errors are expected."""
 BEHIND = -0.15
-"""A limb whose nearest point is farther behind the pad's plane than this cosine is not felt: field models are fitted up to there
-(`penumbra skin model`)."""
+"""Minimum cosine between the pad's normal and the direction to the limb's nearest point: beyond it the limb is not felt, and
+field models are fitted only up to there (`penumbra skin model`)."""
 FEWEST = 12
-"""A place from which a limb is felt in fewer of the scenes is of no use."""
+"""Minimum number of scenes in which a limb must be felt from a useful place."""
 MEASURED = 30
-"""Number of limbs for which it is computed what other links take."""
+"""Number of limbs for which the effect of other links is computed."""
 RANGES = 1.7
-"""Largest gap, in ranges of a pad, at which a limb counts for the model of a place: beyond it the signal is lost in the noise."""
+"""Maximum gap, in ranges of a pad, at which a limb is used for the model of a place: beyond it the signal is lost in the
+noise."""
 
 
 def meeting(drawing: Drawing, scenes: Scenes, pads: tuple[Pad, ...]) -> tuple[Array, NDArray[np.bool_]]:
@@ -63,7 +64,7 @@ class Sensing:
 
     @property
     def prior(self) -> Array:
-        """Information (8, 8) about pose and size before anything is felt."""
+        """Prior information (8, 8) about pose and size."""
         return bound.prior(self.drawing.target)
 
     def information(self, scenes: Scenes) -> Array:
@@ -81,8 +82,8 @@ class Sensing:
 
 
 class FieldModels:
-    """Field models of the pads of a kind (a key of `pad_types`) of a cell for a target, at any places. Raises CellError where
-    there is no model of a bare pad."""
+    """Field models of one type of pad (a key of `pad_types`) of a cell for a target, at any places. Raises CellError if there is
+    no model of a bare pad."""
 
     def __init__(self, cell: cells.Cell, target: str, kind: str, models: Mapping[str, RobotModel]):
         self._cell, self._target, self._models = cell, target, models
@@ -98,7 +99,7 @@ class FieldModels:
         self._bare, self._kind = self._known[bare], cell.pad_types[kind]
 
     def sensing(self, drawing: Drawing, pads: tuple[Pad, ...], scenes: Scenes) -> Sensing:
-        """Pads with their field models; those before links are made for the limbs of these scenes."""
+        """Pads with their field models; models of backed pads are made for the limbs of these scenes."""
         cell = _with(self._cell, pads)
         gaps, before = meeting(drawing, scenes, pads)
         known = dict(self._known)
@@ -108,8 +109,8 @@ class FieldModels:
         return Sensing(drawing, pads, Skin(cell), Response(cell, self._target, known), self.size)
 
     def taken(self, drawing: Drawing, pads: tuple[Pad, ...], scenes: Scenes, room: Room) -> float | None:
-        """The share of the signals of pads before links, in the median, that the other links take, which no field model has: in
-        the middle of the joints' bounds, for the limbs of these scenes that keep clear then. None where no such pad feels one."""
+        """Median share of the signals of backed pads that other links take; no field model contains it. It is computed in the
+        middle of the joints' bounds, for the limbs of these scenes that keep clear there. None if no such pad feels one."""
         links = {name: T[0] for name, T in drawing.middle.items()}
         clear = [T for T in scenes.targets if drawing.gaps(T, drawing.middle, room)[0] >= GAP][:MEASURED]
         meshes = {f"{robot}/{link}": mesh for robot, model in self._models.items() for link, mesh in model.meshes.items()}
@@ -133,7 +134,7 @@ class FieldModels:
         robot, _, link = pad.link.partition("/")
         felt = np.flatnonzero(before & (gaps < RANGES * self._kind.range))
         if not len(felt):
-            return self._bare  # nothing of it counts: see `Sensing.information`
+            return self._bare  # its information is zero: see `Sensing.information`
         T_pad_world = np.stack([rigid.inverse(T @ pad.T_link_pad) for T in scenes.links[pad.link][felt]])
         backing = behind(self._models[robot].meshes[link], pad.T_link_pad)
         return self.shading.network(backing, T_pad_world @ scenes.targets[felt], gaps[felt])
@@ -144,5 +145,5 @@ def _name(place: int) -> str:
 
 
 def _with(cell: cells.Cell, pads: Sequence[Pad]) -> cells.Cell:
-    """The cell with these pads alone."""
+    """The cell with only these pads."""
     return cell.model_copy(update={"pads": {_name(k): pad for k, pad in enumerate(pads)}})

@@ -1,13 +1,12 @@
-"""What the grounded link behind a pad takes from its signals, at any place on the link.
+"""Computes the reduction of a pad's signals by the grounded link behind it, at any place on the link.
 
-A pad before a link has a field model of its own, which takes minutes to fit (`penumbra skin model`). To compare many places, the
-model of a bare pad is corrected: the boundary elements of pad and link give the potentials with and without the link, and to
-first order a limb's signal is the product of two of them (Green's reciprocity, see `sim.skin.field`). The logarithm of the ratio
-is regressed on the network's input (ridge regression), so that the corrected model is a network of the same kind, with
-derivatives.
+A backed pad has its own field model, which takes minutes to fit (`penumbra skin model`). To compare many places, the model of a
+bare pad is corrected: the boundary elements of pad and link give the potentials with and without the link, and to first order a
+limb's signal is the product of two of them (Green's reciprocity, see `sim.skin.field`). The logarithm of the ratio is regressed
+on the network's input (ridge regression), so that the corrected model is a network of the same kind, with derivatives.
 
 Beyond 5 cm its signals at the eight places of the cell `arm` are 0 to 26 % weaker in the median than those of the fitted models,
-and the error that is expected of all eight is 4 % larger (`tests/services/skin/test_placing.py`).
+and the expected error of all eight is 4 % larger (`tests/services/skin/test_placing.py`).
 """
 
 from __future__ import annotations
@@ -27,24 +26,24 @@ from penumbra.shared.skin.response import Network, features
 from penumbra.sim.skin.field import Body, PadField, Panels, limb, shell
 
 LIMB_PANELS = (14, 8)
-"""Rows and columns of panels of the limb. Both of the signals in a ratio have the same ones."""
+"""Rows and columns of panels of the limb, the same for both signals in a ratio."""
 LINK_PANELS = (6, 6)
 """Rows and columns of panels of a link that is not behind the pad."""
 JOINED = 0.005
-"""Least distance [m] of such panels from the link behind the pad."""
+"""Minimum distance [m] of such panels from the link behind the pad."""
 POSES = 48
-"""Largest number of poses at which the ratio is computed: those nearest to the pad."""
+"""Maximum number of poses at which the ratio is computed: those nearest to the pad."""
 RIDGE = 0.3
-"""Weight of the ridge, in poses: what few poses do not show of an input's effect is taken for none."""
+"""Weight of the ridge, in poses: effects of an input that few poses show are shrunk to zero."""
 LEAST = 1e-3
-"""A signal is not taken for weaker than this share of a bare pad's: the first order ends there."""
+"""Minimum signal as a share of a bare pad's: the first order is not valid below it."""
 ERROR = 0.02
-"""Standard deviation of the relative error that a fitted model of the place is expected to have: those of `arm` have 0.7 to
-1.4 %, the one of a place that was not fitted yet counts as worse."""
+"""Assumed standard deviation of the relative error of a fitted model at the place: those of `arm` have 0.7 to 1.4 %, and a place
+that is not fitted yet counts as worse."""
 
 
 class Shading:
-    """Corrects the network of a bare pad of a kind for one target. size (2,): the limb's, beside the target's mesh in the cell
+    """Corrects the network of a bare pad type for one target. size (2,): the limb's, relative to the target's mesh in the cell
     file's size."""
 
     def __init__(self, cell: cells.Cell, kind: PadType, target: str, bare: Network, size: Array):
@@ -56,7 +55,7 @@ class Shading:
         self._sources = self._field.sources()
 
     def network(self, backing: Panels, T_pad_limb: Array, gaps: Array) -> Network:
-        """The network of a pad before grounded panels (in its frame), by limbs at T_pad_limb (k, 4, 4) with gaps (k,) [m]."""
+        """The network of a pad before grounded panels (in its frame), from limbs at T_pad_limb (k, 4, 4) with gaps (k,) [m]."""
         nearest = np.argsort(gaps, kind="stable")[:POSES]
         T = T_pad_limb[nearest]
         ratio = self.ratio(backing, T)
@@ -74,7 +73,8 @@ class Shading:
         )
 
     def ratio(self, backing: Panels, T_pad_limb: Array) -> Array:
-        """Logarithms (k, e) of what the link leaves of the signals of limbs at T_pad_limb (k, 4, 4), to first order."""
+        """Logarithms (k, e) of the ratio of signals with and without the link, for limbs at T_pad_limb (k, 4, 4), to first
+        order."""
         link = self._field.sources(backing)
         changes = [[_change(self._limb, T, *sources) for sources in (link, self._sources)] for T in T_pad_limb]
         with_link, without = np.moveaxis(np.array(changes), 1, 0)
@@ -82,7 +82,7 @@ class Shading:
 
 
 def _body(mesh: Mesh, size: Array) -> Body:
-    """A limb of this size (2,), in LIMB_PANELS."""
+    """A limb of this size (2,), with LIMB_PANELS."""
     length, girth = np.exp(size)
     return limb(mesh, float(length), float(girth), *LIMB_PANELS)
 
@@ -108,7 +108,7 @@ def beside(meshes: Mapping[str, Mesh], links: Mapping[str, Array], pad: Pad) -> 
 
 
 def _change(body: Body, T_pad_body: Array, at: Array, charges: Array) -> Array:
-    """The change (e,), in some unit, by a body at T_pad_body (4, 4) in the field of charges (s, 1 + e) at (s, 3)."""
+    """The change (e,), in arbitrary units, by a body at T_pad_body (4, 4) in the field of charges (s, 1 + e) at (s, 3)."""
     points = rigid.apply(T_pad_body, body.panels.centroids)
     squares = (points**2).sum(axis=1)[:, None] + (at**2).sum(axis=1) - 2.0 * points @ at.T
     potentials = (1.0 / np.sqrt(np.maximum(squares, 1e-8))) @ charges
