@@ -1,4 +1,4 @@
-"""`penumbra certs`: a certificate authority of the cell's own, and a certificate for everybody who may come onto its bus."""
+"""`penumbra certs`: a certificate authority of the cell, and a certificate for every participant of its bus."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from penumbra.shared.runtime import bus
 
 CA_DAYS = 3650
 DAYS = 825
-"""A certificate's life, after which `penumbra certs --force` makes all of them anew."""
+"""Validity [days] of a certificate; then `penumbra certs --force` makes all of them again."""
 SKEW = datetime.timedelta(hours=1)
-"""Certificates hold from a little before now: the clocks of a cell's machines differ."""
+"""Time by which certificates are valid before their creation: the clocks of a cell's machines differ."""
 LOCAL = ("localhost", "127.0.0.1", "::1", "router")
 """Names that a router always has: this machine's, and the one that Compose gives it."""
 
@@ -41,16 +41,17 @@ LOCAL = ("localhost", "127.0.0.1", "::1", "router")
     example="penumbra certs --out certs --hosts cell-7.example 192.168.0.7",
 )
 def main(options: flags.Options) -> None:
-    """Writes the certificates."""
+    """Write the certificates."""
     make(options.out, options.hosts, options.force)
     print(f"{options.out}: {len(access.HOLDERS)} certificates for {DAYS} days: penumbra up --secure {options.out}")
 
 
 def make(folder: Path, hosts: Sequence[str] = (), force: bool = False, names: Iterable[str] = access.HOLDERS) -> None:
-    """Writes ca.pem and ca-key.pem, and NAME.pem and NAME-key.pem for each name; only the user can read them.
+    """Write ca.pem and ca-key.pem, and NAME.pem and NAME-key.pem for each name; only the user can read them.
 
-    hosts: names and addresses of routers. Elliptic keys (P-256), which every TLS library takes. Only the router's certificate is
-    good for a server: nobody else's passes for a router. Raises BusError where files are in the way or cannot be written.
+    hosts: names and addresses of routers. The keys are elliptic (P-256), which every TLS library accepts. Only the router's
+    certificate is valid for a server: no other one passes for a router. Raises BusError if files exist already or cannot be
+    written.
     """
     names = tuple(names)
     files = [path for name in ("ca", *names) for path in (folder / f"{name}.pem", folder / f"{name}-key.pem")]
@@ -139,7 +140,7 @@ def _alternative(host: str) -> x509.GeneralName:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Never readable by others, not even for a moment, and never half written: `path` is replaced by a whole file."""
+    """Replace `path` by a complete file that others can never read, not even briefly."""
     part = path.with_name(f".{path.name}.part")
     part.unlink(missing_ok=True)
     with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:

@@ -1,7 +1,7 @@
-"""`penumbra check CELL`: everything about a cell file that can be known before a process starts.
+"""`penumbra check CELL`: checks everything about a cell file that can be checked before a process starts.
 
-What the file alone shows is checked where every process loads it (`shared.cell`). Here is what takes longer: meshes, field
-models, networks, and by geometry what cameras see and pads reach.
+The file's content is checked wherever a process loads it (`shared.cell`). This module has the slower checks: meshes, field
+models, networks, and by geometry the views of cameras and the reach of pads.
 """
 
 from __future__ import annotations
@@ -30,21 +30,23 @@ SERVICES = Path(__file__).parents[1]
 EMULATOR = SERVICES / "emulator"
 SEGMENTATION, HAPTICS = SERVICES / "segmentation" / "weights", SERVICES / "haptics" / "weights"
 LINK_FACES = 50_000
-"""Number of triangles of a robot's collision meshes above which every picture of the emulator takes longer than its period."""
+"""Number of triangles of a robot's collision meshes above which rendering a picture in the emulator takes longer than its
+period."""
 LINK_M = 5.0
-"""Extent [m] above which a link's mesh is taken for one in other units."""
+"""Extent [m] above which a link's mesh probably has another unit."""
 SAMPLES, FEWEST, JOINT_SAMPLES = 400, 40, 30
-"""Number of poses of all targets, of a target at least, and of joint angles, that are drawn to see what pads reach."""
+"""Number of random poses of all targets, minimum number per target, and number of joint angles, to test the reach of pads."""
 VERTICES = 80
-"""Number of a target's vertices that stand for its surface there."""
+"""Number of vertices that represent a target's surface in this test."""
 SPACING = 0.03
-"""Distance [m] from any point of the surface to one of them."""
+"""Maximum distance [m] from a point of the surface to the nearest of these vertices."""
 FRONT = 0.3
-"""Share of what a pad may sense that lies in front of it, where it faces the target. Pads at the side of a robot have a half."""
+"""Minimum share of the points within a pad's range that lie in front of it, if it faces the target. Pads at the side of a robot
+have a half."""
 SEEN = 0.5
-"""Share of the region of motion that a camera should see."""
+"""Minimum share of the region of motion that a camera should see."""
 HOME_SIGMAS = 3.0
-"""Distance from its home, in standard deviations, at which a target is still expected."""
+"""Distance from its home, in standard deviations, up to which a target is expected."""
 
 Nearby = dict[str, Near]
 """The pads that each target may come near."""
@@ -59,7 +61,7 @@ Nearby = dict[str, Near]
     example="penumbra check mine.yaml",
 )
 def main(options: flags.Options) -> int:
-    """Prints every fault and warning: 0 without faults, 1 with."""
+    """Print every fault and warning; returns 0 without faults, 1 with."""
     path = cells.source(options.cell)
     _, found = examine(path, is_whole=True)
     wrong, warnings = ([fault for fault in found if fault.is_warning is kind] for kind in (False, True))
@@ -77,7 +79,7 @@ def main(options: flags.Options) -> int:
 
 
 def refuse(cell: str | Path) -> cells.Cell:
-    """The cell, after its warnings on stderr. Raises CellError with every fault where it has any."""
+    """Load the cell, with its warnings on stderr. Raises CellError with every fault if it has any."""
     found, faults = examine(cells.source(cell))
     for fault in faults:
         if fault.is_warning:
@@ -88,8 +90,8 @@ def refuse(cell: str | Path) -> cells.Cell:
 
 
 def examine(path: Path, is_whole: bool = False) -> tuple[cells.Cell | None, list[Fault]]:
-    """The cell of a file, None where it has faults, and its faults and warnings: those of the file itself alone where it has
-    any. is_whole: also what a start leaves to the emulator, which would do it again."""
+    """The cell of a file, None if it has faults, and its faults and warnings: only those of the file itself if it has any.
+    is_whole: also the checks that a start leaves to the emulator, which would repeat them."""
     try:
         reading = cells.read(path)
     except cells.CellError as error:
@@ -98,7 +100,7 @@ def examine(path: Path, is_whole: bool = False) -> tuple[cells.Cell | None, list
         return None, list(reading.faults)
     cell, document = reading.cell, reading.document
     found = list(_meshes(cell, document))
-    if all(fault.is_warning for fault in found):  # what follows needs the meshes
+    if all(fault.is_warning for fault in found):  # the other checks need the meshes
         near = {target: Near.of(cell, target) for target in cell.targets}
         for look in (_models, _networks, _sources, _cameras, _pads, _homes):
             found += look(cell, document, near)
@@ -123,7 +125,7 @@ def _count(faults: list[Fault], name: str) -> str:
 
 
 def _meshes(cell: cells.Cell, document: Document) -> Iterator[Fault]:
-    """Meshes of targets and links that cannot be read or have another unit; those with holes or too many triangles."""
+    """Meshes of targets and links that cannot be read or have another unit; meshes with holes or too many triangles."""
     for name, target in cell.targets.items():
         if target.mesh.startswith("body:"):
             continue
@@ -177,7 +179,7 @@ def _models(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Faul
 
 
 def _networks(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
-    """Weights that are missing. Without its network the skin finds a pose too, from the target's home."""
+    """Missing weights. Without its network the skin also finds a pose, from the target's home."""
     if cell.cameras and SEGMENTATION.parent.is_dir() and not any(SEGMENTATION.glob("*.npz")):
         what = f"expected weights of the segmentation in {SEGMENTATION}, got none"
         yield document.fault("cameras", f"{what}; make them with `penumbra segmentation train`")
@@ -200,7 +202,7 @@ def _networks(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fa
 
 
 def _sources(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
-    """Films and folders that are not here: they may be where the camera's process runs."""
+    """Missing films and folders: they may be where the camera's process runs."""
     for name, source in cell.sources.items():
         if source.is_played and not (path := source.path(cell.folder)).exists():
             what = f"expected a film or a folder of pictures, got nothing at {path}"
@@ -236,13 +238,13 @@ def _around(target: cells.Target) -> Array:
 
 
 def _grid(low: ArrayLike, high: ArrayLike) -> Array:
-    """Points (n, 3) that fill a box."""
+    """A grid of points (n, 3) in a box."""
     axes = np.linspace(np.asarray(low, float), np.asarray(high, float), 6).T
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
 
 def _share_seen(camera: cells.Camera, points: Array) -> float:
-    """The share of points (n, 3) [m] in the world that is in a camera's picture."""
+    """The share of points (n, 3) [m] in the world that lie in a camera's picture."""
     local = rigid.apply(rigid.inverse(camera.T_world_camera), points)
     local = local[local[:, 2] > 0.0]
     pixels = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
@@ -281,7 +283,7 @@ def _pads(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]
 
 
 def _motion(cell: cells.Cell, document: Document) -> Iterator[Fault]:
-    """Regions in which the emulator finds no pose to begin with."""
+    """Regions in which the emulator finds no initial pose."""
     if cell.sim is None or not EMULATOR.is_dir():
         return
     from penumbra.sim.world.actor import Actor
@@ -297,14 +299,15 @@ def _motion(cell: cells.Cell, document: Document) -> Iterator[Fault]:
 
 
 def _drawn_skin(cell: cells.Cell, name: str, count: int, rng: np.random.Generator) -> Array:
-    """Points (n, 3) [m] of a target's surface in the world, wherever it may be: in the emulator's region, or around its home."""
+    """Points (n, 3) [m] of a target's surface in the world at all its possible poses: in the emulator's region, or around its
+    home."""
     target = cell.targets[name]
     home, spread = target.home, target.home_spread
     if cell.sim is None:
         middle, half = (*home.position, *home.rpy), HOME_SIGMAS * np.repeat([spread.position, spread.rotation], 3)
         low, high = np.subtract(middle, half), np.add(middle, half)
     else:
-        shift = np.subtract(home.position, next(iter(cell.targets.values())).home.position)  # each person has a region
+        shift = np.subtract(home.position, next(iter(cell.targets.values())).home.position)  # each person has its own region
         motion = cell.sim.motion
         low, high = np.array([*(motion.low + shift), *motion.rpy_low]), np.array([*(motion.high + shift), *motion.rpy_high])
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 6)
@@ -315,7 +318,7 @@ def _drawn_skin(cell: cells.Cell, name: str, count: int, rng: np.random.Generato
 
 
 def _drawn_links(cell: cells.Cell, rng: np.random.Generator) -> dict[str, Array]:
-    """T_world_link (n, 4, 4) of the world and of every robot's links, wherever the joints may be, by the names that pads use."""
+    """T_world_link (n, 4, 4) of the world and of every robot's links over the joints' ranges, by the names that pads use."""
     out = {"world": np.eye(4)[None]}
     first = 0
     for name, model in robot_models(cell).items():
@@ -330,7 +333,7 @@ def _drawn_links(cell: cells.Cell, rng: np.random.Generator) -> dict[str, Array]
 
 
 def _homes(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
-    """A first target whose home is not where the emulator moves it."""
+    """A first target whose home is outside of the emulator's region of motion."""
     if cell.sim is None:
         return
     name, target = next(iter(cell.targets.items()))

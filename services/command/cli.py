@@ -17,7 +17,7 @@ from penumbra.shared.contract.processes import PROCESSES, Process, Tool
 from penumbra.shared.runtime.logs import FULL
 
 COMPLETE = "_PENUMBRA_COMPLETE"
-"""The variable by which a shell asks for completions."""
+"""Environment variable with which a shell requests completions."""
 EXIT_CODES = {
     0: "done",
     1: "failed: something that was checked or started is not well; the lines before say what",
@@ -29,8 +29,8 @@ EXIT_CODES = {
 
 @dataclass(frozen=True)
 class Entry:
-    """A command that is no service. `about`: the line of `penumbra --help`; `function`: `MODULE:NAME` of its `flags.Command` or
-    group; `extra`: what it needs of `pip install -e '.[EXTRA]'`."""
+    """A command that is not a service. `about`: the line of `penumbra --help`; `function`: `MODULE:NAME` of its `flags.Command`
+    or group; `extra`: the extra of `pip install -e '.[EXTRA]'` that it needs."""
 
     about: str
     function: str
@@ -82,11 +82,11 @@ SECTIONS: dict[str, dict[str, Any]] = {
     "Others": TOOLS,
 }
 COMMANDS: dict[str, Entry | Process] = {name: entry for entries in SECTIONS.values() for name, entry in entries.items()}
-"""Everything that `penumbra` can be followed by, in the order of its help. Processes come from their table."""
+"""All subcommands of `penumbra`, in the order of its help. Processes come from their table."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs `penumbra ARGV...` and returns the exit code, one of EXIT_CODES."""
+    """Run `penumbra ARGV...`; returns the exit code, one of EXIT_CODES."""
     argv = sys.argv[1:] if argv is None else argv
     if COMPLETE in os.environ:
         from click.shell_completion import shell_complete
@@ -119,11 +119,11 @@ def main(argv: list[str] | None = None) -> int:
         return 2
 
 
-# ---- groups, which import a command when it is asked for
+# ---- groups, which import a command on demand
 
 
 def load(function: str) -> click.Command:
-    """The command that `MODULE:NAME` names."""
+    """The command named by `MODULE:NAME`."""
     module, _, name = function.partition(":")
     found: click.Command = getattr(importlib.import_module(module), name)
     return found
@@ -155,8 +155,8 @@ def _about(entry: Entry | Process) -> str:
 
 
 class Service(flags.Group):
-    """`penumbra NAME`: runs a service, or one of the tools beside it. The module of the service, which may take long to import,
-    is imported only where the service itself is asked for."""
+    """`penumbra NAME`: runs a service, or one of its tools. The service's module, which may be slow to import, is imported only
+    to run the service itself."""
 
     def __init__(self, process: Process):
         super().__init__(process.name, f"penumbra {process.name}", invoke_without_command=True, callback=self._serve)
@@ -210,7 +210,7 @@ class Bench(flags.Group):
             formatter.write_dl([(name, self._first_line(name)) for name in self.list_commands(ctx)])
 
     def _first_line(self, name: str) -> str:
-        """Of the module's docstring, without importing what takes seconds."""
+        """First line of the module's docstring, without the slow import."""
         with (self.FOLDER / f"{name}.py").open() as file:
             return file.readline().strip().strip('"').partition(": ")[2]
 
@@ -256,7 +256,7 @@ def _show_version(ctx: click.Context) -> None:
     "penumbra completion fish > ~/.config/fish/completions/penumbra.fish",
 )
 def completion(options: flags.Options) -> None:
-    """The script is click's."""
+    """Print click's completion script."""
     from click.shell_completion import get_completion_class
 
     kind = get_completion_class(options.shell)
@@ -271,15 +271,15 @@ def completion(options: flags.Options) -> None:
     example="penumbra help pose\npenumbra help search refine",
 )
 def show_help(options: flags.Options) -> int:
-    """As `penumbra COMMAND --help` does."""
+    """Show help, like `penumbra COMMAND --help`."""
     return flags.execute(PENUMBRA, "penumbra", [*options.command, "--help"])
 
 
-# ---- what is said of errors
+# ---- error messages
 
 
 def _discard_output() -> None:
-    """Nobody takes what is still to be written: Python would complain of it at its end."""
+    """Discard unwritten output without a reader: Python would complain about it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -302,7 +302,7 @@ def _is_ours(error: Exception) -> bool:
 
 
 def _explain_import(command: str, argv: list[str], error: ImportError) -> int:
-    """Names the extra that installs what is missing; an error in our own code is not explained away."""
+    """Name the extra that installs the missing package; an error in our own code is raised as it is."""
     name = (error.name or "").partition(".")[0]
     if not name or (name == "penumbra" and error.name != f"penumbra.services.{command}"):
         raise error

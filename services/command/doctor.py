@@ -1,5 +1,5 @@
-"""`penumbra doctor`: looks at this machine and at what runs, and says how to mend what is wrong; with --skin at the pads of a
-running cell."""
+"""`penumbra doctor`: checks this machine and the running processes, and says how to repair faults; with --skin checks the pads of
+a running cell."""
 
 from __future__ import annotations
 
@@ -26,14 +26,15 @@ from penumbra.shared.runtime import bus, running
 
 ROOT = Path(__file__).parents[2]
 SHM_BYTES = 128 << 20
-"""Frames cross between processes in shared memory; Docker's default of 64 MB is too little for two cameras."""
+"""Minimum shared memory [bytes]: frames pass between processes in it, and Docker's default of 64 MB is too little for two
+cameras."""
 STYLES = {"ok": "green", "warn": "yellow", "fail": "red"}
 FOUND = {"ok": "ok", "starting": "warn", "degraded": "warn", "down": "fail"}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """ok, warn or fail; `mend` says what to do."""
+    """Result of a check: ok, warn or fail; `mend` says what to do."""
 
     status: str
     text: str
@@ -50,7 +51,7 @@ class Finding:
     example="penumbra doctor\npenumbra doctor --skin --seconds 10",
 )
 def main(options: flags.Options) -> int:
-    """Prints every finding; 1 if any failed."""
+    """Print every finding; returns 1 if any failed."""
     if options.skin:
         from penumbra.services.skin import doctor
 
@@ -74,7 +75,7 @@ def main(options: flags.Options) -> int:
 
 
 def findings(cell: str, connection: bus.Connection) -> Iterator[Finding]:
-    """Everything that is looked at, in the order in which it should be mended."""
+    """All findings, in the order in which they should be repaired."""
     yield _python()
     yield from _packages()
     yield _cores()
@@ -93,7 +94,7 @@ def _python() -> Finding:
 
 
 def _packages() -> Iterator[Finding]:
-    """What every process needs, and then, by the extras of the table of processes, what single ones need."""
+    """The packages that every process needs, and then, by the extras of the table of processes, those of single processes."""
     try:
         needed = requirements()
     except importlib.metadata.PackageNotFoundError:
@@ -113,10 +114,11 @@ def _packages() -> Iterator[Finding]:
 
 
 def requirements(lines: Iterable[str] | None = None) -> dict[str, list[str]]:
-    """The requirements of this project by extra, "" for those that it always has; an extra of its own is named `penumbra[EXTRA]`.
+    """The requirements of this project by extra, "" for the unconditional ones; an extra that requires another is listed as
+    `penumbra[EXTRA]`.
 
     lines: as in a package's metadata, `numba<1,>=0.60; extra == "fusion"` (default: those of the installed project). Raises
-    importlib.metadata.PackageNotFoundError where it is not installed.
+    importlib.metadata.PackageNotFoundError if it is not installed.
     """
     out: dict[str, list[str]] = {}
     for line in importlib.metadata.requires("penumbra") or () if lines is None else lines:
@@ -130,7 +132,7 @@ def requirements(lines: Iterable[str] | None = None) -> dict[str, list[str]]:
 
 
 def closure(extras: str, needed: dict[str, list[str]]) -> list[str]:
-    """The packages that extras (`robot`, or `skin,robot`) install, those of the extras that they name in turn included."""
+    """The packages that extras (`robot`, or `skin,robot`) install, including those of the extras that they name in turn."""
     out: list[str] = []
     for name in (name for extra in extras.split(",") for name in needed.get(extra, ())):
         own = re.fullmatch(r"penumbra\[([\w,-]+)\]", name)
@@ -156,7 +158,7 @@ def _shared_memory(folder: Path = Path("/dev/shm")) -> Finding:
 
 
 def _cell(cell: str) -> Iterator[Finding]:
-    """What `penumbra check` finds."""
+    """The findings of `penumbra check`."""
     try:
         path = cells.source(cell)
     except cells.CellError as error:
@@ -172,7 +174,7 @@ def _cell(cell: str) -> Iterator[Finding]:
 
 
 def _weights() -> Iterator[Finding]:
-    """Every trained service that is installed has weights, each with its card beside it."""
+    """Weights of every trained service that is installed, each with its card."""
     for process in PROCESSES:
         folder = ROOT / "services" / process.name
         if not process.trained_by or not folder.is_dir():
@@ -186,10 +188,10 @@ def _weights() -> Iterator[Finding]:
 
 
 def _landmarks() -> Iterator[Finding]:
-    """Models that are no part of an installation, and help where they are there."""
+    """Optional models, which help if they are installed."""
     try:
         from penumbra.shared.perception import landmarks
-    except ImportError:  # told above
+    except ImportError:  # reported above
         return
     folder = landmarks.kept()
     if landmarks.is_installed(folder):
@@ -217,10 +219,10 @@ def _router(connection: bus.Connection) -> Finding:
 
 
 def _processes(cell: str, connection: bus.Connection) -> Iterator[Finding]:
-    """How the running processes of the cell fare, with the reasons."""
+    """State of the running processes of the cell, with the reasons."""
     try:
         name = cells.load(cell).name
-    except cells.CellError:  # told above
+    except cells.CellError:  # reported above
         return
     with bus.open_session(connection, threading.Event(), lambda: None, 0.0) as session:
         instances = running.ask(session, name)

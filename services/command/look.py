@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from penumbra.shared.cell.description import Cell
 
 PATIENCE_S = 1.0
-"""How long a command waits for the router before it says that there is none."""
+"""Time [s] that a command waits for the router before it reports that there is none."""
 WATCH_S = 0.1
 WIDE = 72
-"""Columns that a pose in words takes."""
+"""Columns of a pose in words."""
 LOST = 3
 """Exit code of a lost pose."""
 ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "state")
@@ -59,7 +59,7 @@ ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "st
     example="penumbra pose --wait 30\npenumbra pose forearm --json",
 )
 def pose(options: flags.Options) -> int:
-    """0, or 3 where the pose is lost."""
+    """Print the pose; returns 0, or 3 if it is lost."""
     if options.watch and options.wait is not None:
         flags.refuse("expected --watch or --wait, got both")
     cell = names.read(options.cell)
@@ -97,15 +97,15 @@ def _print_pose(found: dict[str, Any], options: flags.Options) -> None:
         print(json.dumps(found), flush=True)
     elif sys.stdout.isatty():
         text = describe(found, shutil.get_terminal_size().columns)
-        # each line is written over the one before, and what is left of that erased: erased first, it would flicker
+        # overwrite each line and erase its rest: erasing first would flicker
         print("\x1b[H" + text.replace("\n", "\x1b[K\n") + "\x1b[K\n\x1b[J" if options.watch else text, flush=True)
     else:
         print(describe(found), flush=True)
 
 
 def describe(pose: dict[str, Any], columns: int = WIDE) -> str:
-    """The answer to the pose query in words and everyday units. columns: of the terminal; below WIDE, names have lines of their
-    own."""
+    """The answer to the pose query in words and everyday units. columns: of the terminal; below WIDE, names get their own
+    lines."""
     spread = [math.sqrt(max(0.0, pose["covariance"][i][i])) for i in range(6)]
     age_ms = (time.time_ns() - pose["stamp_ns"]) * 1e-6
     senses = [
@@ -139,14 +139,14 @@ def _row(values: list[float], scale: float, spec: str, unit: str, spread: float 
     example="penumbra topics --hz --seconds 5",
 )
 def list_topics(options: flags.Options) -> None:
-    """Prints the table of topics, or what arrives."""
+    """Print the table of topics, or the traffic."""
     if flags.is_given("seconds") and not options.hz:
         flags.refuse("expected --hz beside --seconds, got --seconds alone")
     show_topics(options)
 
 
 def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.TOPICS) -> None:
-    """Prints the topics that are known, or what arrives of them."""
+    """Print the known topics, or their traffic."""
     from penumbra.shared.cell import description
 
     cell = description.load(options.cell)
@@ -174,7 +174,7 @@ def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.T
 
 
 def keys(topic: topics.Topic, cell: Cell) -> list[str]:
-    """The keys of a topic in a cell; none where the cell has no such part."""
+    """The keys of a topic in a cell; empty if the cell has no such part."""
     fields = [name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell"]
     parts = itertools.product(*(getattr(cell, f"{name}s") for name in fields))
     return [topic.at(cell=cell.name, **dict(zip(fields, part, strict=True))) for part in parts]
@@ -218,7 +218,7 @@ def _show_traffic(received: dict[str, TopicReport], instances: list[running.Inst
 
 
 def _console() -> Console:
-    """As wide as the terminal; in a file or pipe so wide that no row breaks."""
+    """A console as wide as the terminal; in a file or pipe wide enough that no row breaks."""
     from rich.console import Console
 
     return Console(width=None if sys.stdout.isatty() else 200)
@@ -227,7 +227,7 @@ def _console() -> Console:
 def listen(
     cell: Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic]
 ) -> tuple[dict[str, TopicReport], list[running.Instance]]:
-    """The counters of every key of the topics that are known after listening for a while, and how the cell's processes fare."""
+    """The counters of every key of the known topics after listening for `seconds`, and the states of the cell's processes."""
     from penumbra.shared.runtime.node import Node
 
     node = Node("topics", cell, connection)
@@ -251,7 +251,7 @@ def listen(
     example="penumbra ls\npenumbra ls --connect tcp/192.168.0.7:7447 --json",
 )
 def list_cells(options: flags.Options) -> None:
-    """Prints a row per router."""
+    """Print a row per router."""
     from penumbra.services.command import runs
 
     asked = bus.connection(options)
@@ -261,7 +261,7 @@ def list_cells(options: flags.Options) -> None:
     places += [replace(asked, connect=found) for found in _announced(options.seconds)]
     known: set[str] = set()
     rows = [row for place in places for row in _rows(place, PATIENCE_S if place is not guess else 0.0, known)]
-    if guess and any(not row["why"] for row in rows):  # that there is none at the default is no news then
+    if guess and any(not row["why"] for row in rows):  # a missing default router does not matter then
         rows = [row for row in rows if not (row["why"] and row["router"] == asked.default)]
     if options.json:
         print(json.dumps(rows))
@@ -271,7 +271,7 @@ def list_cells(options: flags.Options) -> None:
 
 
 def _announced(seconds: float) -> list[tuple[str, ...]]:
-    """The endpoints of each router that answers on the network within a time."""
+    """The endpoints of each router that answers on the network within `seconds`."""
     scout = zenoh.scout(what="router", config=zenoh.Config())
     time.sleep(seconds)
     found = {}
@@ -282,8 +282,8 @@ def _announced(seconds: float) -> list[tuple[str, ...]]:
 
 
 def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dict[str, Any]]:
-    """The router at the first of several endpoints that opens, and its cells; nothing where the router is known already, which it
-    then is. Where none opens, why the first one does not."""
+    """The router at the first of several endpoints that opens, and its cells; empty if the router is in `known`, to which it is
+    added. If none opens, the reason of the first one."""
     reasons = []
     for at in place.connect:
         try:
@@ -315,7 +315,7 @@ def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dic
     example="penumbra sim occlude 0.8\npenumbra sim state --json",
 )
 def sim(options: flags.Options) -> None:
-    """Passes the command on: what is possible is decided by the emulator."""
+    """Pass the command to the emulator, which decides what is possible."""
     cell = names.read(options.cell)
     request = {"command": options.action} | ({"value": " ".join(options.value)} if options.value else {})
     with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:
@@ -331,6 +331,6 @@ def _plain(value: Any) -> str:
 
 
 def open_session(connection: bus.Connection, patience_s: float = PATIENCE_S) -> zenoh.Session:
-    """A session with the router. Raises BusError where there is none after `patience_s`."""
+    """A session with the router. Raises BusError if there is none after `patience_s`."""
     nothing: Callable[[], None] = lambda: None  # noqa: E731
     return bus.open_session(connection, threading.Event(), nothing, patience_s)

@@ -1,4 +1,4 @@
-"""What runs on this machine: `penumbra ps`, `logs` and `down`."""
+"""Commands for the processes on this machine: `penumbra ps`, `logs` and `down`."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.logs import time_of
 
 MEASURED_S = 0.2
-"""Over which CPU is measured."""
+"""Time [s] over which CPU is measured."""
 ANSWER_S = 0.5
 ENDS_S = 10.0
-"""How long a launcher may take to end its processes; then it is killed, and they with it."""
+"""Time [s] that a launcher has to end its processes; then it is killed together with them."""
 LOOK_S = 0.2
 
 
 @dataclass(frozen=True)
 class Row:
-    """One process. `cpu`: cores; `uptime_s`: since it began."""
+    """One process. `cpu`: cores; `uptime_s`: time since its start."""
 
     cell: str
     process: str
@@ -56,7 +56,7 @@ class Row:
     example="penumbra ps\npenumbra ps --json",
 )
 def ps(options: flags.Options) -> None:
-    """Prints a row per process."""
+    """Print a row per process."""
     found = [row for run in runs.running() for row in rows(run)]
     if options.json:
         print(json.dumps([asdict(row) for row in found]))
@@ -75,7 +75,7 @@ def ps(options: flags.Options) -> None:
 
 
 def rows(run: Run) -> list[Row]:
-    """The launcher of a cell and its processes: their states by the launcher's report, the rest by the operating system."""
+    """The launcher of a cell and its processes: their states from the launcher's report, the rest from the operating system."""
     known: dict[str, dict[str, Any]] = {LAUNCHER.name: {"pid": run.pid, "state": "running"}}
     try:
         known |= _reported(run)
@@ -99,7 +99,7 @@ def rows(run: Run) -> list[Row]:
 
 
 def _reported(run: Run) -> dict[str, dict[str, Any]]:
-    """What the launcher reports of its processes. Raises BusError where it cannot be asked."""
+    """The launcher's report of its processes. Raises BusError if it cannot be reached."""
     connection = bus.Connection(connect=run.connect, secure=Path(run.secure) if run.secure else None)
     with open_session(connection, ANSWER_S) as session:
         for answer in bus.ask(session, topics.health(run.cell, LAUNCHER.name), timeout_s=ANSWER_S):
@@ -116,7 +116,7 @@ def _duration(seconds: float) -> str:
 
 
 def complete_cell(ctx: object, param: object, incomplete: str) -> list[CompletionItem]:
-    """The cells that run."""
+    """The running cells."""
     return [CompletionItem(run.cell) for run in runs.running() if run.cell.startswith(incomplete)]
 
 
@@ -127,7 +127,7 @@ def complete_cell(ctx: object, param: object, incomplete: str) -> list[Completio
     example="penumbra down table",
 )
 def down(options: flags.Options) -> None:
-    """Returns when nothing of the cell runs any more."""
+    """Return when no process of the cell runs any more."""
     for run in _chosen(options.cell):
         with contextlib.suppress(psutil.NoSuchProcess):
             launcher = psutil.Process(run.pid)
@@ -139,7 +139,7 @@ def down(options: flags.Options) -> None:
 
 
 def _chosen(cell: str | None) -> list[Run]:
-    """The runs of a cell, or without a name those of the only one. Raises BusError where there are none, or several cells."""
+    """The runs of a cell, or without a name those of the only one. Raises BusError if there are none, or several cells."""
     found = runs.running()
     names = sorted({run.cell for run in found})
     if not found:
@@ -161,7 +161,7 @@ def _chosen(cell: str | None) -> list[Run]:
     example="penumbra logs\npenumbra logs -f fusion",
 )
 def logs(options: flags.Options) -> None:
-    """Prints the newest lines, and follows."""
+    """Print the newest lines, and follow."""
     where = _folder(options.cell)
     names = sorted(path.stem for path in where.glob("*.log"))
     if unknown := [name for name in options.service if name not in names]:
@@ -175,14 +175,14 @@ def logs(options: flags.Options) -> None:
 
 
 def _show(lines: list[Line], width: int) -> None:
-    """width: of the services' names, which are left out where it is 0."""
+    """Print lines. width: of the services' names, which are left out if it is 0."""
     for line in lines:
         print(f"{line.service:{width}} | {line.text}" if width else line.text)
     sys.stdout.flush()
 
 
 def _folder(cell: str | None) -> Path:
-    """The folder of a cell's logs. Raises BusError where it cannot be known which."""
+    """The folder of a cell's logs. Raises BusError if the cell is ambiguous or unknown."""
     base = runs.logs_of("")
     names = sorted(path.name for path in base.glob("*") if any(path.glob("*.log")))
     if not names:
@@ -198,7 +198,7 @@ def _folder(cell: str | None) -> Path:
 
 
 class Line(NamedTuple):
-    """A line of a service's log. time: as it stands there; of the line before where it has none."""
+    """A line of a service's log. time: as written in the line, or that of the previous line if it has none."""
 
     time: str
     service: str
@@ -206,8 +206,8 @@ class Line(NamedTuple):
 
 
 class Merged:
-    """The lines of a cell's logs in the order of their times. only: the services; none stands for all, also those that begin to
-    log later."""
+    """The lines of a cell's logs in the order of their times. only: services; an empty collection stands for all, including those
+    that begin to log later."""
 
     def __init__(self, where: Path, only: Collection[str]):
         self._where, self._only = where, only
@@ -217,11 +217,11 @@ class Merged:
 
     @property
     def width(self) -> int:
-        """Of the services' names; 0 where there is but one."""
+        """Width of the services' names; 0 if there is only one service."""
         return max(map(len, self._tails)) if len(self._tails) > 1 else 0
 
     def read(self) -> list[Line]:
-        """The lines since the last look."""
+        """The lines since the last call."""
         for path in self._where.glob("*.log"):
             if path.stem not in self._tails and (not self._only or path.stem in self._only):
                 self._tails[path.stem] = Tail(path)
@@ -229,8 +229,8 @@ class Merged:
         return sorted(lines, key=lambda line: line.time)
 
     def settled(self) -> list[Line]:
-        """The lines that are not newer than those of the look before: what a service logs may be in its file a little later than
-        what another one logs after it."""
+        """The lines not newer than those of the previous call: a service's line may appear in its file slightly later than a
+        newer line of another service."""
         last = self._waiting[-1].time if self._waiting else ""
         lines = sorted(self._waiting + self.read(), key=lambda line: line.time)
         count = bisect_right(lines, last, key=lambda line: line.time)
@@ -243,7 +243,7 @@ class Merged:
 
 
 class Tail:
-    """The lines of a log file since the last look, also after it was rolled."""
+    """The new lines of a log file at each call, also after it was rolled."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -251,7 +251,7 @@ class Tail:
         self._rest = ""
 
     def read(self) -> Iterator[str]:
-        """Whole lines."""
+        """The new complete lines."""
         yield from self._lines()
         with contextlib.suppress(OSError):
             if os.fstat(self._file.fileno()).st_ino != self._path.stat().st_ino:

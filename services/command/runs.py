@@ -1,4 +1,4 @@
-"""The cells that `penumbra up` runs on this machine: a record of each launcher, and the logs of one in the background.
+"""Records of the launchers that `penumbra up` runs on this machine, and the logs of those in the background.
 
 Both are under `$XDG_STATE_HOME/penumbra`, by default `~/.local/state/penumbra`.
 """
@@ -17,16 +17,16 @@ from pathlib import Path
 import psutil
 
 LOG_BYTES = 5 << 20
-"""Size at which a log is rolled: the newest lines are in SERVICE.log, older ones in SERVICE.log.1 and so on."""
+"""Size [bytes] at which a log is rolled: the newest lines are in SERVICE.log, older ones in SERVICE.log.1 and so on."""
 LOGS_KEPT = 3
 BEGAN_S = 1.0
-"""Two readings of the time at which a process began differ by less."""
+"""Maximum difference [s] between two readings of the same process's start time."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A launcher: its process, the time at which that began [s since the epoch], its cell, the endpoints at which the processes
-    meet, the folder of certificates, and the folder of logs of one in the background."""
+    """A launcher: its process, that process's start time [s since the epoch], its cell, the endpoints at which the processes
+    meet, the folder of certificates, and the folder of logs if it runs in the background."""
 
     pid: int
     began: float
@@ -37,7 +37,7 @@ class Run:
 
 
 def folder() -> Path:
-    """Where records and logs are. Raises RuntimeError for a user without a home."""
+    """Folder of records and logs. Raises RuntimeError for a user without a home."""
     state = os.environ.get("XDG_STATE_HOME")
     return (Path(state) if state else Path.home() / ".local" / "state") / "penumbra"
 
@@ -49,8 +49,8 @@ def logs_of(cell: str) -> Path:
 
 @contextlib.contextmanager
 def recorded(cell: str, connect: tuple[str, ...], secure: Path | None, logs: Path | None) -> Iterator[None]:
-    """Within it `penumbra ps` and `penumbra down` find this launcher. Where nothing can be written they do not, which is no
-    reason not to run."""
+    """Context in which `penumbra ps` and `penumbra down` find this launcher. If nothing can be written they do not, but the
+    launcher runs."""
     run = Run(os.getpid(), psutil.Process().create_time(), cell, connect, str(secure) if secure else None,
               str(logs) if logs else None)  # fmt: skip
     path = None
@@ -69,7 +69,7 @@ def recorded(cell: str, connect: tuple[str, ...], secure: Path | None, logs: Pat
 
 
 def running() -> list[Run]:
-    """The launchers that run, by cell; records of others are removed."""
+    """The running launchers, sorted by cell; stale records are removed."""
     found = []
     try:
         paths = sorted((folder() / "run").glob("*.json"))
@@ -99,7 +99,7 @@ class Logs:
         self._files: dict[str, RotatingFileHandler] = {}
 
     def write(self, service: str, line: str) -> None:
-        """Adds a line to the log of a service. Processes of one service share a file."""
+        """Add a line to the log of a service. Processes of one service share a file."""
         if service not in self._files:
             path = self.where / f"{service}.log"
             self._files[service] = RotatingFileHandler(path, maxBytes=LOG_BYTES, backupCount=LOGS_KEPT, encoding="utf-8")

@@ -29,12 +29,12 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.skin.layout import Skin, link_names, pad_poses
 
 PATIENCE_S = 5.0
-"""How long to wait until every topic has been heard."""
+"""Time [s] to wait for a message of every topic."""
 
 LINES = {"tracking": (30, 230, 60), "coasting": (255, 190, 30), "lost": (240, 40, 40)}
 PAD_HALF = (0.0305, 0.03)
 FULL_SIGNAL = 0.6
-"""Volts of the strongest electrode at which a pad is drawn full: an arm at 1 cm."""
+"""Signal [V] of the strongest electrode at which a pad is drawn full: that of an arm at 1 cm."""
 
 
 def _picture(text: str) -> Path:
@@ -56,7 +56,7 @@ def _picture(text: str) -> Path:
     example="penumbra snapshot cell.png --camera front",
 )
 def main(options: flags.Options) -> None:
-    """Writes the picture, and prints its size."""
+    """Write the picture, and print its size."""
     cell = cells.load(options.cell)
     camera, target = cell.one("cameras", options.camera), cell.one("targets", options.target)
     with look.open_session(bus.connection(options)) as session:
@@ -68,7 +68,7 @@ def main(options: flags.Options) -> None:
 
 
 def listen(session: zenoh.Session, cell: cells.Cell, camera: str, target: str) -> dict[str, Any]:
-    """One moment of the cell: a mask and the frame that it belongs to, the fused pose nearest to it, joints and voltages."""
+    """One moment of the cell: a mask and its frame, the fused pose nearest to it, joints and voltages."""
     keep = {topics.FRAME: 30, topics.MASK: 30, topics.FUSED: 400, topics.JOINTS: 1, topics.VOLTAGES: len(cell.pads)}
     names = {"cell": cell.name, "camera": camera, "target": target}
     readers = {topic: session.declare_subscriber(topic.at(**names), zenoh.handlers.RingChannel(n)) for topic, n in keep.items()}
@@ -123,8 +123,7 @@ def draw(
     joints: Mapping[str, NDArray],
     volts: Mapping[str, NDArray],
 ) -> NDArray[np.uint8]:
-    """The picture (h, w, 3) uint8 RGB. mask: of the frame, None where there is none; joints: by robot; volts: mean electrode
-    amplitudes by pad."""
+    """The picture (h, w, 3) uint8 RGB. mask: of the frame, or None; joints: by robot; volts: mean electrode amplitudes by pad."""
     camera = cell.cameras[camera_name]
     picture = Undistortion(camera.lens)(frame.image).copy()
     if mask is not None:
@@ -145,7 +144,7 @@ def draw(
 
 
 def _tint(picture: NDArray[np.uint8], mask: messages.Mask) -> None:
-    """Blends the classes of the mask's window into the picture, in place."""
+    """Blend the classes of the mask's window into the picture, in place."""
     colours = np.zeros((256, 3), np.float32)
     for label, colour in COLOURS.items():
         colours[label] = colour
@@ -162,7 +161,7 @@ def _tint(picture: NDArray[np.uint8], mask: messages.Mask) -> None:
 
 
 def pad_levels(cell: cells.Cell, volts: Mapping[str, NDArray]) -> dict[str, float]:
-    """How much each pad feels by its strongest electrode, from 0 to 1. volts: mean electrode amplitudes [V] by pad."""
+    """Level of each pad from 0 to 1, by its strongest electrode. volts: mean electrode amplitudes [V] by pad."""
     if not volts:
         return {}
     skin = Skin(cell)
@@ -175,7 +174,7 @@ def pad_levels(cell: cells.Cell, volts: Mapping[str, NDArray]) -> dict[str, floa
 
 
 def _pads(picture: NDArray[np.uint8], cell: cells.Cell, camera: cells.Camera, joints: Mapping, volts: Mapping) -> None:
-    """Draws the pads that face the camera, filled by their strongest signal, in place: those whose place is known."""
+    """Draw the pads that face the camera and whose pose is known, filled by their strongest signal, in place."""
     links = link_names(
         {name: model.link_transforms(joints[name]) for name, model in robot_models(cell).items() if name in joints}
     )

@@ -1,4 +1,4 @@
-"""`penumbra restart` and `penumbra scale`: what a running launcher is asked to change, and how it gets on."""
+"""`penumbra restart` and `penumbra scale`: request a change from a running launcher, and report its progress."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from penumbra.shared.runtime import bus
 
 ASK_S = 0.2
 PATIENCE_S = 10.0
-"""How long a launcher that has begun may keep silent before it counts as gone."""
+"""Maximum time [s] without an answer from a launcher that has begun; then it counts as gone."""
 
 
 @flags.command(
@@ -35,7 +35,7 @@ PATIENCE_S = 10.0
     example="penumbra restart fusion haptics",
 )
 def restart(options: flags.Options) -> int:
-    """1 where a restart failed."""
+    """Restart services; returns 1 if a restart failed."""
     if options.all and options.service:
         flags.refuse(f"expected --all or names, got both: {' '.join(options.service)}")
     return _change(options, {"command": "restart", "services": "all" if options.all else options.service or None})
@@ -57,13 +57,14 @@ def _replicas(text: str) -> tuple[str, int]:
     example="penumbra scale segmentation=2",
 )
 def scale(options: flags.Options) -> int:
-    """1 where the change failed."""
+    """Change numbers of replicas; returns 1 if the change failed."""
     service, number = options.replicas
     return _change(options, {"command": "scale", "service": service, "number": number})
 
 
 def _change(options: flags.Options, command: dict[str, Any]) -> int:
-    """Asks every launcher of the cell for a change, and tells how it gets on until all are done; 1 if one of them failed."""
+    """Request a change from every launcher of the cell, and print its progress until all are done; returns 1 if one of them
+    failed."""
     cell = names.read(options.cell)
     key, name = topics.launcher(cell.name), secrets.token_hex(8)
     with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:

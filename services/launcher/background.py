@@ -1,7 +1,7 @@
-"""`penumbra up --detach`: a launcher in the background, and how its start gets on.
+"""`penumbra up --detach`: starts a launcher in the background and reports the progress of its start.
 
-The launcher says through a pipe what it is waiting for, a line each time, and at last that the cell is up. The end of the pipe
-before that is the end of the launcher, whose log says why.
+The launcher writes to a pipe what it is waiting for, one line at a time, and finally that the cell is up. If the pipe ends before
+that, the launcher has ended, and its log says why.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from penumbra.services.launcher.forkserver import import_path
 from penumbra.shared.runtime import bus
 
 UP = "up: "
-"""Begins the last line that a launcher says: what is up."""
+"""Prefix of the launcher's last line, which names what is up."""
 PATIENCE_S = 120.0
-"""A first start compiles; what takes longer is reported, and goes on."""
+"""Time [s] after which a start that is not finished is reported; it continues. A first start compiles."""
 ENDS_S = 10.0
 NUMBERS = re.compile(r"[\d.]+ m?s\b")
-"""Times in what a launcher says."""
+"""Durations in the launcher's lines."""
 
 
 def start(cell: str, argv: Sequence[str]) -> int:
-    """Starts `penumbra up ARGV...` in the background. Returns 0 once the cell is up, the launcher's exit code where it ended, or
-    1 where it is not up after PATIENCE_S. Raises BusError where the cell runs already."""
+    """Start `penumbra up ARGV...` in the background. Returns 0 once the cell is up, the launcher's exit code if it ended, or 1 if
+    the cell is not up after PATIENCE_S. Raises BusError if the cell runs already."""
     if other := next((run for run in runs.running() if run.cell == cell and run.logs), None):
         raise bus.BusError(f"cell {cell} runs already (pid {other.pid}): end it with `penumbra down {cell}`")
     logs = runs.logs_of(cell)
@@ -62,7 +62,7 @@ def start(cell: str, argv: Sequence[str]) -> int:
 
 
 def _follow(launcher: subprocess.Popen[bytes], said: int, log: Path) -> int:
-    """Prints what the launcher says, until it is up, or has ended."""
+    """Print the launcher's lines until the cell is up, or the launcher has ended."""
     deadline = time.monotonic() + PATIENCE_S
     text, last = "", ""
     while select.select([said], [], [], max(0.0, deadline - time.monotonic()))[0]:
@@ -77,7 +77,7 @@ def _follow(launcher: subprocess.Popen[bytes], said: int, log: Path) -> int:
             if line.startswith(UP):
                 print(f"{line.removeprefix(UP)} (pid {launcher.pid}): see penumbra ps, logs and down")
                 return 0
-            if NUMBERS.sub("", line) != NUMBERS.sub("", last):  # how long something is missing is no news
+            if NUMBERS.sub("", line) != NUMBERS.sub("", last):  # skip lines in which only durations changed
                 print(line, flush=True)
             last = line
     print(f"not up after {PATIENCE_S:.0f} s, and still running (pid {launcher.pid}): {last}; see penumbra logs", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What the launcher shows: processes, topics, the pose and its error, as a table that redraws itself or as plain lines."""
+"""Display of the launcher: processes, topics, the pose and its error, as a live table or as plain lines."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from penumbra.shared.runtime.node import Node
 from penumbra.shared.runtime.rates import TopicRow, topic_rows
 
 ANSWER_S = 2.0
-"""How long an instance may take to say how it is."""
+"""Maximum time [s] for an instance to answer the health query."""
 STYLES = {"running": "green", "starting": "yellow", "degraded": "yellow", "tracking": "green", "coasting": "yellow"}
 PASSING = {"running", "degraded", "tracking", "coasting", "lost"}
-"""States between which a process or a pose may change for a moment."""
+"""States between which a process or a pose may change briefly."""
 LASTS_S = 1.5
-"""A change between passing states is shown when it has lasted so long."""
+"""Time [s] for which a change between passing states must last before it is shown."""
 WIDE = 70
-"""Columns from which every column of the tables is shown."""
+"""Minimum number of terminal columns for which all columns of the tables are shown."""
 
 
 class Watch:
-    """Looks at a cell once a `refresh`: the health of every instance and the newest fused pose beside the truth.
+    """Observes a cell at each `refresh`: the health of every instance, and the newest fused pose against the truth.
 
-    Truth and pose are taken from small rings when they are looked at: nothing is decoded in between.
+    Truth and pose are read from small ring buffers at each refresh: nothing is decoded in between.
     """
 
     def __init__(self, node: Node):
@@ -51,16 +51,16 @@ class Watch:
         self.health: dict[str, Report] = {}
         self.accuracy: Accuracy | None = None
         self.errors: list[tuple[float, float]] = []
-        self.has_tracked = False  # whether a fused pose was `tracking` at some look
+        self.has_tracked = False  # whether a fused pose was `tracking` at some refresh
 
     def refresh(self) -> None:
-        """Asks all instances how they are; `health` is then their answers by instance."""
+        """Query the health of all instances; `health` holds their answers by instance."""
         found = [report.read(answer) for answer in self._node.query(topics.health(self._node.cell.name), timeout_s=ANSWER_S)]
         self.health = {each.instance: each for each in found}
         self._look_at_pose()
 
     def local(self) -> dict[int, Report]:
-        """The answers of this host's instances by pid."""
+        """The reports of this host's instances, by pid."""
         host = socket.gethostname()
         return {each.pid: each for each in self.health.values() if each.host == host}
 
@@ -86,7 +86,7 @@ class Watch:
 
 
 class Steady:
-    """States as they are shown: a change appears when it has lasted, so that what comes and goes does not flicker."""
+    """Displayed states: a change is shown once it has lasted, so that brief changes do not flicker."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
         self._clock = clock
@@ -94,7 +94,7 @@ class Steady:
         self._since: dict[str, tuple[str, float]] = {}
 
     def show(self, name: str, state: str) -> str:
-        """The state to show for a name. Words outside PASSING appear at once: such a process has ended or begun."""
+        """The state to show for a name. States outside PASSING are shown at once: such a process has ended or begun."""
         now = self._clock()
         shown = self._shown.setdefault(name, state)
         if state == shown:
@@ -110,17 +110,17 @@ class Steady:
 
 
 class Picture:
-    """What the screen shows: the pose first, then the processes, then the topics, cut to the size of the terminal. hint: a
-    command for another terminal; link: the link of the web page, empty while it is not served."""
+    """The screen: the pose first, then the processes, then the topics, cut to the size of the terminal. hint: a command for
+    another terminal; link: returns the link of the web page, empty while it is not served."""
 
     def __init__(self, hint: str, watch: Watch, link: Callable[[], str] = str):
         self._hint, self._watch, self._link = hint, watch, link
         self._steady = Steady()
 
     def draw(self, processes: list[ProcessRow], width: int, height: int) -> Group:
-        """At most `height` rows of `width` columns."""
+        """Render at most `height` rows of `width` columns."""
         link = self._link()
-        page = [Text(link, "dim", no_wrap=True, overflow="fold")] if link else []  # a link that is cut leads nowhere
+        page = [Text(link, "dim", no_wrap=True, overflow="fold")] if link else []  # a truncated link is useless
         head = [_line(f"{self._hint}   (in another terminal)", "dim"), *page, *self._pose()]
         is_wide = width >= WIDE
         names = ("process", "state", "pid", "CPU %", "MB", "restarts", "") if is_wide else ("process", "state", "")
@@ -138,7 +138,7 @@ class Picture:
             delay = f"{1e3 * max(line.delays_s):.1f}" if line.delays_s else "-"
             more = (delay, str(line.dropped), str(line.bad)) if is_wide else ()
             right.append([*map(Text, (line.name, f"{line.rate_hz:.1f}", f"{expected:g}", *more))])
-        room = height - len(head) - len(left) - 3  # two headings, and the line on which the cursor stands
+        room = height - len(head) - len(left) - 3  # two headings, and the cursor's line
         tables = [_table(names, left, width)]
         if room > 0 and right:
             tables.append(_table(columns, right[:room], width))
@@ -170,8 +170,8 @@ def _line(text: str, style: str = "") -> Text:
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[Text]], width: int) -> Table:
-    """Names and numbers keep their width; the last column takes what is left of `width`, and is cut."""
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # one column between two, as is counted below
+    """A table whose names and numbers keep their width; the last column gets the rest of `width`, and is cut."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # one column of space between two, as counted below
     left = width
     for k, name in enumerate(columns):
         needed = max([len(name), *(len(row[k]) for row in rows)])
@@ -207,7 +207,7 @@ def plain(processes: list[ProcessRow], watch: Watch, link: str = "") -> str:
 
 
 def summary(processes: list[ProcessRow], watch: Watch) -> str:
-    """What happened, at the end."""
+    """A final summary."""
     restarts = ", ".join(f"{row.name} {row.restarts}" for row in processes if row.restarts) or "none"
     failed = ", ".join(f"{row.name}: {row.note}" for row in processes if row.state == "failed")
     lines = [f"restarts: {restarts}"] + ([f"failed: {failed}"] if failed else [])

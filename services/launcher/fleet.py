@@ -1,7 +1,7 @@
-"""The processes of a launcher by service, and what changes while they run: restarts one after another, and numbers of replicas.
+"""The processes of a launcher by service, and changes while they run: rolling restarts, and numbers of replicas.
 
-A change is a generator that the launcher's main thread takes a step of now and then, because what it starts ends with the thread
-that started it. It is asked for on the bus, and asked about until it is done.
+A change is a generator that the launcher's main thread advances step by step, because a process ends with the thread that started
+it. A change is requested on the bus, and polled until it is done.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from penumbra.services.launcher.forkserver import ForkServer
 from penumbra.services.launcher.supervised import Supervised, stop, wait
 
 READY_S = 120.0
-"""How long a change waits for a process that it started: a first start compiles."""
+"""Maximum time [s] that a change waits for a process that it started: a first start compiles."""
 MOST = 64
-"""Replicas of a service on one machine."""
+"""Maximum number of replicas of a service on one machine."""
 REMEMBERED = 16
-"""Changes that can still be asked about."""
+"""Number of changes whose state can still be queried."""
 
 
 class ChangeFailed(RuntimeError):
-    """A change stops where it is; the text says why."""
+    """A change stops before its end; the text says why."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """How a service's processes are started. beside: whether two may run at once, so that a new one can take over from an old;
-    is_required: whether the others need one."""
+    """How a service's processes are started. beside: whether two may run at once, so that a new one can take over from an old
+    one; is_required: whether the other processes need it."""
 
     command: list[str]
     restart: str = "always"
@@ -42,7 +42,7 @@ class Kind:
     is_required: bool = False
 
     def check(self, service: str, number: int) -> None:
-        """Raises ValueError for a number of replicas that cannot be."""
+        """Raise ValueError for an impossible number of replicas."""
         if self.is_required and number != 1:
             raise ValueError(f"{service}: expected 1, got {number}: all other processes meet there")
         most = MOST if self.beside else 1
@@ -53,7 +53,7 @@ class Kind:
 
 @dataclass
 class Change:
-    """One change: what it is, what it does now, and how it ended."""
+    """One change: its name, its current step, and its result."""
 
     what: str
     steps: Iterator[str]
@@ -66,9 +66,9 @@ class Change:
 
 
 class Fleet:
-    """kinds: every service that may run; counts: how many of each, none where it is not named; forkserver: where a service that
-    died comes from, while there is one; write: takes a service and a line of its standard error, which by default goes to the
-    launcher's own."""
+    """The processes of a launcher. kinds: every service that may run; counts: number of processes per service, 0 by default;
+    forkserver: source of restarted services while it runs; write: receives a service and a line of its standard error, which goes
+    to the launcher's own by default."""
 
     def __init__(
         self,
@@ -85,18 +85,18 @@ class Fleet:
 
     @property
     def processes(self) -> list[Supervised]:
-        """All of them, in the order of the kinds."""
+        """All processes, in the order of the kinds."""
         return [process for group in self._groups.values() for process in tuple(group)]
 
     def start(self, *services: str) -> list[Supervised]:
-        """Starts the processes of these services, or without names all that are not started yet; returns them."""
+        """Start the processes of these services, or without names all that are not started yet; returns them."""
         chosen = [process for name in services or self._groups for process in self._groups[name] if process.state == "stopped"]
         for process in chosen:
             process.start()
         return chosen
 
     def watch(self) -> None:
-        """Looks after every process, and takes a step of the change under way. To be called from the thread that started them."""
+        """Supervise every process, and advance the current change by one step. To be called from the thread that started them."""
         for process in self.processes:
             process.watch()
         if self._forkserver is not None:
@@ -112,11 +112,11 @@ class Fleet:
             change.error, change.is_done = str(error), True
 
     def wait(self, seconds: float) -> None:
-        """Returns when there is something to look after, or after `seconds`."""
+        """Wait until a process ends, or for `seconds`."""
         wait(self.processes, seconds)
 
     def stop(self) -> None:
-        """Ends all, and what the others need last: nobody misses it."""
+        """End all processes, the required ones last, so that no other process misses them."""
         if self._forkserver is not None:
             self._forkserver.stop()
         for is_required in (False, True):
@@ -127,10 +127,10 @@ class Fleet:
                 for process in tuple(group)
             ])  # fmt: skip
 
-    # ---- what is asked for on the bus
+    # ---- requests on the bus
 
     def answer(self, parameters: dict[str, str], payload: bytes) -> bytes:
-        """Answers the launcher's queryable with a change's report: `{command: restart, services, id}` (a list, `all`, or null for
+        """Answer the launcher's queryable with a change's report: `{command: restart, services, id}` (a list, `all`, or null for
         all that can be replaced without a gap), `{command: scale, service, number, id}` or `{command: state, id}`. Raises
         ValueError that says what was expected."""
         try:
@@ -182,17 +182,17 @@ class Fleet:
         self._kinds[service].check(service, number)
         return Change(f"scale {service} to {number}", self._to_number(service, number))
 
-    # ---- changes, a step at a time
+    # ---- changes, step by step
 
     def _one_after_another(self, services: list[str]) -> Iterator[str]:
         for service in services:
             for old in tuple(self._groups[service]):
                 yield from self._replace(service, old)
         if self._forkserver is not None:
-            self._forkserver.renew()  # what was restarted may have been installed anew
+            self._forkserver.renew()  # restarted services may have been installed anew
 
     def _replace(self, service: str, old: Supervised) -> Iterator[str]:
-        if self._kinds[service].beside:  # the old one serves until the new one does
+        if self._kinds[service].beside:  # the old one serves until the new one is ready
             new = yield from self._add(service, is_afresh=True)
             yield from self._remove(service, old)
         else:
@@ -249,7 +249,7 @@ class Fleet:
         return Supervised(service, kind.command, kind.restart, kind.environment, self._forkserver, write)
 
     def _name(self) -> None:
-        """One is called as its service, several are numbered."""
+        """A single process is named like its service; several are numbered."""
         for service, group in self._groups.items():
             for number, process in enumerate(tuple(group), 1):
                 process.name = service if len(group) == 1 else f"{service} {number}"

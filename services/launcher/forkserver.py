@@ -1,18 +1,18 @@
-"""A process that has imported what the services share, and from which they are forked: in some tens of milliseconds, where a
-plain start takes a second or two.
+"""Fork server: a process that has imported the services' common modules, and from which services are forked in some tens of
+milliseconds; a plain start takes a second or two.
 
     launcher ---- command, environment, stderr ----> fork server ----> in between ----> service
     launcher <--------------- its pid --------------------'  (the one in between has ended)
     launcher -------------------------------- go ------------------------------------> `python -m MODULE ...`
 
-The one in between ends at once, and the launcher adopts its child: it waits for it, ends it, and takes it along when it ends
-itself, as if it had started it. A service depends on the fork server no longer than until it runs.
+The process in between ends at once, and the launcher adopts its child: it waits for it, ends it, and takes it along when it ends
+itself, as if it had started it. A service depends on the fork server only until it runs.
 
-The fork server opens no Zenoh session and has one thread: of a process that is forked only the thread that forks goes on, and
-what another one holds stays locked.
+The fork server opens no Zenoh session and has one thread: in a forked process only the forking thread continues, and locks held
+by other threads stay locked.
 
-At first it imports what all services share, and is ready: the cell starts from it. When the cell runs, it also imports the
-services themselves, so that one that dies is back at once.
+At first it imports the modules that all services share, and is ready: the cell starts from it. Once the cell runs, it also
+imports the services themselves, so that a service that dies is back at once.
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ ONE_THREAD = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-"""Every process is one worker: pools of threads that spin would take the cores from the others."""
+"""Every process is one worker: spinning thread pools would take the cores from the other processes."""
 COMMON = ("penumbra.shared.runtime.node", "penumbra.services.flags", "penumbra.services.run")
-"""Imported before the first service is forked. What only some services need they import themselves, side by side."""
+"""Modules imported before the first service is forked. Modules of single services are imported by these, in parallel."""
 ANSWER_S = 2.0
-"""A fork takes some milliseconds, on a machine that is far too busy a second. A fork server that takes longer is ended, and the
-service is started plainly."""
+"""Maximum time [s] for a fork, which takes some milliseconds, and a second on an overloaded machine. A slower fork server is
+ended, and the service is started plainly."""
 CALM_S = 20.0
-"""How long nothing has to be starting before it imports the services: that takes a second, which a limb that is being looked for
-needs more."""
+"""Time [s] for which no process may have been starting before the fork server imports the services: that takes a second of CPU,
+which the search for a limb needs more."""
 AGAIN_S = 10.0
-"""After which a fork server that ended is started again."""
+"""Time [s] after which a fork server that ended is started again."""
 MAX_BYTES = 1 << 17
-"""Size limit of a request: the command and the environment."""
+"""Maximum size [bytes] of a request: the command and the environment."""
 READY = b"ready"
 IMPORT = b"import"
 GO = b"1"
 
 
 def environment(own: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment of the launcher's processes; own: what one of them has besides.
+    """The environment of the launcher's processes; own: additional variables of one of them.
 
-    They import this checkout or installation and nothing from the current folder, whatever it holds.
+    They import this checkout or installation and nothing from the current folder.
     """
     return {**ONE_THREAD, **os.environ, **import_path(), "PENUMBRA_PARENT": str(os.getpid()), **(own or {})}
 
@@ -73,14 +73,14 @@ def import_path() -> dict[str, str]:
 
 
 class Forked:
-    """A service that was forked: as much of `subprocess.Popen` as its supervisor needs. stderr: what it writes there."""
+    """A forked service: the part of `subprocess.Popen` that its supervisor needs. stderr: the service's standard error."""
 
     def __init__(self, command: list[str], pid: int, stderr: TextIO):
         self.args, self.pid, self.stderr = command, pid, stderr
         self.returncode: int | None = None
 
     def poll(self) -> int | None:
-        """The exit code, negative for the number of a signal; None while it runs."""
+        """The exit code, negative for a signal's number; None while it runs."""
         if self.returncode is None:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             if pid:
@@ -88,7 +88,7 @@ class Forked:
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
-        """The exit code, as soon as it has ended. Raises subprocess.TimeoutExpired."""
+        """Wait for the end; returns the exit code. Raises subprocess.TimeoutExpired."""
         if self.poll() is None:
             ended = os.pidfd_open(self.pid)
             select.select([ended], [], [], timeout)
@@ -99,7 +99,7 @@ class Forked:
 
 
 class ForkServer:
-    """The launcher's side. common: modules that are imported before it is ready; modules: those that it imports once the cell
+    """The launcher's side of the fork server. common: modules imported before it is ready; modules: those imported once the cell
     runs. Linux only: elsewhere it is never ready, and services are started plainly."""
 
     def __init__(self, common: Sequence[str] = COMMON, modules: Sequence[str] = ()):
@@ -122,15 +122,15 @@ class ForkServer:
 
     @property
     def has_modules(self) -> bool:
-        """Whether it has imported the services themselves."""
+        """Whether the services themselves are imported."""
         return self._has_modules and self.is_ready
 
     def start(self) -> None:
-        """Starts it. To be called from the main thread, with which the kernel ends it."""
+        """Start the fork server. To be called from the main thread: the kernel ends the server with it."""
         if sys.platform != "linux":
             return
         PR_SET_CHILD_SUBREAPER = 36
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # adopts what it forks
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # adopts the forked processes
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._popen = subprocess.Popen(
@@ -142,15 +142,16 @@ class ForkServer:
             )
 
     def wait(self, seconds: float) -> bool:
-        """Whether a service can be forked, at the latest after `seconds`; False at once where it has ended."""
+        """Wait up to `seconds` until a service can be forked; returns whether it can, and False at once if the server has
+        ended."""
         if self._channel is not None and not self._is_ready and select.select([self._channel], [], [], seconds)[0]:
             with contextlib.suppress(OSError):
                 self._is_ready = self._channel.recv(len(READY), socket.MSG_DONTWAIT) == READY
         return self._is_ready
 
     def watch(self, is_calm: bool) -> None:
-        """Has it import the services once nothing else has been starting for CALM_S (`is_calm`: nothing is now), and starts it
-        again where it has ended. To be called from the main thread."""
+        """Tell the server to import the services once no process has been starting for CALM_S (`is_calm`: none is now), and
+        restart it if it has ended. To be called from the main thread."""
         now = time.monotonic()
         self._busy_at = self._busy_at if is_calm else now
         if self._popen is None:
@@ -164,12 +165,12 @@ class ForkServer:
                 self._channel.send(b"\n".join([IMPORT, *(module.encode() for module in self.modules)]))
 
     def renew(self) -> None:
-        """Lets the next service be forked from what is installed now."""
+        """Fork the next services from the currently installed code."""
         self.stop()
         self._due = 0.0
 
     def stop(self) -> None:
-        """Ends it. The services that came from it go on."""
+        """End the fork server. Services forked from it continue."""
         if self._popen is not None:
             self._popen.kill()
             self._popen.wait()
@@ -179,7 +180,7 @@ class ForkServer:
         self._due = time.monotonic() + AGAIN_S
 
     def fork(self, command: list[str], environment: Mapping[str, str]) -> Forked | None:
-        """A service from `[sys.executable, "-m", MODULE, ...]`; None where it has to be started plainly."""
+        """Fork a service from `[sys.executable, "-m", MODULE, ...]`; None if it has to be started plainly."""
         if command[:2] != [sys.executable, "-m"] or not self.is_ready or self._channel is None:
             return None
         said, stderr = os.pipe()
@@ -190,7 +191,7 @@ class ForkServer:
             self._channel.settimeout(ANSWER_S)
             socket.send_fds(self._channel, [request], theirs)
             pid = int(self._channel.recv(32))
-            os.write(go, GO)  # whoever waits for this in vain ends: nothing runs that is not known here
+            os.write(go, GO)  # a child that never gets this ends: no process runs unknown to the launcher
             ours.remove(said)
             return Forked(command, pid, open(said, errors="replace"))
         except (OSError, ValueError):
@@ -202,7 +203,7 @@ class ForkServer:
 
 
 def main(channel: socket.socket, modules: Sequence[str]) -> None:
-    """The fork server, and in its children the service."""
+    """Run the fork server, and in its children the service."""
     _import(modules)
     with contextlib.suppress(OSError):  # the launcher has ended
         channel.send(READY)
@@ -214,7 +215,7 @@ def main(channel: socket.socket, modules: Sequence[str]) -> None:
 
 def _import(modules: Sequence[str]) -> None:
     for module in modules:
-        with contextlib.suppress(ImportError):  # its service says what is not installed
+        with contextlib.suppress(ImportError):  # its service reports missing packages
             importlib.import_module(module)
     from penumbra.shared import native
 
@@ -223,11 +224,12 @@ def _import(modules: Sequence[str]) -> None:
     if len(threads) > 1:
         sys.exit(f"fork server: expected one thread after its imports, got {len(threads)}: services are started plainly")
     gc.collect()
-    gc.freeze()  # a collection in a child would copy the pages that all share
+    gc.freeze()  # a collection in a child would copy the shared pages
 
 
 def _serve(channel: socket.socket) -> tuple[list[str], dict[str, str], int, int] | None:
-    """Forks for every request. In the child: its command, environment, stderr and what to wait for; None at the end."""
+    """Fork for every request. In the child, returns its command, environment, stderr and the descriptor to wait for; None at the
+    end."""
     while True:
         request, descriptors, _, _ = socket.recv_fds(channel, MAX_BYTES, 2)
         if not request:  # the launcher is gone
@@ -247,7 +249,7 @@ def _serve(channel: socket.socket) -> tuple[list[str], dict[str, str], int, int]
             os.close(write)
             asked = json.loads(request)
             return asked["command"], asked["environment"], descriptors[0], descriptors[1]
-        os.waitpid(between, 0)  # from now on the launcher is its parent
+        os.waitpid(between, 0)  # now the launcher is its parent
         for descriptor in (write, *descriptors):
             os.close(descriptor)
         channel.send(os.read(read, 32))
@@ -255,7 +257,7 @@ def _serve(channel: socket.socket) -> tuple[list[str], dict[str, str], int, int]
 
 
 def _become(command: list[str], environment: dict[str, str], stderr: int, go: int) -> None:
-    """Runs `python -m MODULE ...` in this process, once the launcher has adopted it and knows its pid."""
+    """Run `python -m MODULE ...` in this process, once the launcher has adopted it and knows its pid."""
     if os.read(go, len(GO)) != GO:
         os._exit(1)
     os.close(go)

@@ -1,4 +1,4 @@
-"""The launcher of `penumbra up`: it starts, watches and restarts the processes of a cell, as their table says."""
+"""The launcher of `penumbra up`: starts, watches and restarts the processes of a cell, as their table says."""
 
 from __future__ import annotations
 
@@ -33,19 +33,20 @@ POLL_S = 0.05
 REDRAW_S = 0.5
 PLAIN_S = 5.0
 FORKSERVER_S = 10.0
-"""How long the start waits for the fork server; after that, processes are started plainly. It imports what each of them would
-import itself, so that only a fork server that is broken takes longer than a plain start."""
+"""Maximum time [s] that the start waits for the fork server; after that, processes are started plainly. It imports what each of
+them would import itself, so only a broken fork server takes longer than a plain start."""
 LISTEN_S = 0.005
-"""How often it is looked whether the router listens."""
+"""Period [s] at which the launcher checks whether the router listens."""
 SENSES = (topics.VISION, topics.HAPTIC)
-"""What a fused pose is made of."""
+"""Topics from which a pose is fused."""
 
 
 class Launcher:
-    """Runs the processes of a cell until it is told to stop, and changes them when it is asked to.
+    """Runs the processes of a cell until it is stopped, and changes them on request.
 
-    keep_going: also when a process does not start. notify: takes a line of what the start waits for, in place of a screen.
-    hint: the command that the screen names. page_key: of the links to the web page; opens: whether a browser opens it.
+    keep_going: continue if a process does not start. notify: receives the progress of the start line by line, instead of a
+    screen. hint: the command that the screen names. page_key: key in the links to the web page; opens: whether a browser opens
+    it.
     """
 
     def __init__(
@@ -70,10 +71,11 @@ class Launcher:
         self._looping: set[str] = set()
 
     def run(self, seconds: float) -> int:
-        """Starts what is not started yet, and returns after `seconds` or when the node is stopping; then nothing is left.
+        """Start the processes that are not started yet, and return after `seconds` or when the node is stopping; all processes
+        have then ended.
 
-        Returns the exit code: 1 where a process had failed by then, or where no pose was tracked within `seconds` although a
-        sense and the fusion ran here.
+        Returns the exit code: 1 if a process had failed by then, or if no pose was tracked within `seconds` although a sense and
+        the fusion ran here.
         """
         deadline = time.monotonic() + seconds
         self.node.every(1.0, self._refresh, display.ANSWER_S + HANG_S)
@@ -97,7 +99,7 @@ class Launcher:
         finally:
             failed, rows = self._failed(), self._rows()
             is_over = not failed and not self.node.stopping.is_set()
-            self.node.stopping.set()  # it does not miss the router that it ends
+            self.node.stopping.set()  # so that the node does not report the loss of the router that it ends
             self.fleet.stop()
         lacks_pose = is_over and self._should_track() and not self.watch.has_tracked
         self._print(display.summary(rows, self.watch))
@@ -111,12 +113,12 @@ class Launcher:
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def page_link(self, with_key: bool = True) -> str:
-        """The link of the web page, empty while it is not served. with_key: as only who sees this screen may have it."""
+        """The link of the web page, empty while it is not served. with_key: include the key, only for the user of this screen."""
         address = page.address_in(self.watch.local().values())
         return page.link(address, self._page_key if with_key else None) if address else ""
 
     def _open_page(self) -> None:
-        """Has a browser open the page, once it is served, where that is asked for; one in the terminal returns when it ends."""
+        """Open the page in a browser, once it is served, if requested; a browser in the terminal returns when it ends."""
         if self._opens and (link := self.page_link()):
             self._opens = False
             import webbrowser
@@ -124,13 +126,13 @@ class Launcher:
             threading.Thread(target=webbrowser.open, args=(link,), name="open page", daemon=True).start()
 
     def _failed(self) -> list[str]:
-        """The processes of the start without which the cell is not to run: they cannot begin, or have died each time."""
+        """The processes of the start that prevent the cell from running: they cannot begin, or have died repeatedly."""
         if self._keep_going:
             return []
         return [each.name for each in self._first if each.state == "failed" or (each.is_looping and not each.has_served)]
 
     def _tell_of_start(self) -> None:
-        """Tells who waits for the start what it is at, until it is done."""
+        """Report the progress of the start to the waiting process, until it is done."""
         assert self._notify is not None, "only a launcher in the background reports its start"
         rows = self._rows()
         waiting = [f"{row.name} ({row.note.partition(';')[0] or row.state})" for row in rows if row.state != "running"]
@@ -146,7 +148,7 @@ class Launcher:
         self._notify = lambda text: None
 
     def _should_track(self) -> bool:
-        """Whether a sense and what fuses it run here."""
+        """Whether a sense and the fusion run here."""
         services = {process.service for process in self.fleet.processes}
         return bool(services & set(topics.FUSED.publishers)) and any(services & set(topic.publishers) for topic in SENSES)
 
@@ -208,9 +210,9 @@ def fleet(
     forkserver: ForkServer | None = None,
     write: Callable[[str, str], None] | None = None,
 ) -> Fleet:
-    """The processes that this cell needs, ready to start: the router among them, unless there is one already (--connect). Raises
+    """The processes that this cell needs, ready to start, including the router, unless there is one already (--connect). Raises
     CellError for an unknown name or an impossible number."""
-    own = {"PENUMBRA_METRICS_PORT": ""}  # the launcher's port covers all
+    own = {"PENUMBRA_METRICS_PORT": ""}  # the launcher's port serves the metrics of all
     kinds, counts = {}, {}
     for process in PROCESSES:
         number = process.replicas or int(_started(process, options) is not None)
@@ -246,17 +248,17 @@ def _command(process: Process, options: flags.Options) -> list[str]:
 
 
 def _started(process: Process, options: flags.Options) -> str | None:
-    """The value of the flag that starts a process; None where it is not given, or there is no such flag."""
+    """The value of the flag that starts a process; None if it is not given, or there is no such flag."""
     return getattr(options, process.starter.name) if process.starter is not None else None
 
 
 def listening(options: flags.Options) -> str:
-    """Where the launcher's router listens: on loopback, or, secured, on every network of this machine."""
+    """The endpoint of the launcher's router: on loopback, or, secured, on every network of this machine."""
     return f"tls/0.0.0.0:{options.port}" if options.secure else f"tcp/127.0.0.1:{options.port}"
 
 
 def meeting_points(options: flags.Options) -> tuple[str, ...]:
-    """The endpoints at which all meet."""
+    """The endpoints at which all processes meet."""
     own = f"{'tls' if options.secure else 'tcp'}/127.0.0.1:{options.port}"
     return tuple(options.connect) or (own,)
 
@@ -272,7 +274,7 @@ def pose_command(options: flags.Options) -> str:
 
 
 def _notifier(descriptor: int | None) -> Callable[[str], None] | None:
-    """Writes lines to a pipe, as long as somebody reads them."""
+    """A function that writes lines to a pipe, as long as it is read."""
     if descriptor is None:
         return None
 
@@ -284,7 +286,7 @@ def _notifier(descriptor: int | None) -> Callable[[str], None] | None:
 
 
 def check_port(node: Node, port: int) -> None:
-    """Raises bus.BusError where another router has the port."""
+    """Raise bus.BusError if another router has the port."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -294,7 +296,7 @@ def check_port(node: Node, port: int) -> None:
 
 
 def wait_for_router(node: Node, fleet: Fleet, port: int) -> None:
-    """Returns when the router that was started listens, or the node is stopping. Raises bus.BusError where it cannot start."""
+    """Wait until the started router listens, or the node is stopping. Raises bus.BusError if it cannot start."""
     router = next(process for process in fleet.processes if process.service == ROUTER.name)
     while not node.stopping.wait(LISTEN_S):
         fleet.watch()
@@ -305,7 +307,7 @@ def wait_for_router(node: Node, fleet: Fleet, port: int) -> None:
 
 
 def check_alone(node: Node, fleet: Fleet) -> None:
-    """Raises bus.BusError where the bus has a process already of which a cell can have but one, and this fleet holds another."""
+    """Raise bus.BusError if the bus already has a process of which a cell can have only one, and this fleet has another."""
     assert node.session is not None
     single = {process.name for process in PROCESSES if not process.beside} & {process.service for process in fleet.processes}
     cell = node.cell.name
@@ -318,7 +320,7 @@ def check_alone(node: Node, fleet: Fleet) -> None:
 
 
 def run(options: flags.Options, forkserver: ForkServer) -> int:
-    """`penumbra up`, with processes from a fork server that has been started; returns the exit code."""
+    """Run `penumbra up`, with processes from a started fork server; returns the exit code."""
     if not options.connect and options.port is None:
         options.connect = connect_by_environment()
     options.port = options.port or PORT
@@ -354,8 +356,8 @@ def run(options: flags.Options, forkserver: ForkServer) -> int:
             ):
                 return launcher.run(options.seconds)
         except bus.BusError:
-            if not node.stopping.is_set():  # else: told to stop before the router came
+            if not node.stopping.is_set():  # else: stopped before the router came
                 raise
             return 0
         finally:
-            processes.stop()  # also where it did not come to run
+            processes.stop()  # also if it did not get to run

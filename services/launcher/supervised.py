@@ -1,4 +1,4 @@
-"""One process that the launcher starts, watches, starts again and ends."""
+"""A process that the launcher starts, watches, restarts and ends."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from penumbra.shared.contract.report import Report
 from penumbra.shared.runtime import logs
 
 BACKOFF_S = (0.2, 10.0)
-"""Between the deaths of a process that does not become healthy: the first, doubled each time, and the longest."""
+"""Initial and maximum delay [s] before a process that does not become healthy is restarted; the delay is doubled each time."""
 STABLE_S = 10.0
-"""A process that ran this long is healthy: when it dies it is started again at once."""
+"""Time [s] after which a process is healthy: when it dies it is restarted at once."""
 CRASH_LOOP = 3
 SILENT_S = 10.0
-"""A process that was well before and hangs for this long, or does not answer, is killed and started again."""
+"""Time [s] for which a formerly healthy process may hang or not answer before it is killed and restarted."""
 TERMINATE_S = 1.5
 ASKED_FOR_NOTHING = 2
-"""Exit code of a process whose flags, cell or installation cannot work: starting it again changes nothing."""
+"""Exit code of a process whose flags, cell or installation cannot work: a restart changes nothing."""
 
 
 @dataclass(frozen=True)
 class ProcessRow:
-    """What is known of one process. `note` says why it is not running, or not as it should; `cpu`: cores."""
+    """State of one process. `note` says why it is not running, or not as it should; `cpu`: cores."""
 
     name: str
     state: str
@@ -46,11 +46,11 @@ class ProcessRow:
 
 
 class Supervised:
-    """One process that is started, watched and started again.
+    """One process that is started, watched and restarted.
 
-    state: starting, running, waiting (for its next start), failed (it will not be started again), stopping or stopped. is_ready:
-    it does its part for the others. has_served: it was ready at some time. forkserver: where it comes from, if that is possible.
-    write: takes the lines of its standard error; by default they go to the launcher's.
+    state: starting, running, waiting (for its next start), failed (it will not be restarted), stopping or stopped. is_ready: it
+    serves the others. has_served: it was ready at some time. forkserver: where it is forked, if possible. write: receives the
+    lines of its standard error; by default they go to the launcher's.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Supervised:
         forkserver: ForkServer | None = None,
         write: Callable[[str], None] | None = None,
     ):
-        self.service = self.name = name  # several of a service are numbered in their names
+        self.service = self.name = name  # several processes of a service are numbered in their names
         self.command, self.restart = command, restart
         self.state, self.note, self.restarts = "stopped", "", 0
         self.is_ready = self.has_served = False
@@ -70,8 +70,8 @@ class Supervised:
         self.cpu, self.memory_mb = 0.0, 0.0
         self._environment, self._forkserver = environment or {}, forkserver
         self._write = write or _to_stderr
-        self._orphans: set[int] = set()  # groups of processes that have ended, of which the launcher may have adopted children
-        self.pidfd: int | None = None  # readable when it has ended
+        self._orphans: set[int] = set()  # process groups of ended processes, whose children the launcher may have adopted
+        self.pidfd: int | None = None  # readable when the process has ended
         self._delay_s = BACKOFF_S[0]
         self._crashes = 0
         self._started = self._due = self._heard = 0.0
@@ -86,12 +86,12 @@ class Supervised:
 
     @property
     def is_looping(self) -> bool:
-        """Whether it died again and again, and has not run for STABLE_S since."""
+        """Whether it died repeatedly, and has not run for STABLE_S since."""
         return self._crashes >= CRASH_LOOP
 
     def start(self, is_afresh: bool = False) -> None:
-        """Starts it, from the launcher's main thread: the kernel ends it when that thread ends. is_afresh: from what is installed
-        now, and not from the fork server, which has imported what was installed before."""
+        """Start it, from the launcher's main thread: the kernel ends it when that thread ends. is_afresh: from the currently
+        installed code, and not from the fork server, which has imported earlier code."""
         server = None if is_afresh else self._forkserver
         forked = server.fork(self.command, environment(self._environment)) if server else None
         self._attend(forked or self._plain())
@@ -112,9 +112,9 @@ class Supervised:
         self.start()
 
     def _attend(self, popen: subprocess.Popen[str] | Forked) -> None:
-        """Begins to look after a process that has just begun."""
+        """Begin to supervise a process that has just started."""
         self.popen = popen
-        with contextlib.suppress(OSError, AttributeError):  # only Linux has them; without, its end is noticed a little later
+        with contextlib.suppress(OSError, AttributeError):  # Linux only; elsewhere its end is noticed slightly later
             self.pidfd = os.pidfd_open(popen.pid)
         self._last_words.clear()
         self._started, self._heard = time.monotonic(), 0.0
@@ -132,7 +132,7 @@ class Supervised:
         popen.stderr.close()
 
     def watch(self) -> None:
-        """Looks whether it still runs, and starts it again when it is due."""
+        """Check whether it still runs, and restart it when due."""
         now = time.monotonic()
         self._bury()
         if self.state == "stopping":
@@ -169,8 +169,8 @@ class Supervised:
         self._delay_s = min(max(2 * self._delay_s, BACKOFF_S[0]), BACKOFF_S[1])
 
     def clear(self) -> None:
-        """After its end: nothing of it is left."""
-        self.signal(signal.SIGKILL)  # whatever it started itself
+        """Clean up after its end."""
+        self.signal(signal.SIGKILL)  # processes that it started itself
         if self._listener is not None:
             self._listener.join(0.2)
         if self.popen is not None:
@@ -182,7 +182,7 @@ class Supervised:
         self.is_ready = False
 
     def _bury(self) -> None:
-        """Leaves no zombie of what a process that has ended had started."""
+        """Reap children that ended processes left to the launcher."""
         for group in tuple(self._orphans):
             try:
                 os.waitpid(-group, os.WNOHANG)
@@ -190,7 +190,7 @@ class Supervised:
                 self._orphans.discard(group)
 
     def end(self) -> None:
-        """Asks it to end, for good; `watch` sees to it that it does within TERMINATE_S."""
+        """Ask it to end permanently; `watch` enforces this after TERMINATE_S."""
         if self.popen is None:
             self.state = "stopped"
             return
@@ -206,7 +206,7 @@ class Supervised:
             self.signal(signal.SIGKILL)
 
     def heard(self, is_ready: bool = True, hangs: str = "") -> None:
-        """Its health query was answered, and said whether it does its part, and what in it hangs."""
+        """Its health query was answered: is_ready, and what in it hangs."""
         if not hangs or not self._heard:
             self._heard = time.monotonic()
         self.is_ready, self._hangs = is_ready, hangs
@@ -215,20 +215,20 @@ class Supervised:
             self.state = "running"
 
     def measure(self) -> None:
-        """Takes CPU (cores since the last call) and memory."""
+        """Measure CPU (cores since the last call) and memory."""
         if self._usage is not None and self.popen is not None:
             with contextlib.suppress(psutil.NoSuchProcess):
                 self.cpu = self._usage.cpu_percent() / 100
                 self.memory_mb = self._usage.memory_info().rss / 1e6
 
     def signal(self, number: signal.Signals) -> None:
-        """To its whole process group, which it leads."""
+        """Send a signal to its process group, which it leads."""
         if self.popen is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.popen.pid, number)
 
     def row(self, health: Report | None = None) -> ProcessRow:
-        """For the table; health: its own report, where it gave one."""
+        """Its row in the table; health: its own report, if it gave one."""
         state, note = self.state, self.note
         if state == "running" and health is not None and health.status != "ok":
             state, note = health.status, "; ".join([*([note] if note else []), *health.reasons])
@@ -240,7 +240,7 @@ def _to_stderr(line: str) -> None:
 
 
 def wait(processes: Iterable[Supervised], seconds: float) -> None:
-    """Returns when one of them ends, or after `seconds`."""
+    """Wait until one of them ends, or for `seconds`."""
     ends = select.poll()
     for process in processes:
         if process.pidfd is not None:
@@ -249,7 +249,7 @@ def wait(processes: Iterable[Supervised], seconds: float) -> None:
 
 
 def stop(processes: list[Supervised]) -> None:
-    """SIGTERM to all, and SIGKILL to what is still there after TERMINATE_S."""
+    """Send SIGTERM to all, and SIGKILL to those still running after TERMINATE_S."""
     for process in processes:
         process.signal(signal.SIGTERM)
     deadline = time.monotonic() + TERMINATE_S

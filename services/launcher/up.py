@@ -1,4 +1,4 @@
-"""`penumbra up`, from its first moment: what all processes are forked from imports while the launcher does."""
+"""`penumbra up`, from its start: the fork server imports its modules while the launcher imports its own."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ PARAMS = (
     "penumbra up --detach && penumbra logs -f",
 )
 def main(options: flags.Options) -> int:
-    """Starts the fork server before the launcher is imported."""
+    """Start the fork server before the launcher is imported."""
     if options.detach:
         from penumbra.services.launcher import background
         from penumbra.shared.cell import description
