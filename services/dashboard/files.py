@@ -1,4 +1,4 @@
-"""The page's files: read once, compressed once, and nothing else can be asked for."""
+"""The page's files: read once and compressed once; no other file can be requested."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class File:
 
     @cached_property
     def compressed(self) -> bytes:
-        """The content by gzip."""
+        """The content, compressed by gzip."""
         return gzip.compress(self.content, 6, mtime=0)
 
     @cached_property
     def tag(self) -> str:
-        """Changes with the content."""
+        """ETag: a hash of the content."""
         return f'"{hashlib.sha256(self.content).hexdigest()[:20]}"'
 
 
 def read(folder: Path = PAGE) -> dict[str, File]:
-    """Every file of the page by its path in the address; the page itself is `/`."""
+    """All files of the page by their paths in the address; the page itself is `/`."""
     found = {
         f"/{path.relative_to(folder).as_posix()}": File(path.read_bytes(), TYPES[path.suffix])
         for path in sorted(folder.rglob("*"))

@@ -1,4 +1,5 @@
-"""What goes to the browsers: one slot a stream and page, and the next message only after the page has shown the last one.
+"""Queues of messages to the browsers: one slot per stream and page; the next message is sent only after the page has shown the
+last one.
 
 Everything here belongs to the thread of the server's event loop, except `Hub.wanted`, which is replaced as a whole and may be
 read from any thread.
@@ -11,14 +12,14 @@ from dataclasses import dataclass
 
 PICTURE, MOMENT, SLOW = "picture", "moment", "slow"
 STREAMS = (MOMENT, PICTURE, SLOW)
-"""What a page receives, in the order in which it is sent: pose and scene, the camera's picture, processes and rates."""
+"""Streams of a page, in the order in which they are sent: pose and scene, the camera's picture, processes and rates."""
 MOST_PAGES = 16
-"""Pages that are open at the same time."""
+"""Maximum number of pages that are open at the same time."""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the open pages can take now. pages: their number; moment: whether one of them has shown its last moment; cameras:
+    """What the open pages can receive now. pages: their number; moment: whether one of them has shown its last moment; cameras:
     those that a page looks at; ready: those of them for which a page has shown its last picture."""
 
     pages: int = 0
@@ -29,7 +30,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Offer:
-    """A message for the pages. payload: as they get it, made once for all of them; camera: of a picture, the one that took it."""
+    """A message for the pages. payload: encoded once for all pages; camera: for a picture, its camera."""
 
     stream: str
     payload: bytes
@@ -37,7 +38,7 @@ class Offer:
 
 
 class Page:
-    """One open page: what waits for it, and what it may be sent. camera: the one that it looks at, empty for none."""
+    """One open page, with its waiting messages and its credit. camera: the one that it looks at, empty for none."""
 
     def __init__(self, camera: str = ""):
         self.camera = camera
@@ -46,12 +47,12 @@ class Page:
         self._changed = asyncio.Event()
 
     def offer(self, stream: str, payload: bytes) -> None:
-        """Puts a message into its slot, in place of one that was not sent yet."""
+        """Put a message into its slot, replacing one that was not sent yet."""
         self._slots[stream] = payload
         self._changed.set()
 
     def shown(self, stream: str) -> None:
-        """Takes note that the page has shown the last message of a stream. Raises ValueError for an unknown stream."""
+        """Record that the page has shown the last message of a stream. Raises ValueError for an unknown stream."""
         if stream not in STREAMS:
             raise ValueError(f"expected one of {', '.join(STREAMS)}, got {stream!r:.40}")
         self._credit.add(stream)
@@ -62,7 +63,7 @@ class Page:
         return stream in self._credit
 
     async def next(self) -> tuple[str, bytes]:
-        """The next message to send with its stream, as soon as there is one that the page can take."""
+        """Wait for the next message that the page can receive; returns its stream and payload."""
         while True:
             for stream in STREAMS:
                 if stream in self._slots and stream in self._credit:
@@ -81,28 +82,28 @@ class Hub:
 
     @property
     def is_full(self) -> bool:
-        """Whether no further page may be opened."""
+        """Whether the maximum number of pages is open."""
         return len(self._pages) >= MOST_PAGES
 
     def open(self, page: Page) -> None:
-        """Adds a page."""
+        """Add a page."""
         self._pages.append(page)
         self.look()
 
     def close(self, page: Page) -> None:
-        """Removes a page, and what waited for it."""
+        """Remove a page and its waiting messages."""
         self._pages.remove(page)
         self.look()
 
     def offer(self, *offers: Offer) -> None:
-        """Gives messages to every page, pictures to the pages that look at their camera."""
+        """Offer messages to every page, pictures to the pages that look at their camera."""
         for offer in offers:
             for page in self._pages:
                 if offer.stream != PICTURE or page.camera == offer.camera:
                     page.offer(offer.stream, offer.payload)
 
     def look(self) -> None:
-        """Renews `wanted`."""
+        """Update `wanted`."""
         cameras = frozenset(page.camera for page in self._pages if page.camera)
         ready = frozenset(page.camera for page in self._pages if page.camera and page.has_credit(PICTURE))
         self.wanted = Wanted(len(self._pages), any(page.has_credit(MOMENT) for page in self._pages), cameras, ready)

@@ -1,4 +1,4 @@
-"""`penumbra dashboard link`: the links that open the page of a secured cell, for those whose certificates are in a folder."""
+"""`penumbra dashboard link`: prints the links that open the page of a secured cell, for the certificates in a folder."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from penumbra.shared.runtime import bus, page
     example="penumbra dashboard link --secure certs",
 )
 def main(options: flags.Options) -> None:
-    """Prints a line per right. Raises BusError where the folder has neither certificate."""
+    """Print one line per right. Raises BusError if the folder has neither certificate."""
     if options.secure is None:
         flags.refuse("expected --secure FOLDER, got none: without certificates everybody who reaches the page may open it")
     print("\n".join(links(options.secure, options.at)))
 
 
 def links(folder: Path, address: str) -> list[str]:
-    """The lines. Raises BusError where there are none."""
+    """The lines. Raises BusError if there are none."""
     holders = {access.VIEWER: "to look", access.OPERATOR: "to steer"}
     keys = {right: page.key(folder, holder) for holder, right in holders.items()}
     found = [f"{right:9} {page.link(address, key)}" for right, key in keys.items() if key]

@@ -1,4 +1,4 @@
-"""The camera's picture as a page gets it: a JPEG, the mask as runs, and the outline of each pose."""
+"""Encodes the camera's picture for a page: a JPEG, the mask as runs, and the outline of each pose."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.lens import Undistortion
 
 MOST_WIDE = 640
-"""A wider picture is made smaller by a whole number [px]: the page shows it 500 px wide beside the scene, and OpenCV takes 0.1 ms
-for a half and 1.5 ms for three quarters."""
+"""Maximum width [px]: a wider picture is reduced by an integer factor. The page shows it 500 px wide beside the scene, and OpenCV
+takes 0.1 ms for a half and 1.5 ms for three quarters."""
 QUALITY = 75
-"""Of the JPEG, from 0 to 100."""
+"""Quality of the JPEG, from 0 to 100."""
 TOLERANCE_PX = 0.7
-"""How far an outline may be from the silhouette's edge."""
+"""Maximum distance [px] of an outline from the silhouette's edge."""
 
-cv2.setNumThreads(1)  # its second thread waits busily between two pictures: 1.4 % of a core for nothing
+cv2.setNumThreads(1)  # its second thread busy-waits between two pictures and wastes 1.4 % of a core
 
 
 class Painter:
@@ -40,7 +40,7 @@ class Painter:
     def message(
         self, frame: messages.Frame, mask: messages.Mask | None, poses: Mapping[str, messages.FusedPose], now_ns: int
     ) -> bytes:
-        """What is sent: the length of a header, the header (JSON), the runs of the mask, the JPEG; see `camera.js`."""
+        """The message to a page: the length of a header, the header (JSON), the runs of the mask, the JPEG; see `camera.js`."""
         image: NDArray[Any] = self._undistort(frame.image)
         if (part := -(-self.camera.width // MOST_WIDE)) > 1:
             image = cv2.resize(image, (self.camera.width // part, self.camera.height // part), interpolation=cv2.INTER_AREA)
@@ -61,7 +61,7 @@ class Painter:
             },
         }
         text = json.dumps(header).encode()
-        text += b" " * (-len(text) % 4)  # the runs begin at a multiple of their size
+        text += b" " * (-len(text) % 4)  # align the runs to a multiple of their size
         return struct.pack("<I", len(text)) + text + runs.tobytes() + jpeg.tobytes()
 
     def outline(self, target: str, pose: messages.FusedPose) -> list[list[int]]:
@@ -78,7 +78,7 @@ class Painter:
         return [cv2.approxPolyDP(line, TOLERANCE_PX, True).ravel().astype(int).tolist() for line in found]
 
     def _window(self, points: NDArray[np.float64]) -> tuple[int, int, int, int]:
-        """The part (x0, y0, width, height) of the picture in which points (n, 3) in the camera's frame lie."""
+        """The bounding window (x0, y0, width, height) in the picture of points (n, 3) in the camera's frame."""
         camera = self.camera
         if points[:, 2].min() < raster.NEAR:
             return 0, 0, camera.width, camera.height
@@ -90,12 +90,12 @@ class Painter:
 
 
 def run_lengths(labels: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """The runs (n, 2) of equal labels of a mask, row after row: label and length."""
+    """Run-length encoding (n, 2) of a mask, row after row: label and length."""
     flat = labels.ravel()
     starts = np.concatenate([[0], np.flatnonzero(np.diff(flat)) + 1])
     lengths = np.diff(np.concatenate([starts, [flat.size]]))
     longest = np.iinfo(np.uint16).max
-    if lengths.max() > longest:  # a mask of one label: cut where a number ends
+    if lengths.max() > longest:  # split runs that are longer than the number type allows
         cuts = np.arange(0, flat.size, longest)
         starts = np.union1d(starts, cuts)
         lengths = np.diff(np.concatenate([starts, [flat.size]]))

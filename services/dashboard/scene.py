@@ -1,4 +1,4 @@
-"""The still parts of the scene: meshes of robots and targets, pads and cameras, once for each page that opens."""
+"""The static parts of the scene: meshes of robots and targets, pads and cameras, sent once to each page that opens."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import COLOURS
 
 LINK_DIGITS = 9
-"""Decimals of where a link sits in its parent: errors of a chain of links add up."""
+"""Decimals of a link's pose in its parent: errors along a chain of links add up."""
 
 
 def pack(cell: cells.Cell) -> bytes:
     """The length of a header, the header (JSON), and the meshes: vertices (n, 3) float32 [m] and faces (m, 3) uint32 of each.
 
-    The header says of each mesh where its two arrays begin, in numbers of four bytes after the header. Raises CellError where a
-    mesh cannot be read.
+    The header states the offsets of each mesh's two arrays, in four-byte numbers after the header. Raises CellError if a mesh
+    cannot be read.
     """
     blocks: list[bytes] = []
     meshes: dict[str, dict[str, int]] = {}
@@ -40,7 +40,7 @@ def pack(cell: cells.Cell) -> bytes:
 
 
 def describe(cell: cells.Cell) -> dict[str, Any]:
-    """What a page must know of a cell: names, the places of pads and cameras, colours of the classes."""
+    """Description of a cell for a page: names, poses of pads and cameras, colours of the classes."""
     return {
         "cell": cell.name,
         "frame": cell.frame,
@@ -73,7 +73,7 @@ def describe(cell: cells.Cell) -> dict[str, Any]:
 
 
 def _meshes(cell: cells.Cell) -> dict[str, Mesh]:
-    """`link/ROBOT/LINK` and `target/NAME`."""
+    """Meshes by `link/ROBOT/LINK` and `target/NAME`."""
     out = {f"link/{robot}/{link}": mesh for robot, model in robot_models(cell).items() for link, mesh in model.meshes.items()}
     return out | {f"target/{name}": anatomy.target_mesh(target, cell) for name, target in cell.targets.items()}
 
@@ -81,9 +81,9 @@ def _meshes(cell: cells.Cell) -> dict[str, Mesh]:
 def _links(robot: str, model: RobotModel) -> dict[str, dict[str, Any]]:
     """The links of a robot as `ROBOT/LINK`, a parent before its children.
 
-    parent: the link that carries it, null for the base, which stands in the world. pose: in its parent, where its joint is at
-    zero. joint: the place of its joint in a message of joints, null where it does not move. axis: of the joint, in the link's
-    frame. slides: whether the joint moves it along the axis instead of turning it.
+    parent: the link that carries it, null for the base, which is fixed to the world. pose: in its parent, with its joint at zero.
+    joint: index of its joint in a message of joints, null if it does not move. axis: of the joint, in the link's frame. slides:
+    whether the joint moves the link along the axis instead of turning it.
     """
     out = {}
     for i, (link, parent) in enumerate(zip(model.links, model.parents, strict=True)):

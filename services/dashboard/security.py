@@ -1,10 +1,10 @@
-"""Who may open the page, and who may steer.
+"""Access control of the page: who may view it, and who may steer.
 
-A browser runs pages of others beside ours. None of them may look, and none may steer: `refusal` says why a request is refused
-that was not sent by our page, or that reached us by a name that is not ours (DNS rebinding). Steering also needs a key, which our
-page alone can read. Without certificates everybody who reaches the page may look, and the key to steer is drawn at the start.
-With them (`--secure`) there is a key to look and one to steer, derived from the certificates of viewer and operator
-(`shared.runtime.page`), and who has neither sees nothing.
+A browser also runs pages of other sites, which must neither view nor steer: `refusal` gives the reason to refuse a request that
+our page did not send, or that reached us under a foreign name (DNS rebinding). Steering also needs a key, which only our page can
+read. Without certificates everybody who reaches the page may view it, and the steering key is drawn at the start. With them
+(`--secure`) there is a viewing key and a steering key, derived from the certificates of viewer and operator
+(`shared.runtime.page`), and a client without a key sees nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 Right = Literal["look", "steer"]
 LOCAL = frozenset({"localhost", "127.0.0.1", "::1"})
 HEADERS = {
-    # frames: another page must not show ours and have its buttons pressed by people who mean something else
+    # frames: another page must not embed ours and trick users into pressing its buttons
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -28,18 +28,18 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
-"""Sent with every answer."""
+"""Headers of every answer."""
 
 
 @dataclass(frozen=True)
 class Keys:
-    """The keys of the page. look: None where everybody may look; steer: None where nobody may steer."""
+    """The keys of the page. look: None if everybody may view it; steer: None if nobody may steer."""
 
     look: tuple[str, ...] | None
     steer: str | None
 
     def right(self, key: str) -> Right | None:
-        """What somebody with this key may do, None for nothing."""
+        """The right that a key grants, None for nothing."""
         given = key.encode()
         if self.steer is not None and hmac.compare_digest(given, self.steer.encode()):
             return "steer"
@@ -49,7 +49,7 @@ class Keys:
 
 
 def hosts(address: str, named: Iterable[str] = ()) -> frozenset[str]:
-    """The names by which a server is reached that listens on an address; named: those that a user adds."""
+    """The names under which a server that listens on an address is reached; named: those that a user adds."""
     found = {name.lower() for name in named} | LOCAL
     if not _is_any(address):
         found.add(address.lower())
@@ -64,10 +64,10 @@ def _is_any(address: str) -> bool:
 
 
 def refusal(headers: Mapping[str, str], known: frozenset[str], needs_origin: bool) -> str:
-    """Why a request is refused, empty where it is not.
+    """The reason to refuse a request, empty if it is allowed.
 
-    headers: of the request. known: names by which this server is reached. needs_origin: whether the request must say that our
-    page sent it, as a browser's does for a websocket and for every request that changes something.
+    headers: of the request. known: names of this server. needs_origin: whether the request must state that our page sent it, as a
+    browser does for a websocket and for every request that changes something.
     """
     host = headers.get("Host", "")
     name = _name(host)
@@ -83,14 +83,14 @@ def refusal(headers: Mapping[str, str], known: frozenset[str], needs_origin: boo
         found = urlsplit(origin)
     except ValueError:
         return f"expected an Origin of the page itself, got {origin!r:.80}"
-    # behind a proxy the page has TLS and we have not: the scheme may be either
+    # behind a proxy the page has TLS and we do not: either scheme is valid
     if found.scheme not in ("http", "https") or found.netloc.lower() != host.lower():
         return f"expected an Origin of the page itself, got {origin!r:.80}"
     return ""
 
 
 def _name(host: str) -> str:
-    """The name in a Host header, without the port; empty where it has none."""
+    """The name in a Host header, without the port; empty if there is none."""
     try:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:

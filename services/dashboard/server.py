@@ -1,4 +1,4 @@
-"""The web server: the page's files, a websocket that shows, and requests that steer."""
+"""The web server: the page's files, a websocket for its data, and requests that steer."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 
 KEY = "X-Penumbra-Key"
-"""The header with the key of whoever asks."""
+"""Header with the client's key."""
 MOST_BYTES = 4096
-"""Size of what a page may send."""
+"""Maximum size [bytes] of a request from a page."""
 HELLO_S = 5.0
-"""How long a websocket may wait before it says who it is."""
+"""Time [s] in which a new websocket must identify itself."""
 HEARTBEAT_S = 10.0
 STOP_S = 1.0
 RETRY_S = 0.2
 NEWS_S = 1.0
-"""Time in which a session that opens learns who else is on the bus."""
+"""Time [s] in which a new session learns the other participants of the bus."""
 HANDOVER_S = 10.0
-"""How long a dashboard waits for the port of the one that it takes over from."""
+"""Time [s] that a dashboard waits for the port of the one that it replaces."""
 STRANGER = 4401
-"""The websocket is closed with this where the key is not one."""
+"""Close code of the websocket if the key is not valid."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the page is served. address, port: to listen at; is_chosen: whether a user named the port, so that no other will do;
-    hosts: names by which the page is reached."""
+    """Where the page is served. address, port: to listen at; is_chosen: whether a user named the port, so that no other one is
+    used; hosts: names under which the page is reached."""
 
     address: str
     port: int
@@ -51,9 +51,9 @@ class Place:
 
 
 class Server:
-    """Serves the page in a thread of its own, by `run`.
+    """Serves the page in its own thread, by `run`.
 
-    keys: who may look and steer. look_only: why nobody steers, empty where somebody may.
+    keys: who may view and steer. look_only: the reason why nobody may steer, or empty.
     """
 
     def __init__(self, node: Node, place: Place, keys: security.Keys, look_only: str):
@@ -68,7 +68,7 @@ class Server:
         self.url = ""
         """The address of the page, empty while it is not served."""
         self.fault = ""
-        """Why the page is not served, in words."""
+        """The reason why the page is not served, in words."""
 
     @property
     def pages(self) -> int:
@@ -77,17 +77,17 @@ class Server:
 
     @property
     def can_steer(self) -> bool:
-        """Whether anybody may steer here."""
+        """Whether anybody may steer on this page."""
         return self._keys.steer is not None
 
     def offer(self, *offers: Offer) -> None:
-        """Hands messages to the pages, from any thread."""
+        """Pass messages to the pages, from any thread."""
         if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # the loop ends just now
+            with contextlib.suppress(RuntimeError):  # the loop is just ending
                 self._loop.call_soon_threadsafe(self._hub.offer, *offers)
 
     def emulator(self) -> dict[str, Any] | None:
-        """The settings of the emulator, None where there is none or they may not be asked for."""
+        """The settings of the emulator, None if there is none or they may not be requested."""
         if not self.can_steer or self._node.cell.sim is None:
             return None
         try:
@@ -98,7 +98,7 @@ class Server:
     # ---- life
 
     def run(self) -> None:
-        """Serves until the node stops."""
+        """Serve until the node stops."""
         try:
             asyncio.run(self._run())
         finally:
@@ -125,8 +125,8 @@ class Server:
             await runner.cleanup()
 
     async def _listen(self) -> socket.socket | None:
-        """The socket, None where the node stops before there is one. Where the port is taken by the dashboard that this one takes
-        over from, it waits for it; where it is another program's and nobody chose it, it takes any other."""
+        """The listening socket, None if the node stops before there is one. If the port is used by the dashboard that this one
+        replaces, wait for it; if another program uses it and no user chose it, use any other port."""
         place, waited_s = self._place, 0.0
         port = place.port
         while not self._node.stopping.is_set():
@@ -151,8 +151,8 @@ class Server:
         return None
 
     def _is_second(self) -> bool:
-        """Whether another dashboard of this cell is on the bus, which may be about to end. Asked here: a node that opens just now
-        does not know its replicas yet."""
+        """Whether another dashboard of this cell, which may be about to end, is on the bus. The bus is queried: a node that has
+        just opened does not know its replicas yet."""
         session = self._node.session
         if session is None:
             return False
@@ -178,7 +178,7 @@ class Server:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]) -> Any:
-        """Refuses what our page did not send, before anything else is looked at."""
+        """Refuse requests that our page did not send, before any other check."""
         needs_origin = request.method != "GET" or request.path == "/socket"
         response: web.StreamResponse
         if why := security.refusal(request.headers, self._place.hosts, needs_origin):
@@ -207,7 +207,7 @@ class Server:
         return web.Response(body=body, headers=headers | kind)
 
     async def _send_key(self, request: web.Request) -> web.Response:
-        """The key to steer, where there are no certificates that say who may; null where there are. Only our page can read it."""
+        """The steering key if there are no certificates, else null. Only our page can read it."""
         is_open = self._keys.look is None
         return web.json_response({"key": (self._keys.steer or "") if is_open else None}, headers={"Cache-Control": "no-store"})
 
@@ -236,7 +236,7 @@ class Server:
         return await self._steer(request, lambda asked: self._steering.restart(str(asked.get("service", ""))))
 
     async def _steer(self, request: web.Request, act: Callable[[dict[str, Any]], dict[str, Any]]) -> web.Response:
-        """What `act` answers to the request's JSON, where whoever asks may steer."""
+        """The answer of `act` to the request's JSON, if the client may steer."""
         if self._right(request) != "steer":
             why = self._look_only or "expected the key to steer, got none that fits: reload the page"
             self._node.log.warning("a request to steer was refused", path=request.path, why=why)
@@ -272,7 +272,7 @@ class Server:
         return socket
 
     async def _show(self, socket: web.WebSocketResponse) -> None:
-        """Shows the cell on one page, until it is closed."""
+        """Send the cell's data to one page, until it is closed."""
         try:
             hello = json.loads(await socket.receive_str(timeout=HELLO_S))
             right, camera = self._keys.right(str(hello.get("key", ""))), self._camera(hello.get("camera"))
@@ -309,7 +309,7 @@ class Server:
             self._hub.close(page)
 
     def _camera(self, name: Any) -> str:
-        """A camera of the cell, empty for none. Raises ValueError for another name."""
+        """The name of a camera of the cell, empty for none. Raises ValueError for another name."""
         if name in (None, ""):
             return ""
         if name not in self._node.cell.cameras:

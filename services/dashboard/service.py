@@ -1,4 +1,4 @@
-"""Wiring of the dashboard: a server, a timer that looks at the bus for its pages, and one that asks processes how they are."""
+"""Dashboard service: a server, a timer that reads the bus for its pages, and one that queries the health of processes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from penumbra.shared.runtime.node import Node
 NAME = "dashboard"
 ASK_S = 1.0
 IDLE_TURNS = 5
-"""Without a page the others are asked how they are only every fifth time, for the timeline."""
+"""Without a page the health of processes is queried only every IDLE_TURNS turns, for the timeline."""
 ANSWER_S = 2.0
 KEY_BYTES = 18
 LOOKING = (access.VIEWER, NAME)
-"""Holders of certificates of which keys to look are made: a viewer's, and the dashboard's own, which it always has."""
+"""Holders of certificates from which viewing keys are made: a viewer's, and the dashboard's own, which it always has."""
 NICE = 5
-"""How much less of a busy processor the page's threads take than those that make the pose."""
+"""Niceness of the page's threads, so that on a busy processor the threads that make the pose go first."""
 
 
 FLAGS = (
@@ -48,11 +48,11 @@ penumbra dashboard --page 0.0.0.0:8470 --host cell-7.example --look-only"""
 
 
 def start(node: Node, options: flags.Options) -> None:
-    """Serves the page, and looks at the bus for it. Raises BusError for an address that is none.
+    """Serve the page, and read the bus for it. Raises BusError for an invalid address.
 
-    Threads: the server's event loop owns all that concerns browsers; the timers own what they receive (`Watch`).
+    Threads: the server's event loop owns everything about browsers; the timers own what they receive (`Watch`).
     """
-    from penumbra.services.dashboard.server import Place, Server  # aiohttp: in this process alone, not before all are forked
+    from penumbra.services.dashboard.server import Place, Server  # aiohttp: imported in this process alone, not before the fork
 
     try:
         address, port = flags.address(options.page) if options.page else ("127.0.0.1", page.PORT)
@@ -90,7 +90,7 @@ def start(node: Node, options: flags.Options) -> None:
 
 
 def _keys(node: Node, look_only: bool) -> tuple[security.Keys, str]:
-    """Who may look and steer, and why nobody steers where that is so."""
+    """The keys of the page, and the reason if nobody may steer."""
     folder = node.connection.secure
     if folder is None:
         steer = None if look_only else secrets.token_urlsafe(KEY_BYTES)
@@ -102,6 +102,6 @@ def _keys(node: Node, look_only: bool) -> tuple[security.Keys, str]:
 
 
 def _step_back() -> None:
-    """Lets the pose go first where the processor is busy: on Linux a thread has a priority of its own."""
+    """Lower the thread's priority, so that the pose goes first on a busy processor: on Linux each thread has its own priority."""
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)

@@ -1,6 +1,6 @@
-"""What the page shows in numbers and words: plain functions from messages and health reports to JSON objects.
+"""Numbers and words of the page: plain functions from messages and health reports to JSON objects.
 
-A pose is [x, y, z, qx, qy, qz, qw] in metres. Times are seconds; `null` stands for what is not known.
+A pose is [x, y, z, qx, qy, qz, qw] in metres. Times are seconds; `null` stands for an unknown value.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from penumbra.shared.runtime.rates import topic_rows
 DIGITS = 5
 """Decimals of a number: a hundredth of a millimetre."""
 SILENT = 2.0
-"""A sense whose last message is older than so many of its topic's stale times counts as silent."""
+"""Age of a sense's last message, in stale times of its topic, above which the sense counts as silent."""
 FAR_M = 1.0
-"""A gap [m] that is not shown: the skin feels nothing there."""
+"""Gap [m] from which on it is not shown: the skin feels nothing there."""
 
 
 @dataclass
@@ -37,8 +37,8 @@ class Seen:
 
 
 def target(seen: Seen, now_ns: int, known: Mapping[str, Any]) -> dict[str, Any]:
-    """One target at a moment, what moves in the scene and what is known of it in numbers; only `state: none` where there is no
-    pose that is fresh. known: what `numbers` returned lately."""
+    """One target at a moment: its moving parts in the scene, and its numbers; only `state: none` if there is no fresh pose.
+    known: the last result of `numbers`."""
     pose = seen.fused
     if pose is None or shown_state(seen, now_ns) == "none":
         return {"state": "none"}
@@ -55,8 +55,7 @@ def target(seen: Seen, now_ns: int, known: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def numbers(seen: Seen, now_ns: int) -> dict[str, Any]:
-    """What nobody reads as often as the scene is drawn: angles, speeds, deviations, error and weights; empty where there is no
-    pose that is fresh."""
+    """Values that change slowly on the page: angles, speeds, deviations, error and weights; empty if there is no fresh pose."""
     pose = seen.fused
     if pose is None or shown_state(seen, now_ns) == "none":
         return {}
@@ -79,13 +78,13 @@ def _fresh_truth(seen: Seen, now_ns: int) -> messages.Truth | None:
 
 
 def shown_state(seen: Seen, now_ns: int) -> str:
-    """The state of a target's pose, `none` where there is no pose that is fresh."""
+    """The state of a target's pose, `none` if there is no fresh pose."""
     pose = seen.fused
     return "none" if pose is None or _age_s(pose, now_ns) > topics.FUSED.oldest_s else pose.state
 
 
 def senses(seen: Seen, now_ns: int) -> dict[str, dict[str, Any]]:
-    """What each sense says by itself, by its name and for vision its camera."""
+    """The poses of the single senses, by sense, and for vision by camera."""
     out = {
         f"vision {camera}": {
             "sense": "vision",
@@ -124,9 +123,10 @@ def ellipsoid(covariance: np.ndarray) -> dict[str, list[float]]:
 
 
 def reasons(seen: Seen, expected: Iterable[str], reports: Iterable[Report], now_ns: int) -> list[str]:
-    """Why no sense helps the pose, one reason a sense: what it says, or that it is silent, and then how its process fares.
+    """Reasons why no sense supports the pose, one per sense: its message, or that it is silent, and then the state of its
+    process.
 
-    expected: the senses that the cell has, `vision` and `haptic`. reports: the newest health reports.
+    expected: the senses of the cell, `vision` and `haptic`. reports: the newest health reports.
     """
     out = []
     reports = list(reports)
@@ -166,7 +166,7 @@ def _of_haptic(said: messages.HapticPose) -> str:
 
 
 def _contact(said: messages.HapticPose) -> str:
-    """What touches in words, empty where nothing does."""
+    """The contact in words, empty if there is none."""
     if said.contact == "none":
         return ""
     what = {"in_range": "the limb", "object": "an object"}.get(said.state, "something")
@@ -174,7 +174,7 @@ def _contact(said: messages.HapticPose) -> str:
 
 
 def _because(topic: topics.Topic, reports: list[Report]) -> str:
-    """How the processes fare that publish a topic."""
+    """State of the processes that publish a topic."""
     publishing = [report for report in reports if report.service in topic.publishers]
     if not reports:
         return ""
@@ -188,9 +188,9 @@ def _because(topic: topics.Topic, reports: list[Report]) -> str:
 
 
 def processes(reports: Iterable[Report]) -> dict[str, Any]:
-    """The processes of the cell, those of the launcher by the names that it gives them, others by their service.
+    """The processes of the cell, those of the launcher by its names for them, others by their service.
 
-    rows: one a process; can_restart: whether a launcher runs, which can.
+    rows: one per process; can_restart: whether a launcher runs, which can restart them.
     """
     reports = sorted(reports, key=lambda report: (report.service, report.host, report.pid))
     launchers = [report for report in reports if report.service == LAUNCHER.name]
@@ -215,7 +215,7 @@ def _row(name: str, service: str, report: Report | None, state: str, note: str, 
         status, why = report.status, "; ".join(report.reasons)
     process = find(service)
     return {
-        # a process that is restarted keeps its row on the page
+        # a restarted process keeps its row on the page
         "id": name if is_ours else report.instance if report else name,
         "name": name,
         "service": service,
@@ -232,7 +232,7 @@ def _row(name: str, service: str, report: Report | None, state: str, note: str, 
 
 
 def rates(reports: Iterable[Report], names: Iterable[str]) -> list[dict[str, Any]]:
-    """The traffic by topic: the mean rate of a key beside the nominal one, the longest delay to a reader, losses."""
+    """The traffic by topic: the mean rate per key beside the nominal one, the longest delay to a reader, losses."""
     nominal = {topic.name: topic for topic in topics.TOPICS}
     return [
         {
@@ -249,8 +249,8 @@ def rates(reports: Iterable[Report], names: Iterable[str]) -> list[dict[str, Any
 
 
 def levels(volts: Mapping[str, np.ndarray], skin: Any) -> dict[str, list[float]]:
-    """The signal of each electrode [V] by pad, above the amplitude with nothing near. volts: (samples, electrodes) by pad; skin:
-    the cell's `Skin`."""
+    """The signal of each electrode [V] by pad, relative to the amplitude with nothing near. volts: (samples, electrodes) by pad;
+    skin: the cell's `Skin`."""
     out = {}
     for pad, samples in volts.items():
         own = skin.of(skin.pads.index(pad))
@@ -272,10 +272,10 @@ def joints(q: np.ndarray) -> list[float]:
 
 
 def _numbers(values: np.ndarray, digits: int = DIGITS) -> list[float]:
-    return [round(value, digits) for value in values.tolist()]  # of so few numpy's own rounding takes four times as long
+    return [round(value, digits) for value in values.tolist()]  # for few numbers numpy's own rounding takes four times as long
 
 
 def pose_of(T: np.ndarray, digits: int = DIGITS) -> list[float]:
-    """A transform (4, 4) as a pose with so many decimals."""
+    """A transform (4, 4) as a pose with `digits` decimals."""
     position, orientation = rigid.position_orientation(T)
     return _numbers(position, digits) + _numbers(orientation, digits)

@@ -1,7 +1,7 @@
-"""What an operator asks for on the page: the emulator and the launcher answer it on the bus.
+"""Requests of an operator on the page, answered by the emulator and the launcher on the bus.
 
-On a secured bus only an operator's certificate may ask. The dashboard has one where its folder holds it, and opens a session of
-its own with it; the router decides by that certificate, so that a dashboard without one can steer nothing, whatever a page says.
+On a secured bus only an operator's certificate may make requests. If the dashboard's folder has one, it opens its own session
+with it; the router decides by that certificate, so a dashboard without one can steer nothing, whatever a page sends.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from penumbra.shared.runtime.node import Node
 
 ANSWER_S = 1.0
 OPEN_S = 3.0
-"""How long the operator's session may take to open."""
+"""Maximum time [s] for the operator's session to open."""
 ASK_S = 0.2
 CHANGE_S = 180.0
-"""How long a restart is followed: the launcher gives up earlier."""
+"""Maximum time [s] for which a restart is followed: the launcher gives up earlier."""
 COMMANDS = ("occlude", "motion", "speed", "pause", "resume", "state")
-"""What a page may ask of the emulator. Faults of the skin are for `penumbra sim`."""
+"""Commands that a page may send to the emulator. Faults of the skin are for `penumbra sim`."""
 
 
 class Steering:
-    """Asks as an operator. Its functions wait for answers, and may be called from any thread.
+    """Makes requests as an operator. Its functions wait for answers, and may be called from any thread.
 
-    Raises, in each of them: bus.BusError where nobody answers, ValueError with the answerer's reason where it refuses.
+    All of them raise bus.BusError if nobody answers, and ValueError with the reason if the request is refused.
     """
 
     def __init__(self, node: Node):
@@ -41,7 +41,7 @@ class Steering:
         self._lock = threading.Lock()
 
     def emulator(self, command: str, value: float | str | None = None) -> dict[str, Any]:
-        """Gives the emulator a command, and returns what is in force then."""
+        """Send the emulator a command; returns the settings that are then in force."""
         if command not in COMMANDS:
             raise ValueError(f"expected one of {', '.join(COMMANDS)}, got {command!r:.40}")
         request = {"command": command} | ({"value": value} if value is not None else {})
@@ -51,7 +51,7 @@ class Steering:
         return answers[0]
 
     def restart(self, service: str) -> dict[str, Any]:
-        """Has the launcher restart a service, and returns what became of it: `what` and `error`, empty where all is well."""
+        """Have the launcher restart a service; returns the result: `what` and `error`, empty if it succeeded."""
         key, name = topics.launcher(self._cell), secrets.token_hex(8)
         answers = self._ask(key, {"command": "restart", "services": [service], "id": name})
         if not answers:
@@ -67,7 +67,7 @@ class Steering:
         return {"what": answers[0]["what"], "error": "; ".join(each["error"] for each in answers if each["error"])}
 
     def close(self) -> None:
-        """Ends the operator's session."""
+        """Close the operator's session."""
         with self._lock:
             if self._own is not None:
                 self._own.close()

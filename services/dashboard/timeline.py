@@ -1,4 +1,4 @@
-"""What happened in the cell: states of the poses with their reasons, and processes that came, went or are not well."""
+"""Events of the cell: states of the poses with their reasons, and processes that started, ended or are not well."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 KEPT = 200
-"""Entries that are kept."""
+"""Number of entries that are kept."""
 FLICKER_S = 0.3
-"""A state that lasted no longer than this, between two that are the same, is no news."""
+"""Maximum duration [s] of a state between two equal states that is not recorded."""
 PASSING = ("ok", "degraded")
-"""Statuses of a process between which a busy machine has it change for a moment."""
+"""Statuses of a process that may alternate briefly on a busy machine."""
 
 
 class Timeline:
@@ -26,8 +26,8 @@ class Timeline:
         self._looked: dict[str, str] = {}
 
     def state(self, target: str, state: str, time_s: float, why: Iterable[str]) -> bool:
-        """Takes the state of a target at a time, and where it is another one than before an entry; returns whether there is one.
-        why: is read only then."""
+        """Record the state of a target at a time; adds an entry if it differs from the previous one, and returns whether it did.
+        Instead, the entry of a flicker is removed. why: is read only for a new entry."""
         if self._states.get(target) == state:
             return False
         self._states[target] = state
@@ -39,8 +39,8 @@ class Timeline:
         return True
 
     def processes(self, rows: Iterable[Mapping[str, Any]], time_s: float) -> None:
-        """Takes the rows of all processes (`state.processes`); one that begins, ends or changes its status gets an entry; well or
-        degraded it is only once two looks have found it so. The first look only learns who is there."""
+        """Record the rows of all processes (`state.processes`); a process that starts, ends or changes its status gets an entry.
+        A change between ok and degraded counts only after two looks. The first look only records the existing processes."""
         named = {row["id"]: row for row in rows}
         now = {name: str(row["status"]) for name, row in named.items()}
         looked, self._looked = self._looked, now

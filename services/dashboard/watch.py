@@ -1,8 +1,8 @@
-"""What the pages show, taken from the bus: only while a page is open, and no more than it can show.
+"""Reads the bus for the pages: only while a page is open, and no more than it can show.
 
 Small messages of the poses are always received, for the timeline. Frames, masks, joints and voltages are subscribed to while a
-page looks at them, so that a cell without a page does not pay for it. Everything belongs to the thread of `look`, except what
-`judge` takes from the thread that asks for reports: `reports` is replaced as a whole, and timeline and slow values have a lock.
+page looks at them, so that a cell without a page has no cost. Everything belongs to the thread of `look`, except the data that
+`judge` receives from the thread that queries reports: `reports` is replaced as a whole, and timeline and slow values have a lock.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from penumbra.services.dashboard.picture import Painter
 
 LOOK_S = 1.0 / 30.0
-"""Period of the moments that a page shows."""
+"""Period [s] of the moments that a page shows."""
 IDLE_TURNS = 6
-"""Without a page only every sixth turn looks: five times a second."""
+"""Without a page only every IDLE_TURNS turns look: five times a second."""
 READ_NS = 90_000_000
-"""Numbers and voltages are made every third turn, ten times a second: nobody reads more [ns]."""
+"""Period [ns] of numbers and voltages: every third turn, ten times a second, which is as fast as anybody reads."""
 FRAMES_KEPT = 8
-"""Frames that wait for their mask, for 0.4 s at 20 Hz."""
+"""Number of frames that wait for their mask: 0.4 s at 20 Hz."""
 MASKLESS_NS = 500_000_000
-"""A picture is shown without a mask where there was none for so long [ns]."""
+"""Time [ns] without a mask after which pictures are shown without one."""
 NEAR_NS = 100_000_000
-"""Longest time [ns] between a picture and the pose whose outline is drawn in it."""
+"""Maximum time [ns] between a picture and the pose whose outline is drawn in it."""
 POSES_KEPT = 256
 RING = 64
 
@@ -48,14 +48,15 @@ M = TypeVar("M", bound=Message)
 
 
 class Ring(Generic[M]):
-    """The newest samples of one key. What cannot be read is left out: the readers that work with it count and report it."""
+    """The newest samples of one key. Unreadable ones are skipped: the readers that use them count and report them."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, depth: int, **names: str):
         self._topic = topic
         self._subscriber = session.declare_subscriber(topic.at(**names), zenoh.handlers.RingChannel(depth))
 
     def payloads(self) -> list[bytes]:
-        """What has come since the last time, oldest first. Copied at once: frames lie in memory that their publisher needs."""
+        """The payloads since the last call, oldest first. They are copied at once: a frame lies in memory that its publisher
+        needs."""
         out = []
         while (sample := self._subscriber.handler.try_recv()) is not None:
             if len(sample.payload) <= self._topic.message.MAX_BYTES:
@@ -63,12 +64,12 @@ class Ring(Generic[M]):
         return out
 
     def newest(self, now_ns: int) -> M | None:
-        """The newest message since the last time, None where there is none that can be read."""
+        """The newest message since the last call, None if there is no readable one."""
         found = self.payloads()
         return self.read(found[-1], now_ns) if found else None
 
     def read(self, payload: bytes, now_ns: int) -> M | None:
-        """The message in a payload, None where it is bad or too old."""
+        """The message in a payload, None if it is bad or too old."""
         try:
             return messages.decode(self._topic.message, payload, now_ns, self._topic.oldest_s)  # type: ignore[return-value]
         except BadMessage:
@@ -93,7 +94,7 @@ class View:
         self.painter: Painter = Painter(node.cell, camera)
 
     def take(self, now_ns: int) -> None:
-        """Takes what has come."""
+        """Receive the new samples."""
         for payload in self._frames.payloads():
             try:
                 self._kept[messages.head(messages.Frame, payload).stamp_ns] = payload
@@ -104,7 +105,7 @@ class View:
         self._mask = self._masks.newest(now_ns) or self._mask
 
     def next(self, now_ns: int) -> tuple[messages.Frame, messages.Mask | None] | None:
-        """The newest frame that has its mask, or the newest where masks do not come; None where that was shown already."""
+        """The newest frame that has its mask, or the newest frame if no masks arrive; None if it was already shown."""
         mask = self._mask
         if mask is not None and now_ns - mask.stamp_ns > MASKLESS_NS:
             mask = None
@@ -125,9 +126,9 @@ class View:
 
 
 class Watch:
-    """All that is received, and what is made of it for the pages.
+    """All received data, and the pages' messages made from it.
 
-    wanted: what the pages can take. offer: takes what there is for them, all of a turn at once.
+    wanted: what the pages can receive. offer: receives all messages of a turn at once.
     """
 
     def __init__(self, node: Node, wanted: Callable[[], Wanted], offer: Callable[..., None]):
@@ -153,7 +154,7 @@ class Watch:
     # ---- fast: poses, scene, pictures
 
     def look(self) -> None:
-        """One turn."""
+        """Run one turn."""
         session, wanted = self._node.session, self._wanted()
         self.turns += 1
         if session is None or (not wanted.pages and self.turns % IDLE_TURNS):
@@ -175,14 +176,14 @@ class Watch:
             self._offer(*offers)
 
     def _moment(self, now_ns: int) -> bytes:
-        """Poses, robots and pads as a page gets them."""
+        """Poses, robots and pads in the form that a page receives."""
         self._take_robots(now_ns)
         if now_ns >= self._read_due_ns:
             self._read_due_ns = now_ns + READ_NS
             self._take_pads(now_ns)
             self._numbers = {}
         for name, seen in self.seen.items():
-            if not self._numbers.get(name):  # due, or the pose came just now
+            if not self._numbers.get(name):  # due, or the pose has just arrived
                 self._numbers[name] = state.numbers(seen, now_ns)
         return _text(
             {
@@ -195,7 +196,7 @@ class Watch:
         )
 
     def _subscribe(self, session: zenoh.Session, wanted: Wanted) -> None:
-        """Opens and closes subscriptions, so that there are those that are needed now."""
+        """Open and close subscriptions according to the current needs."""
         if not self._rings:
             per_target = {
                 topics.FUSED: RING,
@@ -256,12 +257,12 @@ class Watch:
         self._levels = self._levels | state.levels(volts, self._skin)
 
     def _poses_at(self, stamp_ns: int) -> dict[str, messages.FusedPose]:
-        """The pose of each target when a picture was taken, or the last before that."""
+        """The pose of each target when a picture was taken, or the last one before."""
         out = {}
         for name, kept in self._poses.items():
             before = next(
                 (each for each in reversed(kept) if each[0] <= stamp_ns), None
-            )  # they come in the order of their stamps
+            )  # they arrive in the order of their stamps
             nearest = before or (kept[0] if kept else None)
             if nearest is not None and abs(nearest[0] - stamp_ns) < NEAR_NS:
                 try:
@@ -283,7 +284,7 @@ class Watch:
     # ---- slow: processes, rates, timeline
 
     def judge(self, reports: Iterable[Report], emulator: dict[str, Any] | None) -> None:
-        """Takes the health reports of all processes and the state of the emulator, and tells the pages."""
+        """Receive the health reports of all processes and the state of the emulator, and send them to the pages."""
         self.reports = tuple(reports)
         found = state.processes(self.reports)
         names = (topic.name for topic in topics.TOPICS if self._node.keys(topic, {}))
@@ -298,7 +299,7 @@ class Watch:
             self._offer(Offer(hub.SLOW, self.slow()))
 
     def slow(self) -> bytes:
-        """Processes, rates and the timeline, as a page gets them."""
+        """Processes, rates and the timeline in the form that a page receives."""
         with self._lock:
             return _text(self._slow | {"stream": hub.SLOW, "timeline": list(self._timeline.entries)})
 
