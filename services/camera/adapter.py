@@ -24,7 +24,7 @@ from penumbra.shared.cell.description import Camera
 
 
 class Adapted:
-    """A feed by a user's class, whose exceptions are those of a camera that is lost."""
+    """A feed by a user's class, whose exceptions count as a lost camera."""
 
     def __init__(self, kind: type[Any], name: str, camera: Camera):
         self._kind = kind.__name__

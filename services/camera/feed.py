@@ -1,4 +1,4 @@
-"""What delivers the pictures of a camera: the classes of `live.py`, `files.py` and the user's own (`adapter.py`)."""
+"""Interface of a picture source, implemented by the classes of `live.py`, `files.py` and the user's own (`adapter.py`)."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ STAMPS: dict[Stamps, str] = {
     "arrival": "the arrival, less the latency",
     "playback": "when it was played",
 }
-"""How the stamps of pictures are known, in words."""
+"""Description of each kind of stamp, in words."""
 WITHOUT_LATENCY: tuple[Stamps, ...] = ("stream", "arrival")
-"""Stamps that are late by a latency which nothing measures."""
+"""Stamps that are late by an unmeasured latency."""
 
 
 class Shot(NamedTuple):
-    """A picture, RGB (height, width, 3), and the time of its exposure [ns since the epoch]; None where that is not known."""
+    """A picture, RGB (height, width, 3), and its time of exposure [ns since the epoch], None if unknown."""
 
     image: Image
     stamp_ns: int | None
 
 
 def rgb(image: Any) -> Image:
-    """The picture that OpenCV delivers, with its colours in our order."""
+    """A picture from OpenCV (BGR), converted to RGB."""
     return cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
 class Feed(Protocol):
-    """An open camera, stream or film. stamps: how the stamps of its last picture are known."""
+    """An open camera, stream or film. stamps: kind of its last picture's stamp."""
 
     @property
     def stamps(self) -> Stamps: ...
 
     def read(self) -> Shot | None:
-        """The next picture, waited for; None where none came within a time of its choice, a few seconds at most.
+        """Wait for the next picture; None if none arrives within a time of its choice, a few seconds at most.
 
-        Raises OSError where the camera is lost, ValueError for a picture that cannot be used, EOFError at the end of a film.
+        Raises OSError if the camera is lost, ValueError for an unusable picture, EOFError at the end of a film.
         """
 
     def close(self) -> None:
-        """Gives the camera back."""
+        """Release the camera."""

@@ -1,4 +1,4 @@
-"""Films and folders of pictures, played at their rate. A pause of the process is a pause of the film."""
+"""Films and folders of pictures, played at their rate. While the process pauses, the film pauses too."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import cv2
 from penumbra.services.camera.feed import Image, Shot, Stamps, rgb
 
 PICTURES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
-"""What names of pictures in a folder end with."""
+"""Suffixes of picture files in a folder."""
 LONGEST_S = 1.0
-"""A longer time [s] between two pictures of a film is none."""
+"""Maximum time [s] between two pictures of a film; a longer one is replaced by the usual one."""
 MOST_HZ = 1000.0
 
 
 class Played(ABC):
-    """Pictures of a film or folder, each when it is due. Every round calls `_pass`, which opens the film anew."""
+    """Pictures of a film or folder, each delivered when it is due. Every round calls `_pass`, which reopens the film."""
 
     stamps: Stamps = "playback"
 
@@ -31,7 +31,7 @@ class Played(ABC):
 
     @abstractmethod
     def _pass(self) -> Iterator[tuple[Image | None, str, float]]:
-        """Each picture (RGB), or what is wrong with it, and the time [s] since the one before. Raises OSError."""
+        """Each picture (RGB), or its fault, and the time [s] since the previous one. Raises OSError."""
 
     def _pictures(self) -> Iterator[tuple[Image | None, str, float]]:
         while True:
@@ -48,7 +48,7 @@ class Played(ABC):
         image, fault, step_s = next(self._next)
         now_s = time.monotonic()
         due_s = now_s if self._due_s is None else self._due_s + step_s
-        self._due_s = max(due_s, now_s - step_s)  # behind by more: the film was held up, and goes on from here
+        self._due_s = max(due_s, now_s - step_s)  # if late by more than a step, continue from now: the film was held up
         if self._stopping.wait(max(0.0, due_s - now_s)):
             return None
         if image is None:
@@ -60,7 +60,7 @@ class Played(ABC):
 
 
 class Film(Played):
-    """A film file. rate_hz: in place of its own. otherwise_hz: where the film has none."""
+    """A film file. rate_hz: replaces the film's own rate. otherwise_hz: used if the film has none."""
 
     def __init__(self, path: Path, is_looping: bool, rate_hz: float | None, otherwise_hz: float, stopping: threading.Event):
         super().__init__(path, is_looping, stopping)
@@ -81,7 +81,7 @@ class Film(Played):
                 if not is_there:
                     return
                 at_s = 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
-                own_s = at_s - last_s if 0.0 < at_s - last_s <= LONGEST_S else usual_s  # films of phones have no even rate
+                own_s = at_s - last_s if 0.0 < at_s - last_s <= LONGEST_S else usual_s  # films of phones have an uneven rate
                 last_s = at_s
                 yield rgb(image), "", 1.0 / self._rate_hz if self._rate_hz else own_s
         finally:

@@ -1,4 +1,4 @@
-"""Cameras that see now, by OpenCV: V4L2 devices and RTSP streams."""
+"""Live cameras by OpenCV: V4L2 devices and RTSP streams."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from penumbra.services.camera.feed import Shot, Stamps, rgb
 from penumbra.shared.cell.description import Camera, CameraSource
 
 OPEN_S, READ_S = 5.0, 2.0
-"""How long [s] is waited for a stream to open, and for a picture."""
+"""Maximum time [s] to wait for a stream to open, and for a picture."""
 EXPOSURE_S = 1.0
-"""How often [s] a camera is asked for its exposure time, which changes with the light."""
+"""Period [s] at which a camera is asked for its exposure time, which changes with the light."""
 EXPOSURE_UNIT_S = 1e-4
 """Unit of V4L2's exposure time [s]."""
 LARGEST_EPOCH_US = 4e15
-"""A stream's beginning [us since the epoch] is below this (the year 2096); where it is not known, OpenCV gives other numbers."""
+"""Upper bound of a stream's start time [us since the epoch] (the year 2096); if it is unknown, OpenCV returns other numbers."""
 
 
 def quiet() -> None:
-    """Silences what OpenCV and FFmpeg print: what is wrong is in the log and the health report, with what to do."""
+    """Silence the output of OpenCV and FFmpeg: faults are in the log and the health report, with what to do."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", f"{READ_S:.0f}")  # 10 s otherwise
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 class V4l2:
-    """A device such as /dev/video0. Its driver stamps each picture: uvcvideo, for USB cameras, at the start of the exposure, of
-    which half is added."""
+    """A device such as /dev/video0. Its driver stamps each picture; uvcvideo, for USB cameras, at the start of the exposure, so
+    half of the exposure time is added."""
 
     def __init__(self, device: str, camera: Camera):
         path = Path(device)
@@ -68,7 +68,7 @@ class V4l2:
         return Shot(rgb(image), None if stamp_ns is None else stamp_ns + round(5e8 * self._exposure()))
 
     def _exposure(self) -> float:
-        """The exposure time [s]; 0 where the camera does not say."""
+        """The exposure time [s]; 0 if the camera does not report it."""
         if (now_s := time.monotonic()) - self._asked_s > EXPOSURE_S:
             found_s = EXPOSURE_UNIT_S * self._capture.get(cv2.CAP_PROP_EXPOSURE)
             self._asked_s, self._exposure_s = now_s, found_s if 0.0 < found_s <= self._period_s else 0.0
@@ -79,8 +79,8 @@ class V4l2:
 
 
 class Rtsp:
-    """An RTSP stream. Its pictures carry the time since its beginning; when that was, the sender says by its own clock, after a
-    few seconds, and the quickest pictures say by ours."""
+    """An RTSP stream. Its pictures carry the time since its start. The start is given by the sender in its own clock after a few
+    seconds, and by the quickest pictures in this host's clock."""
 
     def __init__(self, source: CameraSource):
         self._shown, self._is_synchronised = source.shown, source.synchronised
@@ -91,7 +91,7 @@ class Rtsp:
         options = {
             cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: round(1e3 * OPEN_S),
             cv2.CAP_PROP_READ_TIMEOUT_MSEC: round(1e3 * READ_S),
-            cv2.CAP_PROP_N_THREADS: 1,  # each further one delays pictures by one
+            cv2.CAP_PROP_N_THREADS: 1,  # each further thread delays pictures by one
         }
         self._capture = cv2.VideoCapture(source.url, cv2.CAP_FFMPEG, [word for pair in options.items() for word in pair])
         if not self._capture.isOpened():
@@ -119,7 +119,7 @@ class Rtsp:
                 return Shot(rgb(image), stamp_ns - self._latency_ns)
 
     def _sent_ns(self, own_ns: int) -> int | None:
-        """The time of a picture by the sender's clock (RTCP) [ns since the epoch]; None before the sender has said it."""
+        """The time of a picture by the sender's clock (RTCP) [ns since the epoch]; None until the sender reports it."""
         began_us = self._capture.get(cv2.CAP_PROP_STREAM_OPEN_TIME_USEC)
         return round(1e3 * began_us) + own_ns if 0.0 < began_us < LARGEST_EPOCH_US else None
 

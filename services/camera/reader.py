@@ -1,9 +1,9 @@
-"""Drains a feed in one thread and hands the newest picture to another, so that no pause of either replays old pictures.
+"""Drains a feed in one thread and passes the newest picture to another, so that a pause of either does not replay old pictures.
 
-1. open the feed; where that fails, wait a little longer each time
-2. read the next picture, and leave out what is old: it waited while this process could not read
-3. refuse one that has not the camera's size
-4. put it into the one slot, in place of one that nobody took
+1. open the feed; if that fails, wait, slightly longer each time
+2. read the next picture, and drop old ones, which waited while this process could not read
+3. refuse a picture that does not have the camera's size
+4. put it into the single slot, replacing one that was not taken
 5. when the camera is lost, close it, and begin again
 """
 
@@ -21,30 +21,30 @@ from penumbra.shared.cell.description import Camera, CameraSource
 from penumbra.shared.runtime.lowest import Lowest
 
 BACKOFF_S = (0.2, 2.0)
-"""Waiting before a camera is opened again: at first, and at most."""
+"""Initial and maximum delay [s] before a camera is opened again."""
 LOST_S = 3.0
-"""Time [s] without a picture after which a camera that is open counts as faulty."""
+"""Time [s] without a picture after which an open camera counts as faulty."""
 LATE_S = 0.25
-"""A picture that arrives later than the quickest one by more [s] is of a backlog."""
+"""Delay [s] relative to the quickest picture above which a picture belongs to a backlog."""
 BACK_S = 1.0
-"""A stamp that is before the last one by more [s] is no old picture: a clock was set."""
+"""A stamp that goes back by more than this [s] is not an old picture: a clock was set."""
 AHEAD_S = 0.05
-"""How far [s] stamps may be ahead of this host's clock."""
+"""Maximum time [s] by which stamps may be ahead of this host's clock."""
 FASTER = 2.0
-"""Times the cell file's rate at which pictures come too fast."""
+"""Factor on the cell file's rate above which pictures arrive too fast."""
 FOLLOW = 0.05
 """Weight of the newest picture in the rate."""
 EMPTY_S = 0.001
-"""Waiting after a read without a picture: it may return at once."""
+"""Delay [s] after a read without a picture, which may return at once."""
 
 State = Literal["opening", "streaming", "lost", "ended"]
 
 
 class Reader:
-    """One camera from opening to losing it, again and again.
+    """One camera from opening until it is lost, repeatedly.
 
-    open_feed: opens the camera; raises OSError where it is not there. is_live: whether it sees now; a film is not, and has no
-    backlog. oldest_s: the age [s] above which nobody takes a picture. log: is called with an error now and then.
+    open_feed: opens the camera; raises OSError if it is not there. is_live: whether it is a live camera; a film is not, and has
+    no backlog. oldest_s: age [s] above which readers refuse a picture. log: called with errors, without repetition.
     """
 
     def __init__(
@@ -63,9 +63,9 @@ class Reader:
         self._stopping, self._log = stopping, log
         self._is_filled = threading.Condition()  # guards the slot
         self._slot: Shot | None = None
-        # the rest is written by the thread that reads, and only looked at by others
+        # the rest is written by the reading thread, and only read by others
         self._state: State = "opening"
-        self._since_s = time.monotonic()  # of this state, or of the last picture
+        self._since_s = time.monotonic()  # start of this state, or time of the last picture
         self._why = self._refusal = ""
         self._stamps: Stamps = ""
         self._sender_latency_s: float | None = None
@@ -74,10 +74,10 @@ class Reader:
         self._delay_s, self._failures = BACKOFF_S[0], 0
         self._opened = self._received = self._late = self._refused = self._superseded = 0
 
-    # ---- the thread that reads
+    # ---- the reading thread
 
     def session(self) -> None:
-        """Opens the camera and reads until it is lost; then waits a while. Returns to be called again."""
+        """Open the camera and read until it is lost; then wait. Returns to be called again."""
         self._change("opening")
         feed: Feed | None = None
         try:
@@ -133,7 +133,7 @@ class Reader:
                 self._hand_on(shot)
 
     def _fault(self, shot: Shot) -> str:
-        """What is wrong with a picture; empty where nothing is."""
+        """The fault of a picture; empty if it has none."""
         camera, got = self._camera, shot.image
         if got.shape == (camera.height, camera.width, 3) and got.dtype == "uint8":
             return ""
@@ -168,7 +168,7 @@ class Reader:
         self._change("lost", why)
 
     def _change(self, state: State, why: str = "") -> None:
-        """A camera that is opened again after it was lost stays lost until a picture comes."""
+        """Set the state; a camera that is reopened stays lost until a picture arrives."""
         if state == "opening" and self._state == "lost":
             return
         if state != self._state or state == "streaming":
@@ -178,14 +178,14 @@ class Reader:
     # ---- other threads
 
     def take(self, timeout_s: float) -> Shot | None:
-        """The newest picture, with its stamp; None where none comes within a time."""
+        """The newest picture, with its stamp; None if none arrives within a time."""
         with self._is_filled:
             self._is_filled.wait_for(lambda: self._slot is not None, timeout_s)
             shot, self._slot = self._slot, None
             return shot
 
     def reasons(self) -> Sequence[str]:
-        """What is wrong, in words."""
+        """The faults, in words."""
         return [f"camera {self._name}: {text}" for text in self._faults()]
 
     def _faults(self) -> list[str]:
@@ -218,8 +218,8 @@ class Reader:
         return out
 
     def describe(self) -> dict[str, Any]:
-        """For the health report. late: pictures of a backlog that were left out; superseded: those that nobody took in time;
-        sender_latency_ms: from the sender's time of a picture to its arrival, right where both clocks are synchronised."""
+        """The camera's entry in the health report. late: dropped pictures of a backlog; superseded: those not taken in time;
+        sender_latency_ms: from the sender's time of a picture to its arrival, correct if both clocks are synchronised."""
         latency_s = self._sender_latency_s
         return {
             "state": self._state,

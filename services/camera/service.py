@@ -28,11 +28,11 @@ from penumbra.shared.runtime.node import Node
 
 NAME = "camera"
 AGAIN_S = 0.001
-"""A turn waits by itself; this only keeps one that fails from running hot."""
+"""Period [s] of a turn, which waits by itself; this only keeps a failing one from busy-looping."""
 TAKE_S = 0.5
-"""How long a turn waits for a picture."""
+"""Maximum time [s] that a turn waits for a picture."""
 LOOK_S = 1.0
-"""How often it is looked whether the emulator publishes the same camera."""
+"""Period [s] at which the process checks whether the emulator publishes the same camera."""
 
 FLAGS = (
     flags.Option(
@@ -56,7 +56,7 @@ EXAMPLE = "penumbra camera --source v4l2:/dev/video0\npenumbra camera --camera f
 
 
 def start(node: Node, options: flags.Options) -> None:
-    """Each camera has two threads: one reads, and owns its `Reader` but for the slot; one publishes what is in the slot. The
+    """Start two threads per camera: one reads, and owns its `Reader` except the slot; one publishes the picture in the slot. The
     health report only reads."""
     live.quiet()
     for name, source in sources(node.cell, options).items():
@@ -83,14 +83,14 @@ def start(node: Node, options: flags.Options) -> None:
 
 
 def publish(node: Node, name: str, reader: Reader, conflict: Conflict) -> None:
-    """Publishes the next picture that comes within TAKE_S."""
+    """Publish the next picture that arrives within TAKE_S."""
     shot = reader.take(TAKE_S)
     if shot is not None and shot.stamp_ns is not None and conflict.is_free:
         node.publish(FRAME, Frame(stamp_ns=shot.stamp_ns, image=shot.image), camera=name)
 
 
 def sources(cell: cells.Cell, options: flags.Options) -> dict[str, cells.CameraSource]:
-    """The sources to read, by camera. Raises CellError where there is none, or it cannot be one."""
+    """The sources to read, by camera. Raises CellError if there is none, or an invalid one."""
     given = {"loop": options.loop or None, "rate_hz": options.rate, "latency": options.latency}
     given = {key: value for key, value in given.items() if value is not None}
     if options.source is not None:
@@ -119,7 +119,7 @@ def _checked(values: dict[str, object]) -> cells.CameraSource:
 
 
 def opener(name: str, camera: cells.Camera, source: cells.CameraSource, folder: Path, node: Node) -> Callable[[], Feed]:
-    """What opens a source. folder: of relative paths. Raises CellError for an adapter without its class."""
+    """A function that opens a source. folder: base of relative paths. Raises CellError for an adapter without its class."""
     path = source.path(folder)
     match source.kind:
         case "v4l2":
@@ -134,8 +134,8 @@ def opener(name: str, camera: cells.Camera, source: cells.CameraSource, folder: 
 
 
 class Conflict:
-    """Whether the emulator publishes the same camera: it does where the cell file has `sim` and no source for the camera. Two
-    publishers would contradict each other, so this process keeps silent while an emulator lives."""
+    """Detects that the emulator publishes the same camera: it does if the cell file has `sim` and no source for the camera. Two
+    publishers would contradict each other, so this process stays silent while an emulator lives."""
 
     def __init__(self, node: Node, name: str):
         self._node, self._name = node, name
@@ -143,7 +143,7 @@ class Conflict:
         self.is_free = not self.is_possible
 
     def look(self) -> None:
-        """Looks whether an emulator lives."""
+        """Check whether an emulator lives."""
         session = self._node.session
         if session is None:
             return
