@@ -1,1 +1,1 @@
-"""The upper floor: one folder per process, the launcher and the `penumbra` command."""
+"""The services: one folder per process, the launcher and the `penumbra` command."""

@@ -1,4 +1,4 @@
-"""The command line's parts: commands, flags and the types of their values. click parses, helps and completes."""
+"""Parts of the command line: commands, flags and the types of their values. click parses, helps and completes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from penumbra.shared.runtime.metrics import Reports
 
 Options = SimpleNamespace
-"""The values of a command's flags and arguments, by their names."""
+"""The values of a command's flags and arguments, by name."""
 CELLS = Path(__file__).parents[1] / "shared" / "cell" / "built_in"
 ROUTER = "tcp/127.0.0.1:7447"
-"""Where a router is looked for, as help says; `shared.runtime.connection` has it too, beside what takes long to import."""
+"""Default router, as shown by help; `shared.runtime.connection` has it too, but is slow to import."""
 COMMAND_LINE = click.core.ParameterSource.COMMANDLINE
 WIDTH = 100
 """Columns of help on a wide terminal."""
@@ -34,7 +34,7 @@ WIDTH = 100
 
 
 class Checked(click.ParamType):
-    """A type made of a function that returns the value of a text, or raises ValueError saying what was expected."""
+    """A type from a function that returns the value of a text, or raises ValueError that says what was expected."""
 
     def __init__(self, convert: Callable[[str], Any]):
         self.name = convert.__name__.strip("_")
@@ -50,7 +50,7 @@ class Checked(click.ParamType):
 
 
 class Choice(click.Choice):
-    """One of a few words."""
+    """A type with a fixed set of words."""
 
     def get_invalid_choice_message(self, value: Any, ctx: click.Context | None) -> str:
         return f"expected {any_of(self.choices)}, got {value!r}{meant(str(value), self.choices)}"
@@ -105,13 +105,13 @@ def _number(text: str, is_good: Callable[[float], bool], what: str) -> float:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not is_good(value):  # of nan no comparison is true
+    if not is_good(value):  # a comparison with nan is false
         raise ValueError(f"expected {what}, got {text!r}")
     return value
 
 
 def address(text: str) -> tuple[str, int]:
-    """Type of a flag: an address to listen at, and a port; without an address that of loopback."""
+    """Type of a flag: an address to listen at, and a port; the default address is loopback."""
     host, _, digits = text.rpartition(":")
     try:
         return host.strip("[]") or "127.0.0.1", port(digits)
@@ -133,9 +133,9 @@ TYPES: dict[Any, click.ParamType] = {
 class Option(click.Option):
     """A flag, as in `Option("--seed", type=int, default=1, help=...)`.
 
-    `type`: int, float, Path, str or a function that raises ValueError; `choices`: the words that it may be; `takes`: how many
-    words it takes, `one`, `many` (all that follow, up to the next flag), `rest` (all that follow, flags too) or `maybe` (one
-    of its type, or none, which stands for `without`); `section`: the heading under which help shows it.
+    `type`: int, float, Path, str or a function that raises ValueError; `choices`: the allowed words; `takes`: the number of
+    words, `one`, `many` (all that follow, up to the next flag), `rest` (all that follow, including flags) or `maybe` (one of its
+    type, or none, which stands for `without`); `section`: the heading under which help shows it.
     """
 
     def __init__(
@@ -167,7 +167,8 @@ class Argument(click.Argument):
 
 
 def spread(params: Iterable[click.Parameter], args: Sequence[str]) -> list[str]:
-    """The words of a command line with every flag that takes several words repeated for each: click knows none of these."""
+    """The words of a command line, with every flag that takes several words repeated for each word, because click does not
+    support such flags."""
     takes = {name: param for param in params if isinstance(param, Option) and param.takes != "one" for name in param.opts}
     out: list[str] = []
     rest = list(args)
@@ -182,13 +183,13 @@ def spread(params: Iterable[click.Parameter], args: Sequence[str]) -> list[str]:
             values = []
             while rest and (flag.takes == "rest" or not _is_flag(rest[0])):
                 values.append(rest.pop(0))
-            # without a word, a flag that has a meaning for that stands for it; for the others click misses the word
+            # a flag without a word becomes `without` if it has one; for the others click reports the missing word
             out += [f"{word}={value}" for value in values] or ([f"{word}={flag.without}"] if flag.without else [word])
     return out
 
 
 def _is_value(flag: Option, word: str) -> bool:
-    """Whether a word belongs to the flag before it, which needs none. A bad number does: it is refused there."""
+    """Whether a word belongs to the flag before it, whose word is optional. A bad number does, and is refused there."""
     if _is_flag(word) or _is_number(word):
         return _is_number(word)
     try:
@@ -214,7 +215,7 @@ def _is_number(word: str) -> bool:
 
 
 class _Words(click.Command):
-    """What commands and groups have in common: words that are spread, help with sections and an example."""
+    """Common base of commands and groups: spread words, help with sections and an example."""
 
     example: str
 
@@ -241,8 +242,8 @@ class _Words(click.Command):
 
 
 class Command(_Words):
-    """A command of `penumbra`. Called with a list of words it runs, and returns its exit code; words that it cannot use end the
-    process with exit code 2."""
+    """A command of `penumbra`. A call with a list of words runs it and returns its exit code; invalid words end the process with
+    exit code 2."""
 
     def __init__(self, name: str, example: str, **kwargs: Any):
         super().__init__(name, context_settings=SETTINGS, **kwargs)
@@ -260,7 +261,7 @@ SETTINGS: dict[str, Any] = {"show_default": True, "max_content_width": WIDTH, "h
 
 
 class Group(_Words, click.Group):
-    """A command that is followed by another one; `follows`: what that is called."""
+    """A command with subcommands; `follows`: what a subcommand is called."""
 
     follows = "command"
 
@@ -284,9 +285,9 @@ class Group(_Words, click.Group):
 def command(
     name: str, about: str, *params: click.Parameter, example: str
 ) -> Callable[[Callable[[Options], int | None]], Command]:
-    """Makes the command `penumbra NAME` of a function of its options that returns the exit code, None for 0.
+    """Decorator that makes the command `penumbra NAME` from a function of its options, which returns the exit code, None for 0.
 
-    about: what help says; line breaks within a paragraph do not matter; example: a command line that works, or several lines.
+    about: the help text; line breaks within a paragraph do not matter; example: a working command line, or several lines.
     """
 
     def make(function: Callable[[Options], int | None]) -> Command:
@@ -299,13 +300,13 @@ def command(
 
 
 def _kept(about: str) -> str:
-    """A text for help whose paragraphs with indented lines keep their line breaks: click fills the others."""
+    """A help text whose paragraphs with indented lines keep their line breaks: click refills the others."""
     paragraphs = about.strip().split("\n\n")
     return "\n\n".join(f"\b\n{text}" if "\n " in f"\n{text}" else text for text in paragraphs)
 
 
 def execute(command: click.Command, prog: str, argv: Sequence[str]) -> int:
-    """Runs a command with these words, and returns its exit code. Raises click.ClickException for words that it cannot use."""
+    """Run a command with these words; returns its exit code. Raises click.ClickException for invalid words."""
     try:
         with command.make_context(prog, list(argv)) as ctx:
             return int(command.invoke(ctx) or 0)
@@ -314,30 +315,30 @@ def execute(command: click.Command, prog: str, argv: Sequence[str]) -> int:
 
 
 def parse(params: Iterable[click.Parameter], argv: Sequence[str] = ()) -> Options:
-    """The options that these words give to the flags."""
+    """The options that result from these words for the flags."""
     return Options(**Command("", "", params=list(params)).make_context("penumbra", list(argv)).params)
 
 
 def is_given(name: str) -> bool:
-    """Whether a flag of the command that runs stands on its command line."""
+    """Whether a flag of the running command was given on its command line."""
     return click.get_current_context().get_parameter_source(name) is COMMAND_LINE
 
 
 def words() -> list[str]:
-    """The words that followed the name of the command that runs."""
+    """The words after the name of the running command."""
     return list(click.get_current_context().meta["words"])
 
 
 def refuse(text: str) -> NoReturn:
-    """Ends the command that runs with exit code 2 and a line that says what was expected."""
+    """End the running command with exit code 2 and a line that says what was expected."""
     raise click.UsageError(text, click.get_current_context(silent=True))
 
 
-# ---- what is said of a wrong command line
+# ---- messages about a wrong command line
 
 
 def explain(error: click.ClickException) -> str:
-    """One line: the command, what was expected, and where help is."""
+    """One line: the command, what was expected, and where to find help."""
     path = error.ctx.command_path if isinstance(error, click.UsageError) and error.ctx else "penumbra"
     return f"{path}: {_reason(error)} (see {path} --help)"
 
@@ -368,7 +369,7 @@ def any_of(words: Iterable[str]) -> str:
 
 
 def meant(word: str, known: Iterable[str]) -> str:
-    """`; did you mean X?`, where a word is like one that is known."""
+    """`; did you mean X?` if a word is similar to a known one, else empty."""
     from difflib import get_close_matches
 
     near = get_close_matches(word, list(known), n=1, cutoff=0.6)
@@ -395,7 +396,7 @@ def complete_part(part: str) -> Callable[[click.Context, click.Parameter, str], 
         try:
             names = yaml.safe_load((path if path.is_file() else Path(cell)).read_text())[part]
         except (OSError, yaml.YAMLError, KeyError, TypeError):
-            return []  # a completion has no place to complain
+            return []  # a completion cannot report errors
         return [CompletionItem(str(name)) for name in names if str(name).startswith(incomplete)]
 
     return complete
@@ -468,12 +469,12 @@ METRICS = Option(
 )
 JSON = Option("--json", is_flag=True, help="print JSON")
 COMMON = (CELL, *BUS, *LOG)
-"""Flags of every command that goes onto the bus."""
+"""Flags of every command that connects to the bus."""
 
 
 @contextmanager
 def metrics(where: tuple[str, int] | None, reports: Reports) -> Iterator[None]:
-    """Within it the metrics of `reports()` are served where METRICS said; nothing where it was not given."""
+    """Context in which the metrics of `reports()` are served at the address of METRICS; none are served if it was not given."""
     if where is None:
         yield
         return
@@ -491,7 +492,7 @@ def metrics(where: tuple[str, int] | None, reports: Reports) -> Iterator[None]:
 
 
 def training(name: str, minutes: float) -> tuple[Option, ...]:
-    """The flags of every training; minutes: how long it takes where nothing else is asked for."""
+    """The flags of every training; minutes: its default duration."""
     return (
         Option("--minutes", type=above_zero, default=minutes, callback=_one_of("steps"), help="of the processor's time to train"),
         Option(
@@ -517,7 +518,7 @@ def training(name: str, minutes: float) -> tuple[Option, ...]:
 
 
 def _one_of(other: str) -> Callable[[click.Context, click.Parameter, Any], Any]:
-    """Refuses a flag beside another one that stands for the same."""
+    """Refuse a flag together with another one of the same meaning."""
 
     def check(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
         names = sorted((str(param.name), other))

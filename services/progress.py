@@ -1,4 +1,4 @@
-"""How far a long command is: a bar on a terminal, and a line now and then where its output goes to a file or a pipe."""
+"""Progress of a long command: a bar on a terminal, or a line now and then if its output goes to a file or a pipe."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LINE_S = 10.0
 
 
 def track(items: Collection[T], what: str) -> Iterator[T]:
-    """The items, one after another, while standard error shows how many of them are done."""
+    """Iterate over items while standard error shows how many of them are done."""
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import track

@@ -1,5 +1,4 @@
-"""What a process does before, while and after it runs a service: it ends with its launcher, and with the first of its threads
-that fails."""
+"""Runs a service as a process: it ends with its launcher, and with the first of its threads that fails."""
 
 from __future__ import annotations
 
@@ -17,11 +16,11 @@ from penumbra.services import flags
 from penumbra.shared.contract.processes import Process
 
 SWITCH_S = 0.0005
-"""A reader thread waits at most this long for a computing one; Python's 5 ms would be half of the skin's period."""
+"""Interval [s] after which a computing thread yields to a waiting one; Python's 5 ms would be half of the skin's period."""
 
 
 def serve(process: Process, options: flags.Options, argv: Sequence[str]) -> int:
-    """Runs one service until SIGINT or SIGTERM; returns its exit code. argv: the words that gave the options."""
+    """Run one service until SIGINT or SIGTERM; returns its exit code. argv: the words from which the options were parsed."""
     die_with_parent()
     entitle(" ".join(["penumbra", process.name, *argv]))
     sys.setswitchinterval(SWITCH_S)
@@ -42,8 +41,8 @@ def serve(process: Process, options: flags.Options, argv: Sequence[str]) -> int:
 
 
 def leave() -> int:
-    """Lets a process end whose node has run."""
-    if threading.active_count() > 1:  # something hangs: it must not keep the process, even if Zenoh cannot clean /dev/shm then
+    """End the process after its node has run."""
+    if threading.active_count() > 1:  # a hanging thread must not keep the process, even if Zenoh cannot clean /dev/shm then
         logging.shutdown()
         sys.stdout.flush()
         os._exit(0)
@@ -51,19 +50,19 @@ def leave() -> int:
 
 
 def entitle(title: str) -> None:
-    """Shows a title as the command line of this process, in ps and top."""
+    """Show a title as the command line of this process, in ps and top."""
     import setproctitle
 
     setproctitle.setproctitle(title)
 
 
 def die_with_parent() -> None:
-    """Ties a process to the launcher that started it: it must not stay behind, even if the launcher is killed with SIGKILL."""
+    """End this process when its launcher ends: it must not stay behind, even if the launcher is killed with SIGKILL."""
     parent = os.environ.get("PENUMBRA_PARENT")
     if parent is None:
         return
     if sys.platform == "linux":
         PR_SET_PDEATHSIG = 1
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != int(parent):  # it died before we asked
+    if os.getppid() != int(parent):  # the launcher died before the request
         sys.exit(1)
