@@ -17,11 +17,11 @@ DICTIONARIES = {
     name: getattr(cv2.aruco, f"DICT_{name}")
     for name in ("4X4_50", "4X4_100", "4X4_250", "5X5_50", "5X5_100", "5X5_250", "6X6_50", "6X6_100", "6X6_250")
 }
-"""OpenCV's dictionaries of markers. The fewer bits, the farther away a marker is still read."""
+"""OpenCV's dictionaries of markers. A marker with fewer bits can be read from farther away."""
 MARKER = 0.75
-"""Edge of a marker over that of its square, where nothing else is said."""
+"""Default edge of a marker, as a share of its square's edge."""
 FEWEST = 6
-"""Corners that make a view: a pose has six unknowns, and a few more show a wrong one."""
+"""Minimum number of corners in a view: a pose has six unknowns, and a few more corners reveal a wrong one."""
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 25.4e-3}
 
 
@@ -62,7 +62,7 @@ FLAGS = (
     ),
     flags.Option("--dictionary", choices=DICTIONARIES, default="4X4_100", section="Board", help="OpenCV's name of the markers"),
 )
-"""What the board is."""
+"""Flags that describe the board."""
 MEASURED = flags.Option(
     "--square-measured",
     type=length,
@@ -75,10 +75,11 @@ MEASURED = flags.Option(
 
 @dataclass(frozen=True)
 class Board:
-    """squares: columns and rows; square, marker: edges [m]; dictionary: one of DICTIONARIES. Its frame has x along a row of
-    squares, y down the columns and z into the paper; the origin is the outer corner of the black square at the top left.
+    """A ChArUco board. squares: columns and rows; square, marker: edges [m]; dictionary: one of DICTIONARIES. Its frame has x
+    along a row of squares, y down the columns and z into the paper; the origin is the outer corner of the black square at the top
+    left.
 
-    Raises CalibrationError where OpenCV cannot make it.
+    Raises CalibrationError if OpenCV cannot make it.
     """
 
     squares: tuple[int, int] = (7, 5)
@@ -97,7 +98,7 @@ class Board:
 
     @classmethod
     def of(cls, options: flags.Options) -> Board:
-        """The board that FLAGS and MEASURED describe."""
+        """The board described by FLAGS and MEASURED."""
         square = getattr(options, "square_measured", None) or options.square
         marker = (options.marker or MARKER * options.square) * square / options.square
         return cls(options.squares, square, marker, options.dictionary)
@@ -115,12 +116,12 @@ class Board:
 
     @cached_property
     def corners(self) -> Array:
-        """(c, 3): the inner corners of the chessboard [m], by their numbers."""
+        """The inner corners (c, 3) of the chessboard [m], in the order of their numbers."""
         return np.asarray(self.charuco.getChessboardCorners(), np.float64).reshape(-1, 3)
 
     @cached_property
     def black(self) -> Array:
-        """(r, 4): the rectangles that are black: x, y of the corner nearest to the origin, width and height [m]."""
+        """The black rectangles (r, 4): x, y of the corner nearest to the origin, width and height [m]."""
         columns, rows = self.squares
         out = [
             (x * self.square, y * self.square, self.square, self.square)
@@ -128,13 +129,13 @@ class Board:
             for x in range(columns)
             if (x + y) % 2 == 0
         ]
-        bits = self.charuco.getDictionary().markerSize + 2  # with the black rim
+        bits = self.charuco.getDictionary().markerSize + 2  # including the black rim
         module = self.marker / bits
         for number, corners in zip(np.ravel(self.charuco.getIds()), self.charuco.getObjPoints(), strict=True):
             marker = cv2.aruco.generateImageMarker(self.charuco.getDictionary(), int(number), bits, borderBits=1)
             left, top = np.asarray(corners, np.float64).reshape(4, 3)[0, :2]
             for y, row in enumerate(marker):
-                edges = np.flatnonzero(np.diff(np.concatenate([[0], row == 0, [0]])))  # runs, so that few edges touch
+                edges = np.flatnonzero(np.diff(np.concatenate([[0], row == 0, [0]])))  # horizontal runs, so that few edges touch
                 for first, end in zip(edges[::2], edges[1::2], strict=True):
                     out.append((left + first * module, top + y * module, (end - first) * module, module))
         return np.array(out)
@@ -144,8 +145,8 @@ class Board:
         return cv2.aruco.CharucoDetector(self.charuco)
 
     def find(self, image: NDArray[np.uint8]) -> tuple[Array, NDArray[np.int64]] | None:
-        """The corners (n, 2) [px] that a picture (height, width, 3) RGB or (height, width) shows, and their numbers (n,); None
-        where it shows fewer than FEWEST, or only corners on one line."""
+        """The corners (n, 2) [px] in a picture (height, width, 3) RGB or (height, width), and their numbers (n,); None if there
+        are fewer than FEWEST, or only corners on one line."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
         corners, numbers, _, _ = self._detector.detectBoard(grey)
         if numbers is None or len(numbers) < FEWEST:

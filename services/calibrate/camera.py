@@ -18,9 +18,9 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.runtime import bus
 
 GOOD_PX = 0.5
-"""A residual above this [px] tells of blur, of a board that is not flat, or of a lens that the model does not fit."""
+"""Residual [px] above which the pictures are blurred, the board is not flat, or the model does not fit the lens."""
 GOOD_FOCUS = 0.005
-"""Relative standard deviation of the focal lengths: 5 mm at a metre."""
+"""Relative standard deviation of the focal lengths above which the result is poor: 5 mm at a metre."""
 
 
 @flags.command(
@@ -39,7 +39,7 @@ GOOD_FOCUS = 0.005
     "penumbra calibrate camera --cell mine.yaml --camera front --square-measured 39.8mm --save lens",
 )
 def main(options: flags.Options) -> int:
-    """0, or 2 for views or a cell file that are wrong."""
+    """Run the command; returns 0, or 2 for wrong views or a wrong cell file."""
     return outcome.guarded("camera", lambda: _calibrate(options))
 
 
@@ -59,7 +59,7 @@ def _calibrate(options: flags.Options) -> None:
         found = _watched(cell, camera, board, coverage, options, console)
         size = (cell.cameras[camera].width, cell.cameras[camera].height)
     result = intrinsics.calibrate(board, found, *size)
-    coverage = views.Coverage(board, result.lens)  # tilts by the lens that is known now
+    coverage = views.Coverage(board, result.lens)  # tilts with the lens just found
     for view in found:
         coverage.add(view)
     _show(console, camera, result, coverage.missing())
@@ -92,7 +92,7 @@ def _watched(
 
 
 def values(result: Intrinsics) -> dict[str, str]:
-    """What stands in the cell file, as YAML. The last digit is below a tenth of any uncertainty."""
+    """The values in the cell file, as YAML. The last digit is below a tenth of any uncertainty."""
     lens = result.lens
     focal = {name: f"{getattr(lens, name):.3f}" for name in intrinsics.NAMES[:4]}
     bends = {name: f"{getattr(lens, name):.6f}" for name in intrinsics.NAMES[4:]}

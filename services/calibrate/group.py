@@ -1,4 +1,4 @@
-"""The commands of the calibration, each imported when it is asked for."""
+"""The commands of the calibration, each imported on demand."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ COMMANDS = {
     "camera": ("intrinsics and distortion of a camera, from views of the board", "camera"),
     "hand-eye": ("where a camera stands, from views of the board on a robot's flange", "robot"),
 }
-"""What help says of each command, and the module that has it."""
+"""Help text and module of each command."""
 
 
 class Calibrate(flags.Group):
-    """The command that a calibration follows."""
+    """The group `penumbra calibrate`."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)

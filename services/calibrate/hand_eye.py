@@ -1,14 +1,14 @@
-"""Where a camera stands, from pictures of a board that a robot carries: A Z = X B.
+"""Hand-eye calibration: the pose of a camera, from pictures of a board that a robot carries: A Z = X B.
 
-A is the pose of the link that carries the board in the world, by the robot's joints; B the pose of the board in the camera, by
-its picture; X = T_world_camera and Z = T_link_board are the same in every pair.
+A is the pose of the link that carries the board in the world, from the robot's joints; B is the pose of the board in the camera,
+from its picture; X = T_world_camera and Z = T_link_board are the same in every pair.
 
 1. rotations of X and Z: null space of a linear system, projected onto rotations; then translations: linear too (Shah 2013)
-2. least squares on the corners' reprojection over X and Z; joints and lens are taken as they are
-3. before that the same with weights that fall with a pair's residual: pairs that stay far off are outliers, and left out
-4. leave-one-out: each pair as the others predict it
-5. standard deviations by bootstrap over pairs: what the robot's joints are wrong by is common to all corners of a pair, so that
-   the covariance of 2, which takes every corner for independent, is several times too small
+2. least squares on the corners' reprojection over X and Z; joints and lens are assumed to be exact
+3. before that, the same with weights that fall with a pair's residual: pairs that stay far off are outliers, and left out
+4. leave-one-out: each pair as predicted by the others
+5. standard deviations by bootstrap over pairs: errors of the robot's joints are common to all corners of a pair, so the
+   covariance of 2, which assumes independent corners, is several times too small
 """
 
 from __future__ import annotations
@@ -29,27 +29,28 @@ from penumbra.shared.geometry.lens import Lens
 from penumbra.shared.geometry.rigid import Array
 
 FEWEST_PAIRS = 8
-"""Pairs without which residuals and bootstrap say nothing: three would give a pose."""
+"""Minimum number of pairs for meaningful residuals and bootstrap; three would determine a pose."""
 FAR_ABOVE = 3.0
-"""A pair is an outlier whose residual is so many times the median one, and above GOOD_PX."""
+"""Factor on the median residual above which a pair is an outlier, if its residual also exceeds GOOD_PX."""
 GOOD_PX = 0.4
-"""A residual [px] at which no pair is an outlier, however small the others' are."""
+"""Residual [px] up to which no pair is an outlier, however small the others' residuals are."""
 MOST_BAD = 0.25
-"""Share of pairs that may be outliers: with more it is the robot, the board or the lens."""
+"""Maximum share of outliers: with more, the robot, the board or the lens is at fault."""
 LEAST_TURN = np.radians(3.0)
-"""Spread of the flange's rotation about its second axis below which the problem has no solution that is worth anything."""
+"""Minimum standard deviation [rad] of the flange's rotation about its second axis; below it, the problem has no useful
+solution."""
 GOOD_TURN = np.radians(10.0)
-"""The same, below which the result is poor."""
+"""The same standard deviation [rad] below which the result is poor."""
 ROUNDS = 8
-"""Fits that find the outliers, each with the weights of the one before."""
+"""Number of fits that find the outliers, each with the weights from the previous one."""
 RUNS, NEARBY = 5, 1e-3
-"""The derivatives are those of a small step: while the fit moves by more than NEARBY [m or rad], it is run again."""
+"""Maximum number of runs of the fit, and step [m or rad] below which it stops: the derivatives are those of a small step."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One moment: where the link with the board was in the world (4, 4), and the corners (n, 2) [px] of the undistorted picture,
-    with their places (n, 3) [m] on the board."""
+    """One picture: the pose in the world of the link with the board (4, 4), and the corners (n, 2) [px] in the undistorted
+    picture, with their positions (n, 3) [m] on the board."""
 
     name: str
     T_world_link: Array
@@ -59,7 +60,7 @@ class Pair:
 
     @classmethod
     def of(cls, view: View, T_world_link: Array, board: Board, lens: Lens) -> Pair:
-        """The pair of a view. Raises CalibrationError where the lens cannot have taken it."""
+        """The pair of a view. Raises CalibrationError if the lens cannot have taken it."""
         corners = lens.undistorted(view.corners)
         if np.isnan(corners).any():
             raise CalibrationError(f"{view.name}: expected corners that this lens can show: calibrate the camera first")
@@ -68,7 +69,7 @@ class Pair:
 
     @cached_property
     def T_camera_board(self) -> Array:
-        """The board's pose by its picture alone."""
+        """The board's pose from its picture alone."""
         K = np.array([[self.lens.fx, 0.0, self.lens.cx], [0.0, self.lens.fy, self.lens.cy], [0.0, 0.0, 1.0]])
         _, rotations, places, _ = cv2.solvePnPGeneric(self.points, self.corners, K, None, flags=cv2.SOLVEPNP_IPPE)
         rotation, place = cv2.solvePnPRefineLM(self.points, self.corners, K, None, rotations[0], places[0])
@@ -78,7 +79,8 @@ class Pair:
 
 
 class Corners:
-    """All corners of some pairs in one row (n,), and what they are off by where X and Z hold. `pair` (n,): whose they are."""
+    """The corners of several pairs in one array (n,), and their residuals for given X and Z. `pair` (n,): index of each corner's
+    pair."""
 
     def __init__(self, pairs: Sequence[Pair]):
         counts = [len(pair.points) for pair in pairs]
@@ -91,24 +93,24 @@ class Corners:
         self._focal, self._centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
 
     def residuals(self, X: Array, Z: Array) -> Array:
-        """(n, 2) [px]."""
+        """Reprojection residuals (n, 2) [px]."""
         points = self._in_camera(X, Z)
         return np.asarray(points[:, :2] / points[:, 2:] * self._focal + self._centre - self._corners)
 
     def rms(self, X: Array, Z: Array) -> Array:
-        """(p,): of each pair, per coordinate [px]."""
+        """Root mean square residual (p,) of each pair, per coordinate [px]."""
         squares = np.bincount(self.pair, (self.residuals(X, Z) ** 2).mean(axis=1), self.count)
         return np.asarray(np.sqrt(squares / np.bincount(self.pair, minlength=self.count)))
 
     def jacobian(self, X: Array, Z: Array) -> Array:
-        """(n, 2, 12): derivatives of the residuals by `perturb` of X and of Z."""
+        """Derivatives (n, 2, 12) of the residuals by `perturb` of X and of Z."""
         R_camera_world = X[:3, :3].T
         R_camera_link = R_camera_world @ self._T[:, :3, :3]
         moved = np.empty((len(self._points), 3, 12))
         moved[:, :, :3] = -R_camera_world
         moved[:, :, 3:6] = R_camera_world @ _skew(self._in_world(Z) - X[:3, 3])
         moved[:, :, 6:9] = R_camera_link
-        moved[:, :, 9:] = -R_camera_link @ _skew(self._points @ Z[:3, :3].T)  # turned, not moved
+        moved[:, :, 9:] = -R_camera_link @ _skew(self._points @ Z[:3, :3].T)  # rotated, without translation
         x, y, z = self._in_camera(X, Z).T
         by_point = np.zeros((len(z), 2, 3))
         by_point[:, 0, 0], by_point[:, 1, 1] = self._focal[0] / z, self._focal[1] / z
@@ -121,14 +123,14 @@ class Corners:
 
     def _in_camera(self, X: Array, Z: Array) -> Array:
         points = rigid.apply(rigid.inverse(X), self._in_world(Z))
-        points[:, 2] = np.maximum(points[:, 2], 1e-3)  # what lies behind the camera is far off, and finite
+        points[:, 2] = np.maximum(points[:, 2], 1e-3)  # a point behind the camera gets a large but finite residual
         return points
 
 
 @dataclass(frozen=True)
 class LeftOne:
-    """A pair as the other pairs predict it: rms of its corners [px], and distance [m] and angle [rad] between the predicted pose
-    of the board and the one by its picture."""
+    """A pair as predicted by the other pairs: rms of its corners [px], and distance [m] and angle [rad] between the board's
+    predicted pose and the one from its picture."""
 
     rms_px: float
     distance: float
@@ -138,7 +140,7 @@ class LeftOne:
 @dataclass(frozen=True)
 class HandEye:
     """T_world_camera and T_link_board, their covariances (6, 6) for `perturb`, the rms of all corners per coordinate [px], the
-    leave-one-out residuals of the pairs used and of those left out, and what the result suffers from, in words."""
+    leave-one-out residuals of the pairs used and of those left out, and weaknesses of the result, in words."""
 
     T_world_camera: Array
     T_link_board: Array
@@ -157,7 +159,7 @@ class HandEye:
 
 
 def solve(pairs: Sequence[Pair], resamples: int = 200, rng: np.random.Generator | None = None) -> HandEye:
-    """Where the camera stands. Raises CalibrationError where the pairs do not tell it."""
+    """Solve for the camera's pose. Raises CalibrationError if the pairs do not determine it."""
     rng = rng or np.random.default_rng(0)
     _need(len(pairs))
     look_at_turns([pair.T_world_link for pair in pairs])
@@ -173,15 +175,15 @@ def solve(pairs: Sequence[Pair], resamples: int = 200, rng: np.random.Generator 
     left_out = {pair.name: _left_one(pair, X, Z) for pair in outliers}
     drawn = (refine(corners, X, Z, weights) for weights in _drawn(pairs, resamples, rng))
     offsets = np.array([np.concatenate([rigid.pose_error(a, b) for a, b in zip(each, (X, Z), strict=True)]) for each in drawn])
-    # the pairs give 6 numbers each, of which 12 in all went into the result: what is left is smaller than the errors were
+    # each pair gives 6 numbers, and the result has 12: residuals are smaller than the errors
     covariance = len(pairs) / (len(pairs) - 2.0) * np.cov(offsets, rowvar=False)
     rms = float(np.sqrt(np.mean(corners.residuals(X, Z) ** 2)))
     return HandEye(X, Z, covariance[:6, :6], covariance[6:, 6:], rms, residuals, left_out, tuple(notes))
 
 
 def _apart(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Pair]]:
-    """The pairs that agree, and the outliers: a fit in which a pair counts the less the farther it is off leaves these far off.
-    Raises CalibrationError where there are too many."""
+    """The consistent pairs, and the outliers: in a fit in which a pair's weight falls with its residual, outliers stay far off.
+    Raises CalibrationError if there are too many."""
     corners = Corners(pairs)
     X, Z = refine(corners, *linear(pairs))
     rms = corners.rms(X, Z)
@@ -200,10 +202,10 @@ def _apart(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Pair]]:
 
 
 def look_at_turns(poses: Sequence[Array]) -> list[str]:
-    """What the rotations of the link lack for a good result. Raises CalibrationError where they give none: turned about one axis
-    only, the camera may lie anywhere along it."""
+    """Weaknesses of the link's rotations for a good result. Raises CalibrationError if they determine none: with turns about one
+    axis only, the camera may lie anywhere along it."""
     vectors = np.array([rigid.pose_error(T, poses[0])[3:] for T in poses])
-    for _ in range(3):  # about the mean, where rotation vectors are small and behave
+    for _ in range(3):  # about the mean, where rotation vectors are small and well-behaved
         mean = vectors.mean(axis=0)
         middle = np.eye(4)
         middle[:3, :3] = rigid.rotation(mean) @ poses[0][:3, :3]
@@ -234,7 +236,7 @@ def linear(pairs: Sequence[Pair]) -> tuple[Array, Array]:
     """X and Z in closed form (Shah 2013)."""
     A, B = (np.array(list(each)) for each in zip(*((p.T_world_link, p.T_camera_board) for p in pairs), strict=True))
     eye = np.eye(3)
-    # R_A R_Z = R_X R_B; with rows one after the other, vec(P Q R) = (P kron R') vec(Q)
+    # R_A R_Z = R_X R_B; with row-major vec, vec(P Q R) = (P kron R') vec(Q)
     system = np.concatenate(
         [np.hstack([np.kron(a, eye), -np.kron(eye, b.T)]) for a, b in zip(A[:, :3, :3], B[:, :3, :3], strict=True)]
     )
@@ -256,7 +258,7 @@ def _rotation(matrix: Array) -> Array:
 
 
 def refine(corners: Corners, X: Array, Z: Array, weights: ArrayLike | None = None) -> tuple[Array, Array]:
-    """X and Z with the smallest sum of squares of all corners' residuals; weights: of the pairs (p,)."""
+    """Minimise the sum of squares of all corners' residuals over X and Z; weights: of the pairs (p,)."""
     root = np.sqrt(np.ones(corners.count) if weights is None else np.asarray(weights, float))[corners.pair, None]
 
     def moved(error: Array) -> tuple[Array, Array]:
@@ -276,14 +278,15 @@ def refine(corners: Corners, X: Array, Z: Array, weights: ArrayLike | None = Non
 
 
 def _left_one(pair: Pair, X: Array, Z: Array) -> LeftOne:
-    """A pair as others predict it."""
+    """The residuals of a pair at X and Z."""
     off = rigid.pose_error(rigid.inverse(X) @ pair.T_world_link @ Z, pair.T_camera_board)
     rms = float(Corners([pair]).rms(X, Z)[0])
     return LeftOne(rms, float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:])))
 
 
 def _drawn(pairs: Sequence[Pair], resamples: int, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:
-    """How often each of the pairs (p,) is in a sample of as many, drawn with repetition, that turns about two axes."""
+    """Bootstrap weights: counts of the pairs (p,) in samples of the same size, drawn with repetition, that turn about two
+    axes."""
     count = 0
     while count < resamples:
         weights = np.bincount(rng.integers(len(pairs), size=len(pairs)), minlength=len(pairs))
@@ -296,7 +299,7 @@ def _drawn(pairs: Sequence[Pair], resamples: int, rng: np.random.Generator) -> I
 
 
 def _skew(vectors: Array) -> Array:
-    """(n, 3, 3): [v] with [v] w = v x w."""
+    """Skew matrices (n, 3, 3): [v] with [v] w = v x w."""
     out = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x

@@ -1,10 +1,10 @@
-"""The lens of a camera from views of the board: intrinsics and distortion, their standard deviations, and which views are bad.
+"""Intrinsics and distortion of a camera from views of the board, with standard deviations and bad views.
 
 1. closed form and least squares of all views' corners, by OpenCV (Zhang 2000)
 2. a view whose residual is far above the others' is left out, and the fit repeated
-3. k3 stays only where it differs from zero by more than its uncertainty: else it bends the corners of pictures for nothing
+3. k3 is kept only if it differs from zero by more than its uncertainty: otherwise it bends the corners of pictures needlessly
 4. standard deviations by bootstrap over views: corners of one view share their error (a board that is not quite flat, blur), so
-   that those of the least squares, which take every corner for independent, are too small
+   those of the least squares, which assumes independent corners, are too small
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from penumbra.shared.geometry.rigid import Array
 
 NAMES = ("fx", "fy", "cx", "cy", *COEFFICIENTS)
 FEWEST_VIEWS = 8
-"""Views without which nine unknowns are not worth their name."""
+"""Minimum number of views for nine unknowns."""
 FAR_ABOVE = 3.0
-"""A view is bad whose residual is so many times the median one, and above GOOD_PX."""
+"""Factor on the median residual above which a view is bad, if its residual also exceeds GOOD_PX."""
 GOOD_PX = 0.5
-"""A residual [px] at which no view is bad, however small the others' are."""
+"""Residual [px] up to which no view is bad, however small the others' residuals are."""
 MOST_BAD = 0.25
-"""Share of views that may be bad: with more it is the board or the camera."""
+"""Maximum share of bad views: with more, the board or the camera is at fault."""
 SIGNIFICANT = 3.0
-"""Standard deviations from zero at which k3 is kept."""
+"""Number of standard deviations from zero above which k3 is kept."""
 FLATTEST = np.radians(8.0)
-"""Views that differ in tilt by less than this do not tell the focal length from the distance."""
+"""Minimum difference [rad] in tilt between views; below it, they do not separate the focal length from the distance."""
 
 
 @dataclass(frozen=True)
 class View:
-    """Corners (n, 2) [px] of the board in a picture as the camera took it, and their numbers (n,)."""
+    """Corners (n, 2) [px] of the board in a distorted picture, and their numbers (n,)."""
 
     name: str
     corners: Array
@@ -48,8 +48,9 @@ class View:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """lens: what was found; deviation: standard deviations by NAMES; rms_px: of the corners used, per coordinate; residuals: rms
-    by view [px]; left_out: bad views, with their residuals; poses: T_camera_board by view."""
+    """Result of the calibration. lens: intrinsics and distortion; deviation: standard deviations by NAMES; rms_px: of the corners
+    used, per coordinate; residuals: rms by view [px]; left_out: bad views, with their residuals; poses: T_camera_board by
+    view."""
 
     lens: Lens
     deviation: dict[str, float]
@@ -62,7 +63,7 @@ class Intrinsics:
 def calibrate(
     board: Board, views: Sequence[View], width: int, height: int, resamples: int = 60, rng: np.random.Generator | None = None
 ) -> Intrinsics:
-    """The lens that took the views, in pictures of this size. Raises CalibrationError where the views do not tell it."""
+    """Calibrate the lens from views in pictures of this size. Raises CalibrationError if the views do not determine it."""
     rng = rng or np.random.default_rng(0)
     views = list(views)
     _need(len(views))
@@ -89,7 +90,7 @@ def calibrate(
         reasons = "; ".join(f"{name}: {reason}" for name, reason in faults)
         raise CalibrationError(f"the views give no possible lens ({reasons}): take views that fill the picture up to its corners")
     drawn = np.array(list(_resampled(board, views, (width, height), fit, resamples, rng)))
-    # the spread among n views drawn with repetition is that of a sample of n - 1
+    # the spread among n views drawn with repetition is that of a sample of n - 1 views
     deviation = drawn.std(axis=0, ddof=1) * np.sqrt(len(views) / (len(views) - 1.0))
     deviation = np.maximum(deviation, fit.deviation)
     return Intrinsics(lens, dict(zip(NAMES, map(float, deviation), strict=True)), fit.rms_px, fit.residuals, left_out, fit.poses)
@@ -106,8 +107,8 @@ class _Fit:
 
 
 def _fit(board: Board, views: Sequence[View], size: tuple[int, int], flags: int, start: _Fit | None = None) -> _Fit:
-    """OpenCV's least squares over all views; `start` spares it the closed form."""
-    guess: tuple[Any, Any] = (None, None) if start is None else _matrices(start.k)  # OpenCV's types know of no None
+    """OpenCV's least squares over all views; `start` replaces the closed form."""
+    guess: tuple[Any, Any] = (None, None) if start is None else _matrices(start.k)  # OpenCV's type hints do not allow None
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
     objects = [board.corners[view.numbers].astype(np.float32) for view in views]
@@ -121,7 +122,7 @@ def _fit(board: Board, views: Sequence[View], size: tuple[int, int], flags: int,
     for view, rotation, place in zip(views, rotations, places, strict=True):
         poses[view.name] = T = np.eye(4)
         T[:3, :3], T[:3, 3] = rigid.rotation(np.ravel(rotation)), np.ravel(place)
-    each = np.ravel(rms) / np.sqrt(2.0)  # OpenCV's are lengths
+    each = np.ravel(rms) / np.sqrt(2.0)  # OpenCV's residuals are lengths
     whole = float(np.sqrt(np.average(each**2, weights=[len(view.numbers) for view in views])))
     residuals = {view.name: float(residual) for view, residual in zip(views, each, strict=True)}
     return _Fit(k, np.ravel(deviation)[:9].astype(float), whole, residuals, poses, flags & ~cv2.CALIB_USE_INTRINSIC_GUESS)
@@ -134,7 +135,7 @@ def _matrices(k: Array) -> tuple[Array, Array]:
 def _resampled(
     board: Board, views: Sequence[View], size: tuple[int, int], fit: _Fit, resamples: int, rng: np.random.Generator
 ) -> Iterator[Array]:
-    """The unknowns (9,) of fits to as many views, drawn with repetition."""
+    """The unknowns (9,) of fits to the same number of views, drawn with repetition."""
     for _ in range(resamples):
         drawn = [views[i] for i in rng.integers(len(views), size=len(views))]
         yield _fit(board, drawn, size, fit.flags, fit).k
@@ -146,7 +147,7 @@ def _need(count: int) -> None:
 
 
 def _look_at_tilts(poses: Sequence[Array]) -> None:
-    """Raises CalibrationError where all views have the same tilt."""
+    """Raise CalibrationError if all views have the same tilt."""
     normals = np.array([T[:3, 2] for T in poses])
     mean = normals.mean(axis=0) / np.linalg.norm(normals.mean(axis=0))
     spread = float(np.arccos(np.clip(normals @ mean, -1.0, 1.0)).max())

@@ -1,4 +1,4 @@
-"""Views of the board from the bus: each picture is looked at while the board, and the robot that carries it, stand still."""
+"""Views of the board from the bus: pictures are used while the board, and the robot that carries it, stand still."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 
 PATIENCE_S = 5.0
-"""How long to wait for a picture, or for joints, before saying that none come."""
+"""Time [s] to wait for a picture, or for joints, before an error is reported."""
 STILL_PX = 0.7
-"""The board stands still where its corners have moved by less than this since the picture before: twice their noise."""
+"""Maximum mean motion [px] of the corners since the previous picture at which the board stands still: twice their noise."""
 STILL_RAD = 2e-3
-"""The robot stands still where no joint has moved by more than this for STILL_S."""
+"""Maximum motion [rad] of any joint over STILL_S at which the robot stands still."""
 STILL_S = 0.3
 TOLERANCE_NS = 60_000_000
-"""Largest distance of a picture from the nearest joints."""
+"""Maximum distance [ns] between a picture and the nearest joints."""
 
 
 @dataclass(frozen=True)
 class Still:
-    """A picture of the board standing still: what was found in it, the picture itself, and the joints (n,) [rad] of the robot,
-    None where none was asked for."""
+    """A picture of the board standing still: its view, the picture itself, and the joints (n,) [rad] of the robot, None without a
+    robot."""
 
     view: View
     image: Picture
@@ -43,7 +43,7 @@ class Still:
 
 
 class Watcher:
-    """Reads a camera, and a robot where one is named, and hands out every picture in which both stand still."""
+    """Reads a camera, and optionally a robot, and returns every picture in which both stand still."""
 
     def __init__(self, board: Board, camera: str, robot: str | None):
         self._board, self._camera, self._robot = board, camera, robot
@@ -53,20 +53,20 @@ class Watcher:
         self._last: View | None = None
         self._count = 0
         self.status = ""
-        """Why the last picture was not taken, in words; empty where it was."""
+        """Why the last picture was not used, in words; empty if it was."""
 
     def on_frame(self, frame: Frame, names: dict[str, str]) -> None:
-        """Keeps the newest picture."""
+        """Keep the newest picture."""
         with self._fresh:
             self._frame = frame
             self._fresh.notify()
 
     def on_joints(self, joints: Joints, names: dict[str, str]) -> None:
-        """Keeps the joints of the last seconds."""
+        """Keep the joints of the last seconds."""
         self._history.add(joints.stamp_ns, joints.position)
 
     def stills(self) -> Iterator[Still | None]:
-        """One for each picture that comes: None where it is of no use. Raises BusError where none comes."""
+        """One item per picture: None if it is of no use. Raises BusError if no picture arrives."""
         while True:
             with self._fresh:
                 if not self._fresh.wait_for(lambda: self._frame is not None, PATIENCE_S):
@@ -104,7 +104,7 @@ class Watcher:
 
 
 def _moved(last: View, view: View) -> float:
-    """How far the corners that both show have moved, on average [px]."""
+    """Mean motion [px] of the corners visible in both views."""
     shared, mine, others = np.intersect1d(view.numbers, last.numbers, return_indices=True)
     if not len(shared):
         return np.inf
@@ -115,7 +115,7 @@ def _moved(last: View, view: View) -> float:
 def watcher(
     cell: cells.Cell, connection: bus.Connection, board: Board, camera: str, robot: str | None = None
 ) -> Iterator[Watcher]:
-    """A watcher of a camera, and of a robot, of a running cell. Raises BusError where no router is there."""
+    """A watcher of a camera, and of a robot, of a running cell. Raises BusError if there is no router."""
     node = Node("calibrate", cell, connection)
     found = Watcher(board, camera, robot)
     node.subscribe(topics.FRAME, found.on_frame, camera=camera)
@@ -128,8 +128,8 @@ def watcher(
 def collect(
     found: Watcher, is_wanted: Callable[[Still], bool], count: int, what_next: Callable[[], str], say: Callable[[str], None]
 ) -> list[Still]:
-    """So many stills that are wanted; less where Ctrl-C ends it. what_next: what the person should do; say: shows a line, each
-    time that something changes."""
+    """Collect `count` wanted stills; fewer if Ctrl-C ends it. what_next: the instruction for the person; say: shows a line
+    whenever something changes."""
     out: list[Still] = []
     said, due = "", 0.0
     try:

@@ -1,4 +1,4 @@
-"""What the calibrations have in common: their flags, and how a result gets into the cell file."""
+"""Common parts of the calibrations: their flags, and writing a result to the cell file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WRITING = (
 
 
 def guarded(name: str, run: Callable[[], None]) -> int:
-    """Runs a calibration: 0, or 2 with lines that say what is wrong."""
+    """Run a calibration; returns 0, or 2 after printing what is wrong."""
     try:
         run()
     except (CalibrationError, CellError, bus.BusError) as error:
@@ -42,15 +42,14 @@ def guarded(name: str, run: Callable[[], None]) -> int:
 
 
 def destination(options: flags.Options) -> Path:
-    """The file that the result goes into: known before anything is measured, for nobody likes to measure twice. Raises
-    CellError."""
+    """The file for the result, determined before anything is measured, so that no measurement is lost. Raises CellError."""
     return source(options.cell) if options.dry_run else edit.destination(options.cell, options.out)
 
 
 def store(
     options: flags.Options, camera: str, values: Mapping[str, str], instead: Mapping[str, str], say: Callable[[str], None]
 ) -> None:
-    """Writes values of a camera into the cell file, or shows the change. Raises CellError."""
+    """Write values of a camera to the cell file, or show the change. Raises CellError."""
     path, origin = destination(options), source(options.cell)
     text = edit.with_values(origin, ("cameras", camera), values, instead)
     if options.dry_run:

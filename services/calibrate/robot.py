@@ -25,7 +25,7 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.runtime import bus
 
 ANOTHER = 0.06
-"""A pose of the robot is another one where some joint has turned by so much [rad]."""
+"""Minimum turn [rad] of some joint that makes another pose of the robot."""
 GOOD_M, GOOD_RAD = 0.003, math.radians(0.3)
 """Standard deviations of the camera's pose above which the result is called poor."""
 
@@ -57,7 +57,7 @@ GOOD_M, GOOD_RAD = 0.003, math.radians(0.3)
     "penumbra calibrate hand-eye --cell mine.yaml --camera front --robot panda --save poses",
 )
 def main(options: flags.Options) -> int:
-    """0, or 2 for views, joints or a cell file that are wrong."""
+    """Run the command; returns 0, or 2 for wrong views, joints or a wrong cell file."""
     return outcome.guarded("hand-eye", lambda: _calibrate(options))
 
 
@@ -86,8 +86,7 @@ def _calibrate(options: flags.Options) -> None:
 
 
 def carrier(model: RobotModel, name: str | None) -> str:
-    """The link that carries the board: the last one that a joint of the cell moves, where none is named. Raises
-    CalibrationError."""
+    """The link that carries the board; by default the last one that a joint of the cell moves. Raises CalibrationError."""
     if name is None:
         return {joint.name: joint.child for joint in model.description.joints}[model.joints[-1]]
     if name not in model.links:
@@ -140,7 +139,7 @@ def _watched(
 
 
 def values(result: HandEye) -> dict[str, str]:
-    """What stands in the cell file, as YAML: to a hundredth of a millimetre and of a degree's tenth."""
+    """The values in the cell file, as YAML: to a hundredth of a millimetre and of a tenth of a degree."""
     position, orientation = rigid.position_orientation(result.T_world_camera)
     metres, radians = result.spread
     return {

@@ -1,4 +1,4 @@
-"""`penumbra calibrate board`: the board as a PDF of vectors, in its exact size."""
+"""`penumbra calibrate board`: the board as a vector PDF in its exact size."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from penumbra.services.calibrate.board import Board, CalibrationError
 
 PAGES = {"A5": pagesizes.A5, "A4": pagesizes.A4, "A3": pagesizes.A3, "A2": pagesizes.A2, "A1": pagesizes.A1, "A0": pagesizes.A0,
          "letter": pagesizes.LETTER, "legal": pagesizes.LEGAL, "tabloid": pagesizes.TABLOID}  # fmt: skip
-"""Width and height of pages that stand [pt]."""
+"""Width and height of portrait pages [pt]."""
 POINT = 25.4e-3 / 72
 """A typographic point [m]."""
 MARGIN = 5e-3
-"""White on each side [m]: printers leave so much unprinted, and a marker needs some around it."""
+"""White margin on each side [m]: printers leave this much unprinted, and a marker needs some space around it."""
 LETTERS = 6.0
-"""Size of the line of text [pt]."""
+"""Font size of the line of text [pt]."""
 
 
 @flags.command(
@@ -33,7 +33,7 @@ LETTERS = 6.0
     example="penumbra calibrate board -o board.pdf --squares 7x5 --square 40mm --page A4",
 )
 def main(options: flags.Options) -> int:
-    """0, or 2 where the board does not fit or the file cannot be written."""
+    """Run the command; returns 0, or 2 if the board does not fit or the file cannot be written."""
     try:
         board = Board.of(options)
         write(board, options.out, options.page)
@@ -47,7 +47,7 @@ def main(options: flags.Options) -> int:
 
 
 def write(board: Board, path: Path, page: str = "A4") -> None:
-    """The PDF of a board in the middle of a page. Raises CalibrationError where it does not fit, or cannot be written."""
+    """Write the PDF of a board in the middle of a page. Raises CalibrationError if it does not fit, or cannot be written."""
     width, height = board.size
     room = [each - 2.0 * MARGIN / POINT for each in PAGES[page]]
     fits = {turn: width <= room[turn] * POINT + 1e-9 and height <= room[1 - turn] * POINT + 1e-9 for turn in (0, 1)}
@@ -60,7 +60,7 @@ def write(board: Board, path: Path, page: str = "A4") -> None:
     try:
         canvas = Canvas(str(path), pagesize=paper)
         canvas.setTitle("Penumbra calibration board")
-        canvas.setViewerPreference("PrintScaling", "None")  # what print dialogs begin with
+        canvas.setViewerPreference("PrintScaling", "None")  # the default of print dialogs
         _draw(canvas, board, paper)
         canvas.save()
     except OSError as error:
@@ -68,7 +68,7 @@ def write(board: Board, path: Path, page: str = "A4") -> None:
 
 
 def _draw(canvas: Canvas, board: Board, paper: tuple[float, float]) -> None:
-    """The rectangles as one path, which leaves no hairlines between them, and a line of text along the wider margin."""
+    """Draw the rectangles as one path, which leaves no hairlines between them, and a line of text along the wider margin."""
     width, height = (each / POINT for each in board.size)
     left, bottom = (paper[0] - width) / 2.0, (paper[1] - height) / 2.0
     path = canvas.beginPath()

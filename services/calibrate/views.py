@@ -1,4 +1,4 @@
-"""Views of the board: from a folder of pictures, and which ones are still missing for a good lens."""
+"""Views of the board from a folder of pictures, and the views that are still missing for a good lens."""
 
 from __future__ import annotations
 
@@ -21,22 +21,23 @@ from penumbra.shared.geometry.rigid import Array
 Picture = NDArray[np.uint8]
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 JOINTS = "joints.csv"
-"""File beside the pictures: a line of names, `picture` and every joint, and a line for each picture [rad]."""
+"""File beside the pictures: a header with `picture` and every joint, and a line for each picture [rad]."""
 PARTS = 3
-"""Rows and columns of parts of a picture, in each of which corners are wanted."""
+"""Rows and columns of parts of a picture, each of which should have corners."""
 TILT = math.radians(15.0)
-"""A view counts as tilted from here on."""
+"""Minimum angle [rad] of a tilted view."""
 NEAR = 0.45
-"""Share of the picture's width that the board covers in a near view."""
+"""Minimum share of the picture's width that the board covers in a near view."""
 STEP, TURN, SCALE = 0.12, math.radians(10.0), 1.25
-"""A view is another one where the board has moved by this share of the width, turned by this, or grown by this factor."""
+"""Minimum change that makes another view: the board moved by this share of the width, turned by this angle [rad], or scaled by
+this factor."""
 SLACK = 0.1
-"""How far joints may be beyond their limits [rad]: drives overshoot."""
+"""Maximum excess [rad] of joints beyond their limits: drives overshoot."""
 
 
 def read(folder: Path, board: Board) -> tuple[list[View], list[str], tuple[int, int]]:
     """The views in a folder of pictures, the names of pictures without the board, and their width and height. Raises
-    CalibrationError where there is no picture, or pictures of different sizes."""
+    CalibrationError if there is no picture, or pictures of different sizes."""
     try:
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     except OSError as error:
@@ -61,9 +62,9 @@ def read(folder: Path, board: Board) -> tuple[list[View], list[str], tuple[int, 
 
 
 class Coverage:
-    """Which views there are, and which are missing: corners in all parts of the picture, tilts to all sides, near ones.
+    """Coverage of the views: corners in all parts of the picture, tilts to all sides, near ones.
 
-    lens: about that of the camera, by which tilts are judged; it need not be right.
+    lens: approximately that of the camera, used to judge tilts; it need not be exact.
     """
 
     def __init__(self, board: Board, lens: Lens):
@@ -74,21 +75,21 @@ class Coverage:
         self._poses: list[Array] = []
 
     def add(self, view: View) -> None:
-        """Counts a view."""
+        """Add a view."""
         self._seen |= self._parts(view)
         T = self._pose(view)
         self._kinds |= self._kinds_of(view, T)
         self._poses.append(T)
 
     def adds(self, view: View) -> bool:
-        """Whether a view shows something that is missing, or is unlike all others."""
+        """Whether a view shows something that is missing, or differs from all others."""
         T = self._pose(view)
         if (self._parts(view) & ~self._seen).any() or self._kinds_of(view, T) - self._kinds:
             return True
         return all(self._differ(T, other) for other in self._poses)
 
     def missing(self) -> list[str]:
-        """What would make the lens more certain, in words for the person with the board."""
+        """Instructions for the person with the board that would make the lens more certain."""
         rows, columns = ("upper", "middle", "lower"), ("left", "middle", "right")
         names = [
             "the middle" if row == column == "middle" else f"the {row} {column}"
@@ -117,7 +118,7 @@ class Coverage:
         return T
 
     def _kinds_of(self, view: View, T: Array) -> set[str]:
-        x, y, _ = T[:3, 2]  # the board's back
+        x, y, _ = T[:3, 2]  # normal of the board's back
         low = math.sin(TILT)
         tilts = {"left": x < -low, "right": x > low, "upper": y < -low, "lower": y > low}
         out = {side for side, is_there in tilts.items() if is_there}
@@ -137,7 +138,7 @@ class Coverage:
 
 def read_joints(path: Path, names: Sequence[str], limits: tuple[Array, Array], are_degrees: bool = False) -> dict[str, Array]:
     """Joint angles [rad] by picture, in the order of `names`, whatever the order of the file's columns. limits: lower and upper
-    ones (n,). Raises CalibrationError with the line of what is wrong."""
+    ones (n,). Raises CalibrationError with the faulty line."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = [(n, row) for n, row in enumerate(csv.reader(file), 1) if any(each.strip() for each in row)]
@@ -172,8 +173,8 @@ def read_joints(path: Path, names: Sequence[str], limits: tuple[Array, Array], a
 
 
 def save(folder: Path, taken: Iterable[tuple[str, Picture, Array | None]], joints: Sequence[str]) -> None:
-    """Keeps pictures RGB by their names, and joints [rad] where there are any, as `read` and `read_joints` take them. Raises
-    CalibrationError where they cannot be written."""
+    """Save pictures RGB by their names, and joints [rad] if there are any, as `read` and `read_joints` read them. Raises
+    CalibrationError if they cannot be written."""
     lines = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
