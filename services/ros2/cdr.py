@@ -1,4 +1,4 @@
-"""The messages of a ROS distribution: their classes, type hashes and CDR bytes, by rosbags, which has the definitions of each."""
+"""Messages of a ROS distribution: classes, type hashes and CDR bytes, by rosbags, which has their definitions."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
 DISTRIBUTIONS = {"jazzy": Stores.ROS2_JAZZY, "kilted": Stores.ROS2_KILTED}
-"""Distributions whose rmw_zenoh has the keys of `names`; in Humble they have no type hashes."""
+"""Distributions whose rmw_zenoh uses the keys of `names`; in Humble they have no type hashes."""
 LONGEST = 16_000_000
-"""Largest number of entries of a list in a message that is read."""
+"""Maximum number of entries in a list of a decoded message."""
 TRAILING = (0, 4, 8)
-"""Bytes at the end of a message that are left out where it cannot be read otherwise: what `rclpy.serialization` writes after
-empty lists. rosbags itself accepts three more, which is what alignment may add."""
+"""Numbers of trailing bytes that are dropped if a message cannot be decoded otherwise: `rclpy.serialization` writes them after
+empty lists. rosbags itself accepts three more, for alignment."""
 
 
 class Types:
@@ -25,7 +25,7 @@ class Types:
         self._store.max_sequence_length = LONGEST
 
     def make(self, kind: str, **fields: Any) -> Any:
-        """A message of a type; every field is given."""
+        """Make a message of a type; every field must be given."""
         return self._store.types[kind](**fields)
 
     def constant(self, kind: str, name: str) -> int:
@@ -37,11 +37,11 @@ class Types:
         return self._store.hash_rihs01(kind)
 
     def encode(self, message: Any) -> bytes:
-        """The CDR bytes of a message, little-endian, led by its four bytes of encapsulation."""
+        """The CDR bytes of a message, little-endian, after the four bytes of encapsulation."""
         return bytes(self._store.serialize_cdr(message, message.__msgtype__))
 
     def decode(self, kind: str, payload: bytes) -> Any:
-        """The message of a type in CDR bytes. Raises ValueError for bytes that are none."""
+        """Decode a message of a type from CDR bytes. Raises ValueError for invalid bytes."""
         first: SerdeError | None = None
         for count in TRAILING:
             try:

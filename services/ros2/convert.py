@@ -34,13 +34,13 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 NOT_KNOWN = 1e6
-"""Variance [m^2/s^2, rad^2/s^2] of a twist whose covariance the fused pose does not carry: a filter that fuses it gives it no
-weight. ROS has no mark for an unknown covariance of a twist; zeros would mean that it is exact."""
+"""Variance [m^2/s^2, rad^2/s^2] of a twist, because the fused pose does not carry its covariance: a filter that fuses it gives it
+no weight. ROS cannot mark a twist's covariance as unknown; zeros would mean that it is exact."""
 SECOND_NS = 1_000_000_000
 
 
 def time(ros: Types, stamp_ns: int) -> Any:
-    """A stamp [ns since the epoch]."""
+    """A ROS time from a stamp [ns since the epoch]."""
     return ros.make("builtin_interfaces/msg/Time", sec=stamp_ns // SECOND_NS, nanosec=stamp_ns % SECOND_NS)
 
 
@@ -61,7 +61,7 @@ def quaternion(ros: Types, xyzw: Iterable[float]) -> Any:
 
 
 def placed(ros: Types, position: Iterable[float], orientation: Iterable[float]) -> Any:
-    """A Pose of a position [m] (3,) and a quaternion (4,)."""
+    """A Pose from a position [m] (3,) and a quaternion (4,)."""
     return ros.make("geometry_msgs/msg/Pose", position=point(ros, position), orientation=quaternion(ros, orientation))
 
 
@@ -76,8 +76,8 @@ def pose(ros: Types, fused: FusedPose) -> Any:
 
 
 def twist(ros: Types, fused: FusedPose) -> Any:
-    """The velocity of the target's origin [m/s] and its rate of turn [rad/s], along the axes of the pose's frame. Its covariance
-    is not known."""
+    """The velocity of the target's origin [m/s] and its angular velocity [rad/s], along the axes of the pose's frame. Its
+    covariance is unknown."""
     inner = ros.make(
         "geometry_msgs/msg/Twist",
         linear=point(ros, fused.velocity[:3], "Vector3"),
@@ -93,18 +93,18 @@ def twist(ros: Types, fused: FusedPose) -> Any:
 
 
 def optical_frame(camera: str) -> str:
-    """The frame of a camera of the cell."""
+    """Name of the frame of a camera of the cell."""
     return f"{safe(camera)}_optical_frame"
 
 
 def link_frame(cell: Cell, robot: str, link: str) -> str:
-    """The frame of a robot's link: its name in the URDF, as robot_state_publisher has it; in a cell of several robots led by the
-    robot's."""
+    """Name of the frame of a robot's link: its name in the URDF, as robot_state_publisher uses it; in a cell of several robots
+    prefixed by the robot's name."""
     return link if len(cell.robots) == 1 else f"{robot}/{link}"
 
 
 def transform(ros: Types, stamp_ns: int, parent: str, child: str, T_parent_child: Array) -> Any:
-    """One transform, 4 x 4."""
+    """One transform T_parent_child (4, 4)."""
     position, orientation = rigid.position_orientation(T_parent_child)
     inner = ros.make(
         "geometry_msgs/msg/Transform", translation=point(ros, position, "Vector3"), rotation=quaternion(ros, orientation)
@@ -123,7 +123,7 @@ def target_transform(ros: Types, fused: FusedPose) -> Any:
 
 
 def still_transforms(ros: Types, cell: Cell, models: Mapping[str, RobotModel], stamp_ns: int, with_links: bool) -> list[Any]:
-    """What does not move: cameras, robots' bases and pads; with_links: also links that no moving joint carries."""
+    """The static transforms: cameras, robots' bases and pads; with_links: also links that no moving joint carries."""
     out = [
         transform(ros, stamp_ns, cell.frame, optical_frame(name), camera.T_world_camera) for name, camera in cell.cameras.items()
     ]
@@ -164,7 +164,7 @@ def _joint(ros: Types, cell: Cell, robot: str, model: RobotModel, stamp_ns: int,
 
 
 def camera_info(ros: Types, camera: Camera, name: str, stamp_ns: int) -> Any:
-    """The model of the overlaid picture: undistorted, so a pinhole's without distortion."""
+    """The camera model of the overlaid picture, which is undistorted: a pinhole without distortion."""
     whole = ros.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return ros.make(
         CAMERA_INFO,
@@ -183,7 +183,7 @@ def camera_info(ros: Types, camera: Camera, name: str, stamp_ns: int) -> Any:
 
 
 def compressed_image(ros: Types, camera: str, stamp_ns: int, jpeg: np.ndarray) -> Any:
-    """A picture that is JPEG already, bytes (n,) uint8."""
+    """A message with a picture that is already JPEG, bytes (n,) uint8."""
     return ros.make(
         COMPRESSED_IMAGE,
         header=header(ros, stamp_ns, optical_frame(camera)),
@@ -197,13 +197,13 @@ def compressed_image(ros: Types, camera: str, stamp_ns: int, jpeg: np.ndarray) -
 LEVELS = {"ok": "OK", "starting": "WARN", "degraded": "WARN", "down": "ERROR"}
 """Levels of DiagnosticStatus by the status of a health report."""
 STATES = {"tracking": "OK", "coasting": "WARN", "lost": "ERROR"}
-"""Levels by the state of a fused pose."""
+"""Levels of DiagnosticStatus by the state of a fused pose."""
 
 
 def diagnostics(
     ros: Types, cell: str, stamp_ns: int, reports: Sequence[Report], poses: Mapping[str, FusedPose | None], now_ns: int
 ) -> Any:
-    """The health of every process, and the state of every target: STALE where there is no pose."""
+    """The health of every process, and the state of every target: STALE if there is no pose."""
     out = [_status(ros, cell, report) for report in sorted(reports, key=lambda report: (report.service, report.instance))]
     out += [_state(ros, cell, target, fused, now_ns) for target, fused in poses.items()]
     return ros.make(DIAGNOSTICS, header=header(ros, stamp_ns, ""), status=out)

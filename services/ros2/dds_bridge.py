@@ -29,13 +29,14 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 ATTACHMENT = struct.Struct("<qqB16s")
-"""Number of the message, time of publication [ns], length of the publisher's identity, identity: what rmw_zenoh expects."""
+"""Attachment that rmw_zenoh expects: number of the message, time of publication [ns], length of the publisher's identity,
+identity."""
 ROUTER, NODE = "tcp/localhost:7447", "ros2"
-"""Where a router is looked for, and the name of the ROS node of `penumbra ros2`."""
+"""Default router, and the name of the ROS node of `penumbra ros2`."""
 WAIT_S, STEP_S = 1.0, 0.1
-"""Time [s] between two attempts to reach the router, and between two looks whether ROS ends."""
+"""Period [s] of attempts to reach the router, and of checks whether ROS ends."""
 MOST = 1000
-"""Messages that wait for ROS; where it is slower, new ones are dropped."""
+"""Maximum number of messages that wait for ROS; further ones are dropped."""
 
 
 class Endpoint:
@@ -57,12 +58,12 @@ class Endpoint:
             self.profile.reliability = ReliabilityPolicy.BEST_EFFORT
 
     def message_class(self) -> Any:
-        """Raises ImportError or AttributeError where ROS here does not have the type."""
+        """The ROS class of its messages. Raises ImportError or AttributeError if this ROS does not have the type."""
         return getattr(importlib.import_module(f"{self.package}.msg"), self.name)
 
 
 class Bridge:
-    """The ROS node and the Zenoh session. What Zenoh's threads receive waits in `_work` for the thread of ROS."""
+    """The ROS node and the Zenoh session. Data from Zenoh's threads waits in `_work` for the thread of ROS."""
 
     def __init__(self, session: zenoh.Session, node: Any):
         self._session, self._node = session, node
@@ -72,7 +73,7 @@ class Bridge:
         self._count = 0
 
     def watch(self, domain: int, name: str) -> Any:
-        """Bridges the topics of the nodes of this name that are there, and those that come."""
+        """Bridge the topics of the existing nodes of this name, and of those that appear."""
         return self._session.liveliness().declare_subscriber(
             f"@ros2_lv/{domain}/*/*/*/*/*/*/{name}/**",
             lambda sample: self._work.put(partial(self._on_token, str(sample.key_expr), sample.kind)),
@@ -80,7 +81,7 @@ class Bridge:
         )
 
     def step(self, patience_s: float) -> None:
-        """Does what waits, and lets ROS do what it has to do, for about `patience_s`."""
+        """Process waiting work, and let ROS run, for about `patience_s`."""
         deadline = time.monotonic() + patience_s
         while (left_s := deadline - time.monotonic()) > 0.0:
             try:
@@ -133,7 +134,7 @@ class Bridge:
 
 
 def opened(endpoint: str) -> zenoh.Session:
-    """A session at the router, as soon as that is there."""
+    """Open a session at the router, as soon as it is there."""
     config = zenoh.Config()
     for key, value in {"mode": "client", "connect/endpoints": [endpoint], "scouting/multicast/enabled": False}.items():
         config.insert_json5(key, json.dumps(value))

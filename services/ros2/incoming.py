@@ -1,4 +1,4 @@
-"""Messages of ROS as measurements of the cell: JointState by the names of joints, Image and CompressedImage as RGB."""
+"""Converts messages of ROS to measurements of the cell: JointState by joint names, Image and CompressedImage as RGB."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from penumbra.shared.cell.description import Camera
 
 SPREAD_NS = 100_000_000
-"""Largest time [ns] between the parts of one set of joints, where several nodes publish them."""
+"""Maximum time [ns] between the parts of one set of joints, if several nodes publish them."""
 LEAST_STEP_NS = 10_000_000
-"""Joints that come sooner after the last ones [ns] are left out: robots send up to a thousand sets a second, of which the cell
-reads a hundred."""
+"""Minimum time [ns] between sets of joints; earlier ones are dropped: robots send up to a thousand sets per second, of which the
+cell reads a hundred."""
 SECOND_NS = 1_000_000_000
 
 COLOURS: dict[str, tuple[int, int | None]] = {
@@ -37,11 +37,11 @@ COLOURS: dict[str, tuple[int, int | None]] = {
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUYV),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUYV),
 }
-"""Bytes of a pixel, and OpenCV's way to RGB, by the encoding of sensor_msgs/Image (image_encodings.hpp)."""
+"""Bytes per pixel, and OpenCV's conversion to RGB, by the encoding of sensor_msgs/Image (image_encodings.hpp)."""
 
 
 class Refused(ValueError):
-    """A message that cannot be used, in words."""
+    """A message that cannot be used; the text says why."""
 
 
 def stamp_ns(message: Any) -> int:
@@ -53,7 +53,8 @@ def stamp_ns(message: Any) -> int:
 class Joints:
     """Collects the joints of one robot, each from the newest message that names it.
 
-    names: in the order of `Joints.position`. missing: those that no message has named, or none for SPREAD_NS before the newest.
+    names: in the order of `Joints.position`. missing: joints that no message has named, or whose last value is older than the
+    newest part by more than SPREAD_NS.
     """
 
     def __init__(self, names: Sequence[str]):
@@ -63,8 +64,8 @@ class Joints:
         self._last_ns = 0
 
     def add(self, message: Any) -> tuple[int, NDArray[np.float64]] | None:
-        """Takes a JointState; the stamp of the newest part and all positions (n,) [rad or m], where the set is complete and the
-        last one was LEAST_STEP_NS ago or more. Raises Refused for positions that are none."""
+        """Add a JointState; returns the stamp of the newest part and all positions (n,) [rad or m] if the set is complete and the
+        last one was at least LEAST_STEP_NS ago. Raises Refused for invalid positions."""
         if len(message.position) != len(message.name):
             raise Refused(f"expected a position for each of {len(message.name)} joints, got {len(message.position)}")
         now_ns = stamp_ns(message)
@@ -84,8 +85,8 @@ class Joints:
 
 
 def image(message: Any, camera: Camera) -> NDArray[np.uint8]:
-    """The picture (h, w, 3) RGB of an Image. Raises Refused for another size than the camera's, and for encodings that are no
-    colours or grey of eight bits."""
+    """The picture (h, w, 3) RGB of an Image. Raises Refused for another size than the camera's, and for
+    encodings other than eight-bit colour or grey."""
     if message.encoding not in COLOURS:
         raise Refused(f"expected an encoding of {', '.join(COLOURS)}, got {message.encoding!r:.40}")
     _check_size(message.width, message.height, camera)
@@ -102,7 +103,7 @@ def image(message: Any, camera: Camera) -> NDArray[np.uint8]:
 
 
 def compressed_image(message: Any, camera: Camera) -> NDArray[np.uint8]:
-    """The picture (h, w, 3) RGB of a CompressedImage. Raises Refused for what is no JPEG or PNG of the camera's size."""
+    """The picture (h, w, 3) RGB of a CompressedImage. Raises Refused unless it is a JPEG or PNG of the camera's size."""
     if "compressedDepth" in message.format or not len(message.data):
         raise Refused(f"expected a JPEG or PNG in colour or grey, got {len(message.data)} bytes of format {message.format!r:.40}")
     try:

@@ -1,4 +1,5 @@
-"""The cell for RViz: the target's mesh at the fused pose, the ellipsoid of its position, and the pads, lit by their signal."""
+"""Markers of the cell for RViz: the target's mesh at the fused pose, the ellipsoid of its position, and the pads, lit by their
+signal."""
 
 from __future__ import annotations
 
@@ -18,11 +19,11 @@ from penumbra.shared.geometry.rigid import Array
 
 MARKER = "visualization_msgs/msg/Marker"
 LIFETIME_S = 1
-"""Markers vanish when no new ones have come for so long."""
+"""Time [s] after which markers vanish if no new ones arrive."""
 WITHIN = 0.9
-"""Share of the positions that the ellipsoid holds."""
+"""Share of the position's probability within the ellipsoid."""
 THICKNESS = 0.002
-"""Least thickness [m] at which a pad is drawn."""
+"""Minimum thickness [m] at which a pad is drawn."""
 SEEN = 0.35
 """Opacity of the ellipsoid."""
 Colour = tuple[float, float, float]
@@ -40,7 +41,7 @@ class Markers:
         }
 
     def target(self, fused: FusedPose, colour: Colour) -> list[Any]:
-        """The mesh and the ellipsoid of the position, in a colour; none where the pose is lost."""
+        """The mesh and the position's ellipsoid, in a colour; removes both if the pose is lost."""
         if fused.state == "lost":
             return [self._gone(fused.stamp_ns, space, fused.target) for space in ("target", "covariance")]
         mesh = self._marker(
@@ -105,7 +106,7 @@ class Markers:
 
 
 def ellipsoid(covariance: Array) -> tuple[Array, Array]:
-    """Half axes (3,) [m] of the ellipsoid that holds the share WITHIN of the positions, and the quaternion (4,) of its axes.
+    """Half axes (3,) [m] of the ellipsoid with the probability WITHIN, and the quaternion (4,) of its axes.
 
     covariance: (3, 3) [m^2].
     """

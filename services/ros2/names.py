@@ -1,4 +1,4 @@
-"""What rmw_zenoh calls things on the bus: keys of topics, liveliness tokens, quality of service, gids and attachments.
+"""Names and encodings of rmw_zenoh on the bus: keys of topics, liveliness tokens, quality of service, gids and attachments.
 
 Pure functions of text and bytes. Source: github.com/ros2/rmw_zenoh, `liveliness_utils.cpp` (keys, tokens, quality of service and
 gid, 0.2.9 and later), `attachment_helpers.cpp` and `rmw_publisher_data.cpp`. Types are named as in `geometry_msgs/msg/Pose`.
@@ -14,33 +14,33 @@ from typing import Literal
 import xxhash
 
 ADMIN = "@ros2_lv"
-"""Where the tokens of the ROS graph are."""
+"""Prefix of the tokens of the ROS graph."""
 DEFAULT_DEPTH = 42
-"""Depth of rmw_zenoh's default profile, whose values are left out of a token."""
+"""Depth of rmw_zenoh's default profile; default values are left out of a token."""
 RELIABLE_IS_DEFAULT, BEST_EFFORT = "", "2"
 VOLATILE_IS_DEFAULT, TRANSIENT_LOCAL = "", "1"
-"""Values of rmw/types.h, empty where they are those of the default profile."""
+"""Values of rmw/types.h, empty if they are those of the default profile."""
 ATTACHMENT = struct.Struct("<qqB16s")
-"""Sequence number, time of publication [ns since the epoch], length of the gid, gid."""
+"""Attachment: sequence number, time of publication [ns since the epoch], length of the gid, gid."""
 GID_BYTES = 16
 MOST_DOMAINS = 232
-"""The largest domain of ROS 2: DDS has no ports for others."""
+"""Largest domain of ROS 2: DDS has no ports for larger ones."""
 Kind = Literal["NN", "MP", "MS"]
-"""A node, a publisher (message publisher), a subscription (message subscription)."""
+"""Kinds of entities: node, publisher (message publisher), subscription (message subscription)."""
 _PART = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 @dataclass(frozen=True)
 class Profile:
-    """The quality of service of a publisher or a subscription that keeps the last `depth` messages. is_latched: one that comes
-    later receives them too (transient local)."""
+    """The quality of service of a publisher or a subscription that keeps the last `depth` messages. is_latched: late subscribers
+    receive them too (transient local)."""
 
     depth: int = 10
     is_latched: bool = False
     is_reliable: bool = True
 
     def __str__(self) -> str:
-        """As a token has it: reliability:durability:history,depth:deadline:lifespan:liveliness, a default being empty."""
+        """As in a token: reliability:durability:history,depth:deadline:lifespan:liveliness, with defaults empty."""
         reliability = RELIABLE_IS_DEFAULT if self.is_reliable else BEST_EFFORT
         durability = TRANSIENT_LOCAL if self.is_latched else VOLATILE_IS_DEFAULT
         depth = "" if self.depth == DEFAULT_DEPTH else str(self.depth)
@@ -59,7 +59,7 @@ class Node:
 
 
 def topic(text: str) -> str:
-    """A fully qualified name of ROS, as in `/joint_states`. Raises ValueError for what ROS does not take."""
+    """Type of a fully qualified ROS name, as in `/joint_states`. Raises ValueError for an invalid one."""
     parts = text.removeprefix("/").split("/")
     if not text.startswith("/") or not all(_PART.fullmatch(part) for part in parts):
         raise ValueError(
@@ -69,7 +69,7 @@ def topic(text: str) -> str:
 
 
 def namespace(text: str) -> str:
-    """A namespace of ROS, as in `/penumbra`, or `/` for none. Raises ValueError for what ROS does not take."""
+    """Type of a ROS namespace, as in `/penumbra`, or `/` for none. Raises ValueError for an invalid one."""
     return text if text == "/" else topic(text)
 
 
@@ -79,19 +79,19 @@ def within(space: str, name: str) -> str:
 
 
 def safe(text: str) -> str:
-    """A name of the cell as a part of a ROS name: ROS takes letters, digits and _, and no digit first."""
+    """A name of the cell as a part of a ROS name: only letters, digits and _, and no digit first."""
     found = re.sub(r"[^A-Za-z0-9_]", "_", text)
     return found if _PART.fullmatch(found) else f"_{found}"
 
 
 def dds_type(kind: str) -> str:
-    """A type as DDS has it: `geometry_msgs/msg/Pose` becomes `geometry_msgs::msg::dds_::Pose_`."""
+    """The DDS name of a type: `geometry_msgs/msg/Pose` becomes `geometry_msgs::msg::dds_::Pose_`."""
     package, middle, name = kind.split("/")
     return f"{package}::{middle}::dds_::{name}_"
 
 
 def topic_key(domain: int, name: str, kind: str, hash: str) -> str:
-    """The key on which the messages of a topic go. hash: `RIHS01_` and 64 hexadecimal digits."""
+    """The key of a topic's messages. hash: `RIHS01_` and 64 hexadecimal digits."""
     return f"{domain}/{name.strip('/')}/{dds_type(kind)}/{hash}"
 
 
@@ -101,12 +101,12 @@ def mangled(name: str) -> str:
 
 
 def node_token(node: Node) -> str:
-    """The token that a node lives. ROS asks for no enclave here, which is `/`."""
+    """The liveliness token of a node. Its enclave is `/`, none."""
     return _token(node, node.id, "NN")
 
 
 def endpoint_token(node: Node, id: int, what: Literal["MP", "MS"], name: str, kind: str, hash: str, profile: Profile) -> str:
-    """The token that a publisher or a subscription lives. id: its number in the session."""
+    """The liveliness token of a publisher or a subscription. id: its number in the session."""
     return f"{_token(node, id, what)}/{mangled(name)}/{dds_type(kind)}/{hash}/{profile}"
 
 
@@ -116,11 +116,11 @@ def _token(node: Node, id: int, what: Kind) -> str:
 
 
 def gid(token: str) -> bytes:
-    """The identity (16 bytes) of what lives by a token: XXH3-128 of it, the low half first, each half little-endian."""
+    """The gid (16 bytes) of the entity with a token: XXH3-128 of it, the low half first, each half little-endian."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(GID_BYTES, "little")
 
 
 def attachment(number: int, stamp_ns: int, gid: bytes) -> bytes:
-    """What goes beside a message (33 bytes). number: of the message, counted from 1; stamp_ns: when it was published. A ROS node
-    fails on a message with none, or another one."""
+    """The attachment of a message (33 bytes). number: of the message, counted from 1; stamp_ns: time of publication. A ROS node
+    fails on a message without one, or with another one."""
     return ATTACHMENT.pack(number, stamp_ns, GID_BYTES, gid)

@@ -1,5 +1,5 @@
-"""What the cell says, handed on to the ROS node: poses, frames, pictures, markers, diagnostics. What nobody in ROS reads
-is not made."""
+"""Publishes the cell's data on the ROS node: poses, frames, pictures, markers, diagnostics. Messages without a reader are not
+made."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from penumbra.shared.runtime.node import LatestMessages
 from penumbra.shared.skin.layout import link_names, pad_poses
 
 FRAMES_KEPT = 4
-"""Frames of a camera that wait for their masks."""
+"""Number of frames of a camera that wait for their masks."""
 MASKED_NS = 1_000_000_000
-"""Time [ns] after the last mask from which pictures are sent without: a cell with PoseCNN has none."""
+"""Time [ns] after the last mask after which pictures are sent without: a cell with PoseCNN has none."""
 JPEG_QUALITY = 80
 
 
 class Scene:
-    """What is known of the cell now. Each entry of `poses` (by target) and `joints` (by robot) is replaced as a whole by the
-    reader of its topic."""
+    """Current state of the cell. Each entry of `poses` (by target) and `joints` (by robot) is replaced as a whole by the reader
+    of its topic."""
 
     def __init__(self, cell: Cell, models: dict[str, RobotModel], voltages: LatestMessages | None, now_ns: Callable[[], int]):
         self.cell, self.models = cell, models
@@ -44,24 +44,24 @@ class Scene:
         self._voltages = voltages
 
     def pose(self, target: str) -> FusedPose | None:
-        """The newest pose; None where fusion has been silent for longer than a reader accepts."""
+        """The newest pose; None if fusion has been silent for longer than a reader accepts."""
         found = self.poses.get(target)
         return found if found is not None and self.now_ns() - found.stamp_ns < 1e9 * FUSED.oldest_s else None
 
     def volts(self) -> dict[str, Array]:
-        """Mean amplitudes [V] of each pad that has been heard."""
+        """Mean amplitudes [V] of each pad from which voltages were received."""
         found: dict[str, Voltages | None] = {pad: self._voltages.get(pad=pad) for pad in self.cell.pads} if self._voltages else {}
         return {pad: message.volts.mean(axis=0) for pad, message in found.items() if message is not None}
 
     def pads(self) -> dict[str, Array]:
-        """T_world_pad of every pad whose place is known."""
+        """T_world_pad of every pad whose pose is known."""
         joints = dict(self.joints)
         links = {name: model.link_transforms(joints[name]) for name, model in self.models.items() if name in joints}
         return pad_poses(self.cell, link_names(links))
 
 
 class Poses:
-    """The targets: pose, twist and, where tf is given, frame of each."""
+    """Publishes pose, twist and, if tf is given, frame of each target."""
 
     def __init__(self, ros: Types, participant: Participant, cell: Cell, space: str, tf: Publisher | None):
         self._ros, self._tf = ros, tf
@@ -74,7 +74,7 @@ class Poses:
         }
 
     def send(self, fused: FusedPose) -> None:
-        """A pose that is lost is not sent: ROS has no field that would say so."""
+        """Publish a pose. A lost one is not sent: ROS has no field for that state."""
         if fused.state == "lost":
             return
         pose, twist = self._publishers[fused.target]
@@ -87,7 +87,8 @@ class Poses:
 
 
 class Overlay:
-    """The picture of one camera with mask, silhouette and pads, and its camera's model. Its first target's pose is drawn."""
+    """Publishes the picture of one camera with mask, silhouette and pads, and its camera model. The pose of its first target is
+    drawn."""
 
     def __init__(self, ros: Types, participant: Participant, scene: Scene, camera: str, space: str):
         self._ros, self._scene, self._camera = ros, scene, camera
@@ -123,7 +124,7 @@ class Overlay:
 
 
 class Shown:
-    """The markers."""
+    """Publishes the markers."""
 
     def __init__(self, ros: Types, participant: Participant, scene: Scene, space: str):
         cell = scene.cell
@@ -149,7 +150,7 @@ def colour(pose: FusedPose) -> Colour:
 
 
 class Diagnosis:
-    """The health of all processes, and the targets' states."""
+    """Publishes the health of all processes, and the targets' states."""
 
     def __init__(self, ros: Types, participant: Participant, scene: Scene):
         self._ros, self._scene = ros, scene

@@ -1,7 +1,7 @@
 """One Zenoh session at the router of ROS, in client mode, with the publishers and subscriptions of one ROS node.
 
-A router of rmw_zenoh passes on what clients send. Between its peers it passes on nothing, since they find each other by gossip:
-a peer that does not take part in it would hear nobody.
+A router of rmw_zenoh forwards the messages of clients. It does not forward between peers, because they find each other by gossip:
+a peer that takes no part in gossip would receive nothing.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from penumbra.shared.runtime.connection import short
 from penumbra.shared.runtime.logs import Log
 
 LOOK_S = 0.5
-"""Time [s] between two attempts to reach the router, and between two looks whether it is still there."""
+"""Period [s] of attempts to reach the router, and of checks whether it is still there."""
 HEARTBEAT_S = 0.5
-"""As rmw_zenoh's latched publishers announce the number of their last message."""
+"""Period [s] at which rmw_zenoh's latched publishers announce the number of their last message."""
 
 
 class Publisher:
-    """A topic that this node publishes; may be used from several threads. token: set when the session is open."""
+    """A topic that this node publishes; may be used from several threads."""
 
     def __init__(self, ros: Types, topic: str, kind: str, profile: Profile):
         self.topic, self.kind, self.profile = topic, kind, profile
@@ -41,7 +41,7 @@ class Publisher:
         self._lock = threading.Lock()
 
     def open(self, session: zenoh.Session, key: str, token: str) -> None:
-        """Declares it; a latched message from before is published now."""
+        """Declare the publisher; an earlier latched message is published now."""
         with self._lock:
             self._gid = names.gid(token)
             drop, reliable = zenoh.CongestionControl.DROP, zenoh.Reliability.RELIABLE
@@ -61,7 +61,7 @@ class Publisher:
                 self._put(self._last)
 
     def publish(self, message: Any) -> None:
-        """Sends a message; before the router is there only a latched one is kept."""
+        """Send a message; before the router is there only a latched one is kept."""
         if self._publisher is None and not self.profile.is_latched:
             return
         payload = self._ros.encode(message)
@@ -72,11 +72,11 @@ class Publisher:
                 self._put(payload)
 
     def is_wanted(self) -> bool:
-        """Whether a subscription is there; of a latched topic it is not known."""
+        """Whether there is a matching subscription; unknown for a latched topic."""
         return self._publisher is not None and bool(self._publisher.matching_status.matching)
 
     def close(self) -> None:
-        """Sends nothing any more."""
+        """Stop sending."""
         with self._lock:
             self._publisher = None
 
@@ -84,14 +84,14 @@ class Publisher:
         self.count += 1
         try:
             self._publisher.put(payload, attachment=names.attachment(self.count, time.time_ns(), self._gid))
-        except zenoh.ZError:  # the session was closed just now
+        except zenoh.ZError:  # the session has just been closed
             self._publisher = None
 
 
 class Subscription:
-    """A topic that this node reads, in a thread of its own: `handler(message)` gets the newest `profile.depth` messages; what it
-    refuses with ValueError is counted. last_s: when a message came last, by time.monotonic; why: it was refused, empty where it
-    was not."""
+    """A topic that this node reads, in its own thread: `handler(message)` receives the newest `profile.depth` messages; those
+    that it refuses with ValueError are counted. last_s: time of the last message, by time.monotonic; why: reason of its refusal,
+    empty if it was accepted."""
 
     def __init__(self, ros: Types, topic: str, kind: str, profile: Profile, handler: Callable[[Any], None]):
         self.topic, self.kind, self.profile = topic, kind, profile
@@ -122,9 +122,9 @@ class Subscription:
 
 
 class Participant:
-    """A ROS node. What it publishes and reads is named before `serve`.
+    """A ROS node. Its topics are declared before `serve`.
 
-    connection: of the session, in client mode. node: `zid` is filled in when the session opens.
+    connection: of the session, in client mode.
     """
 
     def __init__(self, ros: Types, connection: bus.Connection, domain: int, namespace: str, name: str, log: Log):
@@ -135,7 +135,7 @@ class Participant:
         self._session: zenoh.Session | None = None
         self._tokens: list[zenoh.LivelinessToken] = []
         self._is_reached: bool | None = None  # before the first attempt
-        bus.configuration(connection)  # refuses a bad endpoint or file before anything else is done
+        bus.configuration(connection)  # refuse a bad endpoint or file first
 
     def publisher(self, topic: str, kind: str, profile: Profile = Profile()) -> Publisher:  # noqa: B008 (frozen)
         """A topic of this node, by its fully qualified name."""
@@ -144,19 +144,19 @@ class Participant:
         return found
 
     def subscribe(self, topic: str, kind: str, profile: Profile, handler: Callable[[Any], None]) -> Subscription:
-        """Calls `handler(message)` for every message of a topic, once the router is there."""
+        """Call `handler(message)` for every message of a topic, once the router is there."""
         found = Subscription(self._ros, topic, kind, profile, handler)
         self.subscriptions.append(found)
         return found
 
     def reasons(self) -> list[str]:
-        """Why ROS cannot be reached; none where it can."""
+        """Why ROS cannot be reached; empty if it can."""
         where = self._connection.where
         what = f"no ROS router at {where}: start `ros2 run rmw_zenoh_cpp rmw_zenohd`, or say where it is with --ros-connect"
         return [what] if self._is_reached is False else []
 
     def serve(self, stopping: threading.Event) -> None:
-        """Opens the session as soon as the router is there, and closes it when `stopping` is set."""
+        """Open the session as soon as the router is there, and close it when `stopping` is set."""
         try:
             self._look()
             while not stopping.wait(LOOK_S):
@@ -165,7 +165,7 @@ class Participant:
             self.close()
 
     def close(self) -> None:
-        """Leaves the ROS graph."""
+        """Leave the ROS graph."""
         for publisher in self.publishers:
             publisher.close()
         session, self._session = self._session, None
@@ -173,7 +173,7 @@ class Participant:
             session.close()
 
     def _look(self) -> None:
-        """Opens the session, or looks whether its router is still there: Zenoh itself returns to one that is back."""
+        """Open the session, or check whether its router is still there: Zenoh itself reconnects to it."""
         session = self._session = self._session or self._open()
         reached = session is not None and bool(session.info.routers_zid())
         if session is not None and reached and not self._tokens:
@@ -187,7 +187,7 @@ class Participant:
 
     def _open(self) -> zenoh.Session | None:
         config = bus.configuration(self._connection)
-        config.insert_json5("timestamping/enabled", json.dumps(True))  # by which a latched message is found again
+        config.insert_json5("timestamping/enabled", json.dumps(True))  # identifies latched messages on retrieval
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
@@ -196,7 +196,7 @@ class Participant:
             return None
 
     def _declare(self, session: zenoh.Session) -> None:
-        """Declares tokens first, so that a ROS node knows whom a message comes from."""
+        """Declare tokens first, so that ROS nodes know the senders of messages."""
         node = names.Node(self._domain, str(session.info.zid()), self._namespace, self._name)
         liveliness = session.liveliness()
         self._tokens = [liveliness.declare_token(names.node_token(node))]

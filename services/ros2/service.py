@@ -30,14 +30,14 @@ from penumbra.shared.runtime.node import Node
 
 NAME = "ros2"
 ROS_ROUTER = "tcp/127.0.0.1:7447"
-"""Where rmw_zenohd listens by default."""
+"""Default endpoint of rmw_zenohd."""
 MARKERS_S, DIAGNOSTICS_S = 0.1, 1.0
 TF_DEPTH = 100
-"""As tf2's own broadcasters have it."""
+"""Depth of tf2's own broadcasters."""
 ASK_S = 0.4
-"""Longest wait [s] for the health reports."""
+"""Maximum time [s] to wait for the health reports."""
 SILENT_S = 2.0
-"""Time [s] without a message after which a topic of ROS is missing."""
+"""Time [s] without a message after which a topic of ROS is reported as missing."""
 
 
 def domain(text: str) -> int:
@@ -102,8 +102,8 @@ penumbra ros2 --joints /joint_states --image front=/camera/image_raw/compressed 
 
 
 def start(node: Node, options: flags.Options) -> None:
-    """Threads: poses, joints, frames and masks are handed on by their readers, of the cell and of ROS; what they share is in
-    `Scene`. A timer of its own opens the session at the ROS router, and closes it when the node stops."""
+    """Threads: poses, joints, frames and masks are passed on by their readers, of the cell and of ROS; shared data is in `Scene`.
+    A separate timer opens the session at the ROS router, and closes it when the node stops."""
     ros = Types(options.distribution)
     connection = bus.Connection("client", (options.ros_connect,), config=options.ros_config)
     participant = Participant(ros, connection, options.domain, options.namespace, NAME, node.log)
@@ -115,7 +115,7 @@ def start(node: Node, options: flags.Options) -> None:
 
 
 def publish(node: Node, ros: Types, participant: Participant, options: flags.Options) -> None:
-    """Declares what goes out, and hands on what comes from the cell."""
+    """Declare the published topics, and pass on the cell's messages."""
     cell, space = node.cell, options.namespace
     models = robot_models(cell)
     scene = Scene(cell, models, node.latest(VOLTAGES) if cell.pads else None, node.now_ns)
@@ -151,20 +151,20 @@ def publish(node: Node, ros: Types, participant: Participant, options: flags.Opt
         node.subscribe(JOINTS, on_joints)
     for camera, overlay in overlays.items():
         node.subscribe(FRAME, overlay.on_frame, camera=camera)
-        node.subscribe(MASK, overlay.on_mask, from_others=True, camera=camera)  # not missed: PoseCNN makes none
+        node.subscribe(MASK, overlay.on_mask, from_others=True, camera=camera)  # no warning if missing: PoseCNN makes none
     node.every(MARKERS_S, shown.send)
     node.every(DIAGNOSTICS_S, diagnose, HANG_S + ASK_S)
 
 
 class Source:
-    """A topic of ROS that is read. why: what is wrong with its messages, in words, beside those that are refused."""
+    """A topic of ROS that is read. why: faults of its messages, in words, besides refused ones."""
 
     def __init__(self, subscription: Subscription, why: Callable[[], Sequence[str]] = tuple):
         self._subscription, self._why = subscription, why
         self._began_s = time.monotonic()
 
     def reasons(self) -> list[str]:
-        """Why the cell does not get what this topic should bring."""
+        """Why the cell does not get this topic's data."""
         found = self._subscription
         silent_s = time.monotonic() - (found.last_s or self._began_s)
         if silent_s > SILENT_S:
@@ -174,8 +174,8 @@ class Source:
 
 
 def read_joints(node: Node, participant: Participant, wanted: Sequence[tuple[str | None, str]]) -> list[Source]:
-    """Subscribes to JointStates; a robot's joints may come from several topics. Raises CellError for a robot that the cell does
-    not have, and where it has none."""
+    """Subscribe to JointStates; a robot's joints may come from several topics. Raises CellError for a robot that the cell does
+    not have, and if it has none."""
     robots_of: dict[str, set[str]] = {}
     for robot, topic in wanted:
         robots_of.setdefault(topic, set()).update([node.cell.one("robots", robot)] if robot else node.cell.robots)
@@ -206,7 +206,7 @@ def read_joints(node: Node, participant: Participant, wanted: Sequence[tuple[str
 
 
 def read_images(node: Node, participant: Participant, wanted: Sequence[tuple[str | None, str]]) -> list[Source]:
-    """Subscribes to pictures. Raises CellError for a camera that the cell does not have."""
+    """Subscribe to pictures. Raises CellError for a camera that the cell does not have."""
 
     def reader(camera: str, topic: str) -> Source:
         is_compressed = topic.endswith("/compressed")
@@ -225,7 +225,7 @@ def read_images(node: Node, participant: Participant, wanted: Sequence[tuple[str
 
 
 def describe(options: flags.Options, participant: Participant) -> dict[str, Any]:
-    """For the health report: where the ROS nodes are, and what was published and read."""
+    """The entry in the health report: the ROS router, and counts of published and read messages."""
     return {
         "router": options.ros_connect,
         "domain": options.domain,
