@@ -1,4 +1,4 @@
-"""Files on a disk, one after another: each ends whole, at a size, at an age, and before the disk is full."""
+"""Recording files on a disk: a file ends complete at a maximum size, at a maximum age, and before the disk is full."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from penumbra.shared.recording.file import File
 from penumbra.shared.runtime.logs import Log
 
 AGAIN_S = 1.0
-"""How often it is tried whether a full disk takes files again [s]: what is recorded again may be that much late."""
+"""Period [s] of attempts to write to a full disk again; recording resumes at most this late."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """roll_bytes, roll_s: size and age at which a file ends and the next one begins. free_bytes: that stay free on the disk."""
+    """roll_bytes, roll_s: size and age at which a file ends and the next one begins. free_bytes: space that stays free on the
+    disk."""
 
     roll_bytes: float
     roll_s: float
@@ -27,11 +28,12 @@ class Limits:
 
 
 class Disk:
-    """out: a file (.mcap), of which the ones that follow have a number, or a folder, in which files are named by cell and time.
-    about, attached: what each file says of itself. stage: the entries with which each begins, at a time [ns].
+    """Writes a sequence of recording files. out: a file (.mcap), with numbers appended for the following ones, or a folder, in
+    which files are named by cell and time. about, attached: metadata and attachments of each file. stage: the first entries of
+    each file, at a time [ns].
 
-    fault: why nothing is written now; empty while all is well. bytes, messages, files: what was written so far. lost: messages
-    that were not, because the disk was full.
+    fault: why nothing is written now; empty if all is well. bytes, messages, files: written so far. lost: number of messages that
+    were not written because the disk was full.
     """
 
     def __init__(
@@ -58,18 +60,19 @@ class Disk:
 
     @property
     def folder(self) -> Path:
-        """Where files are made."""
+        """Folder of the files."""
         return self._out.parent if self._out.suffix == ".mcap" else self._out
 
     def check(self) -> None:
-        """Raises OSError where no file can be made."""
+        """Raise OSError if no file can be made."""
         self.folder.mkdir(parents=True, exist_ok=True)
         probe = next(self._names())
         probe.open("x").close()
         probe.unlink()
 
     def write(self, entries: Iterable[Entry], now_ns: int) -> None:
-        """Adds entries, to the next file where it is time for it. Those of a full disk are lost, and counted."""
+        """Write entries, to the next file if the current one is due to end. Entries are lost, and counted, while the disk is
+        full."""
         now_s = time.monotonic()
         file = self._file
         if file is not None and (file.size >= self._limits.roll_bytes or now_s - self._began_s >= self._limits.roll_s):
@@ -87,7 +90,7 @@ class Disk:
         self.lost += sum(1 for _ in waiting)
 
     def flush(self) -> None:
-        """Hands all to the kernel; ends the file in time before the disk is full."""
+        """Flush to the kernel; ends the file before the disk is full."""
         if self._file is None:
             return
         try:
@@ -100,7 +103,7 @@ class Disk:
             self._pause(f"less than {self._limits.free_bytes / 1e6:g} MB are free in {self.folder}")
 
     def save(self, entries: Iterable[Entry], now_ns: int) -> Path:
-        """Writes a file of its own. Raises OSError where the disk has no room for it."""
+        """Write entries to a separate file. Raises OSError if the disk has no room for it."""
         if not self._has_room():
             raise OSError(28, f"less than {self._limits.free_bytes / 1e6:g} MB are free in {self.folder}")
         file = self._new(now_ns)
@@ -117,13 +120,13 @@ class Disk:
         return file.path
 
     def sync(self) -> None:
-        """Has the disk write what the kernel has. Any thread may call it."""
+        """Sync the kernel's data to the disk. Any thread may call it."""
         if (file := self._file) is not None:
             with suppress(OSError):  # closed meanwhile, or full: `flush` finds out
                 file.sync()
 
     def close(self) -> None:
-        """Ends the file that is open."""
+        """End the open file."""
         if (file := self._file) is None:
             return
         try:
@@ -165,7 +168,7 @@ class Disk:
         raise AssertionError("names have no end")
 
     def _names(self) -> Iterator[Path]:
-        """Paths of the next file that are not there yet, as far as one can know."""
+        """Unused paths for the next file, as far as one can know."""
         first = self._out
         if first.suffix != ".mcap":
             first = self._out / f"{self._cell}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
@@ -180,7 +183,7 @@ class Disk:
         return shutil.disk_usage(self.folder).free >= self._limits.free_bytes
 
     def _fail(self, file: File, error: OSError) -> None:
-        """The disk took no more in the middle of a file."""
+        """Handle a write error in the middle of a file."""
         with suppress(OSError):
             file.cut()
         self._ended(file)

@@ -1,4 +1,4 @@
-"""The last seconds, in memory."""
+"""Ring buffer of the last seconds in memory."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Iterable
 from penumbra.shared.recording.entries import Entry
 
 OVERHEAD = 200
-"""Bytes that an entry takes beside its data."""
+"""Assumed memory [bytes] of an entry besides its data."""
 
 
 class Last:
-    """Entries of the last `seconds`, of at most `most_bytes`. bytes: what they take."""
+    """Entries of the last `seconds`, of at most `most_bytes`. bytes: their current size."""
 
     def __init__(self, seconds: float, most_bytes: float):
         self.seconds, self._most_bytes = seconds, most_bytes
@@ -23,7 +23,7 @@ class Last:
         return len(self._entries)
 
     def add(self, entries: Iterable[Entry]) -> None:
-        """Takes entries in the order of their arrival, and forgets the oldest."""
+        """Add entries in the order of their arrival, and drop the oldest."""
         for entry in entries:
             size = len(entry.data) + OVERHEAD
             while self._entries and self.bytes + size > self._most_bytes:
@@ -38,7 +38,7 @@ class Last:
 
     @property
     def span_s(self) -> float:
-        """From the oldest to the newest entry [s]."""
+        """Time [s] from the oldest to the newest entry."""
         return (self._entries[-1].log_ns - self._entries[0].log_ns) * 1e-9 if self._entries else 0.0
 
     def all(self) -> list[Entry]:

@@ -1,4 +1,4 @@
-"""What came on the bus becomes entries, on a disk or in memory."""
+"""Converts messages from the bus to entries of a recording, on a disk or in memory."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from penumbra.shared.runtime.logs import Log
 from penumbra.shared.runtime.tap import Taken, Tap
 
 FLUSH_TURNS = 4
-"""Every so many turns the kernel is handed what was taken in."""
+"""Number of turns after which received data is flushed to the kernel."""
 AFTER_S = 2.0
-"""A loss is written so long after it: what came next belongs to it."""
+"""Time [s] after a loss at which the last seconds are written, so that they include its aftermath."""
 SAVE_S = 60.0
-"""Longest wait for a file that somebody has asked for."""
+"""Maximum time [s] to wait for a requested file."""
 
 
 class Recorder:
-    """One thread calls `turn`; others may call the rest.
+    """Records a bus. One thread calls `turn`; others may call the rest.
 
-    tap: what comes. keeps_frames: whether frames are kept as they are, too. disk: where files go. last: keeps the last seconds,
-    which become a file when asked for; None: everything goes to the disk. now_ns: the clock.
+    tap: source of the messages. keeps_frames: whether frames are also kept raw. disk: where files are written. last: keeps the
+    last seconds, which become a file on request; None: everything is written to the disk. now_ns: the clock.
     """
 
     def __init__(
@@ -42,10 +42,10 @@ class Recorder:
         self._states: dict[str, str] = {}
         self._lost_s = self._saved_s = float("-inf")
         self._wishes: list[Wish] = []
-        self._lock = threading.Lock()  # of turns, of which the last one closes
+        self._lock = threading.Lock()  # of turns; `close` runs the last one
 
     def turn(self) -> None:
-        """Takes in what came since the last turn."""
+        """Record the messages since the last turn."""
         with self._lock:
             taken = self._tap.take()
             if self._last is None:
@@ -63,7 +63,7 @@ class Recorder:
                     wish.grant(file, why)
 
     def answer(self, payload: bytes) -> dict[str, Any]:
-        """What `penumbra record save` asks: writes the last seconds, and says where. Raises ValueError where it cannot."""
+        """Answer `penumbra record save`: write the last seconds; returns the file. Raises ValueError if that is not possible."""
         try:
             command = json.loads(payload)["command"]
         except (ValueError, KeyError, TypeError):
@@ -77,7 +77,7 @@ class Recorder:
         return {"file": wish.wait(SAVE_S), "seconds": round(self._last.span_s, 1)}
 
     def close(self) -> None:
-        """Writes what there is, and ends the file."""
+        """Write the remaining messages, and end the file."""
         self.turn()
         with self._lock:
             self._disk.close()
@@ -96,11 +96,11 @@ class Recorder:
         }
 
     def reasons(self) -> list[str]:
-        """Why not all is recorded."""
+        """Why not everything is recorded."""
         return [f"not recording: {self._disk.fault}"] if self._disk.fault else []
 
     def _entries(self, taken: Iterable[Taken]) -> Iterator[Entry]:
-        """Of each message its bytes, and what viewers show of it. A frame has its picture alone, unless frames are kept."""
+        """The bytes of each message, and its form for viewers. A frame is kept only as a picture, unless frames are kept raw."""
         for each in taken:
             is_shown = True
             shown: list[Entry] = []
@@ -114,7 +114,7 @@ class Recorder:
             yield from shown
 
     def _watch(self, taken: Iterable[Taken]) -> None:
-        """Notes when a target is lost that was not."""
+        """Note when a target becomes lost."""
         for each in taken:
             if each.topic is topics.FUSED:
                 try:
@@ -127,15 +127,15 @@ class Recorder:
                 self._states[each.key] = state
 
     def _is_loss_due(self) -> bool:
-        """Whether a loss is to be written now. One that follows within the seconds of the last file waits for them to pass: no
-        two files show the same."""
+        """Whether the last seconds are to be written after a loss. Within the duration of the last file they wait, so that no two
+        files show the same."""
         assert self._last is not None, "without --last everything is written"
         now_s = time.monotonic()
         is_due = now_s - self._lost_s >= AFTER_S and self._lost_s > self._saved_s
         return is_due and now_s - self._saved_s >= self._last.seconds
 
     def _save(self, last: Last) -> tuple[str, str]:
-        """The file, or why there is none."""
+        """Write the last seconds; returns the file, or the reason why there is none."""
         self._saved_s = time.monotonic()
         try:
             path = self._disk.save(last.all(), self._now_ns())
@@ -147,7 +147,7 @@ class Recorder:
 
 
 class Wish:
-    """A file that somebody has asked for and waits for."""
+    """A requested file and its waiting requester."""
 
     def __init__(self) -> None:
         self._is_granted = threading.Event()
@@ -158,7 +158,7 @@ class Wish:
         self._is_granted.set()
 
     def wait(self, seconds: float) -> str:
-        """The file. Raises ValueError where there is none."""
+        """Wait for the file. Raises ValueError if there is none."""
         if not self._is_granted.wait(seconds):
             raise ValueError(f"the file was not written within {seconds:g} s: is the disk slow?")
         if self._why:

@@ -1,4 +1,4 @@
-"""Wiring of the recorder: all topics in, files out, and an answer to whoever wants the last seconds kept."""
+"""Recorder service: writes all topics to files, and answers requests to save the last seconds."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from penumbra.shared.runtime.node import Node
 
 NAME = "record"
 TURN_S = 0.05
-"""How often what came is taken in; with `recorder.FLUSH_TURNS` less than 0.3 s are lost where the process is killed."""
+"""Period [s] at which messages are recorded; with `recorder.FLUSH_TURNS` less than 0.3 s are lost if the process is killed."""
 SYNC_S = 5.0
-"""How often the disk itself must have all: what the loss of power costs."""
+"""Period [s] of syncs to the disk: the data lost in a power failure."""
 WAITING_BYTES = 128 << 20
-"""Messages that wait to be taken: raw frames of one camera for some seconds, while the disk stalls."""
+"""Maximum size [bytes] of messages waiting to be recorded: raw frames of one camera for some seconds, while the disk stalls."""
 MB = 10**6
 
 FLAGS = (
@@ -65,7 +65,8 @@ EXAMPLE = "penumbra record -o run.mcap\npenumbra record --topics frame joints vo
 
 
 def start(node: Node, options: flags.Options) -> None:
-    """One timer takes, makes and writes; another one has the disk write. Raises BusError where nothing can be written."""
+    """Start one timer that receives, converts and writes, and one that syncs the disk. Raises BusError if nothing can be
+    written."""
     wanted = [topic for topic in topics.TOPICS if not options.topics or topic.name in options.topics]
     limits = Limits(options.roll_mb * MB, options.roll_minutes * 60.0, options.keep_free_mb * MB)
     viewers = Viewers(node.cell, options.raw)

@@ -1,4 +1,4 @@
-"""`penumbra record save`, `info` and `mend`: what one wants of a recorder and of its files."""
+"""`penumbra record save`, `info` and `mend`: tools for a recorder and its files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PATIENCE_S = 1.0
     example="penumbra record save",
 )
 def save(options: flags.Options) -> None:
-    """Asks every recorder of the cell."""
+    """Request a file from every recorder of the cell."""
     cell = names.read(options.cell)
     request = json.dumps({"command": "save"}).encode()
     connection = replace(bus.connection(options), service=access.OPERATOR)
@@ -49,7 +49,7 @@ def save(options: flags.Options) -> None:
     example="penumbra record info run.mcap",
 )
 def info(options: flags.Options) -> int:
-    """1 where the end is missing."""
+    """Print the contents; returns 1 if the end is missing."""
     found = described(Recording(options.file))
     if options.json:
         print(json.dumps(found))
@@ -64,7 +64,7 @@ def info(options: flags.Options) -> int:
 
 
 def described(recording: Recording) -> dict[str, Any]:
-    """Metadata, seconds, messages by topic, and what is wrong."""
+    """Metadata, seconds, messages by topic, and faults."""
     counts: Counter[str] = Counter()
     stamps: list[int] = []
     for entry in recording.entries():
@@ -88,7 +88,7 @@ def described(recording: Recording) -> dict[str, Any]:
     example="penumbra record mend run.mcap",
 )
 def mend(options: flags.Options) -> None:
-    """Prints what was saved."""
+    """Repair a file, and print what was saved."""
     out = options.out or options.file.with_stem(f"{options.file.stem}-mended")
     try:
         found = reading.mend(options.file, out)

@@ -1,7 +1,7 @@
-"""Messages played through the services in one process, to the bit the same every time: the times in the data drive everything.
+"""Replays messages through the services in one process, bit for bit reproducibly: time is that of the data.
 
-Each service is wired by its own `start`, to a `ReplayNode` in place of the bus; what a service publishes is delivered after the
-time that its making takes on a real machine, so that fusion sees vision late, as it does live.
+Each service is wired by its own `start`, to a `ReplayNode` instead of the bus. A message of a service is delivered after the time
+that a real machine needs to make it, so that fusion receives vision late, as it does live.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from penumbra.shared.runtime.node import ServiceNode
 
 SERVICES = ("segmentation", "search", "haptics", "fusion")
 DELAY_NS = {topics.FRAME: 2_000_000, topics.MASK: 30_000_000, topics.VISION: 5_000_000, topics.HAPTIC: 1_000_000}
-"""From the cause of a message to its arrival; what is not named arrives at once."""
+"""Delay [ns] from the cause of a message to its arrival; other topics arrive at once."""
 
 DEFAULTS = {"search": ("--landmarks", "off"), "segmentation": ("--pixels", str(MAX_PIXELS))}
-"""Arguments of services, before others: a replay shall say the same on every machine, whether or not it has the landmark models
-and however fast it is."""
+"""Default arguments of services, placed before others: a replay must be the same on every machine, with or without the landmark
+models and whatever its speed."""
 
 
 @dataclass(frozen=True)
 class Heard:
-    """A message of the recording or of a service, when it arrived, and its names."""
+    """A message of the recording or of a service, with its arrival time and names."""
 
     time_ns: int
     topic: Topic
@@ -44,10 +44,10 @@ class Heard:
 
 
 class Replay:
-    """The clock, the messages on their way and who listens.
+    """Clock, message queue and subscribers of a replay.
 
-    services: which of them, as far as the cell has work for them; arguments: their flags. hear: is called with every message that
-    is delivered; None: they are kept in `heard`, in order.
+    services: the services to run, if the cell has work for them; arguments: their flags. hear: called with every delivered
+    message; None: messages are kept in `heard`, in order.
     """
 
     def __init__(
@@ -73,13 +73,13 @@ class Replay:
             module.start(ReplayNode(self, name), flags.parse(module.FLAGS, [*DEFAULTS.get(name, ()), *chosen.get(name, ())]))
 
     def run(self, recording: Iterable[tuple[Topic, dict[str, str], Message]]) -> list[Heard]:
-        """Plays messages in the order of their stamps, each delivered after the delay that its sensor has; returns `heard`."""
+        """Play messages in the order of their stamps, each delivered after its sensor's delay; returns `heard`."""
         return self._play(
             Heard(message.stamp_ns + DELAY_NS.get(topic, 0), topic, names, message) for topic, names, message in recording
         )
 
     def run_recorded(self, recording: Iterable[Played]) -> list[Heard]:
-        """Plays messages as they came, at the times of their arrival; returns `heard`."""
+        """Play messages at their recorded times of arrival; returns `heard`."""
         return self._play(Heard(each.received_ns, each.topic, each.names, each.message) for each in recording)
 
     def _play(self, recording: Iterable[Heard]) -> list[Heard]:
@@ -95,18 +95,18 @@ class Replay:
         return self.heard
 
     def publish(self, topic: Topic, names: dict[str, str], message: Message) -> None:
-        """Sends what is made now: it arrives after the time that its making takes."""
+        """Send a message made now: it arrives after the time that it takes to make."""
         self._send(Heard(self.now_ns + DELAY_NS.get(topic, 0), topic, names, message))
 
     def _send(self, item: Heard) -> None:
-        copy = decode(item.topic.message, encode(item.message))  # as over the wire: nobody shares an array
+        copy = decode(item.topic.message, encode(item.message))  # as over the wire: no array is shared
         self._at(item.time_ns, lambda: self._deliver(item.topic, item.names, copy))
 
     def listen(self, topic: Topic, names: dict[str, str], handler: Callable[[Any, dict[str, str]], None]) -> None:
         self._listeners.append((topic, names, handler))
 
     def ask(self, key: str, **parameters: str) -> Any:
-        """What a service answers to a query of this key."""
+        """The answer of a service to a query of this key."""
         return self._answers[key](parameters, b"")
 
     def answer(self, key: str, function: Callable[[dict[str, str], bytes], Any]) -> None:
@@ -139,7 +139,7 @@ class Replay:
 
 
 class ReplayLatest:
-    """The newest message of each key that was delivered."""
+    """The newest delivered message of each key."""
 
     def __init__(self) -> None:
         self._newest: dict[frozenset[tuple[str, str]], Any] = {}
@@ -185,7 +185,7 @@ class ReplayNode(ServiceNode):
         from_others: bool = False,
         **names: str,
     ) -> None:
-        """There is one replica of each service: all streams are its own, and there are no others."""
+        """Subscribe. There is one replica of each service: it owns all streams, and there are no others."""
         if not from_others:
             self._replay.listen(topic, names, handler)
 
@@ -195,13 +195,13 @@ class ReplayNode(ServiceNode):
         return latest
 
     def progress(self, what: str, done: int, total: int) -> None:
-        """Nobody asks during a replay."""
+        """Ignored: nobody queries during a replay."""
 
     def add_report(self, name: str, function: Callable[[], Any]) -> None:
-        """Nobody asks during a replay."""
+        """Ignored: nobody queries during a replay."""
 
     def add_reasons(self, function: Callable[[], Sequence[str]]) -> None:
-        """Nobody asks during a replay."""
+        """Ignored: nobody queries during a replay."""
 
     def warm_when(self, function: Callable[[], bool]) -> None:
         self._warm.append(function)

@@ -98,7 +98,7 @@ def _seconds(text: str) -> float:
     "penumbra replay run.mcap --smooth --motion motion.json",
 )
 def main(options: flags.Options) -> int:
-    """Plays, and prints what was played; 1 where a file had no end."""
+    """Play, and print what was played; returns 1 if a file had no end."""
     if options.out is not None and not (options.in_process or options.smooth):
         flags.refuse("expected --in-process or --smooth beside --out, got --out alone")
     if options.motion is not None and not options.smooth:
@@ -120,7 +120,7 @@ def main(options: flags.Options) -> int:
 
 
 def _here(options: flags.Options, recordings: Sequence[Recording], cell: cells.Cell) -> dict[str, Any]:
-    """Without a bus: through the methods, or as smoothed poses, or both."""
+    """Replay without a bus: through the methods, or as smoothed poses, or both."""
     writer = _writer(options, recordings[0], cell) if options.out is not None else None
     smoothing = smooth.Smoothing(cell) if options.smooth else None
     try:
@@ -140,7 +140,7 @@ def _here(options: flags.Options, recordings: Sequence[Recording], cell: cells.C
 
 
 def _writer(options: flags.Options, recording: Recording, cell: cells.Cell) -> Writer:
-    """A new recording: of this installation where its methods make it, else of that which made the first one."""
+    """A new recording, with the provenance of this installation if its methods make it, else that of the first recording."""
     if not options.in_process:
         return Writer(cell, options.out, {ABOUT: recording.about}, recording.attachments)
     source = options.cell or recording.about["cell_file"]
@@ -171,7 +171,7 @@ def _live(options: flags.Options, recordings: Sequence[Recording], cell: cells.C
 
 
 def _messages(recordings: Iterable[Recording], wanted: Sequence[Topic], from_s: float) -> Iterator[Played]:
-    """The messages of all files, as of one."""
+    """The messages of all files as one sequence."""
     begins_ns = None
     for recording in recordings:
         for each in recording.messages(wanted):

@@ -1,4 +1,4 @@
-"""The sensors of a recording through today's methods, in one process, and how that differs from what was recorded."""
+"""Replays the sensors of a recording through the current methods, in one process, and compares the result with the recording."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def play(
     writer: Writer | None = None,
     smoothing: Smoothing | None = None,
 ) -> dict[str, Any]:
-    """Plays the sensors' messages, and describes the poses of now (`Tracks.described`). writer: a new recording of the sensors'
-    messages and what is made of them. smoothing: smooths what the senses make. Raises RecordingError where they make nothing."""
+    """Play the sensors' messages, and describe the resulting poses (`Tracks.described`). writer: a new recording of the sensors'
+    messages and the results. smoothing: smooths the senses' results. Raises RecordingError if there are none."""
     tracks = Tracks()
 
     def hear(item: Heard) -> None:

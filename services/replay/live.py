@@ -1,4 +1,4 @@
-"""What was recorded, on the bus again: with new stamps, because readers refuse what is old, and at the times at which it came."""
+"""Publishes a recording on the bus again: with new stamps, because readers refuse old messages, and with the recorded timing."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from penumbra.shared.runtime.guard import RATE_TIMES
 from penumbra.shared.runtime.sender import Sender
 
 SENSORS = (topics.FRAME, topics.JOINTS, topics.VOLTAGES)
-"""What a cell's sensors say: all else is made of it, but for the truth, which only an emulator knows."""
+"""Topics of a cell's sensors: all others are derived from them, except the truth, which only an emulator has."""
 
 
 @dataclass
 class Count:
-    """What was published: messages, also by topic, and how late the latest of them was [s]."""
+    """Published messages, in all and by topic, and the maximum lateness [s]."""
 
     messages: int = 0
     late_s: float = 0.0
@@ -32,7 +32,7 @@ class Count:
 
 
 def moved(message: Message, when: Callable[[int], int], rate: float) -> Message:
-    """A message at another time. when: the new time [ns] of an old one. Times between samples shrink with the rate."""
+    """A message with shifted stamps. when: the new time [ns] of an old one. Times between samples shrink with the rate."""
     changes = {name: when(getattr(message, name)) for name in message.__struct_fields__ if name.endswith("stamp_ns")}
     if rate != 1.0 and "period_ns" in message.__struct_fields__:
         changes["period_ns"] = max(1, round(message.period_ns / rate))  # type: ignore[attr-defined]
@@ -40,7 +40,7 @@ def moved(message: Message, when: Callable[[int], int], rate: float) -> Message:
 
 
 class Player:
-    """Publishes messages of a recording. session: of the bus. rate: how many seconds of it pass in one."""
+    """Publishes messages of a recording. session: of the bus. rate: seconds of the recording per second."""
 
     def __init__(self, session: zenoh.Session, rate: float):
         self._session, self._rate = session, rate
@@ -48,7 +48,7 @@ class Player:
         self.count = Count()
 
     def play(self, recording: Iterable[Played], stopping: threading.Event) -> None:
-        """Publishes each message when it is due, until the end, or until `stopping` is set."""
+        """Publish each message when it is due, until the end, or until `stopping` is set."""
         first_ns = began_ns = 0
         began_s = 0.0
         for each in recording:
@@ -75,7 +75,7 @@ class Player:
 
 
 def check_alone(session: zenoh.Session, cell: str, wanted: Iterable[Topic]) -> None:
-    """Raises bus.BusError where a process is there that publishes one of these topics itself."""
+    """Raise bus.BusError if a process on the bus publishes one of these topics itself."""
     found = {str(reply.ok.key_expr).split("/")[-2] for reply in session.liveliness().get(topics.alive(cell)) if reply.ok}
     for topic in wanted:
         for name in sorted(found & set(topic.publishers)):
@@ -86,7 +86,7 @@ def check_alone(session: zenoh.Session, cell: str, wanted: Iterable[Topic]) -> N
 
 
 def check_rate(rate: float) -> None:
-    """Raises ValueError for a rate at which readers would refuse messages."""
+    """Raise ValueError for a rate at which readers would refuse messages."""
     if not 0 < rate <= RATE_TIMES / 2:
         raise ValueError(
             f"expected more than 0 and at most {RATE_TIMES / 2:g}, above which readers refuse messages, got {rate:g}"

@@ -1,4 +1,4 @@
-"""The senses' poses of a recording, smoothed: `services.fusion.smoother` on what a file holds, or on what is made of it now."""
+"""Smooths the senses' poses: `services.fusion.smoother` on the poses of a file, or on poses computed from it now."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from penumbra.shared.recording.reading import Played, Recording
 
 BY_TOPIC = {sense.topic: sense for sense in SENSES}
 READ = (*BY_TOPIC, topics.FUSED, topics.TRUTH)
-"""What is read of a recording whose senses' poses are smoothed."""
+"""Topics that are read to smooth the senses' poses of a recording."""
 
 
 class Smoothing:
-    """The smoothers of all targets of a cell: takes what senses say, and makes the poses of it."""
+    """The smoothers of all targets of a cell: collects the senses' messages, and computes the poses."""
 
     def __init__(self, cell: cells.Cell):
         self._cell = cell
@@ -37,7 +37,7 @@ class Smoothing:
         self.missing: dict[str, str] = {}
 
     def take(self, topic: Topic, names: dict[str, str], message: Any) -> None:
-        """Takes a message of a sense, of others nothing. What is wrong with it is counted."""
+        """Add a message of a sense; other topics are ignored. Faulty messages are counted."""
         sense, smoother = BY_TOPIC.get(topic), self._smoothers.get(names.get("target", ""))
         if sense is None or smoother is None or (sense.usable is not None and message.state != sense.usable):
             return
@@ -48,8 +48,8 @@ class Smoothing:
             smoother.log.refused(sense.name, error.kind)
 
     def poses(self) -> Iterator[Heard]:
-        """The smoothed poses of all targets, one target after the other, at the rate of the topic. A target of which nothing was
-        measured is `missing`. Raises RecordingError where that is all."""
+        """The smoothed poses of all targets, one target after the other, at the rate of the topic. A target without measurements
+        is added to `missing`. Raises RecordingError if all targets are missing."""
         period_ns = round(1e9 / topics.SMOOTHED.rate_hz)
         for name, smoother in self._smoothers.items():
             try:
@@ -76,7 +76,7 @@ class Smoothing:
             raise RecordingError(f"{why}; give --in-process to make them of what the sensors said, or record vision and haptic")
 
     def learned(self) -> Learned:
-        """The motion of all targets. Raises RecordingError where too little was measured."""
+        """The motion of all targets. Raises RecordingError if there are too few measurements."""
         measured = [smoother for name, smoother in self._smoothers.items() if name not in self.missing]
         try:
             return learned(measured)
@@ -84,8 +84,8 @@ class Smoothing:
             raise RecordingError(str(error)) from None
 
     def described(self) -> dict[str, Any]:
-        """By target what became of the measurements of each sense, how many of those that the gates refused were used after all,
-        and how many that passed were not."""
+        """By target: counts of each sense's measurements, number of measurements that the gates refused but the smoother used,
+        and number that passed the gates but were dismissed."""
         return {
             name: {
                 "senses": {source: asdict(counts) for source, counts in smoother.log.counts.items()},
@@ -100,8 +100,8 @@ class Smoothing:
 def smooth(
     recording: Iterable[Played], copied: Iterable[Recording], writer: Writer | None, smoothing: Smoothing
 ) -> dict[str, Any]:
-    """Smooths the senses' poses of a recording, and describes the smoothed ones as `in_process.play` does. writer: a new
-    recording, of all that is in the copied ones and of the smoothed poses. Raises RecordingError where no sense has measured."""
+    """Smooth the senses' poses of a recording, and describe the smoothed ones as `in_process.play` does. writer: a new recording
+    with everything in the copied ones and the smoothed poses. Raises RecordingError if no sense has measured."""
     tracks = Tracks()
     for each in recording:
         smoothing.take(each.topic, each.names, each.message)
@@ -112,7 +112,7 @@ def smooth(
 
 
 def add(smoothing: Smoothing, tracks: Tracks, writer: Writer | None, copied: Iterable[Recording] = ()) -> dict[str, Any]:
-    """Adds the smoothed poses to the tracks and to a new recording, after all that is in the copied ones."""
+    """Add the smoothed poses to the tracks and to a new recording, after everything in the copied ones."""
     items = list(smoothing.poses())
     if writer is not None:
         for each in copied:

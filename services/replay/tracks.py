@@ -1,4 +1,4 @@
-"""What a replay makes, beside what was recorded: tracks of poses that are compared, and a new recording."""
+"""Results of a replay compared with the recording: tracks of poses, and a new recording."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from penumbra.shared.recording.reading import Recording
 from penumbra.shared.runtime.tap import Taken
 
 NEAR_S = 0.02
-"""Poses whose stamps are nearer than this [s] are of one moment."""
+"""Maximum difference [s] between stamps of poses of the same moment."""
 SMOOTHED = topics.SMOOTHED.key.rpartition("{target}")[2]
-"""How the channels of smoothed poses end, those for viewers too."""
+"""Suffix of the channels of smoothed poses, including those for viewers."""
 
 
 class Track:
@@ -47,8 +47,8 @@ class Track:
         return {"messages": len(self.states), "states": shares, "sha256": self._digest.hexdigest()}
 
     def apart_mm(self, other: Track) -> dict[str, float] | None:
-        """How far positions are from those of another track at the same moments [mm]: median and largest; None where there are
-        no such moments, or one of both is lost."""
+        """Distances [mm] between positions and those of another track at the same moments: median and maximum; None if at no
+        moment both are valid."""
         if not self.stamps_ns or not other.stamps_ns:
             return None
         order = np.argsort(other.stamps_ns, kind="stable")
@@ -67,23 +67,23 @@ class Track:
 
 
 class Tracks:
-    """The tracks of what is made now and of what was recorded, by topic and target."""
+    """The replayed and the recorded tracks, by topic and target."""
 
     def __init__(self) -> None:
         self._now: dict[tuple[str, str], Track] = {}
         self._then: dict[tuple[str, str], Track] = {}
 
     def now(self, topic: Topic, names: Mapping[str, str], message: Message) -> None:
-        """Adds a pose that is made now."""
+        """Add a replayed pose."""
         self._now.setdefault((topic.name, names["target"]), Track()).add(message)
 
     def then(self, topic: Topic, names: Mapping[str, str], message: Message) -> None:
-        """Adds a pose, or a truth, that was recorded."""
+        """Add a recorded pose, or a recorded truth."""
         self._then.setdefault((topic.name, names["target"]), Track()).add(message)
 
     def described(self) -> dict[str, dict[str, Any]]:
-        """Of the poses of now by topic and target: number, states and digest, and how far they are from the recorded ones and
-        from the truth [mm]. Smoothed poses, which no recorder records, are compared with the fused ones."""
+        """For each topic and target of the replayed poses: number, states and digest, and their distances from the recorded ones
+        and from the truth [mm]. Smoothed poses, which no recorder records, are compared with the fused ones."""
         found = {}
         for (name, target), track in sorted(self._now.items()):
             truth = self._then.get((topics.TRUTH.name, target), Track())
@@ -98,7 +98,7 @@ class Tracks:
 
 
 class Writer:
-    """A new recording of what is heard, with its metadata `about` and what is attached to it."""
+    """A new recording of replayed messages, with its metadata `about` and attachments."""
 
     def __init__(self, cell: cells.Cell, out: Path, about: Mapping[str, Mapping[str, str]], attached: Mapping[str, bytes]):
         self._cell, self._out, self._about, self._attached = cell, out, about, attached
@@ -118,7 +118,7 @@ class Writer:
             self._file.write(entry)
 
     def copy(self, recording: Recording) -> None:
-        """Takes over all of a recording but smoothed poses."""
+        """Copy all of a recording except smoothed poses."""
         for entry in recording.entries():
             if self._file is None:
                 self._file = File(self._out, self._about, self._attached, entry.log_ns)
