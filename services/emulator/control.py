@@ -1,4 +1,4 @@
-"""What a control query may ask of the world: JSON in, JSON out."""
+"""Control queries of the emulator: JSON in, JSON out."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ COMMANDS = {
     "board": "PAD-NUMBER error, lost, short, missing or slip: a fault of a board that --serial serves, such as p0-1 lost",
     "state": "print the current settings",
 }
-"""Every command, and what its value means."""
+"""Every command, and the meaning of its value."""
 
 
 def control(world: World, payload: bytes, time_s: float, serial: SerialBoards | None = None) -> dict[str, Any]:
-    """Carry out `{"command": NAME, "value": VALUE}` from `time_s` on and answer what is in force then. The value may be a text.
-    serial: the boards that are served on serial ports.
+    """Carry out `{"command": NAME, "value": VALUE}` from `time_s` on; returns the settings then in force. The value may be a
+    text. serial: the boards on serial ports.
 
-    Raises ValueError with what is possible where the request is none of that.
+    Raises ValueError with the possibilities for an invalid request.
     """
     try:
         request = json.loads(payload)

@@ -1,4 +1,4 @@
-"""Turns at fixed instants: what is due at an instant is prepared before it and sent at it."""
+"""Turns at fixed instants: data due at an instant is prepared before it and sent at it."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import time
 from collections.abc import Callable
 
 SMOOTHING = 0.25
-"""Weight of the newest turn in the mean of how long preparing takes: a single slow one must not reduce the rate of the next
-ones."""
+"""Weight of the newest turn in the mean preparation time: a single slow turn must not reduce the rate of the next ones."""
 
 SET_NS = 1_000_000
-"""Difference [ns] of the wall clock from the steady one from which it counts as set."""
+"""Difference [ns] of the wall clock from the steady one above which it was set."""
 
 
 class Time:
-    """The time of the world: it begins now and goes on steadily, whatever happens to the wall clock wall_ns(), as reality does.
+    """The time of the world: it begins now and runs steadily, even if the wall clock wall_ns() is set, as reality does.
 
-    began_ns: when it began by the steady clock, which is the same one for all processes of the machine.
+    began_ns: start by the steady clock, which all processes of the machine share.
     """
 
     def __init__(self, wall_ns: Callable[[], int]):
@@ -26,11 +25,11 @@ class Time:
         self._epoch_ns = wall_ns()
 
     def now_ns(self) -> int:
-        """Since the beginning."""
+        """Time [ns] since the start."""
         return time.monotonic_ns() - self.began_ns
 
     def epoch_ns(self) -> int:
-        """The beginning by the wall clock as it is set now."""
+        """The start by the wall clock as currently set."""
         epoch_ns = self._wall_ns() - self.now_ns()
         if abs(epoch_ns - self._epoch_ns) > SET_NS:
             self._epoch_ns = epoch_ns
@@ -40,8 +39,8 @@ class Time:
 class Pacer:
     """Counts the ticks of a stream: tick k is due at epoch_ns + k * period_ns by the clock now_ns().
 
-    Ticks that could only be ready more than `late_ns` after their instant, as preparing takes lately, are dropped: on a busy
-    machine the stream becomes thinner, not later, and nothing queues.
+    Ticks that would be ready more than `late_ns` late, by the recent preparation times, are dropped: on a busy machine the stream
+    becomes thinner, not later, and nothing queues.
     """
 
     def __init__(self, epoch_ns: int, period_ns: float, now_ns: Callable[[], int], late_ns: float):
@@ -64,7 +63,7 @@ class Pacer:
         return self._last
 
     def ready(self) -> float:
-        """Seconds until the tick is due that was prepared since `next`, zero where it is overdue."""
+        """Seconds until the prepared tick is due, zero if it is overdue; ends the preparation begun by `next`."""
         now_ns = self._now_ns()
         self._takes_ns += SMOOTHING * (now_ns - self._begun_ns - self._takes_ns)
         return max(0.0, (self._epoch_ns + (self._last or 0) * self._period_ns - now_ns) * 1e-9)

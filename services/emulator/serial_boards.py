@@ -1,10 +1,10 @@
-"""The pads' sensing boards on pseudo-terminals: a driver talks to them as to the real ones.
+"""The pads' sensing boards on pseudo-terminals: a driver talks to them as to real ones.
 
-They live in a process of their own, which does nothing else: a board answers to the tenth of a millisecond, while the emulator
-may be rendering. The emulator sends it what the skin will feel in the next moments, tick by tick.
+They run in a separate process: a board answers within a tenth of a millisecond, while the emulator may be rendering. The emulator
+sends it the skin's signals of the next moments, tick by tick.
 
-A pseudo-terminal has no line that could be held low, so no BREAK passes through it. What passes is that the driver empties its
-output queue, which a driver does before a BREAK: that stands for one here.
+A pseudo-terminal has no line that can be held low, so it transmits no BREAK. It does transmit that the driver flushes its output
+queue, which a driver does before a BREAK: the flush stands for the BREAK.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ if TYPE_CHECKING:
     from penumbra.sim.world.world import World
 
 IDLE_S = 0.05
-"""How long the boards wait for bytes before they look whether they are to end."""
+"""Time [s] that the boards wait for bytes before they check whether they are to end."""
 TOLERANCE = 0.01
 """Relative standard deviation of the coils' inductance: every board has its own resonance."""
 CHUNK = 4096
-"""Largest number of bytes read at once."""
+"""Maximum number of bytes read at once."""
 PATIENCE_S = 30.0
-"""Longest start of the boards' process."""
+"""Maximum time [s] for the boards' process to start."""
 
 
 class Feed:
-    """What the skin feels at any time, interpolated between instants `tick_s` apart."""
+    """The skin's signals at any time, interpolated between instants `tick_s` apart."""
 
     def __init__(self, skin: Skin, tick_s: float):
         self._skin, self._tick_s = skin, tick_s
@@ -58,13 +58,13 @@ class Feed:
         self._faults = SkinFaults(skin)
 
     def take(self, k: int, log_change: Array, faults: SkinFaults) -> None:
-        """The logs of the changes (n,) [fF] at tick k, and the faults in force."""
+        """Add the logs of the changes (n,) [fF] at tick k, and the faults in force."""
         self._logs = {tick: logs for tick, logs in self._logs.items() if tick > k - 50} | {k: log_change}
         self._faults = faults
 
     def amplitude(self, pad: int, time_s: float) -> Array:
-        """(e,) [V] of one pad without noise, at rest before the first instant. Between ticks logs are interpolated; after the
-        last one the skin feels what it felt then."""
+        """Amplitudes (e,) [V] of one pad without noise, at rest until the first `take`. Between ticks logs are interpolated;
+        after the last tick its signals persist."""
         own, change = self._skin.of(pad), np.zeros(len(self._skin))
         if self._logs:
             k, part = divmod(time_s / self._tick_s, 1.0)
@@ -75,12 +75,12 @@ class Feed:
 
 
 class Terminals:
-    """boards: by name; time_s: their clock. devices: the paths of their pseudo-terminals by name."""
+    """Pseudo-terminals of boards. boards: by name; time_s: their clock. devices: the paths of the pseudo-terminals by name."""
 
     def __init__(self, boards: Mapping[str, Board], time_s: Callable[[], float]):
         self.boards, self.devices = dict(boards), dict[str, str]()
-        self._names: dict[int, str] = {}  # by the file descriptor of our end
-        self._slaves: list[int] = []  # kept open: what a driver closes stays there for the next one
+        self._names: dict[int, str] = {}  # by our end's file descriptor
+        self._slaves: list[int] = []  # kept open: a driver may close its end and another one open it
         self._time_s = time_s
         for name in boards:
             master, slave = os.openpty()
@@ -91,8 +91,8 @@ class Terminals:
             self._slaves.append(slave)
 
     def turn(self, other: Sequence[int] = ()) -> None:
-        """Carries bytes between the boards and their devices until some were carried, or something came on file descriptors
-        `other`."""
+        """Wait for bytes from the devices, for a board's due answer, or for file descriptors `other`, at most IDLE_S; then
+        transfer bytes both ways."""
         due_s = min(emulated.next_s() for emulated in self.boards.values())
         wait_s = min(max(0.0, due_s - self._time_s()), IDLE_S)
         ready = select.select([*self._names, *other], [], [], wait_s)[0]
@@ -101,17 +101,17 @@ class Terminals:
         for master, name in self._names.items():
             packet = self.boards[name].send(self._time_s())
             if packet:
-                with suppress(BlockingIOError):  # nobody reads: on a line without flow control the bytes are lost
+                with suppress(BlockingIOError):  # no reader: without flow control the bytes are lost
                     os.write(master, packet)
 
     def close(self) -> None:
-        """Ends the devices."""
+        """Close the devices."""
         for fd in (*self._names, *self._slaves):
             os.close(fd)
         self._names, self._slaves = {}, []
 
     def _receive(self, master: int, emulated: Board) -> None:
-        """A packet of a pseudo-terminal in packet mode: its kind in one byte, then data."""
+        """Handle a packet of a pseudo-terminal in packet mode: its kind in one byte, then data."""
         try:
             packet = os.read(master, CHUNK)
         except OSError as error:
@@ -125,7 +125,7 @@ class Terminals:
 
 
 def pad_boards(cell: cells.Cell, pads: Sequence[str], seed: int, feed: Feed) -> dict[str, Board]:
-    """The boards of pads as the cell file has them, each with a coil of its own: p0-0, p0-1 and so on."""
+    """The boards of pads as in the cell file, each with its own coil: p0-0, p0-1 and so on."""
     out = {}
     for pad in pads:
         place = list(cell.pads).index(pad)
@@ -153,7 +153,7 @@ def _chosen(feed: Feed, pad: int, own: list[int], time_s: float) -> Array:
 
 
 def _serve(link: Connection, cell: cells.Cell, pads: Sequence[str], seed: int, began_ns: int, tick_s: float) -> None:
-    """The boards' process, until the emulator closes its end."""
+    """Run the boards' process until the emulator closes its end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator handles Ctrl-C
     feed = Feed(Skin(cell), tick_s)
     terminals = Terminals(pad_boards(cell, pads, seed, feed), lambda: (time.monotonic_ns() - began_ns) * 1e-9)
@@ -172,11 +172,11 @@ def _serve(link: Connection, cell: cells.Cell, pads: Sequence[str], seed: int, b
 
 
 class SerialBoards:
-    """The emulator's end. pads: whose boards are served; folder: where links to their devices are made; began_ns: time zero of
-    the world by the steady clock; tick_s: how often the boards receive what the skin feels; ahead_s: how long before it does.
+    """The emulator's end. pads: whose boards are served; folder: of the links to their devices; began_ns: time zero of the world
+    by the steady clock; tick_s: period at which the boards receive the skin's signals; ahead_s: how long in advance.
 
     devices: the paths of the pseudo-terminals by name, such as p0-2 for the third board of pad p0. Raises CellError for an
-    unknown pad, OSError where a link cannot be made.
+    unknown pad, OSError if a link cannot be made.
     """
 
     def __init__(self, world: World, pads: Sequence[str], folder: Path | None, began_ns: int, tick_s: float, ahead_s: float):
@@ -196,7 +196,7 @@ class SerialBoards:
         self._sent = -1
 
     def fault(self, words: str) -> None:
-        """`PAD-NUMBER FAULT`: let a fault happen on a board's line. Raises ValueError that says what is possible."""
+        """`PAD-NUMBER FAULT`: cause a fault on a board's line. Raises ValueError that says what is possible."""
         name, _, kind = words.partition(" ")
         if name not in self.devices or kind not in FAULTS:
             possible = f"one of {', '.join(self.devices)} and one of {', '.join(FAULTS)}"
@@ -204,7 +204,7 @@ class SerialBoards:
         self._send(words)
 
     def serve(self, stopping: threading.Event) -> None:
-        """Sends the boards what the skin feels, until the emulator stops."""
+        """Send the skin's signals to the boards until the emulator stops."""
         try:
             while not stopping.wait(self._tick_s):
                 now_s = (time.monotonic_ns() - self._began_ns) * 1e-9
@@ -216,7 +216,7 @@ class SerialBoards:
             self.close()
 
     def close(self) -> None:
-        """Ends the boards' process and removes the links to its devices."""
+        """End the boards' process and remove the links to its devices."""
         self._link.close()
         for link in self._links:
             link.unlink(missing_ok=True)
@@ -228,7 +228,7 @@ class SerialBoards:
 
 
 def _linked(devices: Mapping[str, str], folder: Path) -> list[Path]:
-    """Links to the devices, with their names; those of an emulator before are replaced."""
+    """Make links to the devices, with their names; those of an earlier emulator are replaced."""
     folder.mkdir(parents=True, exist_ok=True)
     links = [folder / name for name in devices]
     for link, device in zip(links, devices.values(), strict=True):

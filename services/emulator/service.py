@@ -21,11 +21,11 @@ from penumbra.sim.world.world import TICK_NS, Sensors, Stream, World
 NAME = "emulator"
 
 PLAN_S = 10.0
-"""How far ahead the limb's motion is planned, in the frames' thread: planning must not delay the skin."""
+"""Time [s] by which the limb's motion is planned ahead, in the frames' thread: planning must not delay the skin."""
 AHEAD_S = 0.1
-"""A command acts this much later: frames until then may have been rendered already."""
+"""Delay [s] of a command: frames until then may have been rendered already."""
 AGAIN_S = 0.001
-"""A turn waits by itself; this only keeps one that fails from running hot."""
+"""Period [s] of a turn, which waits by itself; this only keeps a failing one from busy-looping."""
 
 
 ALL_PADS = "*"
@@ -50,15 +50,16 @@ EXAMPLE = "penumbra emulator --cell table --seed 7 --occlude 0.5"
 
 
 def start(node: Node, options: flags.Options) -> None:
-    """Threads: the skin's timer, one timer a camera and the answers share the world; motions and occluders have locks of their
-    own, and commands replace what the timers read.
+    """Threads: the skin's timer, one timer per camera and the answers share the world; motions and occluders have their own
+    locks, and commands replace the data that the timers read.
 
-    Every stream has a turn of its own: what is due next is made ready before its instant, as a real sensor would have it."""
+    Every stream has its own turn: the next data is prepared before its instant, as in a real sensor.
+    """
     cell = node.cell
     world = World(cell, options.seed)
     world.plan(PLAN_S)
     sensors = Sensors(world, node.now_ns())
-    for camera in cell.cameras.keys() - cell.sources.keys():  # compiles what the first turn would wait for
+    for camera in cell.cameras.keys() - cell.sources.keys():  # compile what the first turn would wait for
         sensors.frame(camera, 0)
     sensors.tick(1)
     world_time = Time(node.now_ns)
