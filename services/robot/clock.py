@@ -1,18 +1,19 @@
-"""When a controller's clock says that something was measured, by this host's clock."""
+"""Converts the times of a controller's clock to this host's clock."""
 
 from __future__ import annotations
 
 from penumbra.shared.runtime.lowest import Lowest
 
 WINDOW_S = 10.0
-"""Offsets of the last so many seconds count: clocks drift by some parts in a hundred thousand, 0.5 ms in this time."""
+"""Time [s] for which an offset counts: clocks drift by some parts in a hundred thousand, 0.5 ms in this time."""
 BACK_S = 0.5
-"""A clock that goes back by more has begun anew: the controller was started again."""
+"""Backward step [s] of a clock above which the controller has restarted."""
 
 
 class ControllerClock:
-    """The offset of a controller's clock, from when its messages arrive: a message arrives late by what line and threads take,
-    and never early, so that the smallest difference is nearest to the offset. What the quickest takes stays in the stamps."""
+    """Offset of a controller's clock, from the arrival of its messages. A message arrives late by the delays of line and threads,
+    and never early, so the smallest difference is nearest to the offset. The delay of the quickest message remains in the
+    stamps."""
 
     def __init__(self) -> None:
         self._begin()
@@ -22,8 +23,8 @@ class ControllerClock:
         self._last_s: float | None = None
 
     def stamp(self, clock_s: float | None, arrival_ns: int) -> int:
-        """The stamp [ns since the epoch] of a measurement at a time of the controller's clock [s], None where it says none, that
-        arrived then [ns since the epoch]."""
+        """The stamp [ns since the epoch] of a measurement at clock_s by the controller's clock [s] (None if unknown) that arrived
+        at arrival_ns [ns since the epoch]."""
         if clock_s is None:
             return arrival_ns
         if self._last_s is not None and clock_s < self._last_s - BACK_S:

@@ -28,17 +28,16 @@ from penumbra.shared.cell.description import CellError, JointSource
 from penumbra.shared.runtime.adapter import load
 
 Reading = tuple[dict[str, float], float | None]
-"""Joint angles [rad] or displacements [m] by name, and when they were measured by the controller's own clock [s], None where it
-says nothing."""
+"""Joint angles [rad] or displacements [m] by name, and their time by the controller's own clock [s], None if unknown."""
 UR_HZ = 125.0
-"""Data packages a second: what a CB3 can send, and an e-Series sends as well."""
+"""Data packages per second: the maximum of a CB3; an e-Series also supports it."""
 FRANKA_S = 0.01
-"""Time between two readings of a controller that sends a thousand a second [s]."""
+"""Time [s] between two readings of a controller that sends a thousand per second."""
 SILENCE_S = 1.0
-"""A controller that has sent nothing for so long is lost."""
+"""Time [s] without data after which a controller counts as lost."""
 LOOK_S, LONG_LOOK_S = 0.002, 0.05
-"""How often it is looked whether a data package has come [s]. A look that took longer counts as so long: then it was this process
-that stood still, not the controller."""
+"""Period [s] of checks for a data package. A longer check counts as LONG_LOOK_S: then this process was delayed, not the
+controller."""
 UR_JOINTS = (
     "shoulder_pan_joint",
     "shoulder_lift_joint",
@@ -47,7 +46,7 @@ UR_JOINTS = (
     "wrist_2_joint",
     "wrist_3_joint",
 )
-"""What the URDFs of Universal Robots call the joints, from the base on."""
+"""Names of the joints in the URDFs of Universal Robots, from the base on."""
 FRANKA_JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 
 
@@ -55,10 +54,10 @@ class Driver(Protocol):
     """A connection to a robot, used by one thread."""
 
     def read(self) -> Reading:
-        """Waits for the next measurement, at most about a second. Raises OSError where the robot is gone."""
+        """Wait for the next measurement, at most about a second. Raises OSError if the robot is gone."""
 
     def close(self) -> None:
-        """Ends the connection."""
+        """Close the connection."""
 
 
 class UniversalRobots:
@@ -69,7 +68,7 @@ class UniversalRobots:
 
         try:
             self._receive = RTDEReceiveInterface(address, UR_HZ, ["timestamp", "actual_q"])
-        except RuntimeError as error:  # whatever happens
+        except RuntimeError as error:  # any failure
             raise OSError(f"no controller of Universal Robots at {address}: {_line(error)}") from None
         self._address = address
         self._last_s = 0.0
@@ -79,7 +78,7 @@ class UniversalRobots:
         while silent_s < SILENCE_S:
             now_s = float(self._receive.getTimestamp())
             q = self._receive.getActualQ()
-            # the next data package may have come between the two
+            # the next data package may have arrived between the two calls
             if now_s != self._last_s and len(q) == len(UR_JOINTS) and now_s == self._receive.getTimestamp():
                 self._last_s = now_s
                 return dict(zip(UR_JOINTS, map(float, q), strict=True)), now_s
@@ -93,8 +92,8 @@ class UniversalRobots:
 
 
 class Franka:
-    """A controller of Franka (Panda, FR3) by the Franka Control Interface, which must be enabled in Desk. It serves one client
-    at a time: where another program moves the robot, that one must publish the joints."""
+    """A controller of Franka (Panda, FR3) by the Franka Control Interface, which must be enabled in Desk. It serves one client at
+    a time: if another program moves the robot, that program must publish the joints."""
 
     def __init__(self, address: str):
         from panda_py import libfranka
@@ -114,19 +113,19 @@ class Franka:
         return dict(zip(FRANKA_JOINTS, map(float, state.q), strict=True)), float(state.time.to_sec())
 
     def close(self) -> None:
-        del self._robot  # libfranka closes where the last one that holds it goes
+        del self._robot  # libfranka closes with its last reference
 
 
 DRIVERS: dict[str, tuple[type[UniversalRobots] | type[Franka], str, str, str]] = {
     "ur": (UniversalRobots, "rtde_receive", "ur", ""),
     "panda": (Franka, "panda_py", "panda", "panda_"),
 }
-"""By the kind of a source: driver, the module that it needs, the extra that installs it, and what joints' names begin with."""
+"""By the kind of a source: driver, the module that it needs, the extra that installs it, and the prefix of joint names."""
 
 
 def opener(source: JointSource, folder: Path) -> Callable[[], Driver]:
-    """What connects to a source; folder: where an adapter's module is looked for, too. Raises CellError where a package or the
-    adapter's class is missing."""
+    """A function that connects to a source; folder: additional search path for an adapter's module. Raises CellError if a package
+    or the adapter's class is missing."""
     if source.kind == "adapter":
         connect: Callable[[], Driver] = load(source.place, folder, "docs/robot-joints.md")
         return connect
@@ -137,7 +136,7 @@ def opener(source: JointSource, folder: Path) -> Callable[[], Driver]:
 
 
 def prefix(source: JointSource) -> str:
-    """What the names of the cell's joints have before those of the driver."""
+    """The prefix of the cell's joint names relative to the driver's."""
     if source.prefix is not None:
         return source.prefix
     return DRIVERS[source.kind][3] if source.kind in DRIVERS else ""

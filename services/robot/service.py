@@ -27,11 +27,12 @@ from penumbra.shared.runtime.node import Node
 
 NAME = "robot"
 BACKOFF_S = (0.2, 1.0)
-"""Waiting before a controller is called again: at first, and at most, which is what a cell waits for one that was switched on."""
+"""Initial and maximum delay [s] before a reconnection; the maximum is also the time that a cell waits for a controller that was
+switched on."""
 TOLD_EVERY = 60
-"""Attempts after which a controller that is still missing is logged again."""
+"""Number of attempts after which a missing controller is logged again."""
 LARGEST = 100.0
-"""Joint angles [rad] beyond this, sixteen turns, are degrees."""
+"""Maximum joint angle [rad]; a larger one, beyond sixteen turns, is probably in degrees."""
 
 FLAGS = (
     flags.Option(
@@ -58,7 +59,7 @@ EXAMPLE = "penumbra robot --source ur:192.168.0.2\npenumbra robot --robot panda 
 
 
 def start(node: Node, options: flags.Options) -> None:
-    """Each robot has a thread of its own, to which its `Session` belongs; the health report, in another thread, only reads."""
+    """Start one thread per robot, which owns the robot's `Session`; the health report, in another thread, only reads."""
     for name, source in sources(node.cell, options).items():
         folder = node.cell.folder if options.source is None else Path.cwd()
         session = Session(node, name, source, folder.absolute())
@@ -68,7 +69,7 @@ def start(node: Node, options: flags.Options) -> None:
 
 
 def sources(cell: cells.Cell, options: flags.Options) -> dict[str, cells.JointSource]:
-    """The sources to read, by robot. Raises CellError where there is none, it cannot be one, or the emulator moves the robot."""
+    """The sources to read, by robot. Raises CellError if there is none, if one is invalid, or if the emulator moves the robot."""
     found = cell.joint_sources
     if options.source is not None:
         found = {cell.one("robots", options.robot): _checked(options.source, options.prefix)}
@@ -98,7 +99,7 @@ def _checked(url: str, prefix: str | None) -> cells.JointSource:
 
 
 class Session:
-    """One robot from connecting to losing it, again and again."""
+    """One robot from connecting until it is lost, repeatedly."""
 
     def __init__(self, node: Node, name: str, source: cells.JointSource, folder: Path):
         self._node, self._name, self._source = node, name, source
@@ -113,7 +114,7 @@ class Session:
         self._late_ms = 0.0
 
     def run(self) -> None:
-        """Until the node stops, or the controller is gone: then it returns after a while, to be called again."""
+        """Read until the node stops, or until the controller is gone; then wait and return, to be called again."""
         found: Driver | None = None
         try:
             found = self._open()
@@ -132,7 +133,7 @@ class Session:
         self._node.stopping.wait(self._delay_s)
 
     def _take(self, reading: Reading, clock: ControllerClock, arrival_ns: int) -> None:
-        """Publishes a measurement that has all joints of the cell."""
+        """Publish a measurement that has all joints of the cell."""
         joints, clock_s = reading
         q, self._fault = matched(joints, self._joints, self._prefix)
         stamp_ns = clock.stamp(clock_s, arrival_ns)
@@ -155,7 +156,7 @@ class Session:
         return [f"robot {self._name}: {self._fault}"] if self._fault else []
 
     def describe(self) -> dict[str, Any]:
-        """For the health report."""
+        """The robot's entry in the health report."""
         return {
             "state": self._state,
             "source": self._source.url,
@@ -167,7 +168,7 @@ class Session:
 
 
 def matched(joints: dict[str, float], wanted: tuple[str, ...], prefix: str) -> tuple[np.ndarray | None, str]:
-    """The angles (n,) of the cell's joints in their order, None where one is missing or impossible; and what is wrong."""
+    """The angles (n,) of the cell's joints in order, None if one is missing or impossible; and the fault."""
     named = {f"{prefix}{name}": angle for name, angle in joints.items()}
     if missing := [name for name in wanted if name not in named]:
         return None, (

@@ -1,4 +1,4 @@
-"""The meeting point of a host: a node in router mode passes on what the others say, here and at the routers it is linked to."""
+"""Router of a host: a node in router mode forwards messages between local processes and linked routers."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ penumbra router --connect tcp/THAT-HOST:7447            # processes connect to t
 
 
 def start(node: Node, options: flags.Options) -> None:
-    """Nothing but the links: the session itself is the router. Raises BusError for an interface or a rate that cannot be."""
+    """Nothing but the links: the session itself is the router. Raises BusError for an invalid interface or rate."""
     rates_hz = {topic.name: topic.slow_hz for topic in topics.TOPICS} | dict(_rate(text) for text in options.slow_hz)
     known = psutil.net_if_addrs()
     if unknown := [name for name in options.slow if name not in known]:
