@@ -17,7 +17,7 @@ COMMANDS = {
 
 
 class Calibrate(flags.Group):
-    """The group `penumbra calibrate`."""
+    """The group of the calibration commands."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)

@@ -1,7 +1,7 @@
-"""`penumbra snapshot OUT.png`: what the camera sees, what the network makes of it, and where the observer says the arm is.
+"""`penumbra snapshot OUT.png`: the camera's picture, with the network's mask and the observer's pose of the arm.
 
 Drawn over the camera's picture: the mask's classes as a tint, the silhouette of the fused pose as a line (green: tracking, amber:
-coasting, red: lost), each pad as its outline, filled the brighter the more it feels.
+coasting, red: lost), each pad as its outline, filled more brightly the more it feels.
 """
 
 from __future__ import annotations

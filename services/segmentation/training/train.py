@@ -1,22 +1,22 @@
 """Makes weights/ again: `penumbra segmentation train`; with --data, weights for a user's own frames and masks.
 
-Every step renders simulated sequences that no other step sees: that costs a fifth of it. Step n takes its sequences, patches and
-colours from a generator seeded by (seed, n), and all schedules are functions of the progress, so that a run of --steps
-interrupted and resumed ends with the same weights as one that was not. For days in the background, over several machines:
+Every step renders new simulated sequences, which takes a fifth of its time. Step n draws its sequences, patches and colours from
+a generator seeded by (seed, n), and all schedules are functions of the progress, so a run of --steps that is interrupted and
+resumed ends with the same weights as an uninterrupted one. For days in the background, over several machines:
 
   OMP_NUM_THREADS=1 nice -n 19 penumbra segmentation train --size 16 32 64 128 --steps 150000 --resume --compact FILE
 
-On a GPU drawing is what takes longest, so that other processes do it, one for each core, and a step learns from more at once:
+On a GPU drawing takes longest, so other processes draw, one per core, and a step uses more data at once:
 
   OMP_NUM_THREADS=1 penumbra segmentation train --device cuda --workers 15 --times 4 --steps 5000
 
-Weights from the ends of successive trainings, each with its rate down, differ in what they get wrong, and their mean may be
-better than each: --mean (Izmailov et al. 2018, arXiv:1803.05407). The mean with the weights that a training began with knows what
-is new about as well, and forgets less: --with-start (Wortsman et al. 2022, arXiv:2109.01903).
+Weights from the ends of successive trainings, each with its rate lowered, have different errors, and their mean may be better
+than each: --mean (Izmailov et al. 2018, arXiv:1803.05407). The mean with a training's initial weights is about as good
+on the new data, and forgets less: --with-start (Wortsman et al. 2022, arXiv:2109.01903).
 
-With --priors the network also receives what is known of the robot and of the target, with --encoder what filters that photographs
-have taught find in the picture. A network without, from --start or --resume, is given both, and gives the same masks until it
-has learned to use them.
+With --priors the network also receives silhouettes of robot and target, with --encoder the outputs of filters pretrained on
+photographs. A network without them, from --start or --resume, is extended by both, and gives the same masks until it has learned
+to use them.
 """
 
 from __future__ import annotations
