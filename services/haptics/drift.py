@@ -12,8 +12,8 @@ from blocks of one second
   adds no information.
 
 Electrodes whose innovation cannot be drift are left out. A block is refused if its innovations are too large together: another
-object is near, or the pose was wrong. After REFUSED such blocks in a row the covariance was too small, and the filter starts
-again as after an old calibration.
+object is near, or the pose was wrong. After REFUSED such blocks in a row the covariance counts as too small, and the filter
+starts again as after an old calibration.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ CALIBRATED = (5e-4, 2e-5)
 BLOCK_S = 1.0
 """Length [s] of a block of windows; the filter makes one update per block."""
 QUIET_S = 3.0
-"""Time [s] for which nothing must have been in range before a block counts as empty."""
+"""Time [s] without anything in range after which a block counts as empty."""
 STEADY = 4.0
 """Change of an electrode from one empty block to the next, in standard deviations, above which it counts as moved."""
 STILL = 0.1

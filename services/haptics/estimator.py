@@ -368,7 +368,7 @@ class Estimator:
         misfit carry less information than their noise suggests."""
         trust = 1.0 / max(1.0, solution.misfit)
         best, known = peak(solution.T, trust * information, trust * gradient)
-        turn = best[:3, :3] @ solution.T[:3, :3].T  # the unobserved axis of T is that of the published pose
+        turn = best[:3, :3] @ solution.T[:3, :3].T  # rotate the unobserved directions with the pose
         known[3:] = turn @ known[3:]
         known[:, 3:] = known[:, 3:] @ turn.T
         return best, 0.5 * (known + known.T)
