@@ -67,7 +67,7 @@ class Data(Protocol):
 
     def __getitem__(self, index: int, /) -> Any: ...
     def plain(self, index: int, /) -> Any:
-        """A sequence with nothing pasted in front, from which the encoder learns while it is trained alone."""
+        """A sequence with nothing pasted in front, for training the encoder without the layers."""
 
     def close(self) -> None:
         """Stop making sequences."""
