@@ -1,9 +1,9 @@
 """`penumbra bench ablation`: the authors' comparison of what the segmentation network is made of.
 
 Each variant starts from random weights and learns for the same number of steps from the same small patches of the same sequences;
-the first one's number is what --minutes allow. So that minutes tell anything, the scenes are easy ones: a bare arm before a plain
-wall, and an occluder of one colour that hides up to 93 % of it. Scored on held-out sequences, calibrated on others, as `penumbra
-bench segmentation` does. It says which variant learns faster, not what each can reach.
+the number is what the first one reaches in --minutes. The scenes are easy, so that minutes suffice for a comparison: a bare arm
+before a plain wall, and an occluder of one colour that hides up to 93 % of it. Scored on held-out sequences, calibrated on
+others, as `penumbra bench segmentation` does. It says which variant learns faster, not what each can reach.
 """
 
 from __future__ import annotations

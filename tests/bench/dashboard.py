@@ -1,8 +1,8 @@
 """`penumbra bench dashboard`: what the web page costs the running chain, without and with open pages in turns.
 
-A page is a websocket that says of every message at once that it was shown, as a browser does that keeps up with all that comes;
-what a browser itself computes is not in it. Rounds without and with pages take turns, each pair in the other order than the one
-before, so that what else the machine does hits both. Motion and occlusion are drawn from `--seed`.
+A page is a websocket that confirms every message at once as shown, like a browser that keeps up with all messages; the browser's
+own computing is not included. Rounds without and with pages take turns, in reversed order from pair to pair, so that other load
+on the machine affects both. Motion and occlusion are drawn from `--seed`.
 """
 
 from __future__ import annotations

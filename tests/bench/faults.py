@@ -1,11 +1,11 @@
 """`penumbra bench faults`: every fault for every service of the running chain, measured from outside over the bus.
 
 The arm moves in sight of the camera; a fault strikes the replica that owns the stream. A client of the bus, which knows nothing
-of the fault, counts: the longest time without a fused pose while a sense was alive, how long the service's topics were not what
-they had been, measurements used twice, and poses called tracking that were wrong by more than three sigma.
+of the fault, measures: the longest time without a fused pose while a sense was alive, how long the service's topics took to get
+back to their old rates, measurements used twice, and poses called tracking that were wrong by more than three sigma.
 
-Services that connect the cell with what is outside it (`tests/bench/lib/connected.py`) have faults of their own, which are
-measured by what each of them does.
+Services that connect the cell with the outside (`tests/bench/lib/connected.py`) have faults of their own, which are measured at
+the output of each.
 """
 
 from __future__ import annotations

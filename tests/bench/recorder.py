@@ -1,8 +1,8 @@
 """`penumbra bench recorder`: what a recorder beside the running chain costs: its CPU, and the chain's rates and ages with and
 without it.
 
-The chain runs all the time. Pairs of spans follow one another, one with a recorder and one without, the first of a pair in turn
-the one and the other, so that what drifts on the machine strikes both. Motion and occlusion are drawn from `--seed`.
+The chain runs all the time. Pairs of spans follow one another, one with a recorder and one without, in alternating order, so
+that drifts of the machine affect both. Motion and occlusion are drawn from `--seed`.
 """
 
 from __future__ import annotations

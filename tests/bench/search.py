@@ -430,7 +430,7 @@ def overall(parts: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def judged(seed: int, plan: Plan) -> dict[str, Any]:
-    """What the search says about itself: as a detector of wrong poses, and where nothing is left to see."""
+    """The search's own judgement: as a detector of wrong poses, and where nothing is left to see."""
     segmenter = load_segmenter()
     frames = list(lost_frames(seed, plan.lost, segmenter, plan.domain))
     doubts = np.array([frame.doubt for frame in frames])
@@ -471,7 +471,7 @@ def measure(seed: int, plan: Plan, parts: tuple[str, ...]) -> dict[str, Any]:
 
 
 def tables(result: dict[str, Any]) -> list[Part]:
-    """Errors beside the bound and the paper's search, consistency, and what the search says of itself."""
+    """Errors beside the bound and the paper's search, consistency, and the search's own judgement."""
     parts: list[Part] = [_errors(result, kind) for kind in dict.fromkeys(row["masks"] for row in result["rows"])]
     consistent = Table("masks", "hidden", "mean", "95 % band", "median (4.35)", "frames", title="NEES, 5 degrees of freedom")
     for name, part in (("network", result["nees"]), ("exact", result["nees"].get("exact", {}))):
@@ -513,7 +513,7 @@ def _errors(result: dict[str, Any], kind: str) -> Table:
 
 
 def _judged(result: dict[str, Any]) -> list[Part]:
-    """What the search says about itself."""
+    """Tables of the search's own judgement."""
     kinds = Table(
         "frames with", *next(iter(result["lost"].values())), title="Poses that the search calls tracked, and wrong ones"
     )
@@ -535,7 +535,7 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _goal(row: dict[str, Any], paper: dict[str, Any]) -> str:
-    """What a row reaches of its goals."""
+    """The values of a row beside its goals."""
     position = row["position_cm"]
     if row["masks"] == "exact":
         ratio = position["median"] / row["bound_cm"]

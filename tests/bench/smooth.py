@@ -6,7 +6,7 @@ the simulated limbs and senses of `penumbra bench fusion` (`tests.bench.lib.fusi
 cell goes through segmentation, search, haptics and fusion in this process (`services.replay`), while a panel hides the limb
 wholly again and again, for 0.5 to 2 s.
 
-NEES and its 95 % band as in `penumbra bench fusion`; of a cell there is one run, whose errors hang together, and no band. The
+NEES and its 95 % band as in `penumbra bench fusion`; of a cell there is one run, whose errors are correlated, and no band. The
 six degrees of freedom are those of the pose. Visible and hidden in a cell: at most a third of the limb's pixels, more than 90 %.
 """
 

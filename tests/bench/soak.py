@@ -1,10 +1,10 @@
-"""`penumbra bench soak`: what a cell lives through in a day, in half an hour, and what has grown by then.
+"""`penumbra bench soak`: the events of a day in a cell, in half an hour, and what has grown by then.
 
 Clients come, ask and go, viewers watch, things hide the arm, it leaves and comes back, processes are killed, all are replaced one
 after another, the router goes away, nonsense is published: each as often as on a day, `--speed` times as fast. The sensors are
-not sped up. Clocks could be made to run faster in every process, but the services do not take more: on a machine whose cores are
-busy a camera's frames are already left out, and a delay would only count for more of the faster seconds. So a leak of an event
-shows as in a day, one of a message as in `--minutes`; growth is given per hour of these.
+not sped up. Clocks could be made to run faster in every process, but the services cannot process more: on a machine with busy
+cores frames are already left out, and a delay would only count for more of the faster seconds. So a leak per event shows as after
+a day, one per message as after `--minutes`; growth is given per hour of these.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""`penumbra bench start`: how long `penumbra up` takes to a tracked pose, cold and warm, and what of it is compiling.
+"""`penumbra bench start`: how long `penumbra up` takes to a tracked pose, cold and warm, and how much of it is compiling.
 
 Cold: a copy of this checkout in which nothing is compiled and nothing cached, with the caches of a home of its own. Warm: the
 same copy once more. Times run from before the launcher is started until this process receives a service's first message: for
-fusion the first pose that is `tracking`; a process that publishes nothing counts from when it is alive on the bus. A service's
+fusion the first pose that is `tracking`; for a process that publishes nothing, until it is alive on the bus. A service's
 compiling CPU is what its processes used until then, cold minus warm.
 """
 

@@ -6,7 +6,7 @@ over the visible contour of how far a pose error moves it along its normal. `inf
 edges, and `rendered_information` from nothing but renderings on both sides of the true pose, to check it.
 
 What counts is the target's outer contour where both sides of it are known: beside a pixel that something covers (an occluder, the
-upper arm that goes on from the elbow) a mask does not say whose border it is.
+upper arm beyond the elbow) a mask does not show whose border it is.
 """
 
 from __future__ import annotations

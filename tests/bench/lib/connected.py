@@ -1,4 +1,4 @@
-"""Faults of the services that connect a cell with what is outside it: recorder, web page, ROS 2, camera, robot.
+"""Faults of the services that connect a cell with the outside: recorder, web page, ROS 2, camera, robot.
 
 Each of them is timed where its work arrives: in the recorder's files, in a browser that shows the page, at a ROS node, and on the
 bus for frames and joints. Recorder, page and ROS 2 run beside a whole chain, whose pose must go on; camera and robot run alone,

@@ -1,4 +1,4 @@
-"""The paper's curves as numbers: each function gives what one picture shows, ready for JSON."""
+"""The paper's curves as numbers: each function returns the data of one picture, ready for JSON."""
 
 from __future__ import annotations
 
