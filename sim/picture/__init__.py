@@ -1,1 +1,1 @@
-"""What the simulated cameras see."""
+"""The pictures of the simulated cameras."""

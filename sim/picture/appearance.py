@@ -16,9 +16,9 @@ PLAIN, BLOTCHES, STRIPES, CHECKS, WOOD, PICTURE = range(6)
 """Patterns of a texture."""
 TEXTURE_FIELDS = 20
 CUFF, GLOSS = 18, 19
-"""A row of a body's texture: two of Texture.fields (nine numbers each: its own and its sleeve's), cuff, gloss."""
+"""Columns of cuff and gloss in a row of a body's texture, after two of Texture.fields (the body's and its sleeve's)."""
 NO_CUFF = -1e9
-"""Where a sleeve ends [m] of a body without one: before all of it."""
+"""Cuff [m] of a body without a sleeve: below all of its points."""
 
 Colour = tuple[float, float, float]
 
@@ -39,7 +39,7 @@ class Texture:
 
 @dataclass(frozen=True)
 class Appearance:
-    """A body's texture, what it wears below `cuff` along its x axis [m] (a sleeve), its gloss and whether it casts a shadow."""
+    """A body's texture, its sleeve below `cuff` [m] along its x axis, its gloss and whether it casts a shadow."""
 
     texture: Texture
     sleeve: Texture | None = None
@@ -55,8 +55,8 @@ class Appearance:
 
 @dataclass(frozen=True)
 class Look:
-    """What is common to a picture: lamp position [m] and colours (linear RGB), background at infinity, and the sensor's blur
-    [px], noise (share of full scale), white balance and JPEG quality in percent (None: not compressed)."""
+    """Light, background and sensor of a picture: lamp position [m] and colours (linear RGB), background at infinity, the
+    sensor's blur [px], noise (share of full scale), white balance and JPEG quality in percent (None: not compressed)."""
 
     lamp: tuple[float, float, float]
     lamp_colour: Colour
@@ -75,7 +75,7 @@ def noise_volume() -> NDArray[np.float32]:
 
 
 def hsv(hue: float, saturation: float, value: float) -> Colour:
-    """Linear RGB of a colour named as artists do; `value` is the display's, so it is squared."""
+    """Linear RGB of a colour in HSV; `value` is that of a display, so the result is squared."""
     r, g, b = colorsys.hsv_to_rgb(hue % 1.0, min(max(saturation, 0.0), 1.0), min(max(value, 0.0), 1.0))
     return r * r, g * g, b * b
 
@@ -92,7 +92,7 @@ def skin(rng: np.random.Generator) -> Texture:
 
 
 def cloth(rng: np.random.Generator) -> Texture:
-    """Work clothes: any hue, that of skin less often; mostly plain."""
+    """Work clothes of any hue, that of skin less often; mostly plain or blotched."""
     hue = rng.uniform(0.12, 0.97) if rng.uniform() < 0.8 else rng.uniform()
     colour = hsv(hue, rng.uniform(0.05, 0.8), rng.uniform(0.15, 0.9))
     accent = hsv(hue + rng.uniform(-0.1, 0.1), rng.uniform(0.05, 0.8), rng.uniform(0.15, 0.9))
@@ -101,12 +101,12 @@ def cloth(rng: np.random.Generator) -> Texture:
 
 
 def _period(rng: np.random.Generator, low: float, high: float) -> float:
-    """A length between bounds [m], small ones as likely as large ones."""
+    """A log-uniform length between bounds [m]."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 def metal(rng: np.random.Generator) -> Texture:
-    """A robot's paint: white or grey, now and then orange, yellow or blue."""
+    """A robot's paint: white or grey, at times orange, yellow or blue."""
     if rng.uniform() < 0.85:
         return Texture(hsv(rng.uniform(), 0.05, rng.uniform(0.45, 1.0)), hsv(0.0, 0.0, 0.3), BLOTCHES, 0.2, 0.15)
     hue = rng.choice([0.06, 0.13, 0.6])
@@ -139,13 +139,13 @@ def occluder(rng: np.random.Generator, tidy: bool = False) -> Texture:
 
 
 def picture(rng: np.random.Generator) -> Texture:
-    """Patches of many colours, as a crowded room or a poster has them."""
+    """Patches of many colours, as in a crowded room or on a poster."""
     colours = [hsv(rng.uniform(), rng.uniform(0.1, 0.9), value) for value in (rng.uniform(0.1, 0.5), rng.uniform(0.5, 1.0))]
     return Texture(colours[0], colours[1], PICTURE, _period(rng, 0.03, 0.4), rng.uniform(0.4, 1.0))
 
 
 def person(rng: np.random.Generator, tidy: bool = False) -> dict[Label, Appearance]:
-    """Skin, and clothes of one cloth: short sleeves, rolled up on the forearm, or down to the wrist; now and then gloves. `tidy`:
+    """Skin, and clothes of one cloth: short sleeves, rolled up on the forearm, or down to the wrist; at times gloves. `tidy`:
     short sleeves and bare hands."""
     bare, shirt = skin(rng), cloth(rng)
     gloss = rng.uniform(0.0, 0.06)
@@ -164,8 +164,8 @@ def _dressed(forearm: Appearance, upper_arm: Appearance, shirt: Texture) -> dict
 
 
 def background(rng: np.random.Generator, tidy: bool = False) -> Appearance:
-    """Walls and what stands before them, far away: half of them light and rather grey, with blotches or edges of low contrast;
-    the others (not where `tidy`) of many colours, and a few all in colours of skin."""
+    """Distant walls and furniture: 58 % in colours of low saturation, the others in many colours or, a few, in colours of skin.
+    `tidy`: only the first kind."""
     choice = rng.uniform() if not tidy else 1.0
     if choice < 0.35:
         return Appearance(dataclasses.replace(picture(rng), period=_period(rng, 0.1, 1.0)), casts_shadow=False)

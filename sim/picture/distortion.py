@@ -1,4 +1,4 @@
-"""What a camera with a distorting lens shows: the picture of a pinhole camera, bent."""
+"""Pictures of a camera with lens distortion, warped from those of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry.lens import Lens
 
 WIDEST = 3.0
-"""Largest pinhole picture that is rendered, in widths and heights of the camera's; what lies further out is repeated
-from the edge."""
+"""Maximum size of the pinhole picture that is rendered, in widths and heights of the camera's; beyond it the edge is repeated."""
 
 
 class Distortion:
-    """Bends pinhole pictures of `window` = (x0, y0, width, height), which holds all that the lens shows, into the camera's."""
+    """Warps pinhole pictures of `window` = (x0, y0, width, height), which covers the lens's view, into the camera's."""
 
     def __init__(self, lens: Lens):
         places = lens.undistorted(lens.grid())
@@ -29,13 +28,13 @@ class Distortion:
 
     @staticmethod
     def of(camera: cells.Camera) -> Distortion | None:
-        """That of a camera; None where its lens distorts nothing."""
+        """The distortion of a camera; None for a pinhole."""
         return None if camera.lens.is_pinhole else Distortion(camera.lens)
 
     def __call__(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The camera's picture (h, w, 3) of the window's (height, width, 3)."""
+        """The camera's picture (h, w, 3) from the window's (height, width, 3)."""
         bent = cv2.remap(image, self._columns, self._rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        return np.maximum(bent, np.float32(0.0))  # the cubic swings below black beside an edge
+        return np.maximum(bent, np.float32(0.0))  # cubic interpolation undershoots beside an edge
 
     def pinhole(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The part (h, w) of the window's labels (height, width) that the camera's undistorted picture shows."""

@@ -1,4 +1,4 @@
-"""Forearms with a hand of fingers in any pose, for pictures to learn from: the tracked mesh has one stiff hand, people do not."""
+"""Forearms with hands and fingers in any pose, for training: the tracked mesh has one stiff hand, people do not."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from penumbra.shared.geometry.rigid import Array
 PALM = 0.54
 """Length of the palm as a share of the hand's."""
 FINGERS = ((0.36, 0.40), (0.12, 0.44), (-0.12, 0.41), (-0.35, 0.33))
-"""Index to little finger: where it begins across the palm, as a share of its breadth; length as a share of the hand's."""
+"""Index to little finger: position across the palm as a share of the hand's breadth, length as a share of the hand's."""
 PHALANXES = (0.47, 0.3, 0.23)
 """Lengths of a finger's bones as shares of the finger's."""
 SEGMENTS = 8
-"""Corners of a finger's cross-section."""
+"""Number of corners of a finger's cross-section."""
 
 
 def mesh(body: cells.Body, rng: np.random.Generator) -> Mesh:
-    """A person's forearm and a posed hand, in the frame of `body.forearm_mesh`: wrist bent by up to 60 degrees, fingers from
+    """A person's forearm and a posed hand, in the frame of `anatomy.forearm_mesh`: wrist bent by up to 60 degrees, fingers from
     spread to a fist."""
     whole = bodies.forearm_mesh(body)
     faces = whole.faces[whole.labels == Label.FOREARM]
@@ -43,7 +43,7 @@ def mesh(body: cells.Body, rng: np.random.Generator) -> Mesh:
 
 
 def band(body: cells.Body, rng: np.random.Generator) -> Mesh:
-    """A watch or a bracelet around the wrist, in the frame of `body.forearm_mesh`; it counts as forearm."""
+    """A watch or a bracelet around the wrist, in the frame of `anatomy.forearm_mesh`; it is labelled as forearm."""
     wide, thin = bodies.half_axes(body.wrist_circumference, 0.72)
     half, thick = rng.uniform(0.003, 0.018), rng.uniform(0.002, 0.008)
     x = body.forearm_length / 2.0 - half - rng.uniform(0.0, 0.04) + np.array([-half, -half, half, half])

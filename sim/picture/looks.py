@@ -1,6 +1,8 @@
-"""Looks of real rooms, people and cameras, to learn from, beyond those of `sim.picture.appearance`, by which the benchmarks stay
-comparable: coloured light, wrong white balance, saturated walls, strong shading, black and patterned sleeves, gloves, and what
-a cheap camera does to a picture."""
+"""Looks of real rooms, people and cameras, for training: coloured light, wrong white balance, saturated walls, strong shading,
+black and patterned sleeves, gloves, and the artefacts of a cheap camera.
+
+Those of `sim.picture.appearance` stay as they are, so that benchmarks remain comparable.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from penumbra.sim.picture import appearance
 from penumbra.sim.picture.appearance import BLOTCHES, CHECKS, PLAIN, STRIPES, Appearance, Colour, Look, Texture, hsv
 
 BALANCE = 0.4
-"""A channel is brighter or darker in the picture by up to this share because the white balance is wrong."""
+"""Maximum share by which a wrong white balance makes a channel brighter or darker in the picture."""
 
 
 def skin(rng: np.random.Generator) -> Texture:
@@ -30,8 +32,8 @@ def skin(rng: np.random.Generator) -> Texture:
 
 
 def cloth(rng: np.random.Generator) -> Texture:
-    """Clothes and gloves of any colour: one in four black, one in eight white, the others down to those of skin; half of them
-    patterned, some strongly."""
+    """Clothes and gloves of any colour: one in four black, one in eight white, the others of any hue; two in three patterned,
+    some strongly."""
     choice = rng.uniform()
     if choice < 0.25:
         colour = hsv(rng.uniform(), rng.uniform(0.0, 0.4), rng.uniform(0.03, 0.22))
@@ -45,7 +47,7 @@ def cloth(rng: np.random.Generator) -> Texture:
 
 
 def person(rng: np.random.Generator) -> dict[Label, Appearance]:
-    """Bare, half sleeved and sleeved arms, a quarter with gloves."""
+    """Bare, half sleeved and sleeved arms, a fifth with gloves."""
     bare, shirt, glove = skin(rng), cloth(rng), cloth(rng)
     gloss = float(rng.choice([0.0, rng.uniform(0.0, 0.4)]))
     hand = glove if rng.uniform() < 0.25 else bare
@@ -61,14 +63,14 @@ def person(rng: np.random.Generator) -> dict[Label, Appearance]:
 
 
 def thing(rng: np.random.Generator) -> Appearance:
-    """Furniture, clutter and things held or passing by: as in training so far, or of a strong colour."""
+    """Furniture, clutter and things held or passing by, as in `sim.picture.appearance` or like clothes."""
     if rng.uniform() < 0.6:
         return Appearance(appearance.occluder(rng), gloss=float(rng.choice([0.0, rng.uniform(0.0, 0.5)])))
     return Appearance(cloth(rng), gloss=rng.uniform(0.0, 0.5))
 
 
 def background(rng: np.random.Generator) -> Appearance:
-    """A wall or a room: as in training so far, or of a saturated colour, from blue of the sky to red brick."""
+    """A wall or a room, as in `sim.picture.appearance` or of a saturated colour."""
     if rng.uniform() < 0.6:
         return appearance.background(rng)
     hue, value = rng.uniform(), rng.uniform(0.2, 1.0)
@@ -83,9 +85,9 @@ def look(rng: np.random.Generator, around: tuple[float, float, float]) -> Look:
     usual = appearance.look(rng, around)
     angle, distance, height = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(0.3, 2.5), rng.uniform(0.1, 2.2)
     lamp = (around[0] + distance * math.cos(angle), around[1] + distance * math.sin(angle), around[2] + height)
-    share = rng.uniform(0.4, 0.95)  # of the light that comes from the lamp, and makes shadows
+    share = rng.uniform(0.4, 0.95)  # of the light that comes from the lamp and casts shadows
     strength = rng.uniform(0.9, 1.8)
-    off = 2.0 * math.log1p(BALANCE) * rng.uniform()  # twice: the picture shows the root
+    off = 2.0 * math.log1p(BALANCE) * rng.uniform()  # twice, as the picture shows the square root
     balance = np.exp(off * rng.uniform(-1.0, 1.0, 3))
     return dataclasses.replace(
         usual,
@@ -101,7 +103,7 @@ def look(rng: np.random.Generator, around: tuple[float, float, float]) -> Look:
 
 
 def _tinted(rng: np.random.Generator, strength: float) -> Colour:
-    """Light of a strength: half of the time nearly white, else warm or of any colour."""
+    """Light of a strength: in three of five cases nearly white, otherwise warm or of any colour."""
     choice = rng.uniform()
     if choice < 0.6:
         colour = hsv(rng.uniform(), rng.uniform(0.0, 0.1), 1.0)
@@ -114,8 +116,8 @@ def _tinted(rng: np.random.Generator, strength: float) -> Colour:
 
 
 def filmed(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """What a cheap camera makes of a film (frames, h, w, 3): motion blur, too few pixels, sharpening, a tone curve, flicker of
-    lamps in bands of rows, exposure that hunts, compression; each some of the time."""
+    """A film (frames, h, w, 3) with the artefacts of a cheap camera: motion blur, low resolution, sharpening, a tone curve,
+    flicker of lamps in bands of rows, hunting exposure, compression; each in some films only."""
     frames, height, width = images.shape[:3]
     kernel = _motion(rng) if rng.random() < 0.25 else None
     coarse = rng.uniform(0.35, 0.8) if rng.random() < 0.2 else 1.0
@@ -125,7 +127,7 @@ def filmed(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.ui
     flicker = rng.uniform(0.03, 0.15) if rng.random() < 0.1 else 0.0
     hunting = rng.normal(0.0, 0.04) if rng.random() < 0.3 else 0.0
     quality = int(rng.integers(10, 80)) if rng.random() < 0.2 else None
-    level = (0.45 / max(float(images.mean()) / 255.0, 0.05)) ** rng.uniform(0.0, 1.0)  # automatic exposure, more or less
+    level = (0.45 / max(float(images.mean()) / 255.0, 0.05)) ** rng.uniform(0.0, 1.0)  # automatic exposure of random strength
     pitch, phase = rng.uniform(20.0, 200.0), rng.uniform(0.0, 2.0 * math.pi)
     out = np.empty_like(images)
     for t in range(frames):
@@ -152,7 +154,7 @@ def filmed(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.ui
 
 
 def _motion(rng: np.random.Generator) -> NDArray[np.float32]:
-    """The kernel of a blur along a line of 2 to 9 pixels."""
+    """The kernel of a motion blur along a line of 2 to 9 pixels."""
     length, angle = rng.uniform(2.0, 9.0), rng.uniform(0.0, math.pi)
     along = np.linspace(-length / 2.0, length / 2.0, 33)
     kernel = np.zeros((11, 11), np.float32)
@@ -161,5 +163,5 @@ def _motion(rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def _length(rng: np.random.Generator, low: float, high: float) -> float:
-    """A length between bounds [m], small ones as likely as large ones."""
+    """A log-uniform length between bounds [m]."""
     return float(np.exp(rng.uniform(math.log(low), math.log(high))))

@@ -36,13 +36,13 @@ BOX_FACES = np.array(
 """Corners (12, 3) of the cube's triangles, counter-clockwise from outside. trimesh has the same cube, but importing it costs
 0.3 s of CPU at the emulator's start."""
 AWAY = -1.0
-"""The occluder's level when it is out of the picture; 0 is where it begins to hide the target."""
+"""Level of the occluder when it is out of the picture; at 0 it begins to hide the target."""
 
 
 class OcclusionSchedule:
     """The wanted level of occlusion over time: a share of the target's pixels in [0, 1], or AWAY.
 
-    Automatic: away for 2.5 to 6 s, then for 2.5 to 5 s in the way, three times of five wholly, else 50 to 95 %.
+    Automatic: away for 2.5 to 6 s, then hiding for 2.5 to 5 s, in three of five cases all of it, otherwise 50 to 95 %.
     Levels change at SLOPE per second: the occluder slides.
     """
 
@@ -52,7 +52,7 @@ class OcclusionSchedule:
         self._rng = np.random.default_rng([seed, 3])
         self._lock = threading.Lock()
         self._ends, self._levels = [float(self._rng.uniform(3.0, 5.0))], [AWAY]
-        self._commands: list[tuple[float, float | None, float]] = [(0.0, None, AWAY)]  # from when, level or automatic, level then
+        self._commands: list[tuple[float, float | None, float]] = [(0.0, None, AWAY)]  # time, level or automatic, level before
 
     def command(self, time_s: float, level: float | None) -> None:
         """Holds a level in [0, 1] (0: away) from a time on, or follows the schedule (None)."""
@@ -96,13 +96,13 @@ class Panel:
     target's picture. mesh: in its own frame, x from the hiding edge into the panel, z along the camera's optical axis."""
 
     DEPTH = 0.55
-    """Share of the way from the camera to the target at which it stands: well before the robot."""
+    """Place on the way from the camera to the target, as a share of it: well before the robot."""
     SIZE = 0.45
-    """Width and height [m]: more than the picture of a forearm with hand, drawn back to DEPTH."""
+    """Width and height [m]: larger than the projection of a forearm with hand onto the plane at DEPTH."""
     MARGIN = 0.02
-    """Distance [m] of the edge beyond a target that is hidden wholly: the measured picture may lag by a frame."""
+    """Distance [m] of the edge beyond a wholly hidden target, as the measured picture may lag by a frame."""
     WHOLLY = 0.95
-    """Level from which everything is hidden."""
+    """Level from which on everything is hidden."""
 
     def __init__(self, seed: int):
         angle = np.random.default_rng([seed, 4]).uniform(0.0, 2.0 * np.pi)
@@ -112,8 +112,9 @@ class Panel:
     def pose(self, level: float, camera: cells.Camera, target: Mesh, T_world_target: Array) -> Array | None:
         """T_world_panel that hides `level` of the target's picture in a camera, None where it is out of the picture.
 
-        The picture's area is what front-facing triangles cover; a share of it lies beyond the edge, a weighted quantile along the
-        direction in which the panel slides. Exact for convex bodies, within some hundredths for a hand over its own forearm.
+        The picture's area is that of the front-facing triangles. The panel's edge is a weighted quantile of it along the
+        direction in which the panel slides. This is exact for convex bodies, and within some hundredths for a hand over its own
+        forearm.
         """
         if level <= AWAY:
             return None
@@ -146,7 +147,7 @@ class Panel:
 
 def _upper_quantile(across: Array, area: Array, share: float) -> float:
     """The value above which `share` of the area lies, for triangles with corners (m, 3) and areas (m,): each triangle's area
-    is taken as spread evenly from its lowest to its highest corner."""
+    is assumed to be spread evenly from its lowest to its highest corner."""
     low, high = across.min(axis=1), np.maximum(across.max(axis=1), across.min(axis=1) + 1e-9)
     grid = np.linspace(low.min(), high.max(), 129)
     beyond = np.clip((high - grid[:, None]) / (high - low), 0.0, 1.0) @ area / max(float(area.sum()), 1e-30)

@@ -1,4 +1,4 @@
-"""What a camera sees of the simulated world: RGB image and class of every pixel.
+"""Renders the simulated world as a camera sees it: RGB image and class of every pixel.
 
 A frame takes four passes: a shadow map from the lamp, a z-buffer from the camera (`shared.geometry.raster`), shading of each
 pixel (textures in the bodies' own coordinates, Lambert and Blinn-Phong with shadow and ambient light), and the sensor (blur,
@@ -23,9 +23,9 @@ from penumbra.sim.picture.appearance import CUFF, GLOSS, TEXTURE_FIELDS, Appeara
 from penumbra.sim.picture.distortion import Distortion
 
 SHADOW_PX = 256
-"""Width and height of the picture that the light sees, for shadows."""
+"""Width and height of the shadow map [px]."""
 CREASE = math.cos(math.radians(50.0))
-"""Faces that meet at a sharper angle than this are shaded as an edge."""
+"""Cosine of the angle between the normals of two faces beyond which their common edge is shaded as a crease."""
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,12 @@ class Picture:
 
 
 class Renderer:
-    """Renders scenes for one camera, or for a window of its image at a coarser scale (for training on crops). The image is the
-    pinhole's, or with `distortion`, whose window is rendered then, that of the camera's lens; labels are always the pinhole's.
+    """Renders scenes for one camera, or for a window of its image at a coarser scale (for training on crops). The image is that
+    of a pinhole camera or, with `distortion`, of the camera's lens, and then the distortion's window is rendered. Labels are
+    always those of the pinhole camera.
 
-    One picture after another: what a picture has in common with the last one (background, meshes, memory, and the surfaces of
-    bodies that stand still, but for the shadows on them) is kept.
+    What a picture has in common with the previous one is kept: background, meshes, memory, and the surfaces of bodies that stand
+    still, but not the shadows on them.
     """
 
     def __init__(
@@ -141,7 +142,7 @@ class Renderer:
         return Picture(_expose(seen, self._blurred, look, rng), labels, view.ids.copy())
 
     def _background(self, look: Look) -> NDArray[np.float32]:
-        """What lies at infinity (h, w, 3) in the light of a look: the camera stands still, so it is made once."""
+        """The background at infinity (h, w, 3) in the light of a look; rendered once, as the camera stands still."""
         drawn = look.background, look.ambient, look.lamp_colour
         if self._sky is None or self._sky[0] != drawn:
             albedo = np.empty_like(self._image)
@@ -184,7 +185,7 @@ class Renderer:
 
 
 class _Faces:
-    """All bodies' triangles behind one another, as the shading pass reads them."""
+    """Concatenated triangles of all bodies, as the shading pass reads them."""
 
     def __init__(self, shapes: list[Shape]):
         self.corners = np.concatenate([shape.corners for shape in shapes] or [np.zeros((0, 3, 3), np.float32)])
@@ -193,9 +194,9 @@ class _Faces:
 
 
 class _Surfaces:
-    """What the shading pass found in earlier pictures, for pixels that show the same again. `arrays`: of each pixel, which body's
-    state it shows (a number of `states`, 0 for none) and which triangle, its albedo, and its surface in the lamp's light (cosine
-    to the lamp, what it mirrors, z of its normal)."""
+    """Results of the shading pass in earlier pictures, for pixels that show the same surface again. `arrays`, per pixel: the
+    body's state that it shows (a number of `states`, 0 for none), the triangle, the albedo, and the surface in the lamp's light
+    (cosine to the lamp, specular term, z of the normal)."""
 
     def __init__(self, height: int, width: int):
         self.arrays = (
@@ -209,7 +210,7 @@ class _Surfaces:
         self._last: tuple[_Faces, Array, NDArray[np.float32], Array] | None = None
 
     def states(self, faces: _Faces, T_body_world: Array, textures: NDArray[np.float32], lamp: Array) -> NDArray[np.int32]:
-        """A number for each body, another one whenever it looks otherwise: all do in another light or among other bodies."""
+        """A number for each body that changes with its appearance or pose; all change with the lamp or the set of bodies."""
         last, self._last = self._last, (faces, T_body_world, textures, lamp)
         if last is None or last[0] is not faces or not np.array_equal(last[3], lamp):
             changed = np.ones(len(textures), np.bool_)
@@ -222,7 +223,7 @@ class _Surfaces:
 
 
 def _quantile(x: Array, share: float) -> float:
-    """numpy's quantile, to the last bit, in a seventh of its time."""
+    """The same as `numpy.quantile`, to the last bit, in a seventh of its time."""
     where = (x.size - 1) * share
     low = int(where)
     high, t = min(low + 1, x.size - 1), where - low
@@ -232,8 +233,8 @@ def _quantile(x: Array, share: float) -> float:
 
 
 def _expose(image: NDArray[np.float32], blurred: NDArray[np.float32], look: Look, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The sensor: blur, shot and read noise, gamma of the display, 8 bits, and what JPEG leaves of them. `blurred`: memory of the
-    image's size."""
+    """The sensor: blur, shot and read noise, gamma of the display, 8 bits, and JPEG compression. `blurred`: a buffer of that
+    size."""
     if look.blur_px > 0:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), look.blur_px, dst=blurred), np.float32)
     noise = _grain()
@@ -252,7 +253,7 @@ _GRAIN: list[NDArray[np.float32]] = []
 
 
 def _grain() -> NDArray[np.float32]:
-    """White Gaussian noise, drawn once; each image reads it from another place."""
+    """White Gaussian noise, drawn once; each image reads it from a random position on."""
     if not _GRAIN:
         _GRAIN.append(np.random.default_rng(0).standard_normal(1_000_003).astype(np.float32))
     return _GRAIN[0]

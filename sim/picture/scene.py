@@ -22,7 +22,7 @@ from penumbra.sim.picture.occluder import box
 from penumbra.sim.picture.renderer import Body, Renderer, Shape
 
 PLATE, PLATE_MARGIN, TABLE_THICK = 0.003, 0.02, 0.03
-"""Thickness of a pad, how much wider it is than its electrodes, thickness of the table top [m]."""
+"""Thickness of a pad, margin by which it is wider than its electrodes, thickness of the table top [m]."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,7 @@ class View:
 
 
 class Cameras:
-    """The cell's cameras, and the light and colours of its things, drawn from a seed: a tidy work cell, of all looks that the
-    training draws."""
+    """The cell's cameras, and the light and colours of its things, drawn from a seed: those of a tidy work cell."""
 
     def __init__(self, cell: cells.Cell, seed: int):
         self._cell, self._seed = cell, seed
@@ -74,15 +73,15 @@ class Cameras:
 
 
 def furniture(cell: cells.Cell, sim: cells.Sim) -> dict[str, tuple[Mesh, str]]:
-    """What the cell holds beside people and robots, with the link that carries it: `pad NAME` as plates a little larger than
-    their electrodes' circle, and `table`."""
+    """Furniture of the cell, with the link that carries it: `pad NAME` as plates slightly larger than their electrodes' circle,
+    and `table`."""
     out = {}
     for name, pad in cell.pads.items():
         radius = np.linalg.norm(electrode_positions(cell.pad_types[pad.type]), axis=1).max()
         side = 2.0 * radius + PLATE_MARGIN
         plate = box((side, side, PLATE), (0.0, 0.0, -PLATE / 2.0), Label.BACKGROUND if pad.link == "world" else Label.ROBOT)
         out[f"pad {name}"] = (dataclasses.replace(plate, vertices=rigid.apply(pad.T_link_pad, plate.vertices)), pad.link)
-    if sim.table is not None:  # its top lies a hair below the pads' faces, so that these are seen
+    if sim.table is not None:  # its top lies slightly below the pads' faces, so that these are visible
         middle = (*sim.table_middle, -(PLATE + TABLE_THICK) / 2.0)
         out["table"] = (box((*sim.table, TABLE_THICK), middle, Label.BACKGROUND), "world")
     return out

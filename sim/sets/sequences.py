@@ -28,20 +28,21 @@ from penumbra.sim.world.person import Person, frame
 
 CELLS = ("table", "arm")
 PERIOD_S = 0.05
-"""Time [s] between frames: that of a camera at 20 Hz."""
+"""Time [s] between frames, as of a camera at 20 Hz."""
 ASTRAY = 0.12
-"""Share of sequences whose window lies anywhere in the frame."""
+"""Share of sequences whose window lies anywhere in the frame instead of around the target."""
 ARM_PX = (8.0, 56.0)
-"""Bounds of the forearm's width in the picture [px] where sequences are drawn as real cameras may show them."""
+"""Bounds of the forearm's width in the picture [px] in sequences that imitate real cameras (`Variety.real`)."""
 ARM_M = 0.085
-"""Width of a forearm [m] that the focal length is chosen by."""
+"""Width of a forearm [m], from which the focal length for ARM_PX is computed."""
 
 
 @dataclass(frozen=True)
 class Variety:
-    """What is drawn. frames; size [px] of the window; scale: bounds of the focal length relative to the cell's camera; speed
-    [m/s] and turn [rad/s]: the target's largest; jitter [m]: how far the window's middle is off the target's; real: share of
-    sequences with the looks, hands, sizes and cameras of `sim.picture.looks`, `sim.picture.limb` and ARM_PX."""
+    """The variety of the sequences. frames: per sequence; size [px] of the window; scale: bounds of the focal length relative to
+    the cell's camera; speed [m/s] and turn [rad/s]: maximum of the target's; jitter [m]: maximum offset of the window's middle
+    from the target's along each axis; real: share of sequences with the looks, hands, sizes and cameras of `sim.picture.looks`,
+    `sim.picture.limb` and ARM_PX."""
 
     frames: int = 8
     size: int = 192
@@ -54,8 +55,8 @@ class Variety:
 
 @dataclass(frozen=True)
 class Poses:
-    """Where the target is. T_camera_target (frames, 4, 4); intrinsics (4,) of the window: fx, fy, cx, cy [px]; vertices (n, 3)
-    [m] of the target's mesh, which is that of the person seen."""
+    """Poses of the target. T_camera_target (frames, 4, 4); intrinsics (4,) of the window: fx, fy, cx, cy [px]; vertices (n, 3)
+    [m] of the target's mesh, that of the person in the pictures."""
 
     T_camera_target: Array
     intrinsics: Array
@@ -64,9 +65,9 @@ class Poses:
 
 @dataclass(frozen=True)
 class Sequence:
-    """images (frames, h, w, 3) uint8 RGB, labels (frames, h, w) uint8, hidden (frames,): share of the target's pixels in the
-    window that something covers; poses: None where only the labels are known; robots (frames, h, w): the silhouettes of the
-    robots, whatever covers them, None where these are not known."""
+    """A labelled sequence. images (frames, h, w, 3) uint8 RGB; labels (frames, h, w) uint8; hidden (frames,): share of the
+    target's pixels in the window that something covers; poses: None where only the labels are known; robots (frames, h, w): the
+    robots' silhouettes including covered parts, None where they are not known."""
 
     images: NDArray[np.uint8]
     labels: NDArray[np.uint8]
@@ -77,7 +78,7 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Thing:
-    """A shape, its poses T_world_shape (frames, 4, 4) and its looks."""
+    """A shape, its poses T_world_shape (frames, 4, 4) and its appearance."""
 
     shape: Shape
     T: Array
@@ -116,8 +117,8 @@ def render(seed: int, index: int, variety: Variety = Variety()) -> Sequence:
 
 
 def _window(camera: cells.Camera, target: Thing, variety: Variety, rng: np.random.Generator, anywhere: bool) -> tuple[int, int]:
-    """The window's first column and row: around the target in the middle of the sequence (`anywhere` on it: around one of its
-    points), or, some times, anywhere in the frame."""
+    """The window's first column and row: around the target in the middle of the sequence (`anywhere`: around one of its
+    points), or, for a share ASTRAY, anywhere in the frame."""
     room = np.array([camera.width, camera.height]) - variety.size
     if rng.random() < ASTRAY:
         x0, y0 = rng.integers(0, room + 1)
@@ -169,7 +170,7 @@ def scene(rng: np.random.Generator, variety: Variety = Variety(), is_real: bool 
 
 
 def _zoomed(camera: cells.Camera, target: Array, variety: Variety, rng: np.random.Generator) -> cells.Camera:
-    """The camera with a focal length that shows a forearm at a place [m] as wide as ARM_PX allows; its frame grows with it."""
+    """The camera with a focal length that shows a forearm at `target` (3,) [m] with a width within ARM_PX; its frame scales."""
     low, high = np.log(ARM_PX)
     distance = np.linalg.norm(np.asarray(camera.position) - target)
     scale = float(np.exp(rng.uniform(low, high)) * distance / (ARM_M * camera.fx))
@@ -179,7 +180,7 @@ def _zoomed(camera: cells.Camera, target: Array, variety: Variety, rng: np.rando
 
 
 def _worn_and_held(body: cells.Body, T_target: Array, rng: np.random.Generator) -> list[Thing]:
-    """Now and then a watch, and something in the hand, which covers it as an occluder does."""
+    """At times a watch, and at times a thing in the hand, which counts as an occluder."""
     things = []
     if rng.random() < 0.3:
         things.append(Thing(Shape.of(limb.band(body, rng)), T_target, Appearance(looks.cloth(rng), gloss=rng.uniform(0.0, 0.5))))
@@ -206,7 +207,7 @@ def _robots(name: str) -> dict[str, tuple[RobotModel, dict[str, Shape]]]:
 
 
 def path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.Generator) -> Array:
-    """Poses (frames, 4, 4) of the target at a constant twist; one sequence of seven stands still."""
+    """Poses (frames, 4, 4) of the target at a constant twist; in one of seven sequences it stands still."""
     position = rng.uniform(np.subtract(motion.low, 0.06), np.add(motion.high, 0.06))
     rpy = 1.4 * rng.uniform(motion.rpy_low, motion.rpy_high)
     if rng.random() < 0.15:
@@ -219,7 +220,7 @@ def path(motion: cells.Motion, variety: Variety, times: Array, rng: np.random.Ge
 
 
 def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.random.Generator) -> cells.Camera:
-    """A camera near the cell's or, one time of six, anywhere around the target; its resolution scaled."""
+    """A camera near the cell's or, in one of six cases, anywhere around the target; its resolution is scaled."""
     position = np.asarray(camera.position) + rng.normal(0.0, 0.1, 3)
     look_at = np.asarray(camera.look_at or target) + rng.normal(0.0, 0.08, 3)
     if rng.random() < 1.0 / 6.0:
@@ -247,7 +248,7 @@ def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.rando
 
 
 def _robot(cell: cells.Cell, times: Array, rng: np.random.Generator) -> list[Thing]:
-    """The cell's robots, a little beside where they stand; the table cell borrows the other's at times."""
+    """The cell's robots, slightly displaced; the table cell at times borrows those of the arm cell."""
     if not cell.robots:
         if rng.random() < 0.75:
             return []
@@ -256,8 +257,8 @@ def _robot(cell: cells.Cell, times: Array, rng: np.random.Generator) -> list[Thi
 
 
 def robots(cell: cells.Cell, times: Array, rng: np.random.Generator, astray: float = 0.0) -> tuple[list[Thing], dict[str, Array]]:
-    """The robots of a built-in cell and their joints (frames, n) [rad], somewhere in and around their bounds and moving; `astray`
-    [m]: standard deviation of where they stand."""
+    """The robots of a built-in cell and their joints (frames, n) [rad], which move within and slightly beyond their bounds.
+    `astray` [m]: standard deviation of the robots' displacement."""
     assert cell.sim is not None
     things, joints = [], {}
     offset = np.eye(4)
@@ -277,7 +278,7 @@ def robots(cell: cells.Cell, times: Array, rng: np.random.Generator, astray: flo
 
 
 def furniture(table: tuple[float, float], frames: int, rng: np.random.Generator) -> list[Thing]:
-    """A table, plates in it and clutter on it: all of it background."""
+    """A table, plates in it and clutter on it, all labelled as background."""
     things = []
     if rng.random() < 0.9:
         size = np.array(table) * rng.uniform(0.8, 1.4, 2)
@@ -304,8 +305,8 @@ def _standing(mesh: Mesh, T: Array, frames: int, looks: Appearance) -> Thing:
 
 
 def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, rng: np.random.Generator) -> Thing:
-    """Something that covers a part of the target from the camera, and slides or stands: the emulator's panel, or a thing of
-    another shape somewhere on the line of sight."""
+    """An occluder between camera and target, moving or at rest: the emulator's panel, or a thing of another shape on the line of
+    sight."""
     frames = len(times)
     looks = Appearance(appearance.occluder(rng))
     if rng.random() < 0.6:
@@ -324,7 +325,7 @@ def _between(camera: cells.Camera, target: Mesh, T_target: Array, times: Array, 
 
 
 def shape(rng: np.random.Generator) -> Mesh:
-    """A box, a board, a tube or a stone that covers the target."""
+    """An occluder: a box, a board, a tube or a stone."""
     kind = rng.integers(4)
     if kind == 0:
         return box(rng.uniform(0.04, 0.3, 3), (0.0, 0.0, 0.0), Label.OCCLUDER)

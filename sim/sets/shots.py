@@ -2,8 +2,8 @@
 
 `shot(seed, index, …)` is a function of its arguments: what a camera with a lens of 60 degrees sees of a person, at a given
 distance and with a given share of the target hidden. Persons, poses, looks, robots, furniture and occluders are drawn as
-`sim.sets.sequences` draws them for training; here, though, the target lies wholly in the picture, the share hidden is met, and
-nothing but robot, upper arm and occluder covers it.
+`sim.sets.sequences` draws them for training; here, though, the target lies wholly in the picture, the hidden share is as
+requested, and nothing but robot, upper arm and occluder covers the target.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ Hands = Literal["stiff", "posed"]
 """stiff: the hand of the mesh that is searched for; posed: one with fingers and a bent wrist (`sim.picture.limb`)."""
 
 LENS = math.radians(60.0)
-"""Horizontal field of view."""
+"""Horizontal field of view [rad]."""
 PERIOD_S = sequences.PERIOD_S
 BORDER_PX = 8
-"""Least distance [px] of the target from the border of the picture."""
+"""Minimum distance [px] of the target from the border of the picture."""
 WITHIN = 0.02
-"""Largest deviation of the hidden share from the one asked for."""
+"""Maximum deviation of the hidden share from the requested one."""
 UPPER_ARM = 0.08
 """Hidden share that counts as none: the upper arm's rounded end covers some of the elbow."""
 FOREIGN = 0.003
-"""Share of the target that something which no mask calls an occluder (table, clutter, torso) may cover."""
+"""Maximum share of the target that things not labelled as occluders (table, clutter, torso) may cover."""
 STEPS = 32
-"""Places of an occluder that are tried on its way across the target."""
+"""Number of positions of an occluder that are tried on its way across the target."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,12 @@ class Shot:
 
     @property
     def camera(self) -> cells.Camera:
-        """The camera that took it."""
+        """The camera that took the picture."""
         return next(iter(self.cell.cameras.values()))
 
     @functools.cached_property
     def mesh(self) -> Mesh:
-        """The mesh that is searched for; with stiff hands that of the target exactly."""
+        """The mesh that is searched for; with stiff hands it is exactly the target's."""
         return anatomy.target_mesh(next(iter(self.cell.targets.values())), self.cell)
 
     @property
@@ -117,9 +117,9 @@ def clip(
     present: bool = True,
     hands: Hands = "stiff",
 ) -> list[Shot]:
-    """Pictures PERIOD_S apart, of which the last has the hidden share asked for (within WITHIN): target, robot and occluder move
-    a little. `distance_m`: depth of the target's middle; images: whether they are painted, or only labelled (much faster);
-    present: whether the person is there at all."""
+    """Pictures PERIOD_S apart between which target, robot and occluder move slightly. The last one has the requested hidden share
+    within WITHIN (for 0: at most UPPER_ARM). `distance_m`: depth of the target's middle; images: whether to render images, or
+    only labels (much faster); present: whether the person is in the pictures."""
     if not 0.0 <= hidden <= 1.0:
         raise ValueError(f"hidden: expected a share from 0 to 1, got {hidden}")
     for attempt in itertools.count():
@@ -140,8 +140,8 @@ def passing(
     seconds: float = 10.0,
     rate_hz: float = 20.0,
 ) -> Iterator[Shot]:
-    """A film of the target as it reaches about 1.5 m away, while a board passes before it every three seconds and hides all of it
-    for 0.2 to 2 s. The camera stands still."""
+    """A film of the target as it reaches, about 1.5 m from a fixed camera. About every three seconds a board passes before it and
+    hides all of it for 0.2 to 2 s."""
     frames = round(seconds * rate_hz)
     times: Array = np.arange(frames) / rate_hz
     cell = _cell("table")
@@ -211,7 +211,7 @@ class _Scene:
         self.cell = cell.model_copy(update={"cameras": {name: self.camera}, "robots": robots, "pads": pads})
 
     def occluder(self, wanted: float, rng: np.random.Generator) -> list[Thing] | None:
-        """Nothing or one thing, so that the last frame hides the share wanted; None where this scene cannot."""
+        """No or one occluder, so that the last frame hides the wanted share; None where the scene does not allow it."""
         counts = _Counts(self, -1)
         bare = counts.hidden()
         if not counts.clear or bare > (UPPER_ARM if wanted == 0.0 else wanted + WITHIN):
@@ -224,7 +224,7 @@ class _Scene:
             if found is None:
                 continue
             paint = Appearance(appearance.occluder(rng)) if self.domain == "wide" else _strong(rng)
-            speed = rng.normal(0.0, 0.4) if rng.random() < 0.5 else 0.0  # of its way across a second
+            speed = rng.normal(0.0, 0.4) if rng.random() < 0.5 else 0.0  # shares of its way per second
             ways = found + speed * PERIOD_S * (np.arange(self.frames) - (self.frames - 1.0))
             return [Thing(Shape.of(mesh), np.stack([place(x) for x in ways]), paint)]
         return None
@@ -261,7 +261,7 @@ class _Scene:
 
 @dataclass(frozen=True)
 class _Way:
-    """The share that a thing hides at a point of its way."""
+    """The share of the target that an occluder hides, as a function of its position on its way."""
 
     counts: _Counts
     mesh: Mesh
@@ -272,8 +272,8 @@ class _Way:
 
 
 class _Counts:
-    """What covers the target in a frame of a scene, counted in a window around it. `clear`: whether the target lies in the
-    picture, and nothing covers it that a mask does not call an occluder."""
+    """Counts of the target's covered pixels in a frame of a scene, in a window around it. `clear`: whether the target lies in the
+    picture, and at most FOREIGN of it is covered by things that are not labelled as occluders."""
 
     def __init__(self, scene: _Scene, frame: int):
         camera = scene.camera
@@ -299,7 +299,7 @@ class _Counts:
         self._view.draw(vertices, mesh.faces, *self._k, index)
 
     def hidden(self, mesh: Mesh | None = None, T: Array | None = None) -> float:
-        """Share of the target that is covered, with another thing at T_world_thing or without."""
+        """Share of the target that is covered. mesh, T: a further occluder at T_world_thing, if any."""
         np.copyto(self._view.depth, self._depth)
         np.copyto(self._view.ids, self._ids)
         if mesh is not None and T is not None:
@@ -308,7 +308,7 @@ class _Counts:
 
 
 def _place_for(wanted: float, hidden: Callable[[float], float]) -> float | None:
-    """Where on its way in [0, 1] an occluder first hides a share; None where it never does."""
+    """First position in [0, 1] on an occluder's way at which it hides the wanted share; None where there is none."""
     before = 0.0
     for x in np.linspace(0.0, 1.0, STEPS):
         if hidden(float(x)) >= wanted:
@@ -324,8 +324,8 @@ def _place_for(wanted: float, hidden: Callable[[float], float]) -> float | None:
 
 
 def _approach(scene: _Scene, rng: np.random.Generator, board: bool, scale: float) -> tuple[Mesh, Callable[[float], Array]]:
-    """Something that comes from a side between camera and target, and its T_world_shape by its way: at 0 it touches the target's
-    picture, at 1 its leading edge has reached the other end. `scale`: its size beside that of the training's."""
+    """An occluder that enters between camera and target from one side, and its T_world_shape by the position on its way: at 0 it
+    touches the target's picture, at 1 its leading edge has reached the far end. `scale`: size relative to the training's."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     ahead = np.array([np.cos(angle), np.sin(angle)])  # against its motion in the picture
     aside = np.array([-ahead[1], ahead[0]])
@@ -358,7 +358,7 @@ def _approach(scene: _Scene, rng: np.random.Generator, board: bool, scale: float
 
 
 def _passing_board(scene: _Scene, times: Array, rng: np.random.Generator) -> Thing:
-    """A board that comes from one side about every three seconds, hides all of the target for 0.2 to 2 s, and leaves on the
+    """A board that enters from one side about every three seconds, hides all of the target for 0.2 to 2 s, and leaves on the
     other."""
     share, ramp, size = 0.55, 0.4, 0.5
     mesh = box((size, size, 0.003), (0.0, 0.0, 0.0), Label.OCCLUDER)
@@ -394,8 +394,8 @@ def _passing_board(scene: _Scene, times: Array, rng: np.random.Generator) -> Thi
 def _camera(
     camera: cells.Camera, mesh: Mesh, T_target: Array, size: tuple[int, int], distance_m: float, rng: np.random.Generator
 ) -> cells.Camera:
-    """A camera at a distance from the target, seen from where the cell's stands or, one time of six, from anywhere, and turned so
-    that the target lies somewhere in the inner part of the picture."""
+    """A camera at a distance from the target, in the direction of the cell's camera or, in one of six cases, in a random one, and
+    turned so that the target lies in the inner part of the picture."""
     middle = rigid.apply(T_target[len(T_target) // 2 if len(T_target) > 8 else -1], mesh.vertices.mean(axis=0))
     away = np.asarray(camera.position) - middle + rng.normal(0.0, 0.12, 3)
     if rng.random() < 1.0 / 6.0:
@@ -434,7 +434,7 @@ def _cell(name: str) -> cells.Cell:
 
 
 def _bare(rng: np.random.Generator) -> dict[Label, Appearance]:
-    """Bare arms of a middling skin, a dark shirt."""
+    """Bare arms of medium skin colour and a dark shirt."""
     bare = dataclasses.replace(appearance.skin(rng), colour=appearance.hsv(rng.uniform(0.03, 0.07), 0.5, rng.uniform(0.35, 0.6)))
     shirt = Texture(appearance.hsv(0.6, 0.4, 0.3), (0.0, 0.0, 0.0), contrast=0.0)
     upper_arm = Appearance(bare, shirt, rng.uniform(0.2, 0.32))

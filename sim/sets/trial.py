@@ -4,8 +4,8 @@
 and of `arm` (pads on a moving robot, which hides the limb together with the occluder). Person, motion, light, textures, noise and
 the camera's place are drawn anew for every index. A run that leaves its bands is drawn again, before anything is rendered.
 
-One camera serves all distances. Twelve megapixels twenty times a second are neither needed nor read: a run reads the region of
-the sensor that can show the limb, and near the limb its pixels summed two by two.
+One camera serves all distances. Of its twelve megapixels a run reads only the region that can show the limb, and sums the pixels
+two by two at short distance.
 """
 
 from __future__ import annotations
@@ -41,43 +41,43 @@ HIDDEN: dict[Occlusion, tuple[float, float]] = {"light": (0.0, 0.33), "medium": 
 """Share of the limb's pixels that something covers."""
 
 SENSOR_PX, FOCAL_PX, RATE_HZ = (4096, 3000), 7246.0, 20.0
-"""The camera: width and height, focal length (25 mm before pixels of 3.45 um: 31.5 degrees across), frames a second."""
+"""The camera: width and height [px], focal length [px] (25 mm, pixels of 3.45 um: 31.5 degrees across), frame rate [Hz]."""
 BINNING: dict[Distance, int] = {"short": 2, "medium": 1, "long": 1}
-"""Pixels of the sensor along a side of one that is read."""
+"""Binning: number of sensor pixels along each side of a pixel that is read."""
 STEP_PX = 8
-"""Multiple [px] at which the region that is read begins and ends."""
+"""Multiple [px] to which the borders of the region that is read are rounded."""
 HOME_SIGMAS = 1.0
-"""Distance from home, in standard deviations, within which the region shows the limb: a search may look for it there."""
+"""Distance from home, in standard deviations, up to which the region shows the limb: a search may look for it there."""
 
 LEAD_S, SECONDS = 0.8, 2.6
-"""Before the occluder comes, not scored; and in all."""
+"""Lead-in before the occluder comes, which is not scored, and length of a whole run [s]."""
 HOLD_S = (0.5, 1.0)
 """Bounds of the time [s] that the occluder stays in a place before it slides to the next."""
 MARGIN = 0.03
-"""Distance of the intended share hidden from the borders of its band: it drifts while the limb turns."""
+"""Minimum distance of the intended hidden share from the borders of its band: the share drifts while the limb turns."""
 LEAD_HIDDEN = 0.33
-"""Largest share hidden before the occluder comes: by the robot."""
+"""Maximum share that the robot may hide before the occluder comes."""
 IN_BAND = 0.75
-"""Least share of the frames after the lead-in whose share hidden lies in the band."""
+"""Minimum share of the frames after the lead-in whose hidden share lies in the band."""
 SIZE = 0.12
-"""Largest deviation of a person's length and girth from the median man, as a share."""
+"""Maximum relative deviation of a person's length and girth from the median man's."""
 SPEED_M_S = (0.15, 0.40)
-"""Bounds of the mean speed of a reach."""
+"""Bounds of the maximum speed [m/s] of a run's reaches."""
 DIRECTION = np.radians([12.0, 8.0])
-"""Largest deviation [rad] of the camera's direction from the built-in one: around the vertical, and up and down."""
+"""Maximum deviation [rad] of the camera's direction from the built-in one: around the vertical, and up and down."""
 PASSAGE = ((0.0, 0.0), (1.3, 0.2), (2.6, 0.5), (3.9, 0.85), (5.2, 1.0), (6.5, 0.0))
-"""Times [s] and the shares hidden from then on in a `passage`."""
+"""Times [s] in a `passage` and the share that is hidden from each on."""
 PASSAGE_S, PASSAGE_WITHIN = 8.0, 0.10
-"""Duration [s] of a passage, and largest deviation of the share hidden from that."""
+"""Duration [s] of a passage, and maximum deviation of the hidden share from PASSAGE."""
 COARSE_PX = 160
-"""Width of the pictures in which hidden shares are counted."""
+"""Width [px] of the pictures in which hidden shares are counted."""
 TRIES = 400
 """Maximum number of runs that are drawn until one keeps to its bands."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A cell of the table."""
+    """A cell of the paper's result table."""
 
     reach: Reach
     distance: Distance
@@ -98,7 +98,7 @@ SETTINGS = tuple(
 
 @dataclass(frozen=True)
 class Volume:
-    """Where the limb's origin moves [m], and by how far that is moved from the built-in cell's region: the shoulder too."""
+    """Region [m] in which the limb's origin moves, and displacement `shift` [m] of the shoulder from the built-in cell's."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -113,13 +113,13 @@ VOLUMES: dict[tuple[str, Reach], Volume] = {
 }
 """Volumes of the motion by built-in cell and reach."""
 PASSAGE_VOLUME = Volume((-0.06, -0.20, 0.62), (0.10, -0.10, 0.74))
-"""Above the robot's forearm, as the camera sees it: the robot alone does not hide much there."""
+"""Volume of a passage: above the robot's forearm in the camera's view, where the robot alone hides little."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A run. cell: the built-in one with this person, motion and camera; occlusion: levels of the occluder, each with the time
-    [s] from which it is held."""
+    """A run. cell: the built-in one with this person, motion and camera; occlusion: times [s], each with the occluder's level
+    from then on."""
 
     setting: Setting
     index: int
@@ -153,7 +153,8 @@ class Trial:
 
 
 def draw(setting: Setting, seed: int, index: int) -> Trial:
-    """Trial `index` of the endless set of a setting and a seed. Raises RuntimeError where no run keeps to its bands."""
+    """Trial `index` of the endless set of a setting and a seed. Raises RuntimeError where none of TRIES runs keeps to its
+    bands."""
     for attempt in range(TRIES):
         root = np.random.SeedSequence([seed, SETTINGS.index(setting), index, attempt])
         name = ("table", "arm")[index % 2]
@@ -169,7 +170,7 @@ def draw(setting: Setting, seed: int, index: int) -> Trial:
 
 def passage(seed: int) -> Trial:
     """A longer run of `arm` in the skin's range, PASSAGE_S long, through all levels of occlusion (PASSAGE). Raises RuntimeError
-    where none keeps to them."""
+    where none of TRIES runs keeps to them."""
     setting = Setting("inside", "short", "heavy")
     ends = [begin for begin, _ in PASSAGE[1:]] + [PASSAGE_S]
     for attempt in range(TRIES):
@@ -180,7 +181,7 @@ def passage(seed: int) -> Trial:
         shown, commands = Coarse(trial.world), []
         slide = 1.0 / trial.world.occlusion.SLOPE
         holds = zip(PASSAGE, ends, strict=True)
-        for (begin, share), end in sorted(holds, key=lambda hold: hold[0][1]):  # in sight first: there most fail
+        for (begin, share), end in sorted(holds, key=lambda hold: hold[0][1]):  # the unhidden phases first: most runs fail there
             level = shown.level((begin + end) / 2.0, share) if share else 0.0
             reached = [shown.hidden(t, level or AWAY) for t in (begin + slide, end)]
             if np.abs(np.array(reached) - share).max() > PASSAGE_WITHIN:
@@ -193,13 +194,13 @@ def passage(seed: int) -> Trial:
 
 
 def frame_times(begin_s: float = 0.0, seconds: float = SECONDS) -> Array:
-    """When frames are exposed [s], from a time on."""
+    """Exposure times [s] of the frames from `begin_s` on."""
     times = np.arange(0.0, seconds, 1.0 / RATE_HZ)
     return times[times >= begin_s]
 
 
 class Coarse:
-    """How much of the limb is hidden in a small picture of a world's camera."""
+    """Hidden shares of the limb, counted in small pictures of a world's camera."""
 
     def __init__(self, world: World):
         self.world = world
@@ -214,7 +215,7 @@ class Coarse:
         )
 
     def hidden(self, time_s: float, level: float) -> float:
-        """The share [0, 1] at a time with the occluder at a level."""
+        """Hidden share [0, 1] at a time [s] with the occluder at a level."""
         view, world = self._raster, self.world
         state = world.state(time_s)
         if self._still is None or self._still[0] != time_s:
@@ -226,7 +227,7 @@ class Coarse:
         return 1.0 - int((view.ids == 0).sum()) / whole if whole else 1.0
 
     def level(self, time_s: float, share: float) -> float:
-        """The occluder's level at which a share is hidden; the least one where more is hidden without it."""
+        """The occluder's level at which a share is hidden; the lowest one where more is hidden without it."""
         low, high = 0.0, 1.0
         for _ in range(7):
             middle = (low + high) / 2.0
@@ -250,7 +251,7 @@ class Coarse:
 
 
 def _scene(name: str, volume: Volume, setting: Setting, index: int, root: np.random.SeedSequence, seconds: float) -> Trial | None:
-    """A trial that nothing is commanded in; None where its limb leaves the picture or the bands of its gap."""
+    """A trial without commands; None where its limb leaves the picture or the band of its gap."""
     try:
         trial = Trial(
             setting, index, _cell(name, volume, setting, np.random.default_rng(root)), int(root.generate_state(1)[0]), ()
@@ -285,7 +286,7 @@ def _cell(name: str, volume: Volume, setting: Setting, rng: np.random.Generator)
 
 
 def _camera(position: Vector3, look_at: Vector3, binning: int, cell: cells.Cell) -> cells.Camera:
-    """The region of the sensor, binned, that shows the limb wherever it may be."""
+    """The binned region of the sensor that shows the limb at all poses that it may take."""
     width, height = (size // binning for size in SENSOR_PX)
     focal, cx, cy = FOCAL_PX / binning, (width - 1) / 2.0, (height - 1) / 2.0
     whole = cells.Camera(
@@ -334,7 +335,7 @@ def _keeps_picture(trial: Trial, seconds: float) -> bool:
 
 
 def _occlusion(setting: Setting, shown: Coarse, rng: np.random.Generator) -> tuple[tuple[float, float], ...]:
-    """The commands that hide what the setting wants. The occluder begins to cover the limb when the lead-in ends."""
+    """The occluder's commands for the hidden share of a setting. The occluder begins to cover the limb when the lead-in ends."""
     low, high = HIDDEN[setting.occlusion]
     slide = 1.0 / shown.world.occlusion.SLOPE
     commands: list[tuple[float, float]] = []

@@ -1,1 +1,1 @@
-"""What the simulated skin measures: fields, boards, and their faults."""
+"""The simulated skin: fields, boards, and their faults."""

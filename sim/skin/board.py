@@ -3,7 +3,7 @@
 Behind the bytes are two electrodes on six channels: a sine around half of the converter's reference, its amplitude a function of
 time, through the resonance of the excitation's coil and capacitors, with the noise of the pad and a converter of 12 bits. The
 firmware's quirks are part of it: numbers of cycles in steps, requests that are overtaken or never answered, phases that slip,
-a stop above nine samples a cycle. It has no clock of its own: its caller gives the time.
+a stop above nine samples per cycle. It has no clock: the caller gives the time.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from penumbra.shared.skin import board
 from penumbra.shared.skin.board import Command, Kind
 
 OVERHEAD_S = 0.48e-3
-"""Time [s] of the firmware for a request, beside cycles and line: from 231 replies a second at 128 cycles, 298 at 32."""
+"""Time [s] of the firmware per request, in addition to cycles and transfer: from 231 replies/s at 128 cycles, 298/s at 32."""
 SAMPLE_S = 1e-3
-"""Duration [s] of the sample that a pad's noise is given for: 100 cycles at 100 kHz."""
+"""Duration [s] of the sample to which a pad's noise refers: 100 cycles at 100 kHz."""
 CONVERTER_NOISE = 1.0
-"""Standard deviation of a channel's own noise in a sample [steps]; the rest of a pad's noise is its electrode's, on all of its
-channels alike."""
+"""Standard deviation of a channel's own noise in a sample [steps]; the rest of a pad's noise is common to all channels of an
+electrode."""
 PHASE = 0.35
-"""Phase of the sine at resonance [rad], against the converter's first sample."""
+"""Phase of the sine at resonance [rad], relative to the converter's first sample."""
 LONGEST = 0xFFFF
-"""Ticks of the firmware's timer: a frequency that asks for a longer period gets this one."""
+"""Maximum period of the firmware's timer [ticks]: a request for a longer one gets this one."""
 FAULTS = {
     "error": "the text of an overrun in the middle of the next reply",
     "lost": "one byte of the next command is lost on its way",
@@ -38,12 +38,12 @@ FAULTS = {
     "missing": "the next request is not answered",
     "slip": "a sample is lost in the middle of the next measurement, and its phases stay shifted",
 }
-"""What can be asked of a board, and what it does."""
+"""Faults that a board can be made to have, and their effects."""
 
 
 @dataclass(frozen=True)
 class Tank:
-    """The excitation's resonance: coil [H], its capacitor and the ring's own [F], quality factor."""
+    """The excitation's resonant circuit: coil [H], capacitor and the ring's own capacitance [F], quality factor."""
 
     coil: float = 47e-3
     capacitor: float = 47e-12
@@ -55,16 +55,17 @@ class Tank:
         return float(1.0 / (2.0 * np.pi * np.sqrt(self.coil * (self.capacitor + self.ring))))
 
     def response(self, hz: float) -> complex:
-        """Gain of an amplitude at a frequency, and its phase: 1 at resonance."""
+        """Complex gain at a frequency [Hz]; 1 at resonance."""
         ratio = hz / self.resonance_hz
         return 1.0 / (1.0 + 1j * self.quality * (ratio - 1.0 / ratio))
 
 
 class Board:
-    """amplitude(time_s): volts (e,) of the board's electrodes at resonance. electrode_of (6,): which of them a channel measures,
-    -1 for none. noise [V^2]: variance of an amplitude over a millisecond. reference [V]: of the converter.
+    """An emulated board. amplitude(time_s): amplitudes (e,) [V] of its electrodes at resonance. electrode_of (6,): the electrode
+    that each channel measures, -1 for none. noise [V^2]: variance of an amplitude over a millisecond. reference [V]: of the
+    converter.
 
-    Times are seconds of any clock, never falling from call to call.
+    Times are seconds of any clock and must not decrease from call to call.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class Board:
         self.power_on()
 
     def power_on(self) -> None:
-        """The state after power-on: standard frequencies, nothing pending."""
+        """Resets to the state after power-on: standard frequencies, nothing pending."""
         self._ticks = board.period(board.ELECTRODE_HZ)
         self._sample_ticks = board.period(board.SAMPLE_HZ)
         self._stopped = False
@@ -104,13 +105,13 @@ class Board:
         return board.CLOCK_HZ / self._ticks
 
     def fault(self, kind: str) -> None:
-        """Let one of FAULTS happen once. Raises ValueError for another."""
+        """Let one of FAULTS happen once. Raises ValueError for an unknown one."""
         if kind not in FAULTS:
             raise ValueError(f"expected a fault of a board, one of {', '.join(FAULTS)}, got {kind!r}")
         self._due[kind] += 1
 
     def receive(self, data: bytes, time_s: float) -> None:
-        """Bytes whose sending began at time_s."""
+        """Receives bytes whose transmission began at time_s."""
         self.send(time_s)
         if data and self._happens("lost"):
             data = data[: len(data) // 2] + data[len(data) // 2 + 1 :]
@@ -121,18 +122,18 @@ class Board:
             self._line_s += taken * board.BYTE_S
             if len(self._partial) == board.COMMAND_BYTES:
                 command = Command.unpack(self._partial)
-                if command.is_answered(self.samples_per_cycle):  # what is not has no part in who comes last
+                if command.is_answered(self.samples_per_cycle):  # unanswered commands overtake no request
                     self._pending.append((self._line_s, command))
                 self._partial = b""
 
     def receive_break(self, time_s: float) -> None:
-        """The line was held low: what was received of a command, or is pending, is forgotten."""
+        """Handles a BREAK (the line held low): drops a partly received command and all pending ones."""
         self.send(time_s)
         self._partial = b""
         self._pending.clear()
 
     def send(self, time_s: float) -> bytes:
-        """What has arrived at the other end of the line until time_s and was not taken yet."""
+        """Returns the bytes that have reached the other end of the line by time_s and were not returned before."""
         while self._pending and (begins := self._begins())[0] <= time_s:
             start_s, number = begins
             for _ in range(number):  # only the last of several is answered
@@ -144,14 +145,14 @@ class Board:
         return out
 
     def next_s(self) -> float:
-        """When `send` has something to do: infinity where nothing is under way."""
+        """Time [s] at which `send` next has something to do: infinity where nothing is under way."""
         times = [self._sent[0][0]] if self._sent else []
         times += [self._begins()[0]] if self._pending else []
         return min(times, default=float("inf"))
 
     def _begins(self) -> tuple[float, int]:
-        """When the next request is taken up, and how many of the pending ones have come by then: OVERHEAD_S after the firmware is
-        free, and after the last of a burst."""
+        """Time [s] at which the next request is processed, OVERHEAD_S after the firmware is free and after the last request of a
+        burst, and the number of pending requests that have arrived by then."""
         start_s = max(self._free_s, self._pending[0][0]) + OVERHEAD_S
         number = 0
         for arrived_s, _ in self._pending:
@@ -186,7 +187,7 @@ class Board:
         self._sent.append((self._free_s, packet))
 
     def _set_frequency(self, command: Command) -> Command:
-        """Takes the frequencies, and gives the answer with the actual ones. What no timer can do becomes what it can do."""
+        """Sets the frequencies, within the limits of the timers, and returns the answer with the actual ones."""
         electrode_hz = command.electrode_hz if command.electrode_hz > 0.0 else self.electrode_hz
         sample = command.sample_hz
         if command.kind == Kind.SET_FREQ_2:
@@ -220,10 +221,10 @@ class Board:
         return np.full(board.CHANNELS, count & 0xFFFF), np.clip(sums, 0, board.FULL_SCALE * count).astype(np.int64)
 
     def _blocks(self, count: int) -> tuple[Array, float, Array]:
-        """Runs of cycles with the same phase: their turns [rad] (b,), the share of the amplitude left in each, their cycles (b,).
+        """Runs of cycles with the same phase: phases [rad] (b,), share of the amplitude left in each, numbers of cycles (b,).
 
-        Phases move where the converter's rate is no multiple of the excitation's, and, from one block of 128 samples to the
-        next, where a cycle's samples do not divide it.
+        Phases drift where the converter's rate is no multiple of the excitation's. They jump from one block of 128 samples to
+        the next where the number of samples per cycle does not divide it.
         """
         spc, size = self.samples_per_cycle, board.step(self.samples_per_cycle)
         shift = 2.0 * np.pi * self._slipped / spc
@@ -241,8 +242,8 @@ class Board:
 
 
 def _converted(level: Array, sigma: float) -> tuple[Array, Array]:
-    """Mean and variance of samples of a level with normal noise, cut off at the ends of the converter [steps]. sigma contains the
-    rounding: with noise of many steps it is white, and independent of the level."""
+    """Mean and variance [steps] of samples of a level with normal noise, clipped to the converter's range. sigma includes the
+    rounding, which with noise of many steps is white and independent of the level."""
     low, high = -level / sigma, (board.FULL_SCALE - level) / sigma
     below, above = ndtr(low), ndtr(-high)
     density_low, density_high = (np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) for z in (low, high))

@@ -1,7 +1,7 @@
-"""The paper's characterisation of a pad on the emulated skin: a pad is held before a limb as its authors' robot held it.
+"""The paper's characterisation of a pad on the emulated skin: a pad is held before a limb as the authors' robot held it.
 
 Distances from 1 to 20 cm at angles from 0 to 90 degrees to the limb, and a scan of a plane 1 cm above each part of it. Every pose
-is one solution of the field model (`sim.skin.field`), read as many times with the noise of the pad's signal chain.
+is one solution of the field model (`sim.skin.field`), sampled repeatedly with the noise of the pad's signal chain.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from penumbra.sim.skin.field import PadField, limb
 
 GAPS_M = np.arange(2, 41) * 0.005
 ANGLES_DEG = np.arange(10) * 10.0
-"""Gaps and angles of a scan."""
+"""Gaps [m] and angles [degrees] of the distance scan."""
 PLANE_M = 0.01
-"""Height [m] of the plane above what is scanned."""
+"""Height [m] of a plane scan above its part of the limb."""
 MARGIN_M = (0.06, 0.08)
-"""Lengths [m] by which a scan goes beyond its part of the limb, along the limb and across it."""
+"""Lengths [m] by which a plane scan extends beyond its part of the limb, along the limb and across it."""
 OVER_M = 0.03
-"""Length [m] by which a scan reaches over the part before its own, nearer to the elbow."""
+"""Length [m] by which a plane scan overlaps the adjacent part that is nearer to the elbow."""
 ALONG = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""R_limb_pad: the pad above the limb looks down on it, which lies along its y."""
+"""R_limb_pad of a pad above the limb that faces down, with the limb along the pad's y axis."""
 EMPTY_SAMPLES = 1000
-"""Least number of samples of the scene without a limb."""
+"""Minimum number of samples without a limb."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a pad is held: scan (empty, distance or plane), object (the limb's part), gap [m] between board and skin, angle
+    """Where a pad is held: scan (empty, distance or plane), part (of the limb), gap [m] between board and skin, angle
     [degrees], x and y [m] in the limb's frame, T_limb_pad (4, 4), None where nothing is near."""
 
     scan: str
@@ -50,7 +50,7 @@ class Pose:
 
 
 def poses(cell: cells.Cell, target: str, pad_type: str, step: float) -> list[Pose]:
-    """Every pose of the characterisation, with the plane scans on a grid of this step [m]."""
+    """Every pose of the characterisation, with the plane scans on a grid of `step` [m]."""
     mesh = target_mesh(cell.targets[target], cell)
     surface = Surface(mesh.vertices, mesh.faces)
     size = np.array(cell.pad_types[pad_type].board.size)
@@ -92,7 +92,7 @@ def measure(
     seed: int,
     progress: Callable[[list[Pose]], Iterator[Pose]] = iter,
 ) -> list[Array]:
-    """Amplitudes (s, e) [V] of a new pad of this type at every pose, as it is designed; many where nothing is near."""
+    """Noisy amplitudes (s, e) [V] of a pad of this type as designed, at every pose; at least EMPTY_SAMPLES without a limb."""
     kind = cell.pad_types[pad_type]
     field, body = PadField(kind), limb(target_mesh(cell.targets[target], cell))
     chain, rest = kind.chain, kind.rest
@@ -110,6 +110,6 @@ def measure(
 
 
 def _part(vertices: Array, faces: NDArray[np.integer]) -> Array:
-    """Lowest and highest corner (2, 3) of some faces."""
+    """Lowest and highest corner (2, 3) of the bounding box of some faces."""
     own = vertices[np.unique(faces)]
     return np.stack([own.min(axis=0), own.max(axis=0)])

@@ -1,4 +1,4 @@
-"""Faults of the skin, put into clean voltages: what a broken wire, a warm amplifier or a careless mounting make of them."""
+"""Faults of the skin, applied to clean voltages: the effects of broken wires, warm amplifiers or wrong mounting."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ KINDS = {
     "mirrored": "its left and right electrodes swapped",
     "none": "in order again",
 }
-"""Every fault, and what it means. `turned` and `mirrored` are of a whole pad."""
+"""Every fault and its meaning. `turned` and `mirrored` apply to a whole pad."""
 SIZES = {"drift": 0.05, "warm": 10.0, "hum": 0.01, "gain": 1.5}
 LARGEST = {"drift": 1.0, "warm": 40.0, "hum": 1.0, "gain": 10.0}
-"""Default and largest SIZE of a drift [V], of a warming [K], of a hum [V], and of a gain."""
+"""Default and maximum SIZE of a drift [V], of a warming [K], of a hum [V], and of a gain."""
 ARRANGEMENTS = {"turned": "turned by 180 degrees", "mirrored": "mirrored left to right"}
 MAINS_HZ = 50.0
-"""Frequency of the hum."""
+"""Frequency of the hum [Hz]."""
 WARMS_S = 30.0
 """Time constant [s] of a drift."""
 BOARD_WARMS_S = 300.0
-"""Time constant [s] with which a board becomes warm. Chosen: minutes, as of a populated board in a plastic shell."""
+"""Time constant [s] with which a board warms up: chosen as minutes, as for a populated board in a plastic shell."""
 GAIN_PER_K = (-0.003, -0.001)
-"""Bounds of an electrode's gain coefficient [1/K]. Chosen: of charge amplifiers with ceramic capacitors and an oscillator."""
+"""Bounds of an electrode's gain coefficient [1/K]: chosen as for charge amplifiers with ceramic capacitors and an oscillator."""
 OFFSET_PER_K = 1e-4
-"""Standard deviation of an electrode's offset coefficient [V/K]. Chosen: a twentieth of a sample's noise."""
+"""Standard deviation of an electrode's offset coefficient [V/K]: chosen as a twentieth of a sample's noise."""
 
 
 @dataclass(frozen=True)
 class Warming:
-    """What n electrodes do when they get warmer: coefficients of gain (n,) [1/K] and offset (n,) [V/K]."""
+    """Effect of temperature on n electrodes: coefficients of gain (n,) [1/K] and offset (n,) [V/K]."""
 
     gain: Array
     offset: Array
@@ -53,7 +53,7 @@ class Warming:
         return Warming(rng.uniform(*GAIN_PER_K, n), OFFSET_PER_K * rng.standard_normal(n))
 
     def apply(self, volts: Array, a3: Array, kelvin: ArrayLike) -> Array:
-        """What electrodes with offsets a3 (n,) [V] give instead of volts (s, n) when they are so much warmer (s,)."""
+        """Voltages (s, n) of electrodes with offsets a3 (n,) [V] that are warmer by `kelvin` (s,), from those without warming."""
         warmer = np.asarray(kelvin, np.float64)[..., None]
         return np.asarray(a3 + (1.0 + self.gain * warmer) * (volts - a3) + self.offset * warmer)
 
@@ -77,7 +77,7 @@ class SkinFaults:
     def command(self, words: str, time_s: float) -> None:
         """`PAD[/ELECTRODE] FAULT [SIZE]` or `all none`: a fault of an electrode, or of all of a pad, from time_s on.
 
-        Raises ValueError that says what is possible.
+        Raises ValueError, which lists what is possible.
         """
         where, kind, size = self._parse(words)
         pads, electrodes = self._find(where)
@@ -95,14 +95,14 @@ class SkinFaults:
             self._pads = {pad: arrangement for pad, arrangement in self._pads.items() if pad not in pads}
 
     def describe(self) -> dict[str, str]:
-        """What is wrong by pad or electrode, as it was commanded."""
+        """Faults in force by pad or electrode, as they were commanded."""
         out = {self._skin.pads[pad]: kind for pad, kind in self._pads.items()}
         for k, fault in sorted(self._electrodes.items()):
             out[self._skin.names[k]] = f"{fault.kind} {fault.size:g}" if fault.kind in SIZES else fault.kind
         return out
 
     def apply(self, pad: int, times_s: ArrayLike, volts: Array) -> Array:
-        """What the pad at this place of the skin gives instead of clean voltages (s, e) [V] at times (s,)."""
+        """Voltages (s, e) [V] of the skin's pad number `pad` with its faults, from clean ones at times (s,) [s]."""
         skin, own = self._skin, self._skin.of(pad)
         faults = [(k - own.start, fault) for k, fault in self._electrodes.items() if own.start <= k < own.stop]
         arrangement = self._pads.get(pad)
@@ -150,7 +150,7 @@ class SkinFaults:
         return where, kind, size
 
     def _find(self, where: str) -> tuple[list[int], list[int]]:
-        """Pads and electrodes by their name: places in the skin."""
+        """Indices in the skin of the pads and the electrodes that a name denotes."""
         skin = self._skin
         if where == "all":
             return list(range(len(skin.pads))), list(range(len(skin)))

@@ -1,11 +1,11 @@
-"""What a pad's electrodes measure near a body: the electrostatic field by boundary elements.
+"""Electrostatic field of a pad near a body by boundary elements: what the pad's electrodes measure.
 
 All surfaces are flat panels with a uniform charge each, in units in which a unit charge has the potential 1 / r. Conductors
 have given potentials; where a dielectric meets air the normal displacement is continuous, which binds charge there. Potential
 and field of a panel are exact (Wilton et al. 1984, DOI 10.1109/TAP.1984.1143304), collocated at centroids; between pad and body,
 panels count as the points of a quadrature.
 
-Excited is the ring, at one volt; electrodes and ground pour are held at zero by their amplifiers. A body takes charges q from
+The ring is excited at one volt; electrodes and ground pour are held at zero by their amplifiers. A body takes charges q from
 the ring's potential, and an electrode's charge changes by -sum phi q, with phi the potential that the electrode alone would have
 at the body (Green's reciprocity): a change is computed as such, never as a difference of nearly equal capacitances.
 """
@@ -27,27 +27,27 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import kernel
 
 FEMTOFARAD = 4.0 * np.pi * 8.8541878128e-12 * 1e15
-"""A unit of charge at one volt [fF]."""
+"""Capacitance [fF] of a unit charge at one volt, in the units of this module."""
 PERSON_PF = 150.0
-"""A person's capacitance to ground [pF]; 100 to 200 are usual, and it hardly matters which."""
+"""A person's capacitance to ground [pF]; usual values, 100 to 200, hardly make a difference."""
 SECTOR = math.radians(11.0)
-"""Largest angle [rad] that a panel on the board spans."""
+"""Maximum angle [rad] that a panel on the board spans."""
 PARTS = 6
 """Number of panels side by side across a piece of copper. Panels of half the size in both directions alter a change of
 capacitance by 3 %."""
 NEAR = 2.5
 """Distance to the pad, in sizes of a body's panel, below which the panel counts as nine points instead of one."""
 ACCURACY = 1e-5
-"""Relative change at which the charges of pad and body agree."""
+"""Relative change of the body's charges below which the iteration between pad and body ends."""
 RING, GROUND, BARE = -1, -2, -3
-"""Owners of panels beside the electrodes, which are 0, 1, 2 …: excitation ring, ground, and dielectric without copper."""
+"""Owners of panels other than the electrodes, which are 0, 1, 2 …: excitation ring, ground, and dielectric without copper."""
 CLEAR = 0.003
 """Distance [m] to the board's volume within which parts of the link behind are left out: the board is mounted there."""
 
 
 class Panels:
-    """corners (n, 4, 3) [m], counter-clockwise from outside; a triangle repeats its third. Areas (n,), unit normals and centroids
-    (n, 3)."""
+    """Flat panels. corners (n, 4, 3) [m], counter-clockwise from outside; a triangle repeats its third. areas (n,) [m^2], unit
+    normals and centroids (n, 3)."""
 
     def __init__(self, corners: Array):
         self.corners = np.ascontiguousarray(corners, dtype=np.float64)
@@ -61,7 +61,7 @@ class Panels:
 
     @staticmethod
     def of_mesh(vertices: Array, faces: NDArray[np.integer]) -> Panels:
-        """Every triangle is a panel."""
+        """Panels of a mesh, one per triangle."""
         return Panels(np.asarray(vertices)[np.column_stack([faces, faces[:, 2]])])
 
     def __len__(self) -> int:
@@ -77,16 +77,16 @@ class Panels:
         return np.einsum("ncx,ck->nkx", self.corners, weights)
 
     def matrices(self) -> tuple[Array, Array]:
-        """Potential, and field along the normal, (n, n) at every centroid of a unit charge on every panel; a panel's own normal
-        field, which jumps there, counts as zero."""
+        """Potential and normal field (n, n) at every centroid by a unit charge on every panel. A panel's own normal field, which
+        jumps there, counts as zero."""
         potential, field = np.empty((len(self), len(self))), np.empty((len(self), len(self)))
         _matrices(self.corners, self.normals, self.areas, self.centroids, potential, field)
         return potential, field
 
 
 class Body:
-    """Something near the pads: closed panels in its own frame. conductor: with its capacitance to ground `ground_pF` (zero:
-    floating, infinite: grounded); otherwise a dielectric of this `permittivity`. Prepared once, for any pose."""
+    """A body near the pads: closed panels in its own frame. Without `permittivity` it is a conductor with a capacitance to ground
+    `ground_pF` (zero: floating, infinite: grounded), otherwise a dielectric. It is prepared once for all poses."""
 
     def __init__(self, panels: Panels, ground_pF: float = PERSON_PF, permittivity: float | None = None):
         self.panels, self.ground = panels, ground_pF * 1e3 / FEMTOFARAD
@@ -112,13 +112,13 @@ class Body:
 
 
 def limb(mesh: Mesh, length: float = 1.0, girth: float = 1.0, stations: int = 46, around: int = 22) -> Body:
-    """A person's limb from its closed mesh along x, scaled by `length` along x and `girth` across: what is outermost on rays from
-    the middle of each section."""
+    """A person's limb from its closed mesh along x, scaled by `length` along x and `girth` across: the outermost points on rays
+    from the middle of each section."""
     return Body(_loft((np.asarray(mesh.vertices) * (length, girth, girth))[mesh.faces], stations, around))
 
 
 def shell(vertices: Array, stations: int = 16, around: int = 14) -> Panels:
-    """The convex hull of points (n, 3) in panels of a few centimetres: a robot's link."""
+    """Panels of a few centimetres on the convex hull of points (n, 3), such as a robot's link."""
     middle = vertices.mean(axis=0)
     axes = np.linalg.svd(vertices - middle, full_matrices=False)[2]
     axes[2] = np.cross(axes[0], axes[1])
@@ -127,7 +127,7 @@ def shell(vertices: Array, stations: int = 16, around: int = 14) -> Panels:
 
 
 def _loft(triangles: Array, stations: int, around: int) -> Panels:
-    """Closed panels around what triangles (n, 3, 3) enclose along x."""
+    """Closed panels around the solid that triangles (n, 3, 3) enclose, in sections along x."""
     low, high = triangles[:, :, 0].min(), triangles[:, :, 0].max()
     inset = 0.01 * (high - low)
     x = np.linspace(low + inset, high - inset, stations + 1)
@@ -170,9 +170,9 @@ def _section(triangles: Array, at: float, angles: Array) -> tuple[Array, Array]:
 class PadField:
     """The field of one pad type, its board prepared for bodies at any pose.
 
-    backing: what is grounded behind it, panels in the pad's frame (the robot link that carries it). beside (b, 4, 4): other
-    boards of this type in the pad's frame, whose electrodes are held at zero and whose rings too unless driven with the pad's.
-    plate_pF: capacitance of all conductors together.
+    backing: grounded panels behind the pad in its frame (the robot link that carries it). beside (b, 4, 4): poses of other boards
+    of this type in the pad's frame. Their electrodes are held at zero, and so are their rings unless driven with the pad's.
+    plate_pF: capacitance [pF] of all conductors together.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class PadField:
         self.plate_pF = float((self._inverse @ (~bare).astype(float)).sum() * FEMTOFARAD * 1e-3)
 
     def change(self, body: Body, T_pad_body: Array) -> Array:
-        """Decrease [fF], by a body at T_pad_body (4, 4), of the capacitance between the ring and each electrode (e,)."""
+        """Decrease (e,) [fF] of the capacitance between the ring and each electrode by a body at T_pad_body (4, 4)."""
         R, t = T_pad_body[:3, :3], T_pad_body[:3, 3]
         at_body, along_body, at_pad = self._coupling(body.points @ R.T + t, body.panels.normals @ R.T, body.size)
         seen = at_body if body.conductor else along_body
@@ -212,15 +212,15 @@ class PadField:
         return self._lost(at_body, charges)
 
     def change_of_links(self, panels: Panels) -> Array:
-        """The same (e,) for grounded panels in the pad's frame, which may come near or touch what is behind the pad."""
+        """`change` (e,) [fF] by grounded panels in the pad's frame, which may come near or touch the backing."""
         at_body, _, at_pad = self._coupling(panels.points(), panels.normals, np.sqrt(panels.areas))
         system = panels.matrices()[0] - at_body @ (self._inverse @ at_pad)
         return self._lost(at_body, -np.linalg.solve(system, at_body @ self._unit[:, 0]))
 
     def sources(self, beside: Panels | None = None) -> tuple[Array, Array]:
-        """Points (s, 3) and their charges (s, 1 + e), with the ring or one of the electrodes at one volt, which have the pad's
-        field from a centimetre on. beside: grounded panels in the pad's frame, as a link behind it; what is in the place of the
-        board is left out."""
+        """Point charges that have the pad's field from a distance of a centimetre on: points (s, 3) and charges (s, 1 + e), with
+        the ring or one of the electrodes at one volt. beside: grounded panels in the pad's frame, such as a link behind it; those
+        in the place of the board are left out."""
         if beside is None:
             return self.panels.centroids, self._unit
         beside = self._outside(beside)
@@ -232,15 +232,17 @@ class PadField:
         )
 
     def _outside(self, backing: Panels) -> Panels:
-        """Without the panels in the place of the board."""
+        """The panels that are not in the place of the board."""
         half = np.append(np.array(self._kind.board.size) / 2.0 + CLEAR, np.inf)
         behind = backing.centroids[:, 2] > -self._kind.board.thickness - CLEAR
         return Panels(backing.corners[~((np.abs(backing.centroids) < half).all(axis=1) & behind)])
 
     def _coupling(self, points: Array, normals: Array, size: Array) -> tuple[Array, Array, Array]:
-        """Between a body's panels (points (n, 9, 3), normals (n, 3) and sizes (n,) in the pad's frame) and the pad's: potential
-        and normal field (n, pad) at the body of unit charges on the pad, and what unit charges on the body add to the pad's
-        equations (pad, n)."""
+        """Coupling of a body's panels (points (n, 9, 3), normals (n, 3) and sizes (n,) in the pad's frame) and the pad's.
+
+        Returns potential and normal field (n, pad) at the body by unit charges on the pad, and the terms (pad, n) that unit
+        charges on the body add to the pad's equations.
+        """
         n, pad = len(points), len(self.panels)
         at_body, along_body, bare = np.empty((n, pad)), np.empty((n, pad)), np.empty((len(self._bare), n))
         _couple(points, normals, size, self.panels.centroids, self.panels.normals, self._bare, at_body, bare, along_body)
@@ -255,8 +257,8 @@ class PadField:
 def _board(kind: PadType) -> tuple[Panels, NDArray[np.int64]]:
     """Panels of a board and the owner of each: copper and bare dielectric on the front (z = 0), the ground pour on the back.
 
-    The charge bound on the rim and on the millimetre around the pour is left out: with it the conductors hold 2 % more together,
-    and what a body changes is 3 % less."""
+    The charge bound on the rim and on the millimetre around the pour is left out: with it the capacitance of all conductors
+    together is 2 % larger, and the change by a body 3 % smaller."""
     board, panels, owners = kind.board, [], []
 
     def add(corners: Array, owner: int) -> None:
@@ -295,7 +297,7 @@ def _board(kind: PadType) -> tuple[Panels, NDArray[np.int64]]:
 
 
 def _copper(kind: PadType, points: Array) -> NDArray[np.bool_]:
-    """Which points (n, 3) of the front have copper."""
+    """Whether points (n, 3) of the front lie on copper."""
     out = _between_radii(points, kind.ring.centre, *kind.ring.radii)
     for e in kind.electrodes.values():
         if e.disc is not None:
@@ -313,13 +315,13 @@ def _between_radii(points: Array, centre: tuple[float, float], inner: float, out
 
 
 def _graded(low: float, high: float, both: bool, parts: int = PARTS) -> Array:
-    """Edges from low to high that are closer at the upper end, or at both: charge crowds at the edge of copper."""
+    """Edges from low to high that are denser at the upper end, or at both: charge concentrates at the edge of copper."""
     s = np.linspace(0.0, 1.0, parts + 1)
     return low + (high - low) * (0.5 * (1.0 - np.cos(np.pi * s)) if both else np.sin(0.5 * np.pi * s))
 
 
 def _fine(angles: Array, widest: float) -> Array:
-    """Angles with more between them, until no step is wider."""
+    """Angles [rad] with more inserted between them, so that no step is wider than `widest`."""
     steps = [(a, b) for a, b in itertools.pairwise(angles) if b > a]
     parts = [np.linspace(a, b, math.ceil((b - a) / widest) + 1)[:-1] for a, b in steps]
     return np.append(np.concatenate(parts), angles[-1])

@@ -1,8 +1,8 @@
-"""What the pads read: how a limb changes the capacitance of their electrodes, and the amplitudes that come of it.
+"""Readings of the pads: how a limb changes the capacitance of their electrodes, and the resulting amplitudes.
 
 The changes come from the networks that stand for the boundary-element field (`shared.skin.response`): eight pads at 1 kHz take a
-few per cent of a core. What the robot's other links change is added, as if the limb did not shade them. The person's upper arm
-and torso and other pads are not felt.
+few per cent of a core. The changes by the robot's other links are added, as if the limb did not shade them. The person's upper
+arm and torso and other pads are not modelled.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class SkinModel:
 
     def volts(self, change: ArrayLike, rng: np.random.Generator) -> Array:
         """Amplitudes (..., n) [V] of samples of a millisecond, for changes (..., n) [fF]: signal chain, white noise of the
-        calibrated variance, end of the scale. The converter's steps are lost in the hundred cycles that a sample averages."""
+        calibrated variance, clipping at full scale. The hundred cycles of a sample average out the converter's quantisation."""
         skin = self.skin
         noisy = skin.amplitude(change) + np.sqrt(skin.noise) * rng.standard_normal(np.shape(change))
         return np.clip(noisy, 0.0, skin.full_scale)

@@ -1,4 +1,4 @@
-"""One target of the simulated cell, with the person whose it is: how it moves, and what the skin feels of it."""
+"""One target of the simulated cell and the person it belongs to: its motion and its effect on the skin."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from penumbra.sim.world.person import Person
 
 @dataclass(frozen=True)
 class Placed:
-    """Where a target is. T_world_target (4, 4), the same as pose (6,): x, y, z [m], roll, pitch, yaw [rad]; velocity (6,): linear
-    [m/s] and angular [rad/s] along the world's axes."""
+    """Pose and velocity of a target. T_world_target (4, 4) and pose (6,) are the same: x, y, z [m], roll, pitch, yaw [rad].
+    velocity (6,): linear [m/s] and angular [rad/s] along the world's axes."""
 
     T_world_target: Array
     pose: Array
@@ -30,10 +30,10 @@ class Placed:
 
 
 class Actor:
-    """A target in motion. The cell's `sim` says where its first target moves and where that person's shoulder is; everybody
-    else does the same as far from it as the homes are apart. near: the pads that it may come near.
+    """A moving target and its person. The cell's `sim` gives the motion region and the shoulder of the first target; for every
+    other target both are shifted by the offset between the homes. near: the pads that the target may come near.
 
-    Raises CellError where the region cannot be moved in.
+    Raises CellError where the region holds no allowed pose.
     """
 
     def __init__(
@@ -63,26 +63,26 @@ class Actor:
         self._limb = LimbMotion(here.motion, seed, clearance)
 
     def at(self, scene_s: float, speed: float) -> Placed:
-        """The pose at a time of the scene, which runs at this speed."""
+        """Pose and velocity at a scene time [s]. speed: scene seconds per second."""
         pose, rate = self._limb.at(scene_s)
         velocity = speed * np.concatenate([rate[:3], angular_velocity(pose[3:], rate[3:])])
         return Placed(rigid.from_rpy(pose[:3], pose[3:]), pose, velocity)
 
     def parts(self, scene_s: float) -> list[Array]:
-        """T_world_mesh of each of the person's meshes at a time of the scene."""
+        """T_world_mesh (4, 4) of each of the person's meshes at a scene time [s]."""
         pose, _ = self._limb.at(scene_s)
         return self.person.poses(rigid.from_rpy(pose[:3], pose[3:]))
 
     def plan(self, until_s: float) -> None:
-        """Plans its motion up to a time of the scene."""
+        """Plans the motion up to a scene time [s]."""
         self._limb.plan(until_s)
 
     def change(self, placed: Placed, T_world_pads: Array) -> Array:
-        """Changes of capacitance (m,) [fF] by it at the electrodes that it may come near (`near`), for all pads (p, 4, 4)."""
+        """Changes of capacitance (m,) [fF] by the target at the electrodes of `near`, for poses of all pads (p, 4, 4)."""
         return np.zeros(0) if self._skin is None else self._skin.limb(T_world_pads[self.near.pads], placed.T_world_target)
 
     def gaps(self, placed: Placed, points: Array) -> Array:
-        """Distances [m] (n,) from points (n, 3) in the world to its skin; 0 inside."""
+        """Distances [m] (n,) from points (n, 3) in the world to the target's skin; 0 inside."""
         local = rigid.apply(rigid.inverse(placed.T_world_target), points)
         return np.maximum(self._surface.nearest(local)[0], 0.0)
 

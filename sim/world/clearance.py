@@ -1,4 +1,4 @@
-"""How near the person comes to the robot, the pads and the table: motions are drawn so that they never touch."""
+"""Clearance of the person from the robot, the pads and the table: motions are drawn so that they never touch."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from penumbra.sim.world.motion import JointMotion
 from penumbra.sim.world.person import Person, frame
 
 ROBOT_CLEARANCE = 0.022
-"""Demanded distance [m] to the robot at the planned instants; between them it shrinks by less than 7 mm."""
+"""Minimum distance [m] to the robot at the instants that are checked; between them it shrinks by less than 7 mm."""
 TABLE_CLEARANCE = 0.025
-"""Demanded distance [m] to the table and to pads in it; between the planned instants it shrinks by less than 5 mm."""
+"""Minimum distance [m] to the table and to pads in it at the instants that are checked; between them it shrinks by less than
+5 mm."""
 SAMPLE = 0.02
-"""Distance [m] between the points that stand for a hull."""
+"""Spacing [m] of the points that represent a hull."""
 
 
 def rotations(rpy: Array) -> Array:
-    """The matrices (k, 3, 3) of roll, pitch, yaw (k, 3) [rad] about the fixed x, y, z axes, as `geometry.from_rpy` has them."""
+    """Rotation matrices (k, 3, 3) of roll, pitch, yaw (k, 3) [rad] about the fixed x, y, z axes, as in `rigid.from_rpy`."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy).T, np.sin(rpy).T
     rows = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
@@ -57,7 +58,7 @@ class Obstacle:
 
 
 class BodyPart:
-    """A part of the person, prepared for distances."""
+    """A part of the person, prepared for distance queries."""
 
     def __init__(self, mesh: Mesh):
         self.vertices = mesh.vertices
@@ -65,8 +66,8 @@ class BodyPart:
         self._low, self._high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
 
     def clearance(self, obstacle: Obstacle, T_world_obstacle: Array, T_world_part: Array, enough: float = 0.01) -> float:
-        """How much more than demanded [m] lies between this part and an obstacle, at poses (k, 4, 4) of both: the least of all,
-        at most `enough` (farther points are not measured)."""
+        """Minimum distance [m] to an obstacle in excess of the demanded one, over poses (k, 4, 4) of both. At most `enough`:
+        farther points are not measured."""
         R = T_world_part[:, :3, :3]
         to_part = np.swapaxes(R, 1, 2) @ T_world_obstacle[:, :3, :3]
         shift = np.einsum("kij,ki->kj", R, T_world_obstacle[:, :3, 3] - T_world_part[:, :3, 3])
@@ -83,12 +84,12 @@ class BodyPart:
         return min(enough, float(self._surface.nearest(near)[0].min()) - obstacle.distance)
 
     def height(self, T_world_part: Array) -> float:
-        """The lowest height [m] of the part at poses (k, 4, 4)."""
+        """Minimum height [m] of the part over poses (k, 4, 4)."""
         return float((self.vertices @ T_world_part[:, 2, :3].T + T_world_part[:, 2, 3]).min())
 
 
 class Clearance:
-    """How far the person stays from everything, for `LimbMotion`."""
+    """Clearance of the person from all obstacles, for `LimbMotion`."""
 
     def __init__(
         self,
@@ -114,7 +115,10 @@ class Clearance:
             )
 
     def __call__(self, times: Array, poses: Array) -> float:
-        """The least of what is left over [m] at times (k,) [s of the scene] and poses of the target (k, 6); at most 1 cm."""
+        """Minimum distance [m] in excess of the demanded ones at scene times (k,) [s] and target poses (k, 6).
+
+        At most 1 cm where there is a robot or a pad.
+        """
         T_target = frame(rotations(poses[:, 3:]), poses[:, :3])
         placed = list(zip(self._parts, self._person.poses(T_target), strict=True))
         least = np.inf

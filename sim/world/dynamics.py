@@ -1,8 +1,8 @@
 """The robots of a cell as bodies with motors: they follow a script, carry a load, and stop before they touch a person.
 
 Bullet integrates them (Coumans & Bai, http://pybullet.org). Every TICK_S a servo reads the joints, compares them with the script
-and commands the motors' velocities; the motors have the URDF's efforts and velocities. A robot that a person comes near to stops.
-Where the person pushes it nevertheless, it yields; when the person is away, it catches up with the script.
+and commands the motors' velocities, within the URDF's limits of effort and velocity. A robot stops when a person comes near. It
+yields if the person still pushes it, and catches up with the script when the person has gone.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from penumbra.shared.geometry.rigid import Array
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Sends what C code writes to standard error to nowhere: pybullet prints the time of its build when it is imported."""
+    """Discards what C code writes to standard error: pybullet prints the time of its build when it is imported."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
@@ -44,44 +44,44 @@ with _quiet():
     import pybullet
 
 TICK_S = 0.02
-"""Period of the servo."""
+"""Period of the servo [s]."""
 STEPS = 4
-"""Steps of Bullet in a tick: 200 Hz."""
+"""Number of Bullet's steps per tick (200 Hz)."""
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
 KEPT = 15_000
-"""Ticks that can be asked for again: five minutes."""
+"""Number of past ticks that are kept: five minutes."""
 
 STOP_M = 0.010
-"""Distance [m] to a person at which a robot stops; farther away where they approach each other."""
+"""Distance [m] to a person at which a robot stops; it grows with the speed at which they approach (`REACTION_S`)."""
 REACTION_S = 0.03
-"""Reaction time [s]: a robot stops earlier by the distance that they approach in it (the protective separation distance of ISO/TS
-15066, 5.5.4)."""
+"""Reaction time [s]: the distance that robot and person approach in it is added to `STOP_M` (protective separation distance,
+ISO/TS 15066, 5.5.4)."""
 GO_M = 0.015
-"""Distance [m] to the person from which it goes on. The persons' planned motion keeps to it (`sim.world.clearance`)."""
+"""Distance [m] to a person from which a stopped robot goes on. The planned motion of persons keeps it (`sim.world.clearance`)."""
 TOUCH_M = 0.001
-"""Distance [m] below which a person touches the robot, by the tolerance of Bullet's contacts."""
+"""Distance [m] below which person and robot touch: the tolerance of Bullet's contacts."""
 WATCH_M = 0.10
-"""Distance [m] beyond which persons are left out."""
+"""Distance [m] from a robot beyond which persons are ignored."""
 YIELD = 0.1
-"""Share of the motors' effort that holds a robot, beside its weight, where a person pushes it."""
+"""Share of the motors' maximum effort that holds a robot against a push, in addition to the effort for its weight."""
 ACCELERATION = 7.5
-"""Largest commanded change of a joint's velocity [rad/s^2 or m/s^2]: the lowest of the Panda's published limits (joint 2)."""
+"""Maximum commanded change of a joint's velocity [rad/s^2 or m/s^2]: the lowest of the Panda's published limits (joint 2)."""
 CATCH_UP = 0.5
-"""Velocity [rad/s or m/s], beside that of the script, at which a robot that was stopped returns to it."""
+"""Maximum velocity [rad/s or m/s], in addition to the script's, at which a robot returns to the script after a stop."""
 PERSON_M = 2.0
-"""A person farther from a robot's reach than this is not simulated beside it: as far as a body and its motion extend."""
+"""Distance [m] from a robot's reach beyond which a person is not simulated: the extent of a body and its motion."""
 UNLIMITED = 1e5
-"""Effort [Nm] and velocity of a joint for which the URDF gives none: Bullet wants finite ones."""
+"""Effort [Nm] and velocity of a joint for which the URDF gives none: Bullet needs finite values."""
 LIGHTEST = 1e-3
-"""Least mass [kg] of a link that moves; the mass matrix is singular without any."""
+"""Minimum mass [kg] of a moving link; without mass the mass matrix is singular."""
 
 _CONNECTING = threading.Lock()  # connecting shares state inside pybullet
 
 
 @dataclass(frozen=True)
 class Bystander:
-    """A person beside the robots. meshes: their parts; at(time_s): T_world_mesh (4, 4) of each."""
+    """A person beside the robots. meshes: the parts of the body; at(time_s): T_world_mesh (4, 4) of each."""
 
     meshes: Sequence[Mesh]
     at: Callable[[float], Sequence[Array]]
@@ -90,8 +90,8 @@ class Bystander:
 class Robots:
     """The cell's robots in motion.
 
-    script(time_s): the joint values (n,) [rad or m] by robot that are commanded for a time [s]. persons: whom they stop for.
-    obstacles: fixed things that they may touch, in world coordinates; the links that touch one at the start are mounted on it.
+    script(time_s): commanded joint values (n,) [rad or m] by robot at a time [s]. persons: the persons that the robots stop for.
+    obstacles: fixed meshes in world coordinates; links that touch one at the start count as mounted on it.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class Robots:
         self._lock = threading.Lock()
 
     def at(self, time_s: float) -> dict[str, Array]:
-        """Joint values (n,) by robot at a time >= 0, linear between two ticks. Raises ValueError for a time that is forgotten."""
+        """Joint values (n,) by robot at a time >= 0, linear between ticks. Raises ValueError for a time no longer kept."""
         k, share = divmod(time_s / TICK_S + 1e-9, 1.0)  # a time that is a tick up to rounding needs nothing after it
         first, ahead = int(k), int(share > 2e-9)
         with self._lock:
@@ -164,7 +164,7 @@ class Robots:
         self._count += 1
 
     def _fixed(self, points: Array) -> int:
-        """A body that nothing moves: the convex hull of points (n, 3) in its own frame, which is that of the world."""
+        """Adds a static body, the convex hull of points (n, 3) in its own frame, at the origin of the world."""
         shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=points.tolist(), physicsClientId=self._client)
         return int(pybullet.createMultiBody(0.0, shape, physicsClientId=self._client))
 
@@ -239,12 +239,12 @@ class _Arm:
         )
 
     def mount(self, obstacle: int) -> None:
-        """Lets the links that touch an obstacle now stand on it, without contact forces."""
+        """Disables contact between an obstacle and the links that touch it now: they are mounted on it."""
         for point in pybullet.getClosestPoints(self._body, obstacle, TOUCH_M, physicsClientId=self._client):
             pybullet.setCollisionFilterPair(self._body, obstacle, point[3], -1, 0, physicsClientId=self._client)
 
     def command(self, demanded: Array, soon: Array) -> None:
-        """Sets the motors for a tick. demanded, soon: the script's joint values (n,) at its begin and end."""
+        """Sets the motors for a tick. demanded, soon: the script's joint values (n,) at the tick's begin and end."""
         gap = min((self._distance(person) for person in self._people), default=np.inf)
         approach = max(0.0, self._gap - gap) / TICK_S if np.isfinite(self._gap) else 0.0
         self._gap = gap
@@ -283,13 +283,13 @@ class _Arm:
         )
 
     def _distance(self, person: int) -> float:
-        """To a person's hull [m], infinite beyond WATCH_M."""
+        """Distance [m] to a person's hull, infinite beyond WATCH_M."""
         points = pybullet.getClosestPoints(self._body, person, WATCH_M, physicsClientId=self._client)
         return min((point[8] for point in points), default=np.inf)
 
 
 def within_reach(models: Iterable[RobotModel], position: ArrayLike) -> bool:
-    """Whether a person whose target is at home at a position (3,) [m] may come near one of the robots."""
+    """Whether a person whose target has its home at a position (3,) [m] may come near one of the robots."""
     reaches = ((model, float(np.linalg.norm(model.T_parent_link[1:, :3, 3], axis=1).sum())) for model in models)
     return any(np.linalg.norm(model.T_world_base[:3, 3] - np.asarray(position)) < reach + PERSON_M for model, reach in reaches)
 
@@ -299,8 +299,8 @@ def _kind(kind: str) -> int:
 
 
 def connected_parts(mesh: Mesh) -> list[Array]:
-    """The vertices (n, 3) of each part of a mesh that hangs together: of the parametric forearm its forearm, palm and thumb,
-    which are convex."""
+    """Vertices (n, 3) of each connected component of a mesh. Those of the parametric forearm (forearm, palm, thumb) are
+    convex."""
     n = len(mesh.vertices)
     edges = np.concatenate([mesh.faces[:, :2], mesh.faces[:, 1:]])
     graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))

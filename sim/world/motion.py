@@ -1,4 +1,4 @@
-"""How the world moves: reaches of the limb, the robot's sway, and the clock that drives them.
+"""Motion of the world: reaches of the limb, sway of the robot, and the clock that drives them.
 
 Everything is a function of time and seed, so that a run can be repeated sample by sample.
 """
@@ -17,13 +17,13 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry.rigid import Array
 
 PEAK = 1.875
-"""Peak over mean speed of a minimum-jerk reach."""
+"""Ratio of peak to mean speed of a minimum-jerk reach."""
 ANGULAR_SPEED = 1.2
-"""Fastest change of roll, pitch or yaw [rad/s]."""
+"""Maximum rate of roll, pitch or yaw [rad/s]."""
 STEP_S = 0.04
-"""Time between the poses of a planned reach that are checked: at the default speed the limb moves at most 1 cm in it."""
+"""Interval [s] between the poses of a planned reach that are checked: at the default speed the limb moves at most 1 cm in it."""
 OUTLOOK_S = 3.0
-"""A reach may end only where the limb could stay this long: the robot must not drive it into a corner."""
+"""Time [s] for which the goal of a reach must stay allowed: the robot must not drive the limb into a corner."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class Reach:
 
 
 class LimbMotion:
-    """Reaches between poses drawn uniformly from a region, planned as far ahead as they are asked for.
+    """Reaches between poses drawn uniformly from a region, planned up to the latest time that was asked for.
 
-    clearance(times (k,), poses (k, 6)) -> how far [m] the person stays from everything beyond what is demanded, the least
-    of all times; negative where a pose is not allowed. A reach with a negative one is drawn again.
+    clearance(times (k,), poses (k, 6)): minimum distance [m] of the person from all obstacles in excess of the demanded one,
+    negative where a pose is not allowed. A reach with a negative clearance is drawn again, up to TRIES times.
     Raises CellError where the region holds no allowed pose.
     """
 
@@ -74,8 +74,7 @@ class LimbMotion:
         self._ends = [0.5]
 
     def at(self, time_s: float) -> tuple[Array, Array]:
-        """Pose (6,) and rate (6,) at a time >= 0; plans first where that is not done yet (up to 0.1 s of computing for each
-        reach)."""
+        """Pose (6,) and rate (6,) at a time >= 0; plans missing reaches first (up to 0.1 s of computing each)."""
         self.plan(time_s)
         return self._reaches[bisect.bisect_left(self._ends, time_s)].at(time_s)
 
@@ -90,7 +89,7 @@ class LimbMotion:
                 self._ends.append(reach.end_s)
 
     def _may_stay(self, pose: Array, times: Array) -> bool:
-        """Whether a pose is allowed at all times. Most that are not are not at the first, which takes a part of the computing."""
+        """Whether a pose is allowed at all times. The first time is checked alone, as it rejects most poses at a lower cost."""
         return all(self._clearance(at, np.tile(pose, (len(at), 1))) >= 0.0 for at in (times[:1], times))
 
     def _draw(self) -> Array:
@@ -108,7 +107,7 @@ class LimbMotion:
                 best, best_clearance = reach, clearance
             if clearance >= 0.0:
                 break
-        return best  # the least bad of all tries where none was free
+        return best  # the best of all tries where none was allowed
 
     def _candidate(self, begin_s: float, start: Array) -> Reach:
         goal = self._draw()
@@ -120,7 +119,7 @@ class LimbMotion:
 
 
 class JointMotion:
-    """A slow sway of the robot's joints around the middle of their bounds: three sines a joint, of periods from 9 to 30 s."""
+    """A slow sway of the robot's joints around the middle of their bounds: three sines per joint, of periods from 9 to 30 s."""
 
     def __init__(self, low: ArrayLike, high: ArrayLike, seed: int):
         low, high = np.asarray(low, float), np.asarray(high, float)
@@ -138,7 +137,7 @@ class JointMotion:
 
 
 class Clock:
-    """Scene time as a function of real time: its rate can be changed and then glides to the new value within RAMP_S."""
+    """Scene time as a function of real time. Its rate can be changed, and reaches the new value along a ramp of RAMP_S."""
 
     RAMP_S = 0.3
 
@@ -146,7 +145,7 @@ class Clock:
         self._changes = [(0.0, 0.0, rate, rate)]  # from when [s], scene time there [s], rate before, rate after
 
     def set_rate(self, time_s: float, rate: float) -> None:
-        """Glide to a rate from a time on, which must not lie before the last change."""
+        """Change to a rate from a time on, which must not lie before the last change."""
         self._changes.append((time_s, self.at(time_s), self.rate(time_s), rate))
 
     def _change(self, time_s: float) -> tuple[float, float, float, float]:

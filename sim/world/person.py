@@ -1,4 +1,4 @@
-"""The person of a cell: the target, and where it is the parametric forearm, the upper arm and torso that follow it."""
+"""The person of a cell: the target and, if it is the parametric forearm, the upper arm and torso that follow it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from penumbra.shared.geometry.rigid import Array
 
 
 class Person:
-    """meshes: the target first, then upper arm and torso where the target is `body:forearm`, each in its own frame."""
+    """A person's body. meshes: the target, then upper arm and torso if the target is `body:forearm`, each in its own frame."""
 
     def __init__(self, cell: cells.Cell, sim: cells.Sim, target: cells.Target):
         self.meshes: list[Mesh] = [bodies.target_mesh(target, cell)]

@@ -1,8 +1,8 @@
 """The simulated cell: where everything is at a time, what the cameras see and what the skin feels.
 
 `World(cell, seed).state(t)` is a function of time, seed and the commands given (occlude, motion, pause, speed). Each target is a
-person's (`sim.world.actor`), who moves by reaches that never touch robot, pads or table. Persons do not make way for one another:
-their homes should be as far apart as people work. Robots are bodies that follow a script (`sim.world.dynamics`): their motion is
+person's (`sim.world.actor`), who moves by reaches that never touch robot, pads or table. Persons do not avoid one another: their
+homes should be as far apart as people work. Robots are bodies that follow a script (`sim.world.dynamics`): their motion is
 integrated up to the latest time that was asked for, and the last minutes of it are kept.
 """
 
@@ -39,14 +39,14 @@ if TYPE_CHECKING:
 FAR = 10.0
 """Gap [m] in the truth of a cell without pads."""
 FAINTEST = 1e-9
-"""Least change of capacitance [fF]: a pad without anything near has a logarithm too."""
+"""Minimum change of capacitance [fF], so that the logarithm is finite for a pad with nothing near."""
 MAX_SPEED = 4.0
-"""Fastest scene: more would leave the cameras and the planner behind."""
+"""Maximum speed of the scene [scene seconds per second]: the cameras and the planner could not follow a faster one."""
 
 
 @dataclass(frozen=True)
 class WorldState:
-    """Where everything is. time_s: real time; targets by name; joints by robot (n,); links: T_world_link by robot and link."""
+    """State of the world. time_s: real time; targets by name; joints by robot (n,); links: T_world_link by robot and link."""
 
     time_s: float
     targets: dict[str, Placed]
@@ -55,7 +55,7 @@ class WorldState:
 
     @property
     def T_world_target(self) -> Array:
-        """Pose of the cell's first target; so are the next two."""
+        """Pose (4, 4) of the cell's first target; `pose` and `velocity` are those of the same target."""
         return self._first.T_world_target
 
     @property
@@ -74,7 +74,7 @@ class WorldState:
 class World:
     """The cell in motion. Times are real seconds from the start, >= 0; commands act from `time_s` on.
 
-    Raises CellError where the cell lacks what the emulator needs, or its region cannot be moved in.
+    Raises CellError where the cell lacks what the emulator needs, or its motion region holds no allowed pose.
     """
 
     def __init__(self, cell: cells.Cell, seed: int = 0):
@@ -97,11 +97,11 @@ class World:
 
     @property
     def person(self) -> Person:
-        """The person whose limb the cell's first target is."""
+        """The person to whom the cell's first target belongs."""
         return next(iter(self.actors.values())).person
 
     def model(self, camera: str) -> str:
-        """The target whose picture in a camera is measured, and hidden: the first that it sees."""
+        """Name of the target that a camera's occluder hides and whose hidden share is measured: the first that it sees."""
         return next(iter(self._shown[camera] or self.actors))
 
     def state(self, time_s: float) -> WorldState:
@@ -126,7 +126,7 @@ class World:
         return self.skin.skin.positions(self.skin.skin.T_world_pads(link_names(state.links)))
 
     def gaps(self, state: WorldState, target: str | None = None) -> Array:
-        """Distances [m] from the electrodes that a target may come near to its skin; of the first target where none is named."""
+        """Distances [m] from the electrodes that a target may come near to the target's skin (default: the first target)."""
         target = self.cell.one("targets", target)
         actor = self.actors[target]
         if self.skin is None or not len(actor.near.electrodes):
@@ -134,7 +134,7 @@ class World:
         return actor.gaps(state.targets[target], self.electrodes(state)[actor.near.electrodes])
 
     def change(self, state: WorldState) -> Array:
-        """Changes of capacitance (n,) [fF] by the targets and the robots."""
+        """Changes of capacitance (n,) [fF] that the targets and the robots cause."""
         assert self.skin is not None
         joints = np.concatenate([*state.joints.values(), np.zeros(0)])
         T_world_pads = self.skin.skin.T_world_pads(link_names(state.links))
@@ -167,7 +167,7 @@ class World:
         return out if T_world_panel is None else {**out, "occluder": (self.panel.mesh, T_world_panel)}
 
     def occluder(self, camera: str, state: WorldState) -> Array | None:
-        """T_world_panel (4, 4) before a camera, None where it is away."""
+        """T_world_panel (4, 4) of a camera's occluder, None while it is away."""
         level = self.occlusion.at(self.occlusion_clock.at(state.time_s))
         model = self.model(camera)
         mesh, T_world_target = self.actors[model].person.meshes[0], state.targets[model].T_world_target
@@ -253,9 +253,9 @@ def _scripted(scripts: Mapping[str, JointMotion], clock: Clock, time_s: float) -
 
 
 BATCH = 20
-"""Samples of a voltage message."""
+"""Number of samples in a voltage message."""
 SAMPLE_NS = 1_000_000
-"""Time between two samples of an electrode."""
+"""Sampling period of an electrode [ns]."""
 TICK_NS = BATCH * SAMPLE_NS
 
 Stream = list[tuple[Topic, dict[str, str], Message]]
@@ -263,22 +263,22 @@ Stream = list[tuple[Topic, dict[str, str], Message]]
 
 
 class Sensors:
-    """The messages that a world gives off. Time zero of the world is `epoch_ns`; tick k of the skin ends at epoch + k TICK_NS,
-    frame k is exposed at epoch + k periods of its camera. Ticks and frames may be left out; what is left has the same values.
-    The epoch may be moved at any time, where a clock is set: stamps follow it, the world does not."""
+    """The sensor messages of a world. Time zero of the world is `epoch_ns`; tick k of the skin ends at epoch + k TICK_NS, frame k
+    is exposed at epoch + k periods of its camera. Ticks and frames may be skipped without changing the others. The epoch may be
+    changed at any time, as when a clock is set: stamps follow it, the world does not."""
 
     def __init__(self, world: World, epoch_ns: int):
         self.world, self.epoch_ns = world, epoch_ns
-        self._logs: tuple[int, Array] | None = None  # tick and its log changes, for the samples up to the next
-        self._watch: dict[str, str] = {}  # the first camera that is on a target, and this target
+        self._logs: tuple[int, Array] | None = None  # a tick and its log changes, for the samples up to the next tick
+        self._watch: dict[str, str] = {}  # by the first camera that sees a target, this target
         for camera in world.cell.cameras:
             if (name := world.model(camera)) not in self._watch.values():
                 self._watch[camera] = name
-        # world's times of its frames, and what was hidden in them
+        # by target, times [ns] of its camera's frames and the share hidden in each
         self._hidden = {name: deque([(0, 0.0)], maxlen=4) for name in world.actors}
 
     def frame_ns(self, camera: str, k: int) -> int:
-        """When frame k of a camera is exposed, since the epoch."""
+        """Exposure time of frame k of a camera [ns since the epoch]."""
         return round(k * 1e9 / self.world.cell.cameras[camera].rate_hz)
 
     def frame(self, camera: str, k: int) -> Stream:
@@ -339,7 +339,7 @@ def record(
 def stream(
     world: World, seconds: float, frames: bool = True, epoch_ns: int = 10**18
 ) -> Iterator[tuple[Topic, dict[str, str], Message]]:
-    """`record` of a world that has been given commands."""
+    """`record` for a world that has been given commands."""
     sensors = Sensors(world, epoch_ns)
     ends_ns = epoch_ns + round(seconds * 1e9)
     counts = dict.fromkeys(world.cell.cameras if frames else (), 0)

@@ -1,9 +1,9 @@
 """`penumbra bench ablation`: the authors' comparison of what the segmentation network is made of.
 
 Each variant starts from random weights and learns for the same number of steps from the same small patches of the same sequences;
-the first one's number is what --minutes allow. So that minutes tell anything, the scenes are easy ones: a bare arm before a plain
-wall, and an occluder of one colour that hides up to 93 % of it. Scored on held-out sequences, calibrated on others, as `penumbra
-bench segmentation` does. It says which variant learns faster, not what each can reach.
+the number is what the first one reaches in --minutes. The scenes are easy, so that minutes suffice for a comparison: a bare arm
+before a plain wall, and an occluder of one colour that hides up to 93 % of it. Scored on held-out sequences, calibrated on
+others, as `penumbra bench segmentation` does. It says which variant learns faster, not what each can reach.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ VARIANTS: dict[str, tuple[Settings, float]] = {
     "plain convolution": (Settings(cell="conv"), 0.3),
     "hGRU, no prediction loss": (Settings(), 0.0),
 }
-"""Network and weight of the prediction errors in the loss."""
+"""By name, the network's settings and the weight of the prediction errors in the loss."""
 SIDE = 96
-"""Pixels a side of a sequence's pictures."""
+"""Width and height [px] of a sequence's pictures."""
 SCHEDULE = replace(train.Schedule(), patches=((0.0, 64, 6),), seen=((0, 0.5), (4, 0.5)))
 SEQUENCES = 300
-"""That are learned from."""
+"""Number of training sequences."""
 HELD_OUT = 40
-"""Sequences for the calibration, and as many for the score."""
+"""Number of sequences for the calibration, and of those for the score."""
 
 
 def easy(seed: int, index: int) -> sequences.Sequence:
@@ -59,7 +59,7 @@ def easy(seed: int, index: int) -> sequences.Sequence:
 
 
 def learn(name: str, data: Data, seed: int, minutes: float, steps: int | None, folder: Path) -> tuple[train.Trainer, Any]:
-    """A variant trained for so many steps, or minutes, and the parts of the loss at the end."""
+    """Trains a variant for a number of steps, or of minutes. Returns the trainer and the parts of the loss at the end."""
     settings, error_weight = VARIANTS[name]
     trainer = train.Trainer(settings, replace(SCHEDULE, error_weight=error_weight), seed)
     last = training.run(trainer, data, steps, minutes, folder / "checkpoint")
@@ -67,7 +67,7 @@ def learn(name: str, data: Data, seed: int, minutes: float, steps: int | None, f
 
 
 def score(trainer: train.Trainer, data: Data, seed: int) -> dict[str, Any]:
-    """The averaged weights on held-out sequences, calibrated on others."""
+    """Scores the averaged weights on held-out sequences, after a calibration on others."""
     offset, _ = evaluate.calibrate(trainer.average, data.calibration)
     segmenter = inference.Segmenter(prednet.stored(trainer.average), offset, has_colours=False)  # the network alone, as theirs
     ms = inference.speed(segmenter, segmentation.VARIETY.size, segmentation.VARIETY.size)
@@ -102,7 +102,7 @@ def main(options: flags.Options, report: results.Report) -> None:
     found: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         data = Simulated(options.seed, HELD_OUT, easy, easy, SEQUENCES)
-        for index in range(SEQUENCES):  # rendered ahead: the variants' minutes are those of learning
+        for index in range(SEQUENCES):  # rendered ahead, so that the variants' minutes count only learning
             data[index]
         for name in VARIANTS:
             console.print(f"training: {name}")

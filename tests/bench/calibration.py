@@ -23,11 +23,11 @@ KINDS = (
     ("result", "error", "said"),
     ("result, with the least squares' own sigma", "error", "naive"),
 )
-"""Of a place: its name, its error, and the standard deviation that belongs to it."""
+"""Kinds of results for a place: name, key of the error, and key of its standard deviation."""
 
 
 def tables(result: Result) -> list[Part]:
-    """Errors, what was said of them, and how often they were within it."""
+    """Errors, their reported standard deviations, and how often the errors were within them."""
     lens = Table("", "error (rms)", "said (rms)", "error / said (rms)", "within 2", "within 3", title="camera")
     for name, row in result["lens"].items():
         digits = 2 if name in LENS_NAMES[:4] else 5
@@ -64,7 +64,7 @@ def main(options: flags.Options, report: results.Report) -> None:
 
 
 def _lens(photographer: Photographer, count: int, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
-    """Error and standard deviation of each number."""
+    """Error and standard deviation of each parameter of the lens."""
     poses = held(photographer.board, count, rng)
     views = [view for i, T in enumerate(poses) if (view := photographer.view(str(i), T, rng)) is not None]
     found = intrinsics.calibrate(photographer.board, views, LENS.width, LENS.height)
@@ -89,7 +89,7 @@ def _place(photographer: Photographer, robot: Carried, count: int, rng: np.rando
 
 
 def _places(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Numbers along and about all axes together, in millimetres and degrees."""
+    """Errors along and about all axes together, in millimetres and degrees."""
     out: dict[str, Any] = {}
     for part, what, scale in ((slice(0, 3), "position", 1e3), (slice(3, 6), "rotation", float(np.degrees(1)))):
         for name, error, said in KINDS:
@@ -98,7 +98,7 @@ def _places(runs: list[dict[str, Any]]) -> dict[str, Any]:
             row: dict[str, float] = {}
             if said:
                 row = _row(errors.ravel(), scale * np.array([run[said][part] for run in runs]).ravel())
-                row["said"] *= float(np.sqrt(3.0))  # of the length, as the error
+                row["said"] *= float(np.sqrt(3.0))  # of the length, like the error
             out[f"{name}: {what}"] = row | {"error": float(np.sqrt(np.mean(lengths**2))), "largest": float(lengths.max())}
     return out
 

@@ -1,8 +1,8 @@
 """`penumbra bench dashboard`: what the web page costs the running chain, without and with open pages in turns.
 
-A page is a websocket that says of every message at once that it was shown, as a browser does that keeps up with all that comes;
-what a browser itself computes is not in it. Rounds without and with pages take turns, each pair in the other order than the one
-before, so that what else the machine does hits both. Motion and occlusion are drawn from `--seed`.
+A page is a websocket that confirms every message at once as shown, like a browser that keeps up with all messages; the browser's
+own computing is not included. Rounds without and with pages take turns, in reversed order from pair to pair, so that other load
+on the machine affects both. Motion and occlusion are drawn from `--seed`.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ RATES = {
     "fused_per_s": "fused poses per second",
 }
 CHANGE_GOAL = 0.03
-"""Share by which no rate of the chain may fall while pages are open."""
+"""Maximum share by which a rate of the chain may fall while pages are open."""
 CPU_GOAL = 0.04
-"""Goal [cores] of the dashboard while one page is open."""
+"""Maximum CPU [cores] of the dashboard per open page."""
 MOMENTS_GOAL = 29.0
-"""Goal of the scene's pictures a second on a page; the dashboard offers 30."""
+"""Minimum number of pictures of the scene per second and page; the dashboard offers 30."""
 SETTLE_S = 1.0
-"""Before a round, in which pages open or close."""
+"""Time [s] before a round, in which pages open or close."""
 
 
 class Pages:
-    """Open pages of a dashboard at `url`, from `with` to its end. counts: messages that came, by stream."""
+    """Open pages of a dashboard at `url`, within a `with` block. counts: received messages by stream."""
 
     def __init__(self, url: str, camera: str, number: int):
         self._url, self._camera, self._number = url, camera, number
@@ -88,7 +88,7 @@ class Pages:
 
 
 def measure(running: Running, recording: Recording, pages: Pages | None, seconds: float) -> dict[str, Any]:
-    """Rates of the chain, CPU and what a page received, over so many seconds."""
+    """Rates of the chain, CPU and what the pages received, over `seconds`."""
     time.sleep(SETTLE_S)
     processes = running.processes()
     for rows in recording.samples.values():
@@ -113,14 +113,14 @@ def measure(running: Running, recording: Recording, pages: Pages | None, seconds
 
 
 def change(result: Result, rate: str) -> tuple[float, float, float]:
-    """By which share a rate changes with pages: quartile, median and quartile of the pairs of rounds."""
+    """Relative change of a rate with pages: lower quartile, median and upper quartile over the pairs of rounds."""
     pairs = np.array([[pair[side][rate] for side in ("without", "with")] for pair in result["pairs"]])
     low, middle, high = np.percentile(pairs[:, 1] / np.maximum(pairs[:, 0], 1e-9) - 1.0, (25, 50, 75)).tolist()
     return low, middle, high
 
 
 def tables(result: Result) -> list[Part]:
-    """The chain without and with pages, then what the pages got and cost."""
+    """The chain without and with pages, then what the pages received and cost."""
     pages, pairs = result["pages"], result["pairs"]
     title = f"Cell {result['cell']}, seed {result['seed']}, {len(pairs)} pairs of {result['seconds']:g} s, pages: {pages}"
     table = Table("", "without", "with", "change", "goal", title=title,

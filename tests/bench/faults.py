@@ -1,11 +1,11 @@
 """`penumbra bench faults`: every fault for every service of the running chain, measured from outside over the bus.
 
 The arm moves in sight of the camera; a fault strikes the replica that owns the stream. A client of the bus, which knows nothing
-of the fault, counts: the longest time without a fused pose while a sense was alive, how long the service's topics were not what
-they had been, measurements used twice, and poses called tracking that were wrong by more than three sigma.
+of the fault, measures: the longest time without a fused pose while a sense was alive, how long the service's topics took to get
+back to their old rates, measurements used twice, and poses called tracking that were wrong by more than three sigma.
 
-Services that connect the cell with what is outside it (`tests/bench/lib/connected.py`) have faults of their own, which are
-measured by what each of them does.
+Services that connect the cell with the outside (`tests/bench/lib/connected.py`) have faults of their own, which are measured at
+the output of each.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ SERVICES = ("emulator", "segmentation", "search", "haptics", "fusion")
 REPLICATED = SERVICES[1:]
 ALL = "all"
 BEFORE_S = 3.0
-"""How long the old rates are measured, each half of it within STEADY of the other."""
+"""Time [s] over which the rates before a fault are measured; those of its halves must agree within STEADY."""
 OLD_S = 15.0
-"""How old what is struck has to be: what dies early is in a crash loop, and waits before it is started again."""
+"""Minimum age [s] of a process that is struck: one that dies early counts as in a crash loop, and is restarted after a delay."""
 STEADY = 0.3
 AFTER_S, LONGEST_S = 4.0, 30.0
-"""How long the chain is watched when a fault is over: at least, and at most while the old rate is not back."""
+"""Minimum time [s] for which the chain is watched after a fault, and maximum while the old rate is not back."""
 READY_S = 180.0
-"""A first start compiles."""
+"""Time limit [s] for the chain to be ready: a first start compiles."""
 HOUR_S = 3600.0
 STARVED_S = 10.0
-"""How long a process is watched that goes on without new memory; it ends when it needs some."""
+"""Time [s] for which a process that gets no new memory is watched; it ends when it needs some."""
 GOAL_GAP_MS, GOAL_ALONE_S, GOAL_REPLICA_S = 50.0, 1.5, 0.5
 
 
 @dataclass
 class Chain:
-    """A running chain, who listens to it, and what its setup has that can be broken."""
+    """A running chain, the observer that listens to it (`outside`), and the parts of its setup that can be broken."""
 
     running: Running
     cell: cells.Cell
@@ -70,13 +70,13 @@ class Chain:
         return self.broken
 
     def owner(self, service: str) -> psutil.Process:
-        """The replica that does the most."""
+        """The replica of a service that publishes at the highest rate."""
         reports = [report for report in observed.health(self.running) if report["service"] == service]
         busiest = max(reports, key=lambda report: sum(row["rate_hz"] for row in report["published"].values()))
         return psutil.Process(busiest["pid"])
 
     def is_settled(self, service: str = ALL) -> bool:
-        """Whether everybody is there, a service for long enough, and the arm is tracked in sight of the camera."""
+        """Whether all services are ready, `service` for at least OLD_S, and the arm is tracked in sight of the camera."""
         if self.running.control({"command": "occlude", "value": 0}) is None:
             return False
         reports = [report for report in observed.health(self.running) if report["ready"]]
@@ -114,8 +114,8 @@ def _replicas(number: int) -> list[str]:
 
 @dataclass(frozen=True)
 class Fault:
-    """setup: the chain that it needs; strike: begins the fault of a service's process, and ends it; lasts_s: in between;
-    services: whom it strikes, ALL where it is everybody at once; quick: whether it belongs to the short run."""
+    """A kind of fault. setup: the chain that it needs; strike: begins the fault of a service's process, and ends it; lasts_s:
+    time in between; services: those that it strikes, ALL for all at once; quick: whether it belongs to the short run."""
 
     setup: Callable[[str, int, int], AbstractContextManager[Chain]]
     strike: Callable[[Chain, Any], AbstractContextManager[Any]]
@@ -215,7 +215,7 @@ class Row:
 
 
 def steady_hz(outside: observed.Outside) -> dict[str, float] | None:
-    """The rates [Hz] of all topics over BEFORE_S, None while one of them still changes, or says nothing."""
+    """The rates [Hz] of all topics over BEFORE_S, None while one of them is not steady, or silent."""
     outside.forget()
     times = [time.monotonic()]
     for _ in range(2):
@@ -228,7 +228,7 @@ def steady_hz(outside: observed.Outside) -> dict[str, float] | None:
 
 
 def measure(chain: Chain, name: str, service: str) -> Row:
-    """Strikes once, and watches until the old rate is back."""
+    """Injects a fault once, and watches the chain until the old rate is back."""
     fault = FAULTS[name]
     wait_for(lambda: chain.is_settled(service), READY_S, "a chain that tracks the arm", 0.3)
     old_hz = wait_for(lambda: steady_hz(chain.outside), READY_S, "steady rates of all topics", 0.0)
@@ -249,7 +249,7 @@ def measure(chain: Chain, name: str, service: str) -> Row:
 
 
 def possible(cell: cells.Cell) -> list[str]:
-    """The faults that there can be in a cell: no storm of joint angles where there is no robot."""
+    """The faults that are possible in a cell: no storm of joint angles without a robot."""
     return [name for name in FAULTS if cell.robots or name != f"storm of {topics.JOINTS.name}"]
 
 
@@ -266,7 +266,7 @@ def plan(faults: Sequence[str], services: Sequence[str], replicas: Sequence[int]
 
 
 def run(options: flags.Options, done: Callable[[Row], None]) -> None:
-    """Goes through the plan, and hands every row to `done`."""
+    """Runs the plan, and passes every row to `done`."""
     if options.service and not set(options.service) & set(SERVICES):
         return
     able = possible(cells.load(options.cell))
@@ -291,7 +291,7 @@ def run(options: flags.Options, done: Callable[[Row], None]) -> None:
 
 
 def connected_plan(options: flags.Options) -> dict[str, list[str]]:
-    """The faults to go through of each service that connects, without those that nothing can be struck with here."""
+    """The faults to run for each service that connects the cell, without services that cannot be tested here."""
     out = {}
     for service, faults in connected.SERVICES.items():
         able = [name for name in faults if name in (options.fault or faults)]
@@ -305,13 +305,13 @@ def connected_plan(options: flags.Options) -> dict[str, list[str]]:
 
 
 def is_back(row: Row) -> bool:
-    """Whether the service was back in time. One that is alone cannot be while the fault lasts."""
+    """Whether the service was back in time. One without replicas can be back only after the fault."""
     goal_s = GOAL_REPLICA_S if row.replicas > 1 else row.lasts_s + GOAL_ALONE_S
     return row.recovery_s is not None and row.recovery_s <= goal_s
 
 
 def tables(result: Result) -> list[Part]:
-    """The chain's services, then those that connect it; of each kind what was struck."""
+    """The chain's services, then those that connect it, where any were struck."""
     return [
         *([_chain_table(result)] if result["rows"] else ()),
         *([connected.table(result)] if result.get("connected") else ()),
@@ -319,7 +319,7 @@ def tables(result: Result) -> list[Part]:
 
 
 def _chain_table(result: Result) -> Table:
-    """A row for each fault and number of replicas: what it does where it strikes each service, and the worst of all of these."""
+    """A row for each fault and number of replicas: recovery by struck service, and the worst values over the services."""
     table = Table(
         *("fault", "of each", "lasts s", *(f"{service}\nback s" for service in (*SERVICES, ALL))),
         *("gap ms, fusion\nnot struck / struck", "reused", "false tracking\nof poses", "worst cm"),

@@ -83,7 +83,7 @@ from penumbra.tests.bench.lib.fusion_scores import (
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
 WRONG_RUNS = 10
-"""A wrong sense is played in so many runs for each run of a situation."""
+"""Number of runs with a wrong sense for each run of a situation."""
 WRONG_GOAL_CM, WRONG_MEDIAN_GOAL_CM, BEYOND_GOAL, STAMP_GOAL, GUESSED_GOAL_CM = 3.0, 1.0, 0.001, 1.05, 2.0
 LATE_GOAL, STEP_GOAL_MS, CORE_GOAL = 1.05, 0.3, 1.0
 TARGETS = (1, 10, 100)
@@ -91,7 +91,7 @@ Indices = NDArray[np.int64]
 
 
 def step_times(seed: int, seconds: float) -> dict[str, float]:
-    """Medians [ms] of one predict, update and publish: of measurements in order, and of pictures that come behind the skin's."""
+    """Median times [ms] of one predict, update and publish: of measurements in order, and of pictures later than the skin's."""
     run = runs.drawn("one sense wrong", seed, 0, seconds)
     found = {}
     for name, each in (("in order", runs.delayed(run, lambda: 0.0)), ("late pictures", run)):
@@ -108,13 +108,13 @@ def step_times(seed: int, seconds: float) -> dict[str, float]:
 
 
 def encoded(estimate: Estimate, stamp_ns: int) -> bytes:
-    """The pose at a stamp as it goes over the bus."""
+    """The pose at a stamp, encoded as on the bus."""
     return messages.encode(estimate.message(stamp_ns, "forearm", "world"))
 
 
 def core_shares(seed: int, seconds: float) -> list[dict[str, float]]:
-    """Processor time, as shares of a core, in which a bank of n observers predicts, updates and answers at 200 Hz: its
-    measurements, those of four runs for all targets, in the order of their arrival; and with every pose put into its message."""
+    """Shares of a core that a bank of n observers takes to predict, update and answer at 200 Hz, without and with the encoding of
+    every pose as a message. The measurements of all targets are those of four runs, in the order of their arrival."""
     drawn = [runs.drawn("one sense wrong", seed, i, seconds) for i in range(4)]
     found = []
     for n in TARGETS:
@@ -139,7 +139,7 @@ def core_shares(seed: int, seconds: float) -> list[dict[str, float]]:
 
 
 def _batches(drawn: list[runs.Run], n: int, seconds: float) -> list[tuple[Indices, Indices, Indices, Array, Array]]:
-    """What arrives for n targets in each of the steps of a stream at 200 Hz: the arguments of `Bank.measure`."""
+    """Arguments of `Bank.measure`: the measurements of n targets that arrive in each step of a stream at 200 Hz."""
     steps = int(seconds * PUBLISHED_HZ)
     arrived: list[list[tuple[int, runs.Message]]] = [[] for _ in range(steps)]
     for target in range(n):
@@ -160,7 +160,7 @@ def _batches(drawn: list[runs.Run], n: int, seconds: float) -> list[tuple[Indice
 
 
 def summary(each: list[Scores]) -> dict[str, Any]:
-    """What is told of the runs of a situation."""
+    """Statistics of the runs of a situation."""
     times, count = np.concatenate([s.times for s in each]), len(each)
     stamps, nis = np.concatenate([s.stamps for s in each]), np.concatenate([s.nis for s in each])
     told = consistency(stamps, nis, np.concatenate([s.nis_dof for s in each]), count)
@@ -190,7 +190,7 @@ def summary(each: list[Scores]) -> dict[str, Any]:
 
 
 def guessed(each: list[Scores]) -> dict[str, float]:
-    """Position errors [cm] within GUESSED_S of when nothing is seen or felt any more, and after it."""
+    """Position errors [cm] within GUESSED_S after the limb ceases to be seen or felt, and later."""
     ages = np.concatenate([[t - max(begin for begin, _ in runs.GONE if begin <= t) for t in s.times] for s in each])
     errors = 100.0 * np.concatenate([s.errors["ours"] for s in each])
     early, later = errors[ages <= GUESSED_S], errors[ages > GUESSED_S]
@@ -203,7 +203,7 @@ def guessed(each: list[Scores]) -> dict[str, float]:
 
 
 def jumps(each: list[Jump]) -> dict[str, float]:
-    """What is told of all jumps."""
+    """Statistics of all jumps."""
     return {
         "noticed_median_s": float(np.median([one.noticed for one in each])),
         "noticed_worst_s": max(one.noticed for one in each),
@@ -223,7 +223,7 @@ def lateness(each: list[dict[str, Lateness]]) -> dict[str, Any]:
 
 
 def by_way(each: list[dict[str, Way]]) -> list[dict[str, Any]]:
-    """A row for each way in which a sense is wrong: how far [cm] it moves the pose, and what the pose then says of itself."""
+    """A row for each way in which a sense is wrong: how far [cm] it moves the pose, and how that pose is judged."""
     rows = []
     for name in each[0]:
         found = [one[name] for one in each]
@@ -243,7 +243,7 @@ EXTRA: dict[str, Callable[[int, int, float], Any]] = {"shift": shift, "ways": wa
 
 
 def part(name: str, seed: int, index: int, seconds: float) -> Any:
-    """What one process does at a time: one run of a situation, or of what else is measured."""
+    """The unit of work of a process: one run of a situation, or of an entry of EXTRA."""
     return EXTRA[name](seed, index, seconds) if name in EXTRA else scored(name, seed, index, seconds)
 
 
@@ -384,7 +384,7 @@ def tables(found: Result) -> list[Part]:
 
 
 def _goal(value: float, goal: float, unit: str) -> str:
-    """A value beside the goal that it is not to exceed."""
+    """A value beside the goal that it must not exceed."""
     return f"{marked(f'{value:.2f} {unit}', value <= goal)} (goal {goal:g})"
 
 

@@ -49,21 +49,21 @@ from penumbra.tests.bench.lib import drift, results, surfaces, things
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
 ARRAYS = {"bare": "table", "hull": "arm"}
-"""Cells: pads in a table top, and pads on a robot's hull."""
+"""Cells by array: pads in a table top, and pads on a robot's hull."""
 GAPS = (0.01, 0.02, 0.03, 0.05, 0.075, 0.10, 0.125, 0.15, 0.20)
 PADS = (8, 4, 1)
 SPEEDS = (0.0, 0.5)
 SAMPLES, PERIOD_NS = 10, 1_000_000
 WINDOW_NS = SAMPLES * PERIOD_NS
 BROAD = np.array([0.08, 0.04, 0.04, 0.3, np.radians(8.0), np.radians(15.0)])
-"""Standard deviations of a prior that no track gives: axial, lateral, height [m], roll, pitch, yaw [rad]."""
+"""Standard deviations of the broad prior of a limb without a track: axial, lateral, height [m], roll, pitch, yaw [rad]."""
 TRACKING = np.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])
 GIRTH, LENGTH = (-0.27, 0.11), (-0.1, 0.1)
-"""Range of log sizes."""
+"""Ranges of the log sizes."""
 NAMES = ("axial", "lateral", "height", "roll", "pitch", "yaw")
 RATIO_GOAL, MS_GOAL = 1.2, 2.0
 NEAR_M = (0.02, 0.15)
-"""Gaps for which the first goal holds."""
+"""Range of the gaps [m] for which the first goal holds."""
 REST_S, SETTLED_S = 10.0, 1.0
 SHOWN = ("lateral", "height", "axial")
 RESTING_GAPS = (0.02, 0.03, 0.05, 0.075, 0.10, 0.125, 0.15)
@@ -72,8 +72,8 @@ BANDS = ((0.0, 0.04), (0.04, 0.075), (0.075, 0.125), (0.125, 0.175))
 
 @dataclass(frozen=True)
 class Plan:
-    """How many poses of each row, draws of noise and prior of each pose, resting limbs of each gap, moving ones and their
-    seconds, passes of each kind of thing."""
+    """Numbers of poses per row, of draws of noise and prior per pose, of resting limbs per gap, of moving limbs and their
+    duration [s], and of passes per kind of thing."""
 
     poses: int
     draws: int
@@ -89,7 +89,7 @@ FULL, QUICK = Plan(12, 4, 4, 3, 4.0, 3), Plan(2, 2, 1, 1, 1.0, 1)
 class Rig:
     """The pads of a cell, a robot that carries them in the middle of its joints' ranges, and their true field.
 
-    pads (p, 4, 4): poses in the world; joints (j,); chosen: which pads are used when only so many are.
+    pads (p, 4, 4): poses in the world; joints (j,); chosen: indices of the pads that are used, by their number.
     """
 
     def __init__(self, name: str):
@@ -112,7 +112,7 @@ class Rig:
         fields = {own: field.PadField(each.kind, each.backing) for own, each in known.items()}
         prints = [fingerprint(self.cell, pad, self.target) for pad in self.cell.pads]
         self.fields = [fields[own] for own in prints]
-        self._rest = np.zeros(len(self.skin))  # what the robot's other links add
+        self._rest = np.zeros(len(self.skin))  # changes by the robot's other links
         if len(self.joints):
             self._rest = np.concatenate([links(self.cell, known[own], self.joints[None])[0] for own in prints])
         self.weights: paper_network.PoseNetwork | None = None
@@ -127,11 +127,11 @@ class Rig:
         self.chosen = {count: np.sort(order[:count]) for count in PADS}
 
     def estimator(self, home: Array, spread: Array, method: str = "solve") -> Estimator:
-        """A fresh one that expects the target at home (4, 4), known to spread (6,) along the world's axes."""
+        """A new estimator that expects the target at home (4, 4), with standard deviations spread (6,) along the world's axes."""
         return Estimator(self.skin, self.response, self.surface, home, spread, self.weights, method, shapes=self.shapes)
 
     def samples(self, count: int) -> np.ndarray:
-        """Samples (n,) in a window of each electrode when only so many pads are used."""
+        """Numbers of samples (n,) of the electrodes in a window when `count` pads are used."""
         return np.where(np.isin(self.skin.pad_of, self.chosen[count]), SAMPLES, 0)
 
     def signal(self, body: field.Body, T: Array, count: int) -> Array:
@@ -143,13 +143,13 @@ class Rig:
         return out * self.skin.gain * self.skin.sensitivity
 
     def voltages(self, signal: Array, rng: np.random.Generator) -> Array:
-        """Samples (s, n) [V] of these signals (s, n): with what the robot's other links add, and noise."""
+        """Samples (s, n) [V] of these signals (s, n): with the changes by the robot's other links, and noise."""
         skin = self.skin
         clean = skin.amplitude(signal / (skin.gain * skin.sensitivity) + self._rest)
         return np.clip(clean + np.sqrt(skin.noise) * rng.standard_normal(signal.shape), 0.0, skin.full_scale)
 
     def gap(self, T: Array, size: Array, count: int) -> float:
-        """Smallest distance [m] from an electrode to the skin."""
+        """Minimum distance [m] from an electrode in use to the limb's skin."""
         scale = np.exp(size[[0, 1, 1]])
         used = np.isin(self.skin.pad_of, self.chosen[count])
         local = (self.skin.positions(self.pads)[used] - T[:3, 3]) @ T[:3, :3] / scale
@@ -198,7 +198,7 @@ Scene = tuple[Array, Array, dict[float, Array], np.random.Generator]
 
 
 def _scene(rig: Rig, seed: int, count: int, gap: float, k: int) -> Scene:
-    """A random pose and size, the window's mean signals (n,) by speed, and what draws the rest."""
+    """A random pose and size, the window's mean signals (n,) by speed, and the random generator for the rest."""
     rng = np.random.default_rng([seed, count, int(1e4 * gap), k])
     T, size = rig.place(rng, gap, count)
     body = field.limb(rig.mesh, *np.exp(size))
@@ -219,8 +219,8 @@ def single_windows(
     scenes: dict[tuple[int, float, int], Scene] | None = None,
     counts: Sequence[int] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Rows of single windows with so many pads (default: PADS). scenes: those of another method, whose fields need not be solved
-    again."""
+    """Rows of single windows. counts: numbers of pads (default: PADS); scenes: those of another method, whose fields are
+    reused."""
     scenes = {} if scenes is None else scenes
     for count in counts or PADS:
         for gap in GAPS:
@@ -267,9 +267,9 @@ def _row(rig: Rig, gap: float, count: int, prior: bool, speed: float, row: Row) 
 
 @dataclass(frozen=True)
 class Consistency:
-    """Squared errors over their covariances [per degree of freedom] of one limb: of the published poses (mean over the windows),
-    of the pose that the default observer makes of them; the share of windows in range; how long a window took from its last
-    sample to its pose [ms]; and the pose errors (6,) by NAMES of the windows after SETTLED_S, the size being learnt by then."""
+    """Consistency of one limb. published, fused: mean NEES per degree of freedom of the published poses and of the default
+    observer's; in_range: share of windows in range; ms: times [ms] from a window's last sample to its pose; errors: pose errors
+    (6,) by NAMES of the windows after SETTLED_S, when the size has been learnt."""
 
     published: float
     fused: float
@@ -288,7 +288,7 @@ def resting(rig: Rig, seed: int, gap: float, k: int) -> Consistency:
 
 
 def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: Array) -> Consistency:
-    """What estimator and observer make of windows with these true poses and signals (windows, n)."""
+    """Runs estimator and observer on windows with these true poses and signals (windows, n)."""
     axes = rig.axes(poses[0], 8)
     home = rigid.perturb(poses[0], (BROAD * rng.standard_normal(6)) @ axes)
     estimator = rig.estimator(home, np.sqrt(np.diag(axes.T @ np.diag(BROAD**2) @ axes)))
@@ -306,7 +306,7 @@ def _followed(rig: Rig, rng: np.random.Generator, poses: list[Array], signals: A
         assert window is not None
         estimate = estimator.update(window.stamp_ns, window.amplitude, window.samples, rig.pads, rig.joints)
         ms.append(1e3 * (time.perf_counter() - begin))
-        if estimate.may_be_limb:  # it is one
+        if estimate.may_be_limb:  # the thing is a limb
             observer.measure("haptic", window.stamp_ns, estimate.T, estimate.information, step=estimate.step)
         if stamp_ns < SETTLED_S * 1e9:
             continue
@@ -334,7 +334,7 @@ def _rmse(errors: list[Array]) -> dict[str, float]:
 
 
 def moving(rig: Rig, seed: int, k: int, seconds: float) -> tuple[list[float], Consistency]:
-    """A limb that moves through all gaps at up to the highest speed: its gaps [m], and what was made of it."""
+    """A limb that moves through all gaps at up to the highest speed: its gaps [m] and its consistency."""
     rng = np.random.default_rng([seed, 200, k])
     T, size = rig.place(rng, 0.02, 8)
     body, axes = field.limb(rig.mesh, *np.exp(size)), rig.axes(T, 8)
@@ -437,8 +437,8 @@ def measure(seed: int, plan: Plan, arrays: tuple[str, ...], paper: bool) -> dict
 
 
 def tables(result: Result) -> list[Part]:
-    """Errors beside their bounds, then limbs that rest and move, and what is taken for one. The JSON has the rows of fewer pads
-    and of moving limbs too: here they count as shares."""
+    """Errors beside their bounds, then limbs that rest and move, and things that are taken for one. The JSON also has single
+    windows with fewer pads and of moving limbs, of which only shares are shown."""
     if "surface" in result:
         return surfaces.tables(result)
     if "drift" in result:
@@ -472,7 +472,7 @@ def tables(result: Result) -> list[Part]:
 
 
 def _errors(result: Result) -> Table:
-    """Of eight pads and limbs at rest."""
+    """Errors with eight pads and limbs at rest."""
     theirs = {_key(row): row for row in result["paper"]}
     table = Table(
         *("array", "prior", "gap cm", "lateral mm", "height mm", "axial mm", "pitch deg", "yaw deg", "worst ratio"),

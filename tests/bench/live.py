@@ -29,9 +29,9 @@ AGES = (
     ("age_ms", "exposure to fused pose, p50 / p95 ms", 80.0),
     ("haptic_age_ms", "skin sample to haptic pose, p50 / p95 ms", 10.0),
 )
-"""Keys of the result, what they are called, and their goals; the cameras of the built-in cells give 20 frames a second."""
+"""Keys of the result, their names and their goals; the cameras of the built-in cells give 20 frames a second."""
 CPU_GOAL = 0.8
-"""Goal [cores] of all processes but the emulator."""
+"""Maximum CPU [cores] of all processes but the emulator."""
 
 
 class Recording:
@@ -62,7 +62,7 @@ class Recording:
 
 
 def fused_ages_s(vision: list[messages.VisionPose], fused: list[messages.FusedPose]) -> np.ndarray:
-    """For each tracked frame: from its exposure to the first fused pose that has taken it in."""
+    """Ages [s] of tracked frames: from the exposure to the first fused pose that uses the frame."""
     with_vision = [f for f in fused if "vision" in f.sources]
     taken_in = np.array([f.stamp_ns - f.sources["vision"].age_s * 1e9 for f in with_vision])
     newest = np.maximum.accumulate(taken_in) if len(taken_in) else taken_in

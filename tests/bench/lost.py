@@ -1,13 +1,12 @@
-"""`penumbra bench lost`: how soon an arm of which nothing is known is found, with the landmark models and without.
+"""`penumbra bench lost`: how soon a lost arm is found, with the landmark models and without.
 
 Simulated streams are short films of new scenes (`sim.sets.shots`), with the hand of the searched mesh and with posed hands
-(fingers, bent wrists). Each begins lost, and goes through segmentation, search and fusion (`tests.support.replay`); a pose is
+(fingers, bent wrists). Each begins lost, and goes through segmentation, search and fusion (`services.replay.chain`); a pose is
 right within 5 cm and 20 degrees, and honest within three standard deviations of place and axis, as a bent hand leaves the roll
-open. With --photographs, a folder of images/ and masks/ (drawn by hand: 4 forearm, 5
-hand), every picture is searched once, nothing being known of the arm but that it is before the camera. The camera is not known,
-either: one of 60 degrees across the longer side is assumed. A pose is right where its outline lies on the arm: an intersection
-over union of at least a half with the drawn mask. Beside the network's masks stand the drawn ones, which show what a better
-network would give.
+open. With --photographs, a folder of images/ and masks/ (drawn by hand: 4 forearm, 5 hand), every picture is searched once,
+without knowledge of the arm but that it is before the camera. The camera is unknown too: one of 60 degrees across the longer side
+is assumed. A pose is right where its outline lies on the arm: an intersection over union of at least a half with the drawn mask.
+Beside the network's masks stand the drawn ones, which show what a better network would give.
 """
 
 from __future__ import annotations
@@ -53,18 +52,18 @@ from penumbra.tests.bench.tracking import Film, played
 
 SCENES: tuple[tuple[Domain, Hands], ...] = (("easy", "stiff"), ("easy", "posed"), ("wide", "stiff"), ("wide", "posed"))
 FRAMES = 20
-"""Frames of a film: landmarks are looked for after 0.3 s."""
+"""Number of frames of a film; landmarks are searched for after 0.3 s."""
 LENS = math.radians(60.0)
-"""Assumed field of view across the longer side of a photograph."""
+"""Assumed field of view [rad] across the longer side of a photograph."""
 HOME = (0.7, 0.4, 1.5)
 """Assumed distance from the camera [m] of an arm in a photograph, and its standard deviations [m, rad]."""
 ON_THE_ARM = 0.5
-"""IoU with the drawn mask from which an outline lies on the arm."""
+"""Minimum IoU with the drawn mask at which an outline lies on the arm."""
 MASKS = ("network", "drawn")
 
 
 def search_with(mode: str) -> dict[str, list[str]]:
-    """Arguments of the services."""
+    """Arguments of the services for a mode of the landmarks."""
     return {"search": ["--landmarks", mode]}
 
 
@@ -87,8 +86,8 @@ def streams(
 
 
 def scored(films: list[Film]) -> dict[str, Any]:
-    """How many streams were recovered, in the how manyth frame, how many called a wrong pose tracked, and which share of the
-    camera's poses and of the fused ones that are tracking is beyond three standard deviations in place and axis."""
+    """Number of recovered streams and their frames until then, number of streams with a wrong pose called tracking, and shares of
+    the camera's and the fused tracking poses that are beyond three standard deviations in place and axis."""
     frames: list[int | None] = []
     wrong = 0
     beyond: dict[str, list[bool]] = {"vision": [], "fused": []}
@@ -127,7 +126,7 @@ def _recovery(frames: list[int | None]) -> dict[str, Any]:
 
 
 def cell_of(image: NDArray[np.uint8]) -> Cell:
-    """A cell with the camera that is assumed for an image (h, w, 3), in whose frame everything is, and one person."""
+    """A cell with one person and the camera that is assumed for an image (h, w, 3), whose frame is the cell's."""
     height, width = image.shape[:2]
     focal = max(width, height) / 2.0 / math.tan(LENS / 2.0)
     camera = Camera(
@@ -143,7 +142,7 @@ def cell_of(image: NDArray[np.uint8]) -> Cell:
 
 
 class Outline:
-    """The outline of an arm at T_camera_target in an image, beside the pixels of the arms that are there."""
+    """Outlines of an arm at T_camera_target in an image, compared with the pixels of the arms in it."""
 
     def __init__(self, cell: Cell, labels: NDArray[np.uint8]):
         (camera,), (target,) = cell.cameras.values(), cell.targets.values()
@@ -153,7 +152,7 @@ class Outline:
         _, self._parts = cv2.connectedComponents(np.isin(labels, TARGET_LABELS).astype(np.uint8))
 
     def iou(self, T: Array) -> float:
-        """Intersection over union with the parts of arms that it touches."""
+        """Intersection over union with the labelled arms that the outline touches."""
         shown = self._model.silhouette(T, self._k, self._size)
         touched = np.unique(self._parts[shown])
         there = np.isin(self._parts, touched[touched > 0])
@@ -167,7 +166,7 @@ class Outline:
 
 
 def first_poses(models: Landmarks, image: NDArray[np.uint8], cell: Cell) -> list[Array]:
-    """What the landmarks alone say, best first."""
+    """Poses from the landmarks alone, best first."""
     (camera,), hands_pose = cell.cameras.values(), find(models, image, (), None)
     limbs = [limb_of(hand, hands_pose[1]) for hand in hands_pose[0]]
     found = [one for limb in limbs for one in starter.starts(limb, camera, cell.body)]

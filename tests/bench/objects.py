@@ -35,7 +35,7 @@ WIDTH, HEIGHT = 640, 480
 K = Intrinsics(572.4, 573.6, 325.3, 242.0)
 GOALS = {20.0: 0.97, 30.0: 0.85}
 WRONG, RECOVERY = 0.01, 5
-"""Goals: share of poses that say "tracking" and are wrong, and frames until a lost object is found again."""
+"""Goals: maximum share of poses that say "tracking" and are wrong, and maximum frames until a lost object is found again."""
 MASKS = {"exact": (1.0, 1.0), "0.86": (0.83, 0.89)}
 """Range of the masks' IoU with the truth."""
 
@@ -45,7 +45,7 @@ MASKS = {"exact": (1.0, 1.0), "0.86": (0.83, 0.89)}
 
 @dataclass(frozen=True)
 class Thing:
-    """A mesh in metres; `symmetries`: rotations (n, 3, 3) that leave it as it looks, the identity among them."""
+    """A mesh in metres; `symmetries`: rotations (n, 3, 3) that leave its shape unchanged, including the identity."""
 
     name: str
     mesh: trimesh.Trimesh
@@ -53,7 +53,7 @@ class Thing:
 
     @property
     def diameter(self) -> float:
-        """Largest distance of two of the mesh's points [m], of a sample."""
+        """Largest distance [m] between two of `points`."""
         points = self.points
         return float(np.linalg.norm(points[:, None] - points[None], axis=2).max())
 
@@ -65,7 +65,7 @@ class Thing:
 
 
 def turn(axis: str, count: int) -> Array:
-    """The rotations (count, 3, 3) about an axis by multiples of a part of a turn."""
+    """The rotations (count, 3, 3) about an axis by multiples of 1 / count of a turn."""
     return np.array([from_rpy((0, 0, 0), np.eye(3)["xyz".index(axis)] * a)[:3, :3] for a in _angles(count)])
 
 
@@ -74,7 +74,7 @@ def _angles(count: int) -> Array:
 
 
 def placed(mesh: trimesh.Trimesh, at: tuple[float, float, float], rpy: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
-    """A part moved to a place [mm], turned by roll, pitch, yaw [deg] before."""
+    """A part turned by roll, pitch, yaw [deg], then moved to a place [mm]."""
     return mesh.apply_transform(from_rpy(at, np.radians(rpy)))
 
 
@@ -101,14 +101,14 @@ def tube(points: Array, radii: Array, segments: int = 24, along: Array | None = 
 
 
 def joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh of several."""
+    """One mesh of several parts."""
     whole = trimesh.util.concatenate(parts)
     assert isinstance(whole, trimesh.Trimesh)
     return whole
 
 
 def lathe(profile: Array, flat: float = 1.0, segments: int = 48) -> trimesh.Trimesh:
-    """A body of revolution about z of a profile (n, 2) of radius and height; `flat`: its thin half axis over the wide one."""
+    """A body of revolution about z of a profile (n, 2) of radius and height; `flat`: ratio of its thin to its wide half axis."""
     r, z = np.asarray(profile, float).T
     return tube(np.stack([0 * z, 0 * z, z], 1), np.stack([r, r * flat], 1), segments, np.array([0.0, 0.0, 1.0]))
 
@@ -216,7 +216,7 @@ def pitcher() -> trimesh.Trimesh:
 
 
 def worn(mesh: trimesh.Trimesh, faces: int, rng: np.random.Generator, kind: str) -> trimesh.Trimesh:
-    """The mesh with at least so many triangles and the roughness of a scan; `kind`: of damage that files come with."""
+    """The mesh [m] with at least `faces` triangles and, by `kind`, the roughness of a scan or a defect of mesh files."""
     edge = 2.8 * np.sqrt(mesh.area / faces)
     vertices, triangles = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge, max_iter=20)
     if kind == "rough":
@@ -267,9 +267,9 @@ def iou(a: Bool, b: Bool) -> float:
 
 
 def spoiled(truth: Bool, wanted: float, rng: np.random.Generator) -> Bool:
-    """A mask (h, w) with an IoU of about `wanted` with the truth, wrong as instance segmentation is: its boundary wobbles and is
-    smoothed, the whole is shifted and too large or small, and at times a thin part is missing, something is bitten out or added,
-    or it has a hole."""
+    """A mask (h, w) with an IoU of about `wanted` with the truth, with the errors of instance segmentation: its boundary wobbles
+    and is smoothed, the whole is shifted and too large or small, and at times a thin part is missing, something is bitten out or
+    added, or it has a hole."""
     size = float(np.sqrt(np.count_nonzero(truth)))
     inside = truth.astype(np.uint8)
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
@@ -320,7 +320,7 @@ def _noise(shape: tuple[int, int], sigma: float, rng: np.random.Generator) -> Ar
 
 
 def drawn_pose(rng: np.random.Generator) -> Array:
-    """T_camera_object of an object in the picture, 0.6 to 1.2 m away, any way round."""
+    """T_camera_object of an object in the picture, 0.6 to 1.2 m away, in any orientation."""
     z = rng.uniform(0.6, 1.2)
     centre = (rng.uniform(0.3, 0.7) * WIDTH, rng.uniform(0.3, 0.7) * HEIGHT)
     q = rng.normal(size=4)
@@ -462,7 +462,7 @@ def _sequences_table(result: Result) -> Table:
 
 
 def overall(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The means of the rows of all cases, by what was given and start."""
+    """The means of the rows of all cases, by input and start."""
     out = []
     for given, start in dict.fromkeys((row["with"], tuple(row["start"])) for row in rows):
         some = [row for row in rows if row["with"] == given and tuple(row["start"]) == start]

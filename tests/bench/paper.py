@@ -26,7 +26,7 @@ def passed(seed: int) -> trials.Played:
 
 
 def jobs(seed: int, quick: bool) -> list[campaign.Job]:
-    """What is measured beside the table's runs."""
+    """The measurements in addition to the table's runs."""
     here = "penumbra.tests.bench.paper"
     return [
         campaign.Job(f"{seed}-passage", f"{here}:passed", (seed,)),
@@ -38,7 +38,7 @@ def jobs(seed: int, quick: bool) -> list[campaign.Job]:
 def draw(
     found: dict[str, Any], played: Sequence[trials.Played], others: Sequence[Any], run: results.Result, folder: Path
 ) -> None:
-    """All pictures with their data. run: what is told of the run."""
+    """Writes all pictures with their data. run: description of the run."""
     passage, haptic, response = others
     shown = {
         "table": found,

@@ -40,7 +40,7 @@ SHOWN = ("expected_cm", "expected_p95_cm", "found_cm", "found_p95_cm")
 
 
 def tables(result: Result) -> list[Part]:
-    """What was proposed, and the errors beside the bound."""
+    """The expected errors of the layouts, and the estimator's errors beside the bound."""
     proposed = Table("cell", "pads", "median cm", "95 % below cm", "within 2 cm", title="Expected at best")
     for cell, layouts in result["cells"].items():
         for name in ("present", "proposed"):

@@ -1,8 +1,8 @@
 """`penumbra bench recorder`: what a recorder beside the running chain costs: its CPU, and the chain's rates and ages with and
 without it.
 
-The chain runs all the time. Pairs of spans follow one another, one with a recorder and one without, the first of a pair in turn
-the one and the other, so that what drifts on the machine strikes both. Motion and occlusion are drawn from `--seed`.
+The chain runs all the time. Pairs of spans follow one another, one with a recorder and one without, in alternating order, so
+that drifts of the machine affect both. Motion and occlusion are drawn from `--seed`.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from penumbra.tests.bench.live import Recording, cpu_times, fused_ages_s
 from penumbra.tests.support.live import PATIENCE_S, Running, free_port, penumbra_command, penumbra_up, wait_for
 
 SETTLE_S = 2.0
-"""After a recorder has begun or ended."""
+"""Waiting time [s] after a recorder has begun or ended."""
 GOAL_PERCENT = 3.0
-"""By which rates may change: that of everything that only looks on."""
+"""Maximum loss of a rate [%], as for everything that only observes."""
 NAMES = {
     "vision_hz": "frames used per second",
     "haptic_hz": "haptic poses per second",
@@ -38,13 +38,13 @@ NAMES = {
     "age_ms": "exposure to fused pose, median ms",
     "chain_cores": "CPU of all processes of the chain, cores",
 }
-"""What is measured of a span, and what it is called."""
+"""Keys of the values that are measured over a span, and their names."""
 Span = dict[str, float | None]
-"""The age is None where no pose of vision was tracked."""
+"""Values of a span; the age is None where no pose of vision was tracked."""
 
 
 def span(running: Running, target: str, seconds: float) -> Span:
-    """What the chain does for so long."""
+    """Rates, age and CPU of the chain over `seconds`."""
     recording = Recording(running.session, running.cell, target)
     processes = running.processes()
     before, began = cpu_times(processes), time.monotonic()
@@ -63,7 +63,7 @@ def span(running: Running, target: str, seconds: float) -> Span:
 
 
 def recorded_span(running: Running, target: str, seconds: float, words: Sequence[str]) -> Span:
-    """The same while a recorder writes; its own CPU and what it writes beside."""
+    """`span` while a recorder writes, with the recorder's CPU [cores] and data rate [MB/s]."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
         command = penumbra_command("record", "-o", str(path), "--cell", running.cell, *words)
@@ -127,7 +127,7 @@ def main(options: flags.Options, report: results.Report) -> None:
     target = cells.load(options.cell).one("targets", None)
     found: dict[str, list[dict[str, Any]]] = {"without": [], "beside": []}
     words = ["--raw"] if options.raw else []
-    page = f"127.0.0.1:{free_port()}"  # that of a cell that runs may have the usual port
+    page = f"127.0.0.1:{free_port()}"  # another running cell may use the usual port
     with penumbra_up(options.cell, options.seed, "--log-level", "error", "--page", page) as running:
         wait_for(running.is_tracking, 120, "a tracked pose", 0.5)
         for k in range(options.pairs):

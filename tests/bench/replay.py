@@ -18,7 +18,7 @@ from penumbra.tests.bench.lib.accuracy import SENSES
 from penumbra.tests.bench.lib.results import Part, Result
 
 APART_NS = 10**12
-"""Time from the beginning of one run to that of the next: they are scored together."""
+"""Time [ns] from the beginning of one run to that of the next, as all are scored together."""
 
 
 def tables(result: Result) -> list[Part]:
@@ -53,7 +53,7 @@ def main(options: flags.Options, report: results.Report) -> None:
 
 
 def _heard(cell: cells.Cell, options: flags.Options, run: int) -> Iterator[tuple[str, Any]]:
-    """What a run of the chain says, and the truth, by name; later than all runs before."""
+    """Messages of a run of the chain, and the truth, by name; their stamps are later than those of all earlier runs."""
     replay = Replay(cell, arguments={service: getattr(options, service).split() for service in SERVICES})
     heard = replay.run(record(cell, options.seed + run, options.seconds))
     named = {topic: name for name, topic in {"truth": topics.TRUTH, **SENSES}.items()}

@@ -41,7 +41,7 @@ SINGLE = ("emulator", "dashboard")
 """The others that `penumbra up` starts for such a cell, one of each."""
 START_S, SETTLE_S = 180.0, 5.0
 SAMPLES, LISTEN_S = 10, 3.0
-"""So many messages of a topic are weighed, where so many come within the time."""
+"""Maximum number of messages and maximum time [s] in which the size of a topic's messages is measured."""
 LATENCY_GOAL, THROUGHPUT_GOAL = 1.25, 0.8
 ROUNDS, QUICK_ROUNDS = 9, 3
 MESSAGES, PAUSE_S, FLOOD_S = 60, 0.004, 0.3
@@ -65,7 +65,7 @@ def row(size: int, replicas: int, seed: int, seconds: float, rate_hz: float | No
 
 
 def ready(running: Running) -> dict[str, int]:
-    """Instances by service that have joined in, but the launcher and its router."""
+    """Number of ready instances by service, without the launcher and its router."""
     found: dict[str, int] = defaultdict(int)
     for report in reports(running):
         found[report["service"]] += bool(report["ready"]) and report["service"] not in ("launcher", "router")
@@ -80,7 +80,7 @@ def reports(running: Running) -> list[dict[str, Any]]:
 
 
 def wait_for_masks(session: zenoh.Session, cell: cells.Cell) -> None:
-    """Until segmentation has compiled what it needs for every camera."""
+    """Waits for a mask of every camera: segmentation compiles before."""
     seen: set[str] = set()
     subscriber = session.declare_subscriber(topics.MASK.at(cell=cell.name), lambda sample: seen.add(str(sample.key_expr)))
     wait_for(lambda: len(seen) == len(cell.cameras), START_S, "a mask of every camera", 0.5)
@@ -88,7 +88,7 @@ def wait_for_masks(session: zenoh.Session, cell: cells.Cell) -> None:
 
 
 def payload_sizes(session: zenoh.Session, cell: cells.Cell) -> dict[str, float]:
-    """Bytes of a message on each topic that says something now."""
+    """Mean size [bytes] of the messages on each topic; 0 for a silent one."""
     sizes = {}
     for topic in topics.TOPICS:
         seen: list[int] = []
@@ -106,7 +106,7 @@ def _note_size(sizes: list[int], sample: zenoh.Sample) -> None:
 
 
 def measure(running: Running, recordings: list[Recording], sizes: dict[str, float], seconds: float) -> dict[str, Any]:
-    """Rates, ages, CPU and bytes over so many seconds."""
+    """Rates, ages, CPU and bytes over `seconds`."""
     processes = running.processes()
     for recording in recordings:
         for rows in recording.samples.values():
@@ -145,7 +145,7 @@ def measure(running: Running, recordings: list[Recording], sizes: dict[str, floa
 
 
 def counts(running: Running) -> dict[tuple[str, str, str, str], int]:
-    """Messages so far by service, instance, whether `published` or received, and topic; of the keys of one topic together."""
+    """Messages so far by service, instance, whether `published` or received, and topic; the keys of a topic are summed."""
     found: dict[tuple[str, str, str, str], int] = defaultdict(int)
     for report in reports(running):
         for side in ("published", "topics"):
@@ -165,7 +165,7 @@ def per_topic(rates: dict[tuple[str, str, str, str], float], side: str) -> dict[
 
 
 def bus_rows(rounds: int) -> list[dict[str, Any]]:
-    """Our messages beside plain bytes, in turns, so that what else the machine does hits both. Medians over the rounds."""
+    """Our messages beside plain bytes, in turns, so that other load on the machine affects both. Medians over the rounds."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = bus.open_session(bus.Connection("router", (), (endpoint,)), threading.Event(), lambda: None, START_S)
     out = []
@@ -188,7 +188,7 @@ def bus_rows(rounds: int) -> list[dict[str, Any]]:
 
 
 def ratio(found: dict[str, list[float]]) -> float:
-    """Ours over raw, the median over the rounds."""
+    """Median over the rounds of the ratio of ours to raw."""
     return round(float(np.median(np.divide(found["ours"], found["raw"]))), 3)
 
 

@@ -37,9 +37,9 @@ from penumbra.tests.bench.lib.results import Part, marked
 
 HIDDEN = (0.0, 0.3, 0.6, 0.85)
 VIEWS = ((320, 240, 1.5), (640, 480, 1.5), (1280, 960, 4.5), (1280, 960, 8.0))
-"""Pictures' width and height [px], distance [m]."""
+"""Width and height of the pictures [px], distance [m]."""
 NEES_VIEW = VIEWS[1]
-"""Also that of the goals for the whole chain, and of the frames for the other numbers."""
+"""View of the NEES, of the goals for the whole chain, and of the frames for the other numbers."""
 START = (0.02, np.radians(4.0))
 """Root mean square length of the starts' errors: position [m], rotation [rad]."""
 PRIOR = np.diag(np.repeat(np.square(START) / 3.0, 3))
@@ -49,17 +49,17 @@ EXACT = Noise(edge=0.29, correlation=2.0, dilation=0.02)
 LOST = (0.05, np.radians(20.0))
 """An error in position [m] or of the limb's axis [rad] beyond which a pose is wrong."""
 GONE = 0.95
-"""A larger share hidden leaves nothing to track."""
+"""Hidden share above which nothing is left to track."""
 GOALS = {0.0: (0.25, 0.4), 0.3: (0.3, 0.5), 0.6: (0.6, 1.2), 0.85: (1.5, 2.5)}
-"""Position error of the whole chain at NEES_VIEW, median and mean [cm], by the share hidden."""
+"""Goals for the position error of the whole chain at NEES_VIEW, median and mean [cm], by hidden share."""
 BOUND_GOAL, FASTER_GOAL, BETTER_GOAL, AUC_GOAL = 1.2, 10.0, 5.0, 0.97
 WARM_FRAMES = 4
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How many scenes: of each row; of the rows for the NEES, tracked ones; of each kind of frame for the detector of lost poses;
-    of hidden arms. domain: looks of the scenes."""
+    """Numbers of scenes: per row; tracked ones per row for the NEES; per kind of frame for the detector of lost poses; of hidden
+    arms. domain: looks of the scenes."""
 
     scenes: int
     nees: int
@@ -90,7 +90,7 @@ class Result:
 
     @property
     def with_prior(self) -> float:
-        """Position error [m] of the pose that is the most probable together with the start."""
+        """Position error [m] of the pose that is most probable given the start as a prior."""
         return float(np.linalg.norm(self.shot.T_world_target[:3, 3] - self.estimate.T_searched[:3, 3]))
 
     @property
@@ -118,7 +118,7 @@ class Result:
 
 
 def perturbed(rng: np.random.Generator) -> Array:
-    """A pose error (6,) of a start."""
+    """A random pose error (6,) of a start."""
     return rng.normal(size=6) * np.sqrt(np.diag(PRIOR))
 
 
@@ -127,7 +127,7 @@ def search_of(shot: Shot, method: str, exact: bool) -> Search:
 
 
 def searched(shot: Shot, search: Search, mask: Mask, T_prior: Array | None) -> Result:
-    """One update and the processor's time for it: what other processes take does not count."""
+    """One update and its processor time, which excludes other processes."""
     begin = time.process_time()
     estimate = search.update(mask, T_prior, None if T_prior is None else PRIOR, shot.joints, shot.image)
     return Result(estimate, shot, 1e3 * (time.process_time() - begin))
@@ -187,7 +187,7 @@ def network_results(
     tracked: int = 0,
 ) -> tuple[dict[str, list[Result]], list[Shot]]:
     """Searches of the network's masks by method, after some frames that warm its state, and the pictures: `count` of them, and
-    up to twice as many until so many are `tracked`."""
+    up to twice as many until `tracked` of them are tracked."""
     out: dict[str, list[Result]] = {"contour": [], "paper": []}
     pictures: list[Shot] = []
     while len(pictures) < count or (
@@ -242,7 +242,7 @@ def row(masks: str, view: tuple[int, int, float], hidden: float, method: str, re
 
 def bounds_of(pictures: Iterable[Shot]) -> dict[str, float]:
     """The bound of pictures [cm]: median position error for a round limb, the same where the mesh's flat sides show its roll,
-    the same with what the start tells, and the root mean square for the round limb."""
+    the same with the prior of the start, and the root mean square for the round limb."""
     pictures = list(pictures)
     round_limb = [bound.information(shot) for shot in pictures]
     with_prior = [each + np.linalg.inv(PRIOR) for each in round_limb]
@@ -280,7 +280,7 @@ def nees(results: list[Result]) -> dict[str, Any]:
 
 
 def doubt(estimate: Searched) -> float:
-    """How much an estimate doubts itself, as a score for ranking: infinite where it is not tracking."""
+    """An estimate's doubt in itself, as a score for ranking: infinite where it is not tracking."""
     if estimate.state != "tracking":
         return np.inf
     confidence = getattr(estimate, "confidence", None)
@@ -305,8 +305,8 @@ KINDS = ("good start", "bad start", "wrong mask", "no prior", "absent")
 class Judgement:
     """A frame of one of KINDS: how much the estimate doubts itself, whether its pose is wrong, whether the mask shows the target.
 
-    Where the search gives up, the pose told is the start's: with a good start and a mask that shows something else it is right by
-    no merit of its own. Such a frame counts as one that should be doubted.
+    Where the search gives up, it reports the start's pose. With a good start and a mask that shows something else this pose is
+    right by chance: such a frame counts as one that should be doubted.
     """
 
     kind: str
@@ -350,7 +350,7 @@ def lost_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domai
 
 
 def shows_target(mask: Mask, shot: Shot) -> bool:
-    """Whether at least half of what the mask or the truth calls the target is called so by both."""
+    """Whether the IoU of the target's pixels in the mask and in the truth is at least a half."""
     target = (Label.FOREARM, Label.HAND)
     ours = np.zeros(shot.labels.shape, bool)
     h, w = (n * mask.scale for n in mask.labels.shape)
@@ -367,7 +367,7 @@ def _length(rng: np.random.Generator, low: float, high: float) -> Array:
 
 
 def spoiled(mask: Mask, rng: np.random.Generator) -> Mask:
-    """A mask that is wrong about where the target is: mirrored, turned by a half, moved away, or with the upper arm's region
+    """A mask that is wrong about where the target is: mirrored, turned by 180 degrees, moved away, or with the upper arm's region
     called the target and the target background."""
     labels = mask.labels
     kind = rng.integers(4)
@@ -430,7 +430,7 @@ def overall(parts: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def judged(seed: int, plan: Plan) -> dict[str, Any]:
-    """What the search says about itself: as a detector of wrong poses, and where nothing is left to see."""
+    """The search's own judgement: as a detector of wrong poses, and where nothing is left to see."""
     segmenter = load_segmenter()
     frames = list(lost_frames(seed, plan.lost, segmenter, plan.domain))
     doubts = np.array([frame.doubt for frame in frames])
@@ -471,7 +471,7 @@ def measure(seed: int, plan: Plan, parts: tuple[str, ...]) -> dict[str, Any]:
 
 
 def tables(result: dict[str, Any]) -> list[Part]:
-    """Errors beside the bound and the paper's search, consistency, and what the search says of itself."""
+    """Errors beside the bound and the paper's search, consistency, and the search's own judgement."""
     parts: list[Part] = [_errors(result, kind) for kind in dict.fromkeys(row["masks"] for row in result["rows"])]
     consistent = Table("masks", "hidden", "mean", "95 % band", "median (4.35)", "frames", title="NEES, 5 degrees of freedom")
     for name, part in (("network", result["nees"]), ("exact", result["nees"].get("exact", {}))):
@@ -513,7 +513,7 @@ def _errors(result: dict[str, Any], kind: str) -> Table:
 
 
 def _judged(result: dict[str, Any]) -> list[Part]:
-    """What the search says about itself."""
+    """Tables of the search's own judgement."""
     kinds = Table(
         "frames with", *next(iter(result["lost"].values())), title="Poses that the search calls tracked, and wrong ones"
     )
@@ -535,7 +535,7 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _goal(row: dict[str, Any], paper: dict[str, Any]) -> str:
-    """What a row reaches of its goals."""
+    """The values of a row beside its goals."""
     position = row["position_cm"]
     if row["masks"] == "exact":
         ratio = position["median"] / row["bound_cm"]

@@ -35,11 +35,11 @@ SEED_BASE = 50_000_000
 VARIETY = sequences.Variety(frames=14)
 PERIOD_NS = 50_000_000
 WHOLLY, FREE = 0.999, 0.5
-"""Hidden shares: the target counts as fully hidden from the one on, and as free again below the other."""
+"""Hidden shares from which on the target counts as fully hidden, and below which it counts as free again."""
 BEFORE = 10
-"""Frames before a full occlusion whose median IoU is what it has to come back to."""
+"""Number of frames before a full occlusion whose median IoU is the reference for the recovery."""
 BACK = 0.9
-"""Share of that IoU from which on the mask has recovered."""
+"""Share of that IoU from which on the mask counts as recovered."""
 GOALS: dict[str, Any] = {
     "iou": (0.93, 0.88, 0.78),
     "area_bias": 0.01,
@@ -51,7 +51,7 @@ GOALS: dict[str, Any] = {
 
 
 PRIORS: dict[str, priors.Kind] = {"with_priors": "right", "with_wrong_priors": "wrong"}
-"""What a network that has priors is given beside nothing, by the name in the JSON file."""
+"""Kinds of priors that a network is measured with besides none, if it takes priors; by the name in the JSON file."""
 
 
 def rows(segmenter: inference.Segmenter, data: Iterable[evaluate.Labelled], kind: priors.Kind = "missing") -> list[FrameScore]:
@@ -59,7 +59,7 @@ def rows(segmenter: inference.Segmenter, data: Iterable[evaluate.Labelled], kind
     scores: list[FrameScore] = []
     for index, sequence in enumerate(data, 1):
         height, width = sequence.labels.shape[1:]
-        window, start_ns = Window(0, 0, width, height), index * 10**10  # a gap after which the state is forgotten
+        window, start_ns = Window(0, 0, width, height), index * 10**10  # a gap in time, after which the state is forgotten
         known = evaluate.priors_of(sequence, index, kind)
         masks = [segmenter(image, window, start_ns + t * PERIOD_NS, known[t]) for t, image in enumerate(sequence.images)]
         scores += evaluate.frame_scores(np.stack(masks)[WARM_UP:], sequence.labels[WARM_UP:], sequence.hidden[WARM_UP:])
@@ -83,8 +83,9 @@ def film_scores(segmenter: inference.Segmenter, film: list[shots.Shot]) -> tuple
 
 
 def recoveries(hidden: list[float], iou: list[float]) -> list[int | None]:
-    """For each full occlusion: which frame, counted from the first in which half of the target is free again, is the first whose
-    IoU is BACK of what it was before. None where that says nothing: nothing was found before, or the film ends."""
+    """For each full occlusion, the number of the first frame whose IoU is BACK of the reference, counted from the first in which
+    half of the target is free again. One more than the frames watched where it never is; None where there is no reference, or
+    the target is not free again."""
     found: list[int | None] = []
     covered = [k for k, share in enumerate(hidden) if share >= WHOLLY]
     last = [k for k, following in itertools.zip_longest(covered, covered[1:]) if following is None or following > k + 1]
@@ -102,7 +103,7 @@ def recoveries(hidden: list[float], iou: list[float]) -> list[int | None]:
 
 
 def result(seed: int, scores: list[FrameScore], recovered: list[int | None], ms: dict[str, float]) -> Result:
-    """What the JSON file holds. recovery_frames: nine of ten full occlusions need no more; ms_per_frame: of the processor."""
+    """Content of the JSON file. recovery_frames: 90th percentile over the full occlusions; ms_per_frame: processor time."""
     known = [n for n in recovered if n is not None]
     return {
         "seed": seed,
@@ -126,7 +127,7 @@ def by_occlusion(scores: list[FrameScore]) -> list[dict[str, Any]]:
 
 
 def priors_table(found: Result) -> list[Part]:
-    """What priors give, and what wrong ones cost; nothing of a network without."""
+    """The effect of right and of wrong priors; nothing for a network without priors."""
     if not found.keys() >= PRIORS.keys():
         return []
     table = Table(

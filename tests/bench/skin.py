@@ -41,9 +41,9 @@ CONTRAST = {2: 0.37, 5: 0.14, 10: 0.053, 15: 0.028}
 LINK_FACTOR = {10: 0.49, 15: 0.37}
 """Figures of the published pad: boundary elements and the paper's."""
 CAPSENSE_MS = 100.0
-"""CapSense, an open simulator of capacitive sensors by finite elements, needs up to so long for a step of one sensor."""
+"""Maximum time [ms] per step and sensor of CapSense, an open simulator of capacitive sensors by finite elements."""
 MEDIAN_GOAL, P95_GOAL, CORE_GOAL = 0.01, 0.05, 0.1
-"""Of the networks: relative errors, share of a core."""
+"""Goals of the networks: median and 95th percentile of the relative errors, share of a core."""
 OFF_CENTRE_M = 0.02
 LINK_RADIUS_M, LINK_LENGTH_M, LINK_BEHIND_M = 0.07, 0.30, 0.005
 """A robot's link: a grounded cylinder behind the pad's face."""
@@ -63,7 +63,8 @@ def part(mesh: Mesh, label: Label) -> Mesh:
 
 
 def across(mesh: Mesh, gap: float, aside: float = 0.0) -> Array:
-    """T_pad_mesh (4, 4): its axis along the pad's y, `aside` [m] along x, its skin at this gap [m] above the middle of itself."""
+    """T_pad_mesh (4, 4): its axis along the pad's y, `aside` [m] along x, its skin at this gap [m] from the point of the pad's
+    plane below its middle."""
     T = rigid.from_rpy((aside, 0.0, 0.0), (0.0, 0.0, np.pi / 2))
     T[1, 3] = -0.5 * (mesh.vertices[:, 0].min() + mesh.vertices[:, 0].max())
     surface, under = Surface(mesh.vertices, mesh.faces), np.array([[aside, 0.0, 0.0]])
@@ -88,7 +89,7 @@ def law(gaps: Array, volts: Array) -> dict[str, float]:
 
 
 def figures(cell: cells.Cell) -> dict[str, Any]:
-    """What is compared with the real pad's figures, of the cell's first pad type without a link."""
+    """The figures to compare with the real pad's, of the cell's first pad type without a link."""
     kind = next(iter(cell.pad_types.values()))
     pad, mesh = PadField(kind), forearm(cell)
     body, volt = limb(mesh), kind.chain.sensitivity
@@ -121,7 +122,7 @@ def figures(cell: cells.Cell) -> dict[str, Any]:
 
 
 def bodies(cell: cells.Cell, pad: PadField) -> dict[str, dict[int, list[float]]]:
-    """What different bodies change [fF] at all electrodes, by name and gap [cm]."""
+    """Changes [fF] by different bodies at all electrodes, by name and gap [cm]."""
     whole = target_mesh(next(iter(cell.targets.values())), cell)
     arm, hand = part(whole, Label.FOREARM), part(whole, Label.HAND)
     cylinder = trimesh.creation.cylinder(0.02, 0.3, sections=24, transform=rigid.from_rpy((0, 0, 0), (0, np.pi / 2, 0)))
@@ -172,7 +173,7 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
 
 
 def tables(found: Result) -> list[Part]:
-    """Figures beside the real pad's, what different bodies change, and the networks that run live."""
+    """Figures beside the real pad's, changes by different bodies, and the networks that run live."""
     if "left_out" in found:
         return [left_out.table(found)]
     figure = Table("figure", "ours", "the real pad", title="The pad near a forearm")

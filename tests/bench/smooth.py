@@ -6,7 +6,7 @@ the simulated limbs and senses of `penumbra bench fusion` (`tests.bench.lib.fusi
 cell goes through segmentation, search, haptics and fusion in this process (`services.replay`), while a panel hides the limb
 wholly again and again, for 0.5 to 2 s.
 
-NEES and its 95 % band as in `penumbra bench fusion`; of a cell there is one run, whose errors hang together, and no band. The
+NEES and its 95 % band as in `penumbra bench fusion`; of a cell there is one run, whose errors are correlated, and no band. The
 six degrees of freedom are those of the pose. Visible and hidden in a cell: at most a third of the limb's pixels, more than 90 %.
 """
 
@@ -40,16 +40,16 @@ from penumbra.tests.bench.lib.results import Part, Result, marked
 
 POSES = {"published": "as published", "stamp": "as of the stamp", "smoothed": "smoothed"}
 HIDE_S, SEE_S, SLIDE_S = (0.5, 1.0, 1.5, 2.0), 1.4, 0.8
-"""In turn: for how long the panel hides the limb wholly, for how long it is away, and how long it takes from one to the other."""
+"""Times [s] for which the panel hides the limb wholly (in turn), for which it is away, and that it takes in between."""
 EVERY = 22
-"""Of the published poses one in so many is scored: as often as in `penumbra bench fusion`."""
+"""One of this many published poses is scored: as often as in `penumbra bench fusion`."""
 Measurement = tuple[str, int, Array, Array, Array | None]
 Score = tuple[float, float]
 """Position error [m] and NEES."""
 
 
 def trajectories(subject: Subject, measurements: Sequence[Measurement], stamps_ns: Sequence[int]) -> list[dict[str, Estimate]]:
-    """The estimates as of each stamp (ascending), by the measurements up to it and by all: `stamp` and `smoothed`."""
+    """The estimates as of each stamp (ascending), from the measurements up to it (`stamp`) and from all (`smoothed`)."""
     observer, smoother = ErrorStateObserver(subject.home, subject.spread), Smoother(subject)
     in_order = sorted(measurements, key=lambda each: (each[1], list(observer.log.counts).index(each[0])))
     for each in measurements:
@@ -65,12 +65,12 @@ def trajectories(subject: Subject, measurements: Sequence[Measurement], stamps_n
 
 
 def score(truth: rigid.Array, T: rigid.Array, covariance: Array, rolls: bool = True) -> Score:
-    """Of a pose (4, 4) with its covariance (6, 6); without `rolls` as `scores.normalised`."""
+    """Score of a pose (4, 4) with its covariance (6, 6); `rolls` as in `scores.normalised`."""
     return float(np.linalg.norm(truth[:3, 3] - T[:3, 3])), scores.normalised(truth, T, covariance, rolls)
 
 
 def summary(rows: Sequence[dict[str, Score]], dof: Sequence[int], states: Sequence[str]) -> dict[str, Any]:
-    """Of the moments of a situation, their degrees of freedom and the states of their smoothed poses."""
+    """Summary of the moments of a situation, from their scores, degrees of freedom and states of the smoothed poses."""
     out: dict[str, Any] = {"moments": len(rows), "tracking": states.count("tracking") / len(states), "poses": {}}
     for name in POSES:
         errors, nees = np.array([row[name] for row in rows]).T
@@ -116,7 +116,7 @@ def of_senses(seed: int, count: int, seconds: float, console: Console) -> dict[s
 
 
 class Truths:
-    """Where the limb is between the truths of an emulator."""
+    """The limb's pose between the truths of an emulator."""
 
     def __init__(self, said: Sequence[messages.Truth]):
         self._said = sorted(said, key=lambda each: each.stamp_ns)
@@ -130,7 +130,7 @@ class Truths:
 
 
 def heard_of(cell: cells.Cell, seed: int, seconds: float) -> list[Heard]:
-    """What a recorder of the cell hears while the panel comes and goes: poses of the senses and of fusion, and the truth."""
+    """Messages in the cell while the panel comes and goes: poses of the senses and of fusion, and the truth."""
     world, at, number = World(cell, seed), SEE_S, 0
     world.occlude(0.0, 0.0)
     while at < seconds:
@@ -145,7 +145,7 @@ def heard_of(cell: cells.Cell, seed: int, seconds: float) -> list[Heard]:
 
 
 def of_cell(cell: cells.Cell, seed: int, seconds: float, skip: float) -> dict[str, Any]:
-    """A row for each situation that there was, of the cell's first target."""
+    """A row for each situation that occurred, of the cell's first target."""
     name, target = next(iter(cell.targets.items()))
     heard = [item for item in heard_of(cell, seed, seconds) if item.names["target"] == name]
     truths = Truths([item.message for item in heard if item.topic is topics.TRUTH])

@@ -1,10 +1,10 @@
-"""`penumbra bench soak`: what a cell lives through in a day, in half an hour, and what has grown by then.
+"""`penumbra bench soak`: the events of a day in a cell, in half an hour, and what has grown by then.
 
 Clients come, ask and go, viewers watch, things hide the arm, it leaves and comes back, processes are killed, all are replaced one
 after another, the router goes away, nonsense is published: each as often as on a day, `--speed` times as fast. The sensors are
-not sped up. Clocks could be made to run faster in every process, but the services do not take more: on a machine whose cores are
-busy a camera's frames are already left out, and a delay would only count for more of the faster seconds. So a leak of an event
-shows as in a day, one of a message as in `--minutes`; growth is given per hour of these.
+not sped up. Clocks could be made to run faster in every process, but the services cannot process more: on a machine with busy
+cores frames are already left out, and a delay would only count for more of the faster seconds. So a leak per event shows as after
+a day, one per message as after `--minutes`; growth is given per hour of these.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from penumbra.tests.support.live import Running, connect, penumbra_command, penu
 DAY_S = 86_400.0
 SAMPLE_S = 5.0
 WARM_UP_S = 60.0
-"""Of every process: caches fill and code is compiled. A third of a shorter run."""
+"""Warm-up [s] of every process, in which caches fill and code is compiled; at most a third of the run."""
 ANSWER_S = 60.0
 LOOK_S, AWAY_S = 2.0, 4.0
-"""How long a viewer watches, and an arm is away."""
+"""Times [s] for which a viewer watches, and for which the arm is away."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One process at one time. memory_mb: what is its own; mapped: files of /dev/shm that it maps."""
+    """One process at one time. memory_mb: private memory; mapped: number of files in /dev/shm that it maps."""
 
     at_s: float
     memory_mb: float
@@ -58,8 +58,9 @@ class Sample:
 
 @dataclass(frozen=True)
 class Row:
-    """All processes of one service that lived long enough: how many; the memory of the last; the median slope of their memory,
-    None where none lived long; the most that one gained of the others between its first and its last third."""
+    """Growth of the processes of one service that lived long enough. processes: their number; memory_mb: of the last one;
+    mb_per_hour: median slope of their memory, None where none lived long enough; threads, handles, mapped: maximum that one
+    process gained between the first and the last third of its life."""
 
     service: str
     processes: int
@@ -71,7 +72,7 @@ class Row:
 
 
 class Life:
-    """What happens to a chain. Every event is a method, in EVENTS with how often it happens on a day."""
+    """The events in the life of a chain. Each is a method; EVENTS has how often it happens per day."""
 
     def __init__(self, running: Running, router: injected.Router, cell: cells.Cell, seed: int):
         self.running, self.router, self.cell = running, router, cell
@@ -81,14 +82,14 @@ class Life:
         self._publishers: list[zenoh.Publisher] = []
 
     def client(self) -> None:
-        """Comes, asks for the pose, and goes."""
+        """A client comes, asks for the pose, and goes."""
         with connect(self.router.port) as session:
             key = topics.current_pose(self.running.cell, self.cell.one("targets", None))
             for _ in range(3):
                 list(session.get(f"{key}?format=json", timeout=1.0))
 
     def viewer(self) -> None:
-        """Watches pictures, masks and poses for a while."""
+        """A viewer watches pictures, masks and poses for a while."""
         with connect(self.router.port) as session:
             rings = [
                 session.declare_subscriber(topic.at(cell=self.running.cell), zenoh.handlers.RingChannel(1))
@@ -133,17 +134,17 @@ class Life:
         self.router.replace()
 
     def turn(self) -> None:
-        """Ends what has lasted."""
+        """Ends an absence whose time is over."""
         if self._away_until_s is not None and time.monotonic() > self._away_until_s:
             self._away_until_s = None
             self._set_away(False)
 
     def settle(self) -> None:
-        """The arm is back, in sight."""
+        """Brings the arm back, in sight."""
         self._set_away(False)
 
     def end(self) -> None:
-        """Nothing happens any more."""
+        """Stops a restart that still runs."""
         if self._restart is not None:
             self._restart.kill()
             self._restart.wait()
@@ -154,7 +155,7 @@ class Life:
             self._control("skin", words)
 
     def _control(self, command: str, value: float | str) -> None:
-        """Asks again while the emulator is away."""
+        """Sends a command, again and again while the emulator is away."""
         wait_for(lambda: self.running.control({"command": command, "value": value}), ANSWER_S, "the emulator's answer", 0.2)
 
 
@@ -168,7 +169,7 @@ EVENTS: dict[str, tuple[float, Callable[[Life], None]]] = {
     "restart": (4, Life.restart),
     "router loss": (8, Life.router_loss),
 }
-"""How often on a day, and what."""
+"""By name, how often per day an event happens, and its method."""
 
 
 class Gauge:
@@ -178,10 +179,10 @@ class Gauge:
         self._launcher, self._router = launcher, router
         self.series: defaultdict[tuple[str, int], list[Sample]] = defaultdict(list)
         self.names: set[str] = set()  # of files in /dev/shm that one of them has mapped at any time
-        self.shm_mb: list[float] = []  # what those took that were there
+        self.shm_mb: list[float] = []  # total size of those that existed, by sample
 
     def look(self) -> None:
-        """Takes a sample of each."""
+        """Takes a sample of each process."""
         now_s = time.monotonic()
         for name, process in self._processes():
             with suppress(psutil.NoSuchProcess, FileNotFoundError, ProcessLookupError):
@@ -209,7 +210,7 @@ class Gauge:
                     yield name, child
 
     def rows(self, warm_up_s: float) -> list[Row]:
-        """By service, what grew after the warm-up of each process."""
+        """Growth by service after the warm-up of each process."""
         by_service: defaultdict[str, list[list[Sample]]] = defaultdict(list)
         for (service, _), samples in self.series.items():
             by_service[service].append([each for each in samples if each.at_s >= samples[0].at_s + warm_up_s])
@@ -226,14 +227,14 @@ def row_of(service: str, all_series: Sequence[Sequence[Sample]]) -> Row:
 
 
 def gain(series: Sequence[Sample], name: str) -> int:
-    """By how much a number's median of the last third is above that of the first."""
+    """Increase of the median of a number from the first to the last third."""
     values, third = [getattr(each, name) for each in series], len(series) // 3
     return round(float(np.median(values[-third:]) - np.median(values[:third])))
 
 
 def slope(all_series: Sequence[tuple[Sequence[float], Sequence[float]]]) -> float:
-    """The median slope between any two points of the same series (Theil 1950, Sen 1968, doi:10.1080/01621459.1968.10480934): a
-    step or an outlier does not make it."""
+    """The median slope between any two points of the same series (Theil 1950, Sen 1968, doi:10.1080/01621459.1968.10480934),
+    which a step or an outlier hardly changes."""
     slopes: list[float] = []
     for x, y in all_series:
         i, j = np.triu_indices(len(x), 1)
@@ -243,8 +244,8 @@ def slope(all_series: Sequence[tuple[Sequence[float], Sequence[float]]]) -> floa
 
 @contextmanager
 def chain(cell: str, seed: int) -> Iterator[tuple[Running, injected.Router]]:
-    """`penumbra up --connect` to a router that can be killed, with an empty cache: models that look for lost arms are loaded when
-    one is lost first, and their hundred megabytes would look like a leak."""
+    """`penumbra up --connect` to a router that can be killed, with an empty cache. With models in it, those that look for lost
+    arms would be loaded when an arm is first lost, and their hundred megabytes would look like a leak."""
     with tempfile.TemporaryDirectory() as cache:
         router = injected.Router(os.environ)
         try:
@@ -256,7 +257,7 @@ def chain(cell: str, seed: int) -> Iterator[tuple[Running, injected.Router]]:
 
 
 def soak(cell: str, seed: int, minutes: float, speed: float) -> dict:
-    """Lives through it; the numbers."""
+    """Runs the events for `minutes` at `speed`, and returns the numbers."""
     with chain(cell, seed) as (running, router):
         wait_for(running.is_tracking, 180, "a tracked pose", 0.5)
         life, gauge = Life(running, router, cells.load(cell), seed), Gauge(psutil.Process(running.launcher.pid), router)

@@ -1,8 +1,8 @@
-"""`penumbra bench start`: how long `penumbra up` takes to a tracked pose, cold and warm, and what of it is compiling.
+"""`penumbra bench start`: how long `penumbra up` takes to a tracked pose, cold and warm, and how much of it is compiling.
 
 Cold: a copy of this checkout in which nothing is compiled and nothing cached, with the caches of a home of its own. Warm: the
 same copy once more. Times run from before the launcher is started until this process receives a service's first message: for
-fusion the first pose that is `tracking`; a process that publishes nothing counts from when it is alive on the bus. A service's
+fusion the first pose that is `tracking`; for a process that publishes nothing, until it is alive on the bus. A service's
 compiling CPU is what its processes used until then, cold minus warm.
 """
 
@@ -35,18 +35,18 @@ from penumbra.tests.bench.lib.results import ROOT, Part, Result, marked
 from penumbra.tests.support.live import connect, free_port, penumbra_command, service_of
 
 LEFT_OUT = ("__pycache__", ".*", "build", "runs", "*.egg-info")
-"""What a fresh clone does not hold: everything compiled or cached."""
+"""Patterns of files that a fresh clone does not hold: everything compiled or cached."""
 PATIENCE_S = 300.0
-"""After which a start that is not complete counts as failed."""
+"""Time [s] after which a start that is not complete counts as failed."""
 LOOK_S = 0.01
 MEASURE_S = 0.2
-"""Period of looking at the processes' times: every 10 ms it took half a core of the two that start."""
+"""Period [s] at which the processes' CPU times are read: every 10 ms it took half a core of the two in use."""
 GOALS_S = {"cold_s": 10.0, "warm_s": 3.0}
-"""Of the time to a tracked pose."""
+"""Goals for the time [s] to a tracked pose."""
 
 
 class Failed(RuntimeError):
-    """A start ended before every process had shown itself; the text holds the launcher's last words."""
+    """A start ended before every process was seen on the bus; the text holds the end of the launcher's log."""
 
 
 @dataclass
@@ -87,14 +87,14 @@ class Listener:
                     if messages.decode(messages.FusedPose, sample.payload.to_bytes()).state != "tracking":
                         continue
                     self.first_s.setdefault("fusion", time.monotonic())
-                else:  # of two that may publish it one runs: posecnn in place of search, skin beside the emulator
+                else:  # of two possible publishers one runs: posecnn in place of search, skin beside the emulator
                     self.first_s.setdefault(next(name for name in topic.publishers if name in self.names), time.monotonic())
                 subscriber.undeclare()
                 return
 
     @property
     def is_done(self) -> bool:
-        """Whether every process has shown itself."""
+        """Whether every process has been seen on the bus."""
         return self.first_s.keys() >= set(self.names)
 
     @property
@@ -109,7 +109,7 @@ class Listener:
 
 
 def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
-    """Starts the cell from the checkout in `folder`, and ends it when all of it has shown itself. Raises Failed."""
+    """Starts the cell from the checkout in `folder`, and ends it when all processes have been seen. Raises Failed."""
     port = free_port()
     environment = {name: value for name, value in os.environ.items() if name != "PENUMBRA_CACHE"}
     environment |= {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(home)}
@@ -139,7 +139,7 @@ def start(folder: Path, cell: str, seed: int, home: Path) -> Start:
 
 
 def _until(is_done: Callable[[], bool], deadline_s: float, period_s: float = LOOK_S) -> None:
-    """Returns when something is done, looking each period, or at a time of the monotonic clock."""
+    """Waits until a condition holds, checked each period, or until a deadline of the monotonic clock."""
     while not is_done() and time.monotonic() < deadline_s:
         time.sleep(period_s)
 
@@ -151,13 +151,13 @@ def _listens(port: int) -> bool:
 
 
 def _words(log: IO[str]) -> str:
-    """The last words of a launcher."""
+    """The end of a launcher's log."""
     log.seek(0)
     return log.read()[-2000:]
 
 
 def _until_done(listener: Listener, launcher: subprocess.Popen[bytes]) -> dict[str, float]:
-    """CPU [s] of each service's processes at its first message; returns when all have shown themselves."""
+    """CPU [s] of each service's processes at its first message; returns when all have been seen."""
     used_s: dict[str, float] = {}
     known: dict[int, tuple[str, psutil.Process]] = {}
 

@@ -41,18 +41,18 @@ COLUMNS = {
     "paper_multimodal_procnet": ("faithful", "fused"),
     "live_multimodal_procnet": ("procnet", "live"),
 }
-"""By name, the chain and which of its poses. The first four are the paper's, two more its method, as we built it; the last is the
-fused pose as it is published, some 40 ms before the camera's pose of the same moment is known."""
+"""By name, the chain and the kind of its poses. The first four are the paper's, two more its method, as we built it; the last is
+the fused pose as it is published, some 40 ms before the camera's pose of the same moment is known."""
 PAPERS = tuple(COLUMNS)[:4]
 REACHES = {"inside": "haptic_range_inside", "outside": "haptic_range_outside"}
 DISTANCES = {"short": "short_0_3m", "medium": "medium_3_6m", "long": "long_6_10m"}
-"""Names of the paper's table."""
+"""Names in the paper's table."""
 TRIALS, QUICK_TRIALS = 20, 1
 QUICK_S = 1.6
-"""Length of a quick run: half of its scored time."""
+"""Length [s] of a quick run: about half of the scored time."""
 SHARES = {"inside": (1.0 / 5.0, 1.0 / 4.0), "outside": (1.0 / 3.0, 1.0 / 2.0)}
-"""What multimodal ProcNet may have of the error of the paper's best column, by what the skin reaches; the second where that is
-hardest: under heavy occlusion, and out of range at a long distance."""
+"""Maximum error of multimodal ProcNet as a share of that of the paper's best column, by reach of the skin. The second share holds
+for the hardest settings: under heavy occlusion, and out of range at a long distance."""
 GOALS = {
     "multimodal": "multimodal ProcNet in range at most a fifth of the paper's best column, a quarter under heavy occlusion; "
     "out of range at most a third, a half under heavy occlusion and at 6 to 10 m",
@@ -83,7 +83,7 @@ def paper_of(setting: Setting) -> list[float]:
 
 
 def one(setting: dict[str, Any], seed: int, index: int, seconds: float) -> trials.Played:
-    """A trial, drawn and played."""
+    """Draws and plays a trial."""
     return trials.played(trial.draw(Setting(**setting), seed, index), seconds)
 
 
@@ -149,8 +149,8 @@ def score(results: Sequence[trials.Played]) -> dict[str, Any]:
 
 
 def bootstrap(groups: Sequence[np.ndarray]) -> list[float] | None:
-    """The 95 % confidence interval of the mean over all values, drawn anew by groups: values within one hang together. None of
-    fewer than two groups with values."""
+    """The 95 % confidence interval of the mean over all values, resampled by groups, as values within one are correlated. None
+    for fewer than two groups with values."""
     groups = [each for each in groups if len(each)]
     if len(groups) < 2:
         return None
@@ -168,7 +168,8 @@ def cells_of(found: dict[str, Any]) -> Iterator[tuple[trial.Reach, trial.Distanc
 
 
 def goals(found: dict[str, Any]) -> dict[str, Any]:
-    """How many cells meet each goal, and which miss it, with their errors over what it allows (None: no error to tell)."""
+    """Number of cells that meet each goal, and those that miss it, with the ratios of their errors to the allowed ones (None: no
+    error)."""
     ratios: dict[str, dict[str, float | None]] = {goal: {} for goal in GOALS}
     for reach, distance, occlusion, cell in cells_of(found):
         name, ours, paper = str(Setting(reach, distance, occlusion)), cell["ours"], cell["paper"]
@@ -190,7 +191,7 @@ def _ratio(value: float | None, allowed: float | None) -> float | None:
 
 
 def _both(vision: list[np.ndarray], fused: list[np.ndarray]) -> dict[str, Any]:
-    """Mean errors where both have a pose, and the confidence interval of what fusion adds."""
+    """Mean errors where both have a pose, and the confidence interval of the error that fusion adds."""
     both = [np.isfinite(v) & np.isfinite(f) for v, f in zip(vision, fused, strict=True)]
     v = [each[use] for each, use in zip(vision, both, strict=True)]
     f = [each[use] for each, use in zip(fused, both, strict=True)]

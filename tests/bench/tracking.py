@@ -33,13 +33,13 @@ from penumbra.tests.bench.search import GONE, LOST
 BACKGROUNDS: dict[str, Domain] = {"plain": "easy", "cluttered": "wide"}
 SERVICES = ("segmentation", "search", "fusion")
 VISIBLE = 0.33
-"""At most this share hidden: visible."""
+"""Maximum hidden share at which the arm counts as visible."""
 BACK = 0.5
 """The arm counts as back in sight when less than this share is hidden again."""
 SKIPPED_S = 1.0
-"""At the start, until the arm is found, nothing is scored."""
+"""Time [s] at the start that is not scored, until the arm is found."""
 AFTER_S = 1.0
-"""So long after it came back is the time after an occlusion."""
+"""Time [s] after the arm came back that counts as after an occlusion."""
 RECOVERY_GOAL = 5
 ERRORS = {
     "visible_cm": "position error cm, at most a third hidden",
@@ -61,14 +61,14 @@ class Truth:
 
 @dataclass(frozen=True)
 class Film:
-    """What was said about a film. vision, fused: by the stamp of the frame that they belong to."""
+    """Poses of a film. vision, fused: by the stamp of the frame that they belong to."""
 
     truths: list[Truth]
     vision: dict[int, VisionPose]
     fused: dict[int, FusedPose]
 
     def errors(self, pose: VisionPose | FusedPose, truth: Truth) -> tuple[float, float]:
-        """Position error [m] and the axis's [rad]."""
+        """Errors of the position [m] and of the axis [rad]."""
         T = rigid.transform(pose.position, pose.orientation)
         return float(np.linalg.norm(T[:3, 3] - truth.T[:3, 3])), rigid.axis_angle_error(truth.T, T)
 
@@ -79,7 +79,7 @@ class Film:
 
 
 def played(film: Iterator[Shot], arguments: dict[str, list[str]] | None = None) -> Film:
-    """A film through the services, with these arguments of theirs."""
+    """Plays a film through the services. arguments: of each service."""
     first = next(film)
     truths: list[Truth] = []
 
@@ -100,8 +100,8 @@ def played(film: Iterator[Shot], arguments: dict[str, list[str]] | None = None) 
 
 
 def passes(film: Film) -> list[tuple[int, int, int]]:
-    """The times that everything was hidden: the first and last frame of each (more than GONE hidden), and the first one after
-    that shows enough again."""
+    """The full occlusions: first and last frame of each (more than GONE hidden), and the first frame after it with less than BACK
+    hidden."""
     hidden = np.array([truth.hidden for truth in film.truths])
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (hidden > GONE).astype(np.int8), [0]])))
     out = []
@@ -113,8 +113,8 @@ def passes(film: Film) -> list[tuple[int, int, int]]:
 
 
 def recovery(film: Film, back: int) -> int | None:
-    """Frames from the first that shows the arm again to the first right pose, both counted; None where none came before the end
-    or the next time that the arm was hidden."""
+    """Number of frames from frame `back` to the first right pose, both counted; None where there is none before the end or the
+    next full occlusion."""
     for k, truth in enumerate(film.truths[back:]):
         if truth.hidden > GONE:
             break

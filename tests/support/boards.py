@@ -1,4 +1,4 @@
-"""An emulated board on a port with a clock of its own: what the driver does takes as long as on the real line."""
+"""An emulated board on a port with a clock of its own: the driver's actions take as long as on the real line."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from penumbra.sim.skin.board import Board
 
 
 class SimulatedPort:
-    """Waiting lets the clock run on; nothing depends on the machine's speed. `deaf`: the board hears nothing until a BREAK;
-    `dead`: nor after it."""
+    """A port whose clock advances only when somebody waits, so that nothing depends on the machine's speed. `deaf`: the board
+    receives nothing until a BREAK; `dead`: nor after it."""
 
     def __init__(self, device: Board, clock: list[float], name: str = "simulated"):
         self.device, self.name, self._clock = device, name, clock
@@ -48,7 +48,7 @@ class SimulatedPort:
 
 
 def ask(device: Board, clock: list[float], command: bytes) -> bytes:
-    """What a board sends after a command, until nothing more is under way."""
+    """All bytes that a board sends after a command."""
     device.receive(command, clock[0])
     out = b""
     while (due := device.next_s()) < np.inf:
@@ -58,5 +58,5 @@ def ask(device: Board, clock: list[float], command: bytes) -> bytes:
 
 
 def amplitudes(packet: bytes) -> np.ndarray:
-    """(6,) [V] of a reply."""
+    """Amplitudes (6,) [V] of the channels in a reply."""
     return np.abs(board.decode(packet).fourier()[1]) * 3.3 / board.FULL_SCALE

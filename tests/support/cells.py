@@ -1,4 +1,4 @@
-"""Cells of any size, made from a built-in one: so many work places side by side, each with what the built-in one has."""
+"""Cells of any size, made from a built-in one: work places side by side, each with the equipment of the built-in cell."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ PITCH = 4.0
 
 
 def derive(base: str, cameras: int, targets: int, folder: Path, rate_hz: float | None = None) -> Path:
-    """Writes a cell file with so many cameras and targets, and says where.
+    """Writes a cell file with these numbers of cameras and targets, and returns its path.
 
     A work place for each target, with its own set of pads; camera k looks at place k modulo their number, from the built-in
     place and, where a place has several, from other directions around it. A robot stays with the first place. rate_hz: of the
-    cameras, where it is not the built-in one.
+    cameras (default: the built-in rate).
     """
     source = cells.source(base)
     data = yaml.safe_load(source.read_text())
@@ -50,7 +50,7 @@ def _shifted(description: dict, place: int) -> dict:
 
 
 def _turned(camera: dict, place: int, turn: int, rate_hz: float | None) -> dict:
-    """A camera at a place, turned about what it looks at: by 0, 40, -40, 80 … degrees about the vertical."""
+    """A camera at a place, turned about the point that it looks at: by 0, 40, -40, 80 … degrees about the vertical."""
     angle = math.radians(40.0 * ((turn + 1) // 2) * (-1) ** (turn + 1))
     x, y, z = (a - b for a, b in zip(camera["position"], camera["look_at"], strict=True))
     c, s = math.cos(angle), math.sin(angle)

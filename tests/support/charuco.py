@@ -16,19 +16,19 @@ from penumbra.shared.geometry.lens import Lens
 from penumbra.shared.geometry.rigid import Array
 
 LENS = Lens(640, 480, 615.0, 613.0, 322.5, 236.0, k1=-0.28, k2=0.09, p1=0.0008, p2=-0.0006)
-"""A webcam's: a barrel of 6 % at the corners."""
+"""Lens of a webcam, with a barrel distortion of 6 % at the corners."""
 TEXTURE = 2e-4
-"""Edge of a pixel of the board's own picture [m]."""
+"""Edge [m] of a pixel of the board's texture."""
 SAMPLES = 2
-"""Rays of a pixel along each direction."""
+"""Number of rays per pixel along each direction."""
 CORNER_PX = 0.06
-"""Noise of a corner that is found in a picture of the default blur and noise: what the fits leave of them."""
+"""Noise [px] of a corner that is found in a picture of the default blur and noise: the residuals of the fits."""
 NEAR, FAR = 0.25, 4.0
 
 
 @dataclass(frozen=True)
 class Photographer:
-    """Takes pictures of a board. blur: of the optics [px]; noise: of a pixel [levels]."""
+    """Takes pictures of a board. blur: of the optics [px]; noise: of a pixel [grey levels]."""
 
     board: Board
     lens: Lens = LENS
@@ -37,7 +37,7 @@ class Photographer:
 
     @cached_property
     def _rays(self) -> NDArray[np.float32]:
-        """(SAMPLES height, SAMPLES width, 2): x / z and y / z of the rays of a finer picture."""
+        """x / z and y / z of the rays of a finer picture: (SAMPLES height, SAMPLES width, 2)."""
         first = (1.0 / SAMPLES - 1.0) / 2.0
         x = first + np.arange(SAMPLES * self.lens.width) / SAMPLES
         y = first + np.arange(SAMPLES * self.lens.height) / SAMPLES
@@ -57,7 +57,7 @@ class Photographer:
         return sheet
 
     def picture(self, T_camera_board: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """(height, width, 3) uint8."""
+        """The picture (height, width, 3) uint8 of a board at a pose."""
         R, t = T_camera_board[:3, :3], T_camera_board[:3, 3]
         n = R[:, 2]  # of the plane in the camera's frame
         rays = self._rays
@@ -73,12 +73,12 @@ class Photographer:
         return np.repeat(np.clip(seen, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
     def view(self, name: str, T_camera_board: Array, rng: np.random.Generator) -> View | None:
-        """What is found in such a picture."""
+        """The corners that are found in such a picture; None where the board is not found."""
         found = self.board.find(self.picture(T_camera_board, rng))
         return None if found is None else View(name, *found)
 
     def corners(self, name: str, T_camera_board: Array, rng: np.random.Generator) -> View | None:
-        """What would be found in such a picture, without taking it: a thousand times faster."""
+        """The corners that would be found in such a picture, without rendering it: a thousand times faster."""
         points = rigid.apply(T_camera_board, self.board.corners)
         k = (self.lens.fx, self.lens.fy), (self.lens.cx, self.lens.cy)
         shown = self.lens.distorted(points[:, :2] / points[:, 2:] * k[0] + k[1])
@@ -88,7 +88,8 @@ class Photographer:
 
 
 def held(board: Board, count: int, rng: np.random.Generator) -> list[Array]:
-    """T_camera_board of a board that somebody holds before the camera: everywhere in the picture, near and far, tilted."""
+    """T_camera_board (4, 4) of a board that is held before the camera by hand: everywhere in the picture, near and far,
+    tilted."""
     middle = np.array([*board.size, 0.0]) / 2.0
     out = []
     for _ in range(count):
@@ -110,14 +111,14 @@ NOISE = 2e-4, float(np.radians(0.05))
 @dataclass(frozen=True)
 class Carried:
     """A robot that shows a board to a camera. T_world_camera: where the camera stands; T_link_board: how the board is mounted;
-    noise: standard deviations of the link's position [m] and rotation [rad] about what the joints say."""
+    noise: standard deviations of the link's position [m] and rotation [rad] about those from the joints."""
 
     T_world_camera: Array = field(default_factory=lambda: rigid.look_at((1.3, -0.5, 0.9), (0.4, 0.0, 0.5)))
     T_link_board: Array = field(default_factory=lambda: MOUNT)
     noise: tuple[float, float] = NOISE
 
     def poses(self, board: Board, count: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
-        """T_world_link as the joints say and T_camera_board as it is, of so many poses."""
+        """T_world_link from the joints and the true T_camera_board of `count` poses."""
         middle = np.array([*board.size, 0.0]) / 2.0
         out = []
         for _ in range(count):
@@ -131,6 +132,6 @@ class Carried:
         return out
 
     def said(self, T_camera_board: Array, rng: np.random.Generator) -> Array:
-        """T_world_link by the joints where the board is there."""
+        """T_world_link from the joints, with noise, for a board at T_camera_board."""
         T_world_link = self.T_world_camera @ T_camera_board @ rigid.inverse(self.T_link_board)
         return rigid.perturb(T_world_link, np.repeat(self.noise, 3) * rng.standard_normal(6))

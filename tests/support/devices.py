@@ -1,5 +1,5 @@
-"""What a cell's drivers are connected with, as processes that may hang, be killed and start again at the same address: a robot's
-controller and a camera's server; and a cell with a robot."""
+"""Devices of a cell as processes that may hang, be killed and start again at the same address: a robot's controller and a
+camera's server; and a cell with a robot."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Self
 from penumbra.tests.support import numbered
 
 ORDER = ("elbow_joint", "shoulder_pan_joint", "wrist_3_joint", "shoulder_lift_joint", "wrist_1_joint", "wrist_2_joint")
-"""Of the cell's joints: not the controller's."""
+"""Order of the cell's joints, which differs from the controller's."""
 
 
 class Device:
-    """A program that prints `listening`. `process` is the one that runs now."""
+    """A program that prints `listening` when it is ready. `process` is the current one."""
 
     def __init__(self, *command: str):
         self._command = command
@@ -28,7 +28,7 @@ class Device:
         assert self.process.stdout is not None and self.process.stdout.readline() == "listening\n"
 
     def tell(self, line: str) -> None:
-        """A line for its standard input."""
+        """Writes a line to its standard input."""
         assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
@@ -53,7 +53,7 @@ class Controller(Device):
 
 
 class CameraServer(Device):
-    """GStreamer's RTSP server, whose pictures show when they were made (`gstreamer`)."""
+    """GStreamer's RTSP server, whose pictures show their time of creation (`gstreamer`)."""
 
     def __init__(self, port: int, rate_hz: int):
         self.url = f"rtsp://127.0.0.1:{port}/camera"
@@ -61,7 +61,7 @@ class CameraServer(Device):
 
 
 def urdf(names: Sequence[str]) -> str:
-    """A chain of revolute joints."""
+    """The URDF of a chain of revolute joints."""
     links = "".join(f'<link name="l{i}"/>' for i in range(len(names) + 1))
     joints = "".join(
         f'<joint name="{name}" type="revolute"><parent link="l{i}"/><child link="l{i + 1}"/><axis xyz="0 0 1"/>'
@@ -72,7 +72,7 @@ def urdf(names: Sequence[str]) -> str:
 
 
 def robot_cell(folder: Path, source: str | None = None, joints: Sequence[str] = ORDER, more: str = "") -> Path:
-    """The path of a cell with one robot. more: what follows in its source."""
+    """Writes a cell with one robot, and returns its path. more: further fields of its source."""
     (folder / "arm.urdf").write_text(urdf(joints))
     origin = f", source: {{url: '{source}'{more}}}" if source else ""
     path = folder / "mine.yaml"

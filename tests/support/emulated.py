@@ -26,7 +26,7 @@ INTEGER = struct.Struct("<q")
 
 @dataclass(frozen=True)
 class Call:
-    """A call of a kernel: the arguments before it and after it, as copies, and the result, None where it has none."""
+    """A call of a kernel: copies of the arguments before and after it, and the result, None where it has none."""
 
     kernel: Kernel
     before: tuple[Any, ...]
@@ -35,13 +35,13 @@ class Call:
 
 
 def missing() -> str:
-    """What is not installed of what it takes; empty where all is."""
+    """The required programs that are not installed; empty where all are."""
     return ", ".join(name for name in (EMULATOR, COMPILER) if shutil.which(name) is None)
 
 
 @contextmanager
 def recorded(most: int) -> Iterator[list[Call]]:
-    """The calls of kernels within, of each kernel the first ones."""
+    """The kernel calls within the context, at most the first `most` of each kernel."""
     calls: list[Call] = []
     counts: Counter[str] = Counter()
     call = Kernel.__call__
@@ -79,16 +79,16 @@ def run(calls: Sequence[Call], folder: Path) -> Iterator[tuple[Call, list[np.nda
 
 
 def _arrays(call: Call) -> list[np.ndarray]:
-    """All arrays of a call; the last takes the result."""
+    """All arrays of a call; the last is for the result, if there is one."""
     result = call.kernel.signature.result
     arrays = [each for each, kind in zip(call.before, call.kernel.signature.parameters, strict=True) if kind.is_array]
     return arrays + ([np.empty(1, result)] if result is not None else [])
 
 
 def _packed(call: Call) -> bytes:
-    """A call as the program reads it: in the block, where a pointer to an array goes, there is 0."""
+    """A call as the program reads it; pointers to arrays are 0 in its block."""
     symbol = call.kernel.symbol.encode()
-    block, slots = [INTEGER.pack(0)], []  # an array object holds its data's address 0 bytes from its beginning
+    block, slots = [INTEGER.pack(0)], []  # an array object begins with the address of its data
     for value, kind in zip(call.before, call.kernel.signature.parameters, strict=True):
         if kind.is_array:
             slots.append(len(block))

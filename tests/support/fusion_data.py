@@ -15,19 +15,19 @@ T0_NS = 1_700_000_000_000_000_000
 HOME = rigid.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0])
 SPREAD = (0.12, 0.4)
 VISION = np.diag(1.0 / np.square([0.01, 0.01, 0.01, 0.03, 0.03, 0.03]))
-"""Information of a camera's pose."""
+"""Information (6, 6) of a camera's pose."""
 SKIN = [0.006, 0.003, 0.002, 1.0, 0.02, 0.03]
-"""Standard deviations of a haptic pose along the limb's axes."""
+"""Standard deviations [m, rad] of a haptic pose along and about the limb's axes."""
 NO_ROLL = np.diag([1.0, 1.0, 1.0, 0.0, 1.0, 1.0])
 
 
 def ns(seconds: float) -> int:
-    """A stamp."""
+    """The stamp [ns] of a time [s]."""
     return T0_NS + round(seconds * 1e9)
 
 
 class Errors:
-    """A sense's pose errors, a lasting and a white part, none where nothing is observed."""
+    """A sense's pose errors: a lasting and a white part, zero in directions that are not observed."""
 
     def __init__(self, errors: senses.Errors, period: float, rng: np.random.Generator):
         self._errors, self._rng = errors, rng
@@ -45,8 +45,8 @@ class Errors:
 
 
 def motion(dt: float, settings: FusionSettings) -> tuple[Array, Array]:
-    """How position, velocity and acceleration (3,) along one axis go on for dt [s]: transition and process noise (3, 3), by
-    Van Loan, "Computing integrals involving the matrix exponential" (1978), DOI 10.1109/TAC.1978.1101743."""
+    """Transition and process noise (3, 3) of position, velocity and acceleration along one axis over dt [s], by Van Loan,
+    "Computing integrals involving the matrix exponential" (1978), DOI 10.1109/TAC.1978.1101743."""
     w = 1.0 / settings.motion_time[0]
     rates = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -(w**2), -2.0 * settings.damping * w]])
     both = np.zeros((6, 6))
@@ -58,6 +58,6 @@ def motion(dt: float, settings: FusionSettings) -> tuple[Array, Array]:
 
 
 def without_roll(T: Array, sigma: list[float]) -> Array:
-    """Information (6, 6) of a measurement with these standard deviations along the limb's axes that does not see its roll."""
+    """Information (6, 6) of a measurement without roll, with these standard deviations along the limb's axes."""
     B = np.kron(np.eye(2), T[:3, :3])
     return B @ NO_ROLL @ np.diag(1.0 / np.square(sigma)) @ B.T

@@ -1,7 +1,7 @@
-"""What only GStreamer makes, in the system's Python, which has its bindings; nothing of ours is imported here.
+"""Streams and films that only GStreamer makes, in the system's Python, which has its bindings; imports nothing of Penumbra.
 
 `/usr/bin/python3 gstreamer.py serve PORT RATE_HZ` is a real RTSP server at rtsp://127.0.0.1:PORT/camera whose pictures (JPEG over
-RTP) show the time at which they were made [ms since the epoch]; it prints a line when it listens. `gstreamer.py film FILE MS...`
+RTP) show their time of creation [ms since the epoch]; it prints a line when it listens. `gstreamer.py film FILE MS...`
 writes a film (Matroska) without an even rate, whose pictures show their numbers, at these times.
 """
 
@@ -46,7 +46,7 @@ def serve(port: str, rate_hz: int) -> None:
     Gst.init(None)
 
     def push(source: Gst.Element) -> None:
-        """A picture each period, for as long as somebody takes them."""
+        """Pushes a picture each period, for as long as there is a client."""
         due = time.monotonic()
         while True:
             picture = Gst.Buffer.new_wrapped(luma(time.time_ns() // 1_000_000) + GREY)
@@ -77,7 +77,7 @@ def serve(port: str, rate_hz: int) -> None:
 
 
 def film(path: str, times_ms: list[int]) -> None:
-    """Writes a film of a picture at each of these times."""
+    """Writes a film with a picture at each of these times."""
     import gi
 
     gi.require_version("Gst", "1.0")

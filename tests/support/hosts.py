@@ -1,6 +1,6 @@
 """Hosts for tests: namespaces of this machine with a network, a host name and a shared memory of their own, linked by veth pairs.
 
-Without a /dev/shm of their own Zenoh would find out that they are one machine, and send large messages past the network.
+With a common /dev/shm Zenoh would detect that they are one machine, and send large messages past the network.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NAMESPACES = ("--net", "--mount", "--uts")
 
 @cache
 def why_not() -> str:
-    """Why there can be no hosts here; empty where there can be."""
+    """The reason why hosts cannot be made here; empty where they can."""
     try:
         command = "ip link add type veth && tc qdisc add dev veth0 root tbf rate 1mbit burst 4kb latency 50ms"
         made = subprocess.run(["unshare", *NAMESPACES, "sh", "-c", command], capture_output=True, text=True)
@@ -38,7 +38,7 @@ def why_not() -> str:
 
 @dataclass
 class Host:
-    """One host, for as long as it is entered. processes: what was started on it, by name."""
+    """One host, for as long as its context is open. processes: those that were started on it, by name."""
 
     name: str
     processes: dict[str, subprocess.Popen] = field(default_factory=dict)
@@ -47,7 +47,7 @@ class Host:
         setup = f"mount -t tmpfs tmpfs /dev/shm && hostname {self.name} && ip link set lo up && echo ready && exec cat"
         self._holder = subprocess.Popen(
             ["unshare", *NAMESPACES, "sh", "-c", setup], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )  # ends with the test: its input does
+        )  # ends with the test, which closes its input
         assert self._holder.stdout is not None and self._holder.stdout.readline() == "ready\n"
         return self
 
@@ -66,7 +66,7 @@ class Host:
 
     @property
     def pid(self) -> int:
-        """Of the process whose namespaces the host is."""
+        """The process whose namespaces make up the host."""
         return self._holder.pid
 
     def run(self, *command: str) -> None:
@@ -74,13 +74,13 @@ class Host:
         subprocess.run([*self._enter(), *command], check=True, capture_output=True, text=True)
 
     def penumbra(self, *words: str) -> str:
-        """What `penumbra WORDS...` prints on the host."""
+        """The output of `penumbra WORDS...` on the host."""
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         command = [*self._enter(), *penumbra_command(*words)]
         return subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
 
     def start(self, service: str, *arguments: str) -> subprocess.Popen:
-        """Starts `penumbra SERVICE`, which connects to the host's own router unless it is told otherwise."""
+        """Starts `penumbra SERVICE`, which by default connects to the host's own router."""
         environment = os.environ | {"PYTHONPATH": str(ROOT), "PENUMBRA_PARENT": str(os.getpid())}
         command = [*self._enter(), *penumbra_command(service, "--log-level", "warning", *arguments)]
         self.processes[service] = subprocess.Popen(command, env=environment)
@@ -92,7 +92,7 @@ class Host:
 
 @dataclass(frozen=True)
 class Link:
-    """A cable between two hosts, of which each calls its end by the name of the other. number: of its network, 10.77.NUMBER.0/30,
+    """A cable between two hosts; each names its end after the other host. number: of its network, 10.77.NUMBER.0/30,
     in which `one` is .1 and `other` .2."""
 
     one: Host
@@ -108,14 +108,14 @@ class Link:
         return self
 
     def throttle(self, bytes_per_s: int) -> None:
-        """Lets so much through in each direction; more waits up to 0.2 s in the modem, as it were, then it is lost."""
+        """Limits the rate in each direction, as a modem does: excess data waits for up to 0.2 s, then it is lost."""
         for host, end in self._ends():
             host.run("tc", "qdisc", "add", "dev", end, "root", "tbf", "rate", f"{8 * bytes_per_s}bit",
                      "burst", "4kb", "latency", "200ms")  # fmt: skip
 
     @contextmanager
     def cut(self) -> Iterator[None]:
-        """Within it the cable is unplugged."""
+        """Unplugs the cable within the context."""
         self.one.run("ip", "link", "set", self.other.name, "down")
         try:
             yield
@@ -128,8 +128,8 @@ class Link:
 
 @dataclass
 class Hosts:
-    """A cell, by its name, on three hosts: the camera's, linked to the one that computes and to the robot's. The sensors are on
-    the camera's. sessions: a client's at each host's router, by the host's name."""
+    """A cell on three hosts: the camera's, linked to the one that computes and to the robot's. The sensors are on the camera's.
+    sessions: a client session at each host's router, by the host's name."""
 
     cell: str
     hosts: dict[str, Host]
@@ -142,10 +142,10 @@ SERVICES = {"camera": ("emulator",), "compute": ("segmentation", "search"), "rob
 
 @contextmanager
 def three_hosts(folder: Path, cell: str, seed: int, slow: int | None = None) -> Iterator[Hosts]:
-    """The services of a cell on three hosts, each with a router, as soon as all are on the bus.
+    """Starts the services of a cell on three hosts, each with a router.
 
-    folder: of the routers' sockets, by which a test meets each of them without a network. slow: bytes a second over the robot's
-    link, which its routers are told is slow; None for a fast one.
+    folder: of the routers' sockets, through which a test connects to each of them without a network. slow: limit [bytes/s] of the
+    robot's link, which the flags of its routers declare as slow; None for a fast one.
     """
     with ExitStack() as stack:
         found = {name: stack.enter_context(Host(name)) for name in SERVICES}

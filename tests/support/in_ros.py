@@ -38,7 +38,7 @@ def plain(value: Any) -> Any:
 
 
 class Answers:
-    """What is asked, and the ROS node by which it is answered."""
+    """The possible questions, and the ROS node that answers them."""
 
     def __init__(self) -> None:
         rclpy.init()

@@ -1,4 +1,4 @@
-"""Faults for real processes, brought in from outside as they would happen: the tests and `penumbra bench faults` share them."""
+"""Faults for real processes, injected from outside as they would happen: the tests and `penumbra bench faults` share them."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from penumbra.tests.support.live import Running, free_port, penumbra_command, pe
 
 CLOCK_SOURCE = Path(__file__).parent / "clock_shift.c"
 PIDS = 1 << 22
-"""More than Linux gives out."""
+"""More process ids than Linux gives out."""
 QUESTION_BYTES = 1 << 26
-"""As much in one piece has no process at hand: malloc maps new memory for 32 MB and more."""
+"""Size [bytes] of a question that no process has room for: malloc maps new memory for 32 MB and more."""
 
 
 @contextmanager
 def at_once(fault: Callable[[], object]) -> Iterator[None]:
-    """A fault that needs no ending."""
+    """A fault that happens at once and does not need to be ended."""
     fault()
     yield
 
@@ -42,14 +42,14 @@ def at_once(fault: Callable[[], object]) -> Iterator[None]:
 
 
 def kill(process: psutil.Process) -> None:
-    """SIGKILL, as by the kernel's out-of-memory killer."""
+    """Sends SIGKILL, as the kernel's out-of-memory killer does."""
     with suppress(psutil.NoSuchProcess):
         process.kill()
 
 
 @contextmanager
 def frozen(process: psutil.Process) -> Iterator[None]:
-    """SIGSTOP: it keeps its connections and its memory, and does nothing."""
+    """Stops a process (SIGSTOP): it keeps its connections and its memory, and does nothing."""
     with _signalled(process, signal.SIGCONT):
         process.send_signal(signal.SIGSTOP)
         yield
@@ -57,8 +57,8 @@ def frozen(process: psutil.Process) -> Iterator[None]:
 
 @contextmanager
 def slowed(process: psutil.Process, stopped_s: float = 0.4, running_s: float = 0.1) -> Iterator[list[tuple[float, float]]]:
-    """It runs for a fifth of the time, in bursts that the lease of its connection does not notice. From when to when it was
-    stopped, by the steady clock, is in the list."""
+    """Lets a process run for a fifth of the time, in bursts that the lease of its connection does not notice. The list has the
+    begin and end of each stop [s, steady clock]."""
     done = threading.Event()
     stops: list[tuple[float, float]] = []
 
@@ -78,7 +78,7 @@ def slowed(process: psutil.Process, stopped_s: float = 0.4, running_s: float = 0
 
 @contextmanager
 def meanwhile(function: Callable[[], None], done: threading.Event) -> Iterator[None]:
-    """Calls a function in a thread of its own, which ends when `done` is set, as it is in the end."""
+    """Runs a function in a thread of its own, which ends when `done` is set; the end of the context sets it."""
     thread = threading.Thread(target=function)
     thread.start()
     try:
@@ -98,16 +98,16 @@ def _signalled(process: psutil.Process, number: signal.Signals) -> Iterator[None
 
 
 def starve(process: psutil.Process, session: zenoh.Session, cell: str, seconds: float) -> bool:
-    """Out of memory: the kernel refuses a service's process every further page (RLIMIT_AS at less than it has already), until it
-    has ended, at most for so long; whether it has. It may go on for ever with what it has: it is asked for its health again and
-    again, with a question for which it needs new memory."""
+    """Out of memory: the kernel refuses a service's process every further page (RLIMIT_AS below its present size), until it ends
+    or `seconds` are over. Returns whether it ended. A process may go on for ever with the memory that it has, so it is asked for
+    its health again and again, with a question for which it needs new memory."""
     before = resource.prlimit(process.pid, resource.RLIMIT_AS, (1 << 20, resource.RLIM_INFINITY))
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         session.get(
             topics.health(cell, instance=f"$*-{process.pid}-$*"),
             payload=bytes(QUESTION_BYTES),
-            priority=zenoh.Priority.BACKGROUND,  # the others' messages pass by
+            priority=zenoh.Priority.BACKGROUND,  # messages of others are not delayed
         )
         with suppress(psutil.TimeoutExpired):
             process.wait(1.0)
@@ -119,7 +119,7 @@ def starve(process: psutil.Process, session: zenoh.Session, cell: str, seconds: 
 
 @contextmanager
 def crash_loop(processes: Callable[[], Iterable[psutil.Process]], period_s: float = 0.05) -> Iterator[None]:
-    """Whatever `processes` finds dies at its start, again and again."""
+    """Kills every process that `processes` finds, at its start, again and again."""
     done = threading.Event()
 
     def reap() -> None:
@@ -136,7 +136,7 @@ def crash_loop(processes: Callable[[], Iterable[psutil.Process]], period_s: floa
 
 @contextmanager
 def small_disk(folder: Path, megabytes: float) -> Iterator[None]:
-    """A disk of its own of this size at `folder`. Raises OSError where this user may not mount one."""
+    """Mounts a separate disk of this size at `folder`. Raises PermissionError where this user may not."""
     folder.mkdir(parents=True, exist_ok=True)
     command = ["mount", "-t", "tmpfs", "-o", f"size={int(megabytes * 1024)}k", "penumbra-test", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -150,7 +150,7 @@ def small_disk(folder: Path, megabytes: float) -> Iterator[None]:
 
 @contextmanager
 def full(folder: Path) -> Iterator[None]:
-    """The disk of a folder has not a byte left."""
+    """Fills the disk of a folder to the last byte."""
     ballast = folder / "ballast"
     with ballast.open("wb", buffering=0) as file, suppress(OSError):
         for size in (1 << 16, 1 << 10, 1):
@@ -177,7 +177,7 @@ class Link:
 
     @contextmanager
     def cut(self, process: psutil.Process) -> Iterator[None]:
-        """Nothing of this process passes any more, and nobody hears that the link is gone."""
+        """Stops all traffic of this process; no side is notified that the link is gone."""
         connections = process.net_connections("tcp")
         ports = [c.laddr.port for c in connections if c.raddr and c.raddr.port == self.port]
         if not ports:
@@ -223,7 +223,7 @@ class Router:
         self.popen.wait()
 
     def replace(self) -> None:
-        """It is killed, and the next one takes its place."""
+        """Kills the router, and starts another one in its place."""
         self.kill()
         self.start()
 
@@ -232,7 +232,8 @@ class Router:
 
 
 class Clocks:
-    """The wall clocks of the processes that run with `environment`, which can be set while they run. folder: for two files."""
+    """The wall clocks of the processes that run with `environment`, which can be changed while they run. folder: for two
+    files."""
 
     def __init__(self, folder: Path):
         library, shifts = folder / "clock_shift.so", folder / "clock_shift"
@@ -245,7 +246,7 @@ class Clocks:
 
     @contextmanager
     def shifted(self, seconds: float, process: psutil.Process | None = None) -> Iterator[None]:
-        """The clock of one process, or of all, jumps by so much, and back at the end."""
+        """Makes the clock of one process, or of all, jump by `seconds`, and back at the end."""
         self.jump(seconds, process)
         try:
             yield
@@ -253,7 +254,7 @@ class Clocks:
             self.jump(-seconds, process)
 
     def jump(self, seconds: float, process: psutil.Process | None = None) -> None:
-        """The clock of one process, or of all, jumps by so much."""
+        """Makes the clock of one process, or of all, jump by `seconds`."""
         at = 8 * (process.pid if process else 0)
         (before,) = struct.unpack("=q", self._shifts[at : at + 8])
         self._shifts[at : at + 8] = struct.pack("=q", before + round(seconds * 1e9))
@@ -268,7 +269,7 @@ class Clocks:
 
 @contextmanager
 def storm(session: zenoh.Session, key: str, times: int = 10) -> Iterator[list[int]]:
-    """Every message of a key comes again, `times` times, numbered as another publisher's own; how many so far is in the list."""
+    """Repeats every message of a key `times` times, numbered as another publisher's own. The list has the count so far."""
     sent = [0]
     numbering = Numbering()
     publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
@@ -297,7 +298,7 @@ def storm(session: zenoh.Session, key: str, times: int = 10) -> Iterator[list[in
 @dataclass(frozen=True)
 class Breakable:
     """`penumbra up --connect` to a router of its own through a link that can be cut, with clocks that can be set, and with its
-    logs, caches, temporary files and heartbeat on a disk that can be filled; None where this user may not mount one.
+    logs, caches, temporary files and heartbeat on a disk that can be filled. disk: None where this user may not mount one.
 
     The link is a proxy on loopback: it cuts one running process off at any time and needs no rights, where network namespaces
     would cut off whole hosts."""
@@ -322,7 +323,7 @@ def breakable(cell: str, seed: int, *arguments: str) -> Iterator[Breakable]:
             stack.enter_context(small_disk(folder / "disk", DISK_MB))
         except PermissionError:
             disk = None
-        files = folder / "disk"  # a folder like others where nothing is mounted
+        files = folder / "disk"  # an ordinary folder where nothing is mounted
         clocks = Clocks(folder)
         stack.callback(clocks.close)
         router = Router(clocks.environment)
@@ -337,11 +338,11 @@ def breakable(cell: str, seed: int, *arguments: str) -> Iterator[Breakable]:
             yield Breakable(running, router, link, clocks, disk)
 
 
-# ---- who is struck
+# ---- the processes that are struck
 
 
 def instances(launcher: psutil.Process, service: str) -> list[psutil.Process]:
-    """The running processes of a service, by their titles."""
+    """The running processes of a service, recognised by their titles."""
     with suppress(psutil.NoSuchProcess):
         return [child for child in launcher.children(recursive=True) if service_of(child) == service]
     return []

@@ -1,4 +1,4 @@
-"""What may come over a wire or stand in a file, as strategies of hypothesis: the good, and what somebody made of it."""
+"""Inputs that may come over a wire or from a file, as strategies of hypothesis: valid ones, and damaged ones."""
 
 from typing import Any
 
@@ -114,7 +114,7 @@ SPOILERS = [
 
 @st.composite
 def damaged(draw, whole: bytes) -> bytes:
-    """Bytes that were good before somebody changed, cut, doubled or put in a few."""
+    """Valid bytes of which a few were changed, cut, doubled or inserted."""
     out = bytearray(whole)
     for _ in range(draw(st.integers(1, 4))):
         start = draw(st.integers(0, len(out)))

@@ -1,7 +1,7 @@
 """A link that can be cut: `python -m penumbra.tests.support.link LISTEN TARGET` passes TCP bytes on between ports of loopback.
 
-On standard input: `cut PORT...` stops the bytes of the callers that have these ports, and of whoever calls from then on; `mend`
-lets all pass again, those held back first, as where a cable is plugged in again. Nobody is told: a cut link is silent.
+On standard input: `cut PORT...` stops the bytes of the callers that have these ports, and of all later callers; `mend` lets all
+pass again, those held back first, as when a cable is plugged in again. No side is notified: a cut link is silent.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ CHUNK = 1 << 16
 
 
 class Link:
-    """Every caller has a gate that is open or shut."""
+    """Passes the bytes of its callers on; each caller has a gate that is open or shut."""
 
     def __init__(self, target: int):
         self._target = target
@@ -34,7 +34,7 @@ class Link:
             far_reader, far_writer = await asyncio.open_connection(HOST, self._target)
             pumps = [self._pump(gate, reader, far_writer), self._pump(gate, far_reader, writer)]
             await asyncio.gather(*pumps, return_exceptions=True)
-        except OSError:  # nobody there: the caller is told by the end of its connection
+        except OSError:  # nobody there: the end of its connection notifies the caller
             pass
         finally:
             del self._gates[port]
@@ -52,7 +52,7 @@ class Link:
                 writer.close()
 
     def command(self, words: list[str]) -> None:
-        """`cut PORT...` or `mend`."""
+        """Carries out `cut PORT...` or `mend`."""
         self._is_cut = words[0] == "cut"
         for port, gate in self._gates.items():
             if not self._is_cut:
@@ -62,7 +62,7 @@ class Link:
 
 
 async def serve(listen: int, target: int) -> None:
-    """Until standard input ends."""
+    """Serves until standard input ends."""
     link = Link(target)
     server = await asyncio.start_server(link.call, HOST, listen)
     loop = asyncio.get_running_loop()

@@ -20,7 +20,7 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, processes, topics
 
 PATIENCE_S = 60.0
-"""A test waits at least so long: what takes a moment on a quiet machine takes a while on a busy one, and a deadline that is not
+"""Minimum deadline [s] of a test: a step that is short on a quiet machine takes a while on a busy one, and a deadline that is not
 reached costs nothing."""
 
 
@@ -60,10 +60,11 @@ _held: list[socket.socket] = []
 
 
 def free_port() -> int:
-    """A TCP port that nobody listens on, and that nobody but who is told it gets before this process has ended.
+    """A TCP port that nobody listens on, and that is reserved for the caller until this process ends.
 
-    The socket that the kernel gave it to stays bound and does not listen: the kernel gives the port to nobody else, neither to
-    listen on nor to call from, and lets one that asks for it by its number listen there (SO_REUSEADDR, as all servers set it)."""
+    The socket that got it from the kernel stays bound and does not listen. The kernel assigns the port to no other socket,
+    neither to listen on nor to connect from, but lets a server listen there that asks for it by number (SO_REUSEADDR, which all
+    servers set)."""
     holder = socket.socket()
     holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     holder.bind(("", 0))
@@ -113,13 +114,13 @@ class Running:
         return None
 
     def health(self) -> dict[str, dict]:
-        """The health of every living instance by service."""
+        """The health of an instance of every service that answers, by service."""
         replies = self.session.get(topics.health(self.cell), timeout=1.0)
         found = [json.loads(reply.ok.payload.to_string()) for reply in replies if reply.ok]
         return {item["service"]: item for item in found}
 
     def processes(self) -> dict[str, psutil.Process]:
-        """The launcher and its services by name, from their titles."""
+        """The launcher and its services by name, recognised by their titles; further instances have their pid in the name."""
         launcher = psutil.Process(self.launcher.pid)
         out = {"launcher": launcher}
         for child in launcher.children(recursive=True):
@@ -129,7 +130,8 @@ class Running:
 
 
 def service_of(process: psutil.Process) -> str | None:
-    """The service that a process runs, by its title; None for any other process, one that has ended, and one that only begins."""
+    """The service that a process runs, by its title; None for any other process, one that has ended, and one that is just
+    starting."""
     try:
         words = " ".join(process.cmdline()).split()
     except psutil.NoSuchProcess:
@@ -141,10 +143,10 @@ def service_of(process: psutil.Process) -> str | None:
 def penumbra_up(
     cell: str, seed: int, *arguments: str, port: int | None = None, environment: Mapping[str, str] | None = None, **streams: Any
 ) -> Iterator[Running]:
-    """The whole chain as real processes, stopped as by Ctrl-C at the end.
+    """The whole chain as real processes, stopped by SIGTERM at the end.
 
-    port: of the router on loopback, a free one if none is given. environment: beside that of this process. streams: where stdout
-    (default: nowhere) and stderr of the launcher go.
+    port: of the router on loopback, a free one if none is given. environment: variables in addition to those of this process.
+    streams: where stdout (default: nowhere) and stderr of the launcher go.
     """
     port = port or free_port()
     command = penumbra_command("up", "--cell", cell, "--seed", str(seed), "--port", str(port), *arguments)
@@ -158,8 +160,8 @@ def penumbra_up(
 
 
 def hold_in_reach(running: Running) -> None:
-    """Waits until the arm is tracked in sight of the camera and above the pads, and stops it there: what happens to the pose from
-    then on is the test's doing."""
+    """Waits until the arm is tracked in sight of the camera and above the pads, and stops it there, so that only the test changes
+    the pose from then on."""
     wait_for(running.is_tracking, 180, "a tracked pose", 0.2)
     wait_for(lambda: running.control({"command": "occlude", "value": 0}), 10, "the emulator's answer")
     truths = running.session.declare_subscriber(topics.TRUTH.at(cell=running.cell))

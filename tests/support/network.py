@@ -1,4 +1,4 @@
-"""What the segmentation network is tested with: a small scene, and its state as the running service has it."""
+"""Data to test the segmentation network with: a small scene, and tensors in the layout of the running service."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ def scene(frames: int = 6, size: int = 96) -> NDArray[np.uint8]:
 
 
 def as_rows(tensor: torch.Tensor) -> NDArray:
-    """(1, c, h, w) as the running service has it: (1, h, w, c)."""
+    """A tensor (1, c, h, w) in the layout of the running service, (1, h, w, c)."""
     return tensor.permute(0, 2, 3, 1).contiguous().numpy()

@@ -21,7 +21,7 @@ from penumbra.shared.runtime.node import Node
 
 
 def node_command(service: str, endpoint: str, *arguments: str) -> list[str]:
-    """The words that run a small service of this file, which connects to a router."""
+    """The command line of a small service of this file that connects to a router."""
     return [sys.executable, "-m", "penumbra.tests.support.nodes", service, "--connect", endpoint, *arguments]
 
 
@@ -40,7 +40,7 @@ def pose(stamp_ns: int | None = None, x: float = 0.0) -> messages.FusedPose:
 
 
 def pose_json(target: str = "forearm") -> bytes:
-    """What fusion answers with ?format=json."""
+    """Fusion's answer to a pose query with ?format=json."""
     now = pose()
     return json.dumps(
         {

@@ -27,14 +27,14 @@ from penumbra.tests.support.live import PATIENCE_S, penumbra_command, wait_for
 
 SYSTEM_PYTHON = "/usr/bin/python3"
 GSTREAMER = [SYSTEM_PYTHON, str(Path(gstreamer.__file__))]
-"""The words that run `gstreamer.py`."""
+"""The command line of `gstreamer.py`."""
 FRONT = {"width": WIDTH, "height": HEIGHT, "fx": 110.0, "fy": 110.0, "cx": 63.5, "cy": 47.5, "position": [0.35, -1.15, 0.9]}
-"""A camera of these pictures."""
+"""A camera that takes pictures of this size."""
 
 
 @functools.cache
 def lacks_gstreamer() -> str:
-    """Why GStreamer's server cannot run here; empty where it can."""
+    """The reason why GStreamer's server cannot run here; empty where it can."""
     code = "import gi; gi.require_version('GstRtspServer', '1.0'); from gi.repository import GstRtspServer"
     try:
         found = subprocess.run([SYSTEM_PYTHON, "-c", code], capture_output=True)
@@ -57,7 +57,7 @@ def number(picture: np.ndarray) -> int:
 
 
 def film(path: Path, numbers: Sequence[int], rate_hz: float, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
-    """A film of numbers; size: in which they are drawn."""
+    """Writes a film of numbers. size: of its pictures."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, size)
     for each in numbers:
         writer.write(cv2.resize(image(each), size, interpolation=cv2.INTER_NEAREST))
@@ -66,7 +66,7 @@ def film(path: Path, numbers: Sequence[int], rate_hz: float, size: tuple[int, in
 
 
 def cell(folder: Path, source: dict[str, Any] | None = None, **camera: Any) -> Path:
-    """A cell file with one camera, and its source."""
+    """Writes a cell file with one camera and its source, and returns its path."""
     front = {**FRONT, "look_at": [0.05, 0.0, 0.15], **camera, **({"source": source} if source else {})}
     forearm = {"mesh": "body:forearm", "labels": ["forearm", "hand"], "home": {"position": [0.0, 0.0, 0.2]}}
     path = folder / "numbered.yaml"
@@ -83,7 +83,7 @@ class Seen(NamedTuple):
 
 
 class Viewer:
-    """A program that looks at the frames of a cell, and asks for the health of its camera process."""
+    """A program that receives the frames of a cell, and asks for the health of its camera process."""
 
     def __init__(self, node: Node):
         self.node = node
@@ -99,19 +99,19 @@ class Viewer:
         return json.loads(answers[0]) if answers else {}
 
     def front(self) -> dict[str, Any]:
-        """What it says of its camera."""
+        """The part of the report about its camera."""
         return self.health().get("report", {}).get("front", {})
 
     def waits_for(self, state: str) -> None:
         wait_for(lambda: self.front().get("state") == state, PATIENCE_S, f"the state {state}", 0.1)
 
     def waits_for_reason(self, text: str) -> str:
-        """The reason with this text, where there is one in time."""
+        """Waits for a reason that contains this text, and returns it."""
         reasons = lambda: next((why for why in self.health().get("reasons", ()) if text in why), None)  # noqa: E731
         return wait_for(reasons, PATIENCE_S, f"the reason {text!r}", 0.1)
 
     def more(self, count: int) -> list[Seen]:
-        """So many frames that arrive from now on."""
+        """The next `count` frames that arrive."""
         before = len(self.frames)
         wait_for(lambda: len(self.frames) >= before + count, PATIENCE_S, f"{count} frames")
         return self.frames[before : before + count]
@@ -135,7 +135,7 @@ class Service(NamedTuple):
 
 @contextmanager
 def camera_process(path: Path, router: str, *arguments: str, **popen: Any) -> Iterator[Service]:
-    """`penumbra camera` for a cell file, ended as by Ctrl-C, which must succeed."""
+    """`penumbra camera` for a cell file, ended by SIGTERM, after which its exit code must be 0."""
     command = penumbra_command("camera", "--cell", str(path), "--connect", router, *arguments)
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **popen)
     assert process.stderr is not None

@@ -1,4 +1,4 @@
-"""What a fault does to a running chain, as any client of the bus sees it: gaps, recovery, repeats and false tracking."""
+"""Effects of a fault on a running chain, as any client of the bus sees them: gaps, recovery, repeats and false tracking."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from penumbra.tests.support.live import Running, wait_for
 
 READ = (topics.FUSED, topics.VISION, topics.HAPTIC, topics.TRUTH, topics.MASK, topics.FRAME, topics.VOLTAGES)
 DECODED = {topics.FUSED.name, topics.VISION.name, topics.HAPTIC.name, topics.TRUTH.name}
-"""Of the others only the time of arrival is kept: a frame is a megabyte."""
+"""Topics whose messages are decoded. Of others only the arrival time is kept, as a frame is a megabyte."""
 OUTPUTS = {
     "emulator": (topics.FRAME, topics.VOLTAGES, topics.TRUTH),
     "segmentation": (topics.MASK,),
@@ -29,23 +29,24 @@ OUTPUTS = {
     "haptics": (topics.HAPTIC,),
     "fusion": (topics.FUSED,),
 }
-"""What each service says; all of it where all are meant."""
+"""The observed topics of each service; READ for all services together."""
 SENSES = ((topics.VISION, "tracking"), (topics.HAPTIC, "in_range"))
-"""The senses, and the state of their poses that fusion takes."""
+"""The topics of the senses, and the state of the poses that fusion uses."""
 CHI2_3_SIGMA = 20.06
-"""Squared Mahalanobis distance of six dimensions that 99.73 % of all errors stay within: three standard deviations of one."""
+"""Squared Mahalanobis distance in six dimensions within which 99.73 % of errors lie, as in one within three standard
+deviations."""
 SHARE, WINDOW_S = 0.75, 0.5
-"""A rate is back when so much of it is seen in two windows of this length, one after the other: below is no hiccup."""
+"""A rate is back when at least this share of it is reached in two consecutive windows of this length [s]."""
 FAR_S = 0.5
-"""A pose stamped further from the truth of its time of arrival is not of that time."""
+"""Maximum difference [s] between the stamps of a pose and of the truth that arrived with it; beyond, one of them is wrong."""
 SETTLE_S = 20.0
-"""Within this a message that was sent has come wherever it goes."""
+"""Time [s] within which a message that was sent has arrived everywhere."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """One message: when it came [s, steady clock], what it was, None where only its arrival counts, and who sent it as which of
-    all that it has sent, None where it does not say."""
+    """One message: arrival time [s, steady clock], content (None where only the arrival counts), publisher, and its number among
+    all messages of this publisher (None where it is not numbered)."""
 
     at_s: float
     message: Any = None
@@ -54,7 +55,7 @@ class Seen:
 
 
 class Outside:
-    """Listens to a chain from outside, but not to what its own session sends. Everything is decoded afterwards."""
+    """Listens to a chain from outside, but not to messages of its own session. Everything is decoded afterwards."""
 
     def __init__(self, session: zenoh.Session, cell: str, target: str, pad: str):
         self._rows: dict[str, list[tuple[float, bytes, bytes, int | None]]] = {}
@@ -80,7 +81,7 @@ class Outside:
             subscriber.undeclare()
 
     def seen(self, topic: topics.Topic, begin_s: float = -np.inf, end_s: float = np.inf) -> list[Seen]:
-        """What came on a topic between two times of the steady clock."""
+        """The messages that arrived on a topic between two times of the steady clock."""
         out = []
         for at_s, payload, publisher, number in list(self._rows[topic.name]):
             if not begin_s <= at_s <= end_s:
@@ -90,22 +91,22 @@ class Outside:
         return out
 
     def newest_ns(self, topic: topics.Topic) -> int:
-        """The stamp of the message of a topic that came last, 0 where none did."""
+        """The stamp of the last message on a topic, 0 where there was none."""
         rows = self._rows[topic.name]
         return int(messages.decode(topic.message, rows[-1][1]).stamp_ns) if rows else 0
 
     def forget(self) -> None:
-        """Drops what came until now, but for the last message of each topic, from which the next are counted on."""
+        """Drops all messages but the last one of each topic, from which the numbers of the next ones go on."""
         for rows in self._rows.values():
             del rows[:-1]
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """What a fault did. gap_ms: longest time without a fused pose that is not lost while a sense was alive; recovery_s: until all
-    of a service's topics had their old rate, None where they never had; reused: measurements used twice; false_tracking: poses
-    called tracking, of `tracking` in all, whose error was beyond three sigma of their own covariance; worst_cm: the largest error
-    of their positions."""
+    """The effects of a fault. gap_ms: longest time without a fused pose that is not lost while a sense was alive; recovery_s:
+    until all of a service's topics had their old rate, None where they never had; reused: measurements used twice;
+    false_tracking: poses called tracking, of `tracking` in all, whose error was beyond three sigma of their own covariance;
+    worst_cm: the largest error of their positions."""
 
     gap_ms: float
     recovery_s: float | None
@@ -116,8 +117,8 @@ class Numbers:
 
 
 def gap_s(fused: Sequence[Seen], senses: Iterable[tuple[topics.Topic, Sequence[Seen]]], end_s: float) -> float:
-    """The longest time between two fused poses that are not lost, not counting what no sense was alive of it: a sense is alive
-    until its last pose that can be used is stale."""
+    """The longest time [s] between two fused poses that are not lost, without the time in which no sense was alive: a sense is
+    alive until its last usable pose is stale."""
     usable = {topic.name: state for topic, state in SENSES}
     alive = _union(
         (seen.at_s, min(seen.at_s + topic.stale_s, end_s))
@@ -159,14 +160,14 @@ def recovery_s(times: Iterable[float], rate_hz: float, fault_s: float, end_s: fl
 
 
 def repeats(seen: Iterable[Seen]) -> int:
-    """How many messages tell again what was told: the same stamp."""
+    """Number of messages that repeat the stamp of an earlier one."""
     stamps = [each.message.stamp_ns for each in seen]
     return len(stamps) - len(set(stamps))
 
 
 def offered(seen: Sequence[Seen], usable: str) -> int:
-    """How many measurements that can be used there were, each once, with those that were lost on their way to us: where the count
-    of a publisher, which numbers all that it says, has gaps."""
+    """Number of usable measurements, each counted once, with those that were lost on their way to us: they are gaps in the
+    numbers that a publisher gives to its messages."""
     numbers: dict[str, list[int]] = {}
     for each in seen:
         if each.number is not None:
@@ -178,11 +179,11 @@ def offered(seen: Sequence[Seen], usable: str) -> int:
 
 
 def tracking_errors(fused: Iterable[Seen], truth: Sequence[Seen], epoch_ns: int) -> np.ndarray:
-    """Of every pose that is called tracking while the truth is heard (n, 2): the squared Mahalanobis distance of its error by its
-    own covariance, and the error of its position [m], at its own stamp; both infinite where that is of another time than the
-    truth that came with it. Where it is the truth that is stamped with another time than ours, nothing is said.
+    """Errors (n, 2) of every pose that is called tracking while the truth is received: the squared Mahalanobis distance by the
+    pose's own covariance, and the position error [m], at the pose's own stamp.
 
-    epoch_ns: what our wall clock says when the steady clock says zero."""
+    Both are infinite for a pose whose stamp is of another time than the truth that arrived with it. A pose is left out if its
+    stamp is of our time but that of the truth is not. epoch_ns: our wall clock [ns] at zero of the steady clock."""
     rows = []
     order = sorted(truth, key=lambda each: each.message.stamp_ns)
     stamps, arrivals = np.array([each.message.stamp_ns for each in order]), np.array([each.at_s for each in truth])
@@ -204,7 +205,7 @@ def tracking_errors(fused: Iterable[Seen], truth: Sequence[Seen], epoch_ns: int)
 
 
 def epoch_ns() -> int:
-    """What the wall clock says when the steady clock says zero."""
+    """The wall clock [ns] at zero of the steady clock."""
     return time.time_ns() - time.monotonic_ns()
 
 
@@ -218,11 +219,11 @@ def health(running: Running, service: str = "*") -> list[dict[str, Any]]:
 
 
 Taken = dict[tuple[str, str], int]
-"""How many measurements each instance of fusion has accepted of each sense."""
+"""Number of measurements that each instance of fusion has accepted of each sense."""
 
 
 def taken(running: Running) -> Taken:
-    """What fusion has accepted until now."""
+    """The measurements that fusion has accepted until now."""
     return {
         (report["instance"], sense): target[sense]["accepted"]
         for report in health(running, "fusion")
@@ -232,7 +233,7 @@ def taken(running: Running) -> Taken:
 
 
 def believed_ns(running: Running) -> list[dict[str, int]]:
-    """By each instance of fusion that answers, the stamp of the newest measurement that it has of each sense."""
+    """For each instance of fusion that answers, the stamp [ns] of its newest measurement of each sense."""
     selector = topics.current_pose(running.cell, "*") + "?format=json"
     poses = [json.loads(answer) for answer in bus.ask(running.session, selector)]
     return [
@@ -241,8 +242,8 @@ def believed_ns(running: Running) -> list[dict[str, int]]:
 
 
 def opened(running: Running, outside: Outside) -> Taken:
-    """What fusion has accepted, with all that came before forgotten by `outside`: none of that is still on its way to fusion, or
-    it would be accepted afterwards, and counted as one that nobody has offered."""
+    """The measurements that fusion has accepted, after `outside` has dropped all earlier ones. It waits until none of these is on
+    its way to fusion: one that is accepted later would count as a measurement that was never sent."""
 
     def settled() -> Taken | None:
         outside.forget()
@@ -255,7 +256,7 @@ def opened(running: Running, outside: Outside) -> Taken:
 
 
 def closed(running: Running, outside: Outside) -> Taken:
-    """What fusion has accepted, all of which `outside` has seen: what it sees later than fusion would be missing there."""
+    """The measurements that fusion has accepted, after a wait until `outside` has seen all of them."""
     found = taken(running)
     believed = believed_ns(running)
 
@@ -267,14 +268,14 @@ def closed(running: Running, outside: Outside) -> Taken:
 
 
 def reused(outside: Outside, before: Taken, after: Taken) -> int:
-    """How many measurements an instance of fusion has accepted more than there were: by its own counters, between `opened` and
-    `closed`."""
+    """Number of measurements that instances of fusion have accepted in excess of those sent, by their own counters, between
+    `opened` and `closed`."""
     there_were = {topic.name: offered(outside.seen(topic), usable) for topic, usable in SENSES}
     return sum(max(0, n - before.get((instance, sense), 0) - there_were[sense]) for (instance, sense), n in after.items())
 
 
 def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: float, end_s: float, reused: int) -> Numbers:
-    """What was seen of a fault of a service until end_s; old_hz: by topic, before it; reused: what fusion has used again."""
+    """The effects of a fault of a service until end_s. old_hz: rates by topic before it; reused: measurements used again."""
     begin_s = fault_s - WINDOW_S
     fused, truth = outside.seen(topics.FUSED, begin_s, end_s), outside.seen(topics.TRUTH, begin_s, end_s)
     senses = [(topic, outside.seen(topic, begin_s, end_s)) for topic in (topics.VISION, topics.HAPTIC)]
@@ -295,10 +296,10 @@ def numbers(outside: Outside, service: str, old_hz: dict[str, float], fault_s: f
 
 
 def rates_hz(outside: Outside, begin_s: float, end_s: float) -> dict[str, float]:
-    """By topic, the messages a second of all its keys that are listened to."""
+    """Messages per second by topic, over all keys that are listened to."""
     return {topic.name: len(known_poses(outside.seen(topic, begin_s, end_s))) / (end_s - begin_s) for topic in READ}
 
 
 def known_poses(seen: Iterable[Seen]) -> list[Seen]:
-    """Without the fused poses that are lost: saying so is no service."""
+    """The messages without fused poses that are lost, which do not count as output."""
     return [each for each in seen if not (isinstance(each.message, messages.FusedPose) and each.message.state == "lost")]

@@ -1,9 +1,9 @@
-"""The pictures of the page in the documents: the running chain in Debian's Chromium, with something before the arm.
+"""Takes the pictures of the page in the documents: the running chain in Debian's Chromium, with an occluder before the arm.
 
     python -m penumbra.tests.support.pictured --cell arm --out docs/pictures
 
-All that is shown is the chain's. Chromium draws the scene without a graphics card and would take every processor: it gets what
-the chain leaves, and the scene moves at a quarter of its speed.
+All that is shown comes from the chain. Chromium draws the scene without a graphics card and would take every processor: it gets
+what the chain leaves, and the scene moves at a quarter of its speed.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ VIEWS: dict[str, tuple[int, Literal["light", "dark"]]] = {
     "dashboard-dark": (1280, "dark"),
     "dashboard-360": (360, "dark"),
 }
-"""Names of the pictures, their widths [px] and schemes."""
+"""Names of the pictures, with their widths [px] and colour schemes."""
 SPEED, OCCLUSION = 0.25, 0.4
 PATIENCE_S = 180.0
 HIDDEN = (0.2, 0.6)
-"""Share of the arm that is hidden in the pictures."""
+"""Bounds of the share of the arm that is hidden in the pictures."""
 CHARTS_S, SETTLE_S = 90.0, 3.0
-"""So long the charts are filled before the first picture, and the page is left alone after a change of its width."""
+"""Times [s] for which the charts fill before the first picture, and for which the page settles after a change of its width."""
 SHOWS = """
 document.querySelector('#pose-state').dataset.state === 'tracking'
 && document.querySelectorAll('#process-rows tr').length >= 8

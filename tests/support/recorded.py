@@ -1,4 +1,4 @@
-"""Recordings for tests, made of the simulated cell's messages as a recorder makes them of the bus."""
+"""Recordings for tests, made from the simulated cell's messages as a recorder makes them from the bus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from penumbra.shared.runtime.tap import Taken
 from penumbra.sim.world.world import record
 
 DELAY_NS = 3_000_000
-"""From a measurement to its arrival."""
+"""Time [ns] from a measurement to its arrival."""
 PUBLISHER = bytes(range(12))
 
 
@@ -27,13 +27,13 @@ def taken(cell: cells.Cell, topic: Topic, names: dict[str, str], message: messag
 
 
 def on_the_bus(cell: cells.Cell, seed: int, seconds: float, frames: bool = True) -> Iterator[Taken]:
-    """What the emulator says."""
+    """The messages of the emulator, as a recorder takes them."""
     for number, (topic, names, message) in enumerate(record(cell, seed, seconds, frames)):
         yield taken(cell, topic, names, message, number)
 
 
 def entries(cell: cells.Cell, messages: Iterable[Taken], keeps_frames: bool = False) -> Iterator[Entry]:
-    """As a recorder writes them."""
+    """The entries that a recorder writes for these messages."""
     viewers = Viewers(cell, keeps_frames)
     for each in messages:
         if each.topic is not topics.FRAME or keeps_frames:
@@ -42,7 +42,7 @@ def entries(cell: cells.Cell, messages: Iterable[Taken], keeps_frames: bool = Fa
 
 
 def new_file(path: Path, cell: str = "table") -> File:
-    """A file that has begun."""
+    """A new file with its first entries."""
     file = File(path, provenance.about(cell), provenance.attachments(cell), 10**18)
     for entry in Viewers(cells.load(cell)).stage(10**18):
         file.write(entry)
@@ -50,7 +50,7 @@ def new_file(path: Path, cell: str = "table") -> File:
 
 
 def recorded(path: Path, cell: str, messages: Iterable[Taken], keeps_frames: bool = False) -> Path:
-    """A whole recording of messages of a cell."""
+    """Writes a complete recording of messages of a cell, and returns its path."""
     file = new_file(path, cell)
     for entry in entries(cells.load(cell), messages, keeps_frames):
         file.write(entry)

@@ -1,4 +1,4 @@
-"""Robots that tests use: the built-in Panda, and one of everything that the Panda has not."""
+"""Robots for tests: the built-in Panda, and one with all features that the Panda lacks."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ PANDA = cells.Robot(
     base=cells.Placement(position=(0.5, 0.1, 0.2), rpy=(0.1, 0.2, 3.0)),
     joints=tuple(f"panda_joint{i}" for i in range(1, 8)),
 )
-# Everything that the Panda has not: tilted inertial frames, a prismatic and a continuous joint, primitives, a held joint.
+# All features that the Panda lacks: tilted inertial frames, a prismatic and a continuous joint, primitives, a held joint.
 ODD = """<robot name="odd">
  <link name="base"><inertial><origin xyz="0.1 0.2 0.3" rpy="0.3 0.2 0.1"/><mass value="1"/>
    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
@@ -32,7 +32,7 @@ ODD = """<robot name="odd">
  <link name="four"><inertial><mass value="1"/><inertia ixx="1" iyy="2" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
 </robot>"""
 ODD_JOINTS = ("spin", "turn", "slide")
-"""Of these the order is not that of the URDF."""
+"""Joints of ODD, in another order than in the URDF."""
 
 
 def odd_robot(folder: Path, text: str = ODD) -> cells.Robot:

@@ -26,7 +26,7 @@ COMMON: dict[str, Any] = {
     "timestamping/enabled": True,
     "transport/shared_memory/enabled": False,
 }
-"""What DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5 and DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5 have in common."""
+"""Settings that DEFAULT_RMW_ZENOH_ROUTER_CONFIG.json5 and DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5 have in common."""
 
 
 def session(settings: dict[str, Any]) -> zenoh.Session:
@@ -37,7 +37,7 @@ def session(settings: dict[str, Any]) -> zenoh.Session:
 
 
 def router(port: int, connect: tuple[str, ...] = ()) -> zenoh.Session:
-    """A router as rmw_zenohd is: between its peers it passes on nothing."""
+    """A router like rmw_zenohd, which passes nothing on between its peers."""
     return session(
         {
             "mode": "router",
@@ -74,7 +74,7 @@ class Peer:
         return self.session.declare_subscriber(self.key(topic, kind), zenoh.handlers.RingChannel(100))
 
     def subscribe_latched(self, topic: str, kind: str) -> Any:
-        """As rmw_zenoh subscribes where the durability is transient local."""
+        """A subscription as rmw_zenoh makes it for the durability transient local."""
         return zenoh.ext.declare_advanced_subscriber(
             self.session,
             self.key(topic, kind),
@@ -96,7 +96,7 @@ class Peer:
 
 
 def taken(subscriber: Any) -> list[Any]:
-    """The samples that have come since the last time."""
+    """The samples that have arrived since the last call."""
     return list(iter(subscriber.try_recv, None))
 
 
@@ -124,7 +124,8 @@ def python_of(name: str) -> str:
 
 
 def environment(**more: str) -> dict[str, str]:
-    """The variables of a user who has nothing of Penumbra. What speaks DDS stays on loopback, in a domain of its own."""
+    """The environment variables of a user without Penumbra. Programs that speak DDS stay on loopback, in a domain of their
+    own."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV", "ROS_", "RMW_"))}
     own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "87", "PYTHONUNBUFFERED": "1"}
     return kept | own | more

@@ -2,8 +2,8 @@
 
 It speaks version 2 of the published protocol on port 30004 ("Real-Time Data Exchange (RTDE) Guide" of Universal Robots): version
 of protocol and controller, a recipe of outputs, start, pause, and data packages. A process of its own, because the client holds
-Python's lock while it waits for answers. What it is told on standard input happens: `freeze` and `thaw` its data, `move ANGLE`
-its base.
+Python's lock while it waits for answers. It takes commands on standard input: `freeze` and `thaw` its data, `move ANGLE` its
+base.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ TYPES = {"timestamp": "DOUBLE", "actual_q": "VECTOR6D", "robot_status_bits": "UI
 FORMATS = {"DOUBLE": "d", "VECTOR6D": "6d", "UINT32": "I", "INT32": "i", "UINT64": "Q", "VECTOR6INT32": "6i", "VECTOR3D": "3d"}
 JOINTS = [0.1, -1.2, 1.3, -0.4, 0.5, -0.6]
 UPTIME_S = 1234.5
-"""What the controller's clock says when the peer starts."""
+"""Time [s] of the controller's clock when the peer starts."""
 
 
 class Peer:

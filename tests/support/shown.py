@@ -1,7 +1,7 @@
-"""A cell for tests of what looks at one, on a real bus, at a fraction of what the chain costs: pictures, masks, truth and
-voltages of the emulated world, made beforehand and sent again and again, and poses that senses and fusion would say of them.
+"""A cell for tests of programs that display one, on a real bus, at a fraction of the chain's cost: pictures, masks, truth and
+voltages of the emulated world, made beforehand and sent in a loop, and poses as senses and fusion would publish them.
 
-The nodes, the router, the messages and the emulator's answers are the real ones; the estimates are the truth and an error.
+The nodes, the router, the messages and the emulator's answers are the real ones; the estimates are the truth plus an error.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ STEPS, STEP_TICKS = 12, 6
 PERIOD_S = 0.1
 SCALE, MARGIN = 4, 24
 TOO_HIDDEN = 0.7
-"""Share of the target from which on vision says that it sees too little."""
+"""Hidden share of the target from which on vision reports that it is occluded."""
 SERVICES = ("emulator", "segmentation", "search", "haptics", "fusion")
 
 
 @dataclass(frozen=True)
 class Step:
-    """One moment of the clip: what the emulator says, and the mask of its first camera."""
+    """One moment of the clip: the emulator's messages, and the mask of its first camera."""
 
     frame: messages.Frame
     mask: messages.Mask
@@ -44,7 +44,7 @@ class Step:
 
 
 def clip(world: World) -> list[Step]:
-    """A second or so of the emulated world."""
+    """A clip of about a second of the emulated world."""
     sensors, camera = Sensors(world, 0), next(iter(world.cell.cameras))
     out = []
     for k in range(1, STEPS * STEP_TICKS, STEP_TICKS):
@@ -61,7 +61,7 @@ def clip(world: World) -> list[Step]:
 
 
 class Shown:
-    """The cell on a router at `endpoint`, from `with` to its end. hidden: the share that vision says is hidden; feels: whether
+    """The cell on a router at `endpoint`, within a `with` block. hidden: the share that vision reports as hidden; feels: whether
     the skin is in range; both may be set at any time."""
 
     def __init__(self, cell: cells.Cell, endpoint: str, seed: int = 3):
@@ -149,7 +149,7 @@ class Shown:
         nodes["fusion"].publish(topics.FUSED, fused, target=self._target)
 
     def _near(self, truth: messages.Truth, metres: float, radians: float) -> dict[str, Any]:
-        """A pose with an error of this standard deviation."""
+        """The true pose with an error of these standard deviations [m, rad]."""
         error = self._rng.normal(size=6) * np.repeat([metres, radians], 3)
         T = rigid.perturb(rigid.transform(truth.position, truth.orientation), error)
         position, orientation = rigid.position_orientation(T)

@@ -24,19 +24,19 @@ POSITION = (0.05, -0.02, 0.15)
 
 @dataclass
 class Small:
-    """The chain. connection: to its router. seen: whether the arm is measured, 20 times a second."""
+    """The chain. connection: to its router. seen: whether the arm is measured, at 20 Hz."""
 
     cell: cells.Cell
     connection: bus.Connection
     seen: threading.Event
 
     def node(self, service: str) -> Node:
-        """A node at the router, not open yet."""
+        """A node that connects to the router, not yet open."""
         return Node(service, self.cell, self.connection)
 
     @contextmanager
     def fusion(self) -> Iterator[Node]:
-        """The real service."""
+        """Runs the real service in the context."""
         node = self.node("fusion")
         fusion.start(node, SimpleNamespace(observer="default", target=None, motion=None))
         with node:
@@ -51,7 +51,7 @@ class Small:
 
 @contextmanager
 def small(cell: str | Path, endpoint: str, secure: Path | None = None) -> Iterator[Small]:
-    """A chain of the cell at the router of `endpoint`, without its fusion yet. secure: folder of certificates."""
+    """A chain of the cell at the router of `endpoint`, with fusion not yet started. secure: folder of certificates."""
     chain = Small(cells.load(cell), bus.Connection(connect=(endpoint,), secure=secure), threading.Event())
     search = chain.node("search")
     search.every(0.05, lambda: chain.see(search))

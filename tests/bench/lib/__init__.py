@@ -1,1 +1,1 @@
-"""What the benchmarks share: baselines, bounds, campaigns, pictures."""
+"""Common parts of the benchmarks: baselines, bounds, campaigns, pictures."""

@@ -1,4 +1,4 @@
-"""How far a chain's estimates are from the truth, by what is seen and felt: what the live chain and the replay have in common.
+"""Errors of a chain's estimates by situation (what is seen and felt), for the live chain and the replay.
 
 Errors are taken at each estimate's own stamp against the truth there.
 """
@@ -21,9 +21,9 @@ from penumbra.shared.geometry import rigid
 from penumbra.tests.bench.lib.results import Result, marked
 
 VISIBLE = 0.33
-"""At most this share of the target hidden: visible (the paper's light occlusion)."""
+"""Maximum hidden share at which the target counts as visible (the paper's light occlusion)."""
 OCCLUDED, OCCLUDED_S = 0.90, 2.0
-"""More than this share hidden, for at least this long: occluded."""
+"""The target counts as occluded when more than this share is hidden for at least this time [s]."""
 
 SENSES = {"vision": topics.VISION, "haptic": topics.HAPTIC, "fused": topics.FUSED}
 GOALS_CM = {
@@ -32,11 +32,11 @@ GOALS_CM = {
     ("occluded", "in_range"): 2.5,
     ("occluded", "out_of_range"): None,
 }
-"""By situation, what the median position error of the fused pose is to be below."""
+"""Maximum median position error [cm] of the fused pose by situation; None: no goal."""
 CHI2_3_SIGMA = float(chi2.ppf(0.9973, 6))
-"""Squared Mahalanobis distance of six dimensions that 99.73 % of normal errors stay within."""
+"""Squared Mahalanobis distance in six dimensions within which 99.73 % of normal errors lie."""
 BEYOND_GOAL = 0.001
-"""Share of the poses called tracking that may be beyond three sigma."""
+"""Maximum share of the poses called tracking that are beyond three sigma."""
 USED_STATES = {"tracking", "in_range", "coasting"}
 
 
@@ -63,14 +63,15 @@ class TruthTrack:
         )
 
     def situations(self, reach: float) -> dict[tuple[str, str], np.ndarray]:
-        """(visible|occluded, in_range|out_of_range) to a boolean per stamp."""
+        """By (visible|occluded, in_range|out_of_range), a boolean per stamp. reach: range of the skin [m]."""
         occluded = long_runs(self.hidden > OCCLUDED, self.stamp_ns, OCCLUDED_S)
         sight = {"visible": self.hidden <= VISIBLE, "occluded": occluded}
         skin = {"in_range": self.gap <= reach, "out_of_range": self.gap > reach}
         return {(a, b): seen & felt for a, seen in sight.items() for b, felt in skin.items()}
 
     def errors(self, estimates: list[Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For estimates within the track: index of the nearest truth, position error [m], angle between limb axes [rad]."""
+        """For estimates within the track: index of the first truth from their stamp on, position error [m], angle between limb
+        axes [rad]."""
         estimates = [e for e in estimates if self.stamp_ns[0] <= e.stamp_ns <= self.stamp_ns[-1]]
         if not estimates:
             return np.zeros(0, int), np.zeros(0), np.zeros(0)
@@ -85,8 +86,8 @@ class TruthTrack:
 
 
 def beyond_3_sigma(truths: list[messages.Truth], estimates: list[messages.FusedPose] | list[messages.VisionPose]) -> float | None:
-    """Of the poses called tracking, the share whose squared error in units of their own covariance is beyond what 99.73 % of
-    normal errors of six dimensions stay within; None where there are none."""
+    """Share of the poses called tracking whose squared Mahalanobis distance by their own covariance exceeds CHI2_3_SIGMA; None
+    where there are none."""
     order = sorted(truths, key=lambda truth: truth.stamp_ns)
     stamps, wrong = np.array([truth.stamp_ns for truth in order]), []
     for pose in estimates:
@@ -101,7 +102,7 @@ def beyond_3_sigma(truths: list[messages.Truth], estimates: list[messages.FusedP
 
 
 def long_runs(flags: np.ndarray, stamps_ns: np.ndarray, seconds: float) -> np.ndarray:
-    """`flags`, without the runs of true that last less than `seconds`; where nothing is stamped for as long, one ends."""
+    """`flags` without runs of true shorter than `seconds`; a gap between stamps that is longer than that ends a run."""
     out = np.zeros_like(flags)
     breaks = np.flatnonzero(np.diff(flags) | (np.diff(stamps_ns) > seconds * 1e9)) + 1
     for start, end in itertools.pairwise([0, *breaks.tolist(), len(flags)]):
@@ -119,8 +120,8 @@ def percentiles(values: np.ndarray, scale: float = 1.0) -> dict[str, float | Non
 def summary(
     cell: cells.Cell, options: flags.Options, truths: list[messages.Truth], estimates: dict[str, list[Any]], seconds: float
 ) -> Result:
-    """What both benchmarks write: errors of each sense's estimates in each situation, how long these lasted of so many seconds,
-    and the share of the fused states. options: those of the command, with seed and seconds."""
+    """The result of both benchmarks: errors of each sense's estimates in each situation, how long these lasted of `seconds`, and
+    the shares of the fused states. options: those of the command, with seed and seconds."""
     truth = TruthTrack.of(truths)
     situations = truth.situations(max(cell.pad_types[pad.type].range for pad in cell.pads.values()))
     result: Result = {"cell": cell.name, "seed": options.seed, "seconds": options.seconds}

@@ -6,7 +6,7 @@ over the visible contour of how far a pose error moves it along its normal. `inf
 edges, and `rendered_information` from nothing but renderings on both sides of the true pose, to check it.
 
 What counts is the target's outer contour where both sides of it are known: beside a pixel that something covers (an occluder, the
-upper arm that goes on from the elbow) a mask does not say whose border it is.
+upper arm beyond the elbow) a mask does not show whose border it is.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from penumbra.shared.perception.robot_depth import RobotDepth
 from penumbra.sim.sets.shots import Shot
 
 VARIANCE_PX2 = 1.0 / 12.0
-"""Of an error that is uniform in a pixel."""
+"""Variance [px^2] of an error that is uniform in a pixel."""
 FINE = 8
-"""Whether an edge lies on the outside of the silhouette is read from a rendering so much finer than the picture."""
+"""Factor by which the rendering that shows whether an edge is on the silhouette's outside is finer than the picture."""
 CREASE = 0.8
-"""Facets that meet at a larger angle [rad] are a crease of the body, and not a sample of a round surface."""
+"""Angle [rad] above which facets meet at a crease of the body instead of approximating a round surface."""
 
 
 def states(shot: Shot) -> NDArray[np.uint8]:
-    """What every pixel of a picture tells about the target, see `services.search.evidence`."""
+    """State of every pixel of a picture with respect to the target, see `services.search.evidence`."""
     k = Intrinsics.of_window(shot.camera, 0, 0, 1)
     depth = None
     if shot.joints:
@@ -45,8 +45,8 @@ def states(shot: Shot) -> NDArray[np.uint8]:
 
 
 def information(shot: Shot, facets: bool = False) -> Array:
-    """The Fisher information (6, 6) about the pose error along the camera's axes, as `geometry.pose_error` defines it, around the
-    true pose. facets: whether the flat sides of a mesh that stands for a round limb show its roll."""
+    """The Fisher information (6, 6) about the pose error along the camera's axes, as `rigid.pose_error` defines it, around the
+    true pose. facets: whether the flat sides of the mesh of a round limb show its roll."""
     points, normals, lengths = _contour(shot, facets)
     camera, origin = shot.camera, shot.T_camera_target[:3, 3]
     X, Y, Z = points.T
@@ -115,8 +115,8 @@ def _edges(mesh: Mesh) -> NDArray[np.int64]:
 
 
 def _roundness(along: Array, area: Array, unit: Array, f: NDArray, g: NDArray, points: Array) -> Array:
-    """How far behind a facet's edge, along the line of sight, the round surface that it stands for is seen edge-on [m] (n,):
-    between the middles of two facets its normal turns evenly."""
+    """Distance (n,) [m] along the line of sight from a facet's edge to where the round surface that the mesh approximates is seen
+    edge-on. The surface's normal turns evenly between the middles of two facets."""
     turn = np.arccos(np.clip(np.sum(unit[f] * unit[g], axis=1), -1.0, 1.0))
     middle = unit[f] + unit[g]
     away = np.sum(middle * points, axis=1) / (np.linalg.norm(middle, axis=1) * np.linalg.norm(points, axis=1))
@@ -125,8 +125,8 @@ def _roundness(along: Array, area: Array, unit: Array, f: NDArray, g: NDArray, p
 
 
 def rendered_information(shot: Shot, blur_px: float = 0.7, step_px: float = 0.25) -> Array:
-    """The same with facets, from renderings: the silhouette's share of each pixel, blurred a little, is a level set whose
-    differences between poses on both sides of the true one, over its gradient, are the contour's motion. Its noise adds
+    """`information` with facets, from renderings. The silhouette's share of each pixel, slightly blurred, is a level set. Its
+    differences between poses on both sides of the true one, divided by its gradient, are the contour's motion. Its noise adds
     information where there is next to none."""
     grid, fine = 8, 32  # cells a pixel of the level set, and of the renderings
     camera, T = shot.camera, shot.T_camera_target
@@ -166,7 +166,7 @@ def position_errors(informations: list[Array], draws: int = 400) -> Array:
 
 
 def root(information: Array) -> Array:
-    """A square root (6, 6) of the covariance; what is not informed on at all gets a metre or radian."""
+    """A square root (6, 6) of the covariance; directions without information get a metre or a radian."""
     values, axes = np.linalg.eigh(information)
     return np.asarray(axes / np.sqrt(np.maximum(values, 1.0)))
 

@@ -1,9 +1,9 @@
 """Our bus beside plain Zenoh: arrays of the same size, quality of service and rings between the same two processes.
 
-Both sides have an array and want an array. Plain Zenoh does the least for that: the array's bytes behind as many others as our
-message has, so that payloads are equally long; it numbers, checks and counts nothing.
+Both sides send and receive an array. Plain Zenoh does the minimum for that: its payload is the array's bytes after as many others
+as our message has, so that payloads are equally long. It numbers, checks and counts nothing.
 
-`python -m penumbra.tests.bench.lib.buses ENDPOINT` is the receiver: on `begin` it forgets, on `end` it prints what came as JSON.
+`python -m penumbra.tests.bench.lib.buses ENDPOINT` is the receiver: on `begin` it drops what came, on `end` it prints it as JSON.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ NAMES = {"robot": "panda", "camera": "side"}
 KINDS = ("ours", "raw")
 ACK = "raw/ack"
 QUIET_S = 0.15
-"""What has not come after so long without anything does not come any more."""
+"""Time [s] without a message after which no more messages are expected."""
 PATIENCE_S = 30.0
 
 
 @dataclass(frozen=True)
 class Payload:
-    """A message of `bytes` on the wire, as `topic` carries it; unlimited in rate, so that the guard lets a flood through. Its
-    depth, what a reader keeps, is how many are under way at once in a flood."""
+    """A message as `topic` carries it, unlimited in rate so that the guard lets a flood through. The topic's depth, the number of
+    messages that a reader keeps, is the number in flight in a flood."""
 
     topic: Topic
     make: Callable[[int], messages.Message]
@@ -53,7 +53,7 @@ class Payload:
 
     @property
     def array(self) -> np.ndarray:
-        """What a message carries."""
+        """The array that a message carries."""
         (array,) = (value for value in msgspec.structs.astuple(self.make(0)) if isinstance(value, np.ndarray))
         return array
 
@@ -75,12 +75,12 @@ PAYLOADS = {
     230_000: _payload(topics.MASK, "mask", 8, lambda now: messages.Mask(stamp_ns=now, labels=LABELS, x0=0, y0=0, scale=1)),
     921_000: _payload(topics.FRAME, "image", 2, lambda now: messages.Frame(stamp_ns=now, image=IMAGE)),
 }
-"""By their size in bytes, roughly: 64 B, 4 kB, 230 kB and a frame; all that are under way fit into the shared memory of a small
-cell (`bus.POOL_BYTES`)."""
+"""Payloads by approximate size [bytes]: 64 B, 4 kB, 230 kB and a frame. All that are in flight fit into the shared memory of a
+small cell (`bus.POOL_BYTES`)."""
 
 
 class Sender:
-    """Sends a payload of each kind; the raw one is as long as ours, and carries its stamp beside it."""
+    """Sends a payload of each kind; the raw one is as long as ours, and has its stamp in the attachment."""
 
     def __init__(self, node: Node, payload: Payload):
         self._node, self._payload = node, payload
@@ -117,7 +117,7 @@ class Link:
                 self._until_heard(sender, kind)
 
     def latencies_s(self, size: int, kind: str, count: int, pause_s: float) -> np.ndarray:
-        """From before a message is made until it is read, of those that came of `count`."""
+        """Times from before a message is made until it is read, of those of `count` messages that arrived."""
         self._ask("begin")
         for _ in range(count):
             self.senders[size].send(kind)
@@ -125,7 +125,7 @@ class Link:
         return np.array([(came - sent) * 1e-9 for came, sent in self._ask("end")])
 
     def per_s(self, size: int, kind: str, seconds: float) -> float:
-        """Messages a second that are sent and read without losing one: as many are under way as the reader keeps."""
+        """Messages per second that are sent and read without a loss, with as many in flight as the reader keeps."""
         self._ask("begin")
         self._read, sent, ends, depth = 0, 0, time.monotonic() + seconds, PAYLOADS[size].topic.depth
         while time.monotonic() < ends:
@@ -173,7 +173,7 @@ def linked(endpoint: str) -> Iterator[Link]:
 
 
 def receive(endpoint: str) -> None:
-    """The receiver's end, until its input ends."""
+    """Runs the receiver until its input ends."""
     came: list[tuple[int, int]] = []
     node = Node("receiver", CELL, bus.Connection(connect=(endpoint,)))
 

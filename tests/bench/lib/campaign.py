@@ -1,7 +1,7 @@
-"""Many trials on several cores, each stored as soon as it is done: what was killed goes on where it was.
+"""Many trials on several cores, each stored as soon as it is done, so that an interrupted campaign can go on.
 
 Results lie in FOLDER/FINGERPRINT, where the fingerprint is that of all code, weights and cells that a trial depends on: a change
-of any of them begins anew and leaves the old results alone.
+of any of them starts anew and keeps the old results.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from penumbra.tests.bench.lib import results
 from penumbra.tests.bench.lib.results import ROOT, Result
 
 DEPENDS = ("shared", "sim", "services", "tests/bench/lib/trials.py")
-"""What a trial's result depends on, of the project's files."""
+"""The project's files and folders on which a trial's result depends."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Every process computes on one thread: they share the cores."""
+"""Variables that limit each process to one thread, as the processes share the cores."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A call of a function of the project, `MODULE:NAME`, with arguments; `name` is that of its result's file."""
+    """A call of a function of the project, `MODULE:NAME`, with arguments; `name`: of its result's file."""
 
     name: str
     function: str
@@ -47,7 +47,7 @@ class Job:
 
 
 def fingerprint() -> str:
-    """Of the files that results depend on: their names and contents."""
+    """A hash of the names and contents of the files that results depend on."""
     digest = hashlib.sha256()
     for part in DEPENDS:
         path = ROOT / part
@@ -85,13 +85,13 @@ def _computed(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, Result
         try:
             for future in as_completed(pending):
                 yield pending[future], future.result()
-        finally:  # an error or Ctrl-C: what has not begun is not begun
+        finally:  # after an error or Ctrl-C no further job is begun
             pool.shutdown(wait=False, cancel_futures=True)
 
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Processes that are started meanwhile compute on one thread."""
+    """Within it, processes that are started compute on one thread."""
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
@@ -102,7 +102,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def _start() -> None:
-    """In a worker: ends without a word on Ctrl-C, and when the process that started it is gone."""
+    """Prepares a worker process: one thread, and a silent end on Ctrl-C or when its parent process is gone."""
     import torch
 
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Faults of the services that connect a cell with what is outside it: recorder, web page, ROS 2, camera, robot.
+"""Faults of the services that connect a cell with the outside: recorder, web page, ROS 2, camera, robot.
 
 Each of them is timed where its work arrives: in the recorder's files, in a browser that shows the page, at a ROS node, and on the
 bus for frames and joints. Recorder, page and ROS 2 run beside a whole chain, whose pose must go on; camera and robot run alone,
@@ -38,20 +38,20 @@ from penumbra.tests.support.live import Running, free_port, penumbra_up, wait_fo
 
 READY_S, LOOK_S = 180.0, 1.0
 OLD_S = 15.0
-"""How old what is struck has to be: what dies early is in a crash loop, and waits before it is started again."""
+"""Minimum age [s] of a process that is struck: one that dies early counts as in a crash loop, and is restarted after a delay."""
 BEFORE_S, SETTLED_S = 3.0, 0.5
-"""The old rate is that of so long before the fault, but for its last moments, of which a recorder may lose a part."""
+"""The old rate is measured for BEFORE_S before the fault, without the last SETTLED_S, of which a recorder may lose a part."""
 AFTER_S, LONGEST_S = 4.0, 30.0
-"""How long is watched when a fault is over: at least, and at most while the old rate is not back."""
+"""Minimum time [s] for which a service is watched after a fault, and maximum while the old rate is not back."""
 FREEZE_S, AWAY_S = 3.0, 5.0
 DISK_MB = 900
-"""Of which the recorder leaves 500 free."""
+"""Size [MB] of the recorder's disk, of which the recorder leaves 500 MB free."""
 CAMERA_HZ = 20
 GOAL_BACK_S, GOAL_LOST_S, GOAL_GAP_MS = 1.5, 0.3, 50.0
-"""As those of the chain; what a recorder may lose is in docs/recording.md."""
+"""Goals, as for the chain; docs/recording.md says what a recorder may lose."""
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 WITHOUT_GL = ("--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu", "--disable-3d-apis")
-"""A browser whose pictures of the scene would take the processors from the chain."""
+"""Flags of a browser that draws no scene: drawing it would take the processors from the chain."""
 NOTE_ARRIVALS = """
 window.arrivals = [];
 window.WebSocket = class extends WebSocket {
@@ -61,13 +61,13 @@ window.WebSocket = class extends WebSocket {
   }
 };
 """
-"""Notes in the page itself when messages come: what the browser's driver says of them is late."""
+"""Script that notes arrivals of messages in the page itself, since the browser's driver reports them late."""
 
 
 @dataclass(frozen=True)
 class Row:
     """One fault of one service. back_s: from its beginning until the old rate is back, None where it never was; missing_s: the
-    longest time of which nothing arrived; before_s: how much of that was before the fault, in the recorder's files; gap_ms: the
+    longest time without an arrival; before_s: how much of that was before the fault, in the recorder's files; gap_ms: the
     longest time without a fused pose of the chain beside it, None where there is none."""
 
     service: str
@@ -81,8 +81,8 @@ class Row:
 
 @dataclass
 class Probe:
-    """A service that runs, and the times of what arrives from it [s, steady clock]. outside: listens to the chain beside
-    it; device: what the service is connected with; disk: where its files go, None where that cannot be filled."""
+    """A running service, and the arrival times of its output [s, steady clock]. outside: listens to the chain beside it; device:
+    the other end of the service's connection; disk: folder of its files, None where that cannot be filled."""
 
     running: Running
     times: Callable[[], list[float]]
@@ -134,9 +134,10 @@ FAULTS: dict[str, tuple[Strike, float]] = {
     "other end hangs": (_hangs, AWAY_S),
     "other end away": (_gone, AWAY_S),
 }
-"""By name what begins and ends it, and how long it lasts [s]. The other end is the camera, the controller or the ROS router."""
+"""By name, what begins and ends the fault, and its duration [s]. The other end is the camera, the controller or the ROS
+router."""
 SUDDEN = ("kill", "freeze")
-"""What a recorder cannot see coming; before a disk is full it ends its file."""
+"""Faults that a recorder cannot foresee; before a disk is full it ends its file."""
 SERVICES: dict[str, tuple[str, ...]] = {
     "record": ("kill", "freeze", "full disk"),
     "dashboard": ("kill", "freeze"),
@@ -148,7 +149,7 @@ SERVICES: dict[str, tuple[str, ...]] = {
 
 
 def lacks(service: str) -> str:
-    """Why a service cannot be struck here; empty where it can."""
+    """The reason why a service cannot be tested here; empty where it can."""
     modules = {"record": "mcap", "ros2": "rosbags", "robot": "rtde_receive", "dashboard": "playwright"}
     if (module := modules.get(service)) and importlib.util.find_spec(module) is None:
         return f"{module} is not installed"
@@ -165,7 +166,7 @@ def _browser() -> str | None:
 
 
 class Arrivals:
-    """When messages come on a key of a session."""
+    """Arrival times [s, steady clock] of the messages on a key of a session."""
 
     def __init__(self, session: zenoh.Session, key: str):
         self._times: list[float] = []
@@ -181,14 +182,15 @@ class Arrivals:
 
 
 def recorded(folder: Path) -> list[float]:
-    """When the fused poses came that are in the files of a folder; a file without an end counts as far as it can be read."""
+    """Arrival times [s, steady clock] of the fused poses in a folder's files; a file without an end is read as far as
+    possible."""
     epoch_s = observed.epoch_ns() * 1e-9
     return sorted(at_s - epoch_s for path in folder.glob("*.mcap") for at_s in _poses(path, path.stat().st_size))
 
 
 @functools.lru_cache(maxsize=64)
 def _poses(path: Path, size: int) -> list[float]:
-    """When the fused poses of a file came [s since the epoch], while it has this size."""
+    """Arrival times [s since the epoch] of the fused poses in a file, cached while it has this size."""
     try:
         return [1e-9 * each.received_ns for each in Recording(path).messages([topics.FUSED])]
     except RecordingError:  # nothing of it is written yet
@@ -238,7 +240,7 @@ def _page(beside: Beside) -> Iterator[Probe]:
 
 @dataclass
 class Beside:
-    """A chain with recorder, ROS and web page. folder: of the recordings, a disk where this user may mount one."""
+    """A chain with recorder, ROS and web page. folder: of the recordings; a disk of its own where this user may mount one."""
 
     running: Running
     target: str
@@ -297,7 +299,7 @@ ALONE: dict[str, Callable[[int], AbstractContextManager[Probe]]] = {"camera": _c
 
 
 def run(cell: str, seed: int, plan: dict[str, list[str]], done: Callable[[Row], None]) -> None:
-    """Strikes services with their faults, and hands every row to `done`. Those beside the chain share one."""
+    """Injects the planned faults, and passes every row to `done`. Services beside a chain share one chain."""
 
     def strike(service: str, probe: Probe) -> None:
         for fault in track(plan[service], service, console=Console(stderr=True)):
@@ -317,12 +319,12 @@ def run(cell: str, seed: int, plan: dict[str, list[str]], done: Callable[[Row], 
 
 
 def measure(probe: Probe, service: str, fault: str) -> Row:
-    """Strikes once, and watches until the old rate is back."""
+    """Injects a fault once, and watches the service until the old rate is back."""
     strike, lasts_s = FAULTS[fault]
     wait_for(lambda: _is_ready(probe, service), READY_S, f"what {service} does", LOOK_S)
     time.sleep(BEFORE_S)
     with strike(probe, service):
-        fault_s = time.monotonic()  # to fill a disk takes a while
+        fault_s = time.monotonic()  # filling a disk takes a while
         time.sleep(lasts_s)
     over_s = time.monotonic()
     while True:
@@ -347,7 +349,7 @@ def measure(probe: Probe, service: str, fault: str) -> Row:
 
 
 def _is_ready(probe: Probe, service: str) -> bool:
-    """Whether the service is old enough, and something came from it within the last second."""
+    """Whether the service is at least OLD_S old, and had output within the last second."""
     found = injected.instances(psutil.Process(probe.running.launcher.pid), service)
     if len(found) != 1 or time.time() - found[0].create_time() < OLD_S:
         return False

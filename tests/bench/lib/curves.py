@@ -1,4 +1,4 @@
-"""The paper's curves as numbers: each function gives what one picture shows, ready for JSON."""
+"""The paper's curves as numbers: each function returns the data of one picture, ready for JSON."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from penumbra.tests.bench import haptics, skin, table1
 from penumbra.tests.bench.lib.trials import ERRORS, Played
 
 EDGES_M = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0)
-"""Camera distances are pooled between these."""
+"""Borders [m] of the bins of camera distance."""
 CLEAR = 0.10
-"""Largest share hidden where errors are told by distance, as in the paper."""
+"""Maximum hidden share for errors by distance, as in the paper."""
 AXES = ("lateral_cm", "depth_cm", "attitude_deg")
 GAPS_CM = np.arange(1.0, 20.5, 1.0)
 LEVELS = {"no occlusion": 0.9, "light": 2.0, "medium": 3.3, "heavy": 4.6}
-"""When [s] each level of a passage is in the middle of its stay."""
+"""Time [s] in the middle of each level of a passage."""
 
 
 def vision_by_distance(results: Sequence[Played]) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def vision_by_distance(results: Sequence[Played]) -> dict[str, Any]:
 
 
 def _clear(result: Played, chain: str, error: str) -> np.ndarray:
-    """An error of vision in the frames in which the limb stands free, after the lead-in of half a second."""
+    """An error of vision in the frames with less than CLEAR hidden, from half the lead-in on."""
     values = np.array(result["chains"][chain]["vision"][error], dtype=float)
     use = (np.array(result["hidden"]) < CLEAR) & (np.array(result["times_s"]) >= trial.LEAD_S / 2.0)
     return values[use & np.isfinite(values)]
@@ -53,7 +53,7 @@ def _clear(result: Played, chain: str, error: str) -> np.ndarray:
 
 def haptic_by_gap(seed: int, quick: bool) -> dict[str, Any]:
     """Root mean squares of the skin's errors by the gap, of one window of ten samples from eight pads (`penumbra bench haptics`):
-    ours started broadly and from a track, the Cramér-Rao bound of the latter, and the paper's network."""
+    ours from a broad prior and from a track, the Cramér-Rao bound of the latter, and the paper's network."""
     rig, plan = haptics.Rig("bare"), haptics.Plan(1 if quick else 12, 4, 0, 0, 0.0, 0)
     scenes: dict[tuple[int, float, int], haptics.Scene] = {}
     out: dict[str, Any] = {"array": rig.name, "pads": 8, "rows": []}
@@ -97,7 +97,7 @@ def through_occlusion(result: Played) -> dict[str, Any]:
 
 
 def examples(result: Played, chain: str = "procnet") -> list[dict[str, Any]]:
-    """A frame of a passage for every level: when it was exposed, what is hidden, the fused pose and its errors."""
+    """A frame of a passage for every level: its exposure time, the hidden share, the fused pose and its errors."""
     times = np.array(result["times_s"])
     out = []
     for name, time_s in LEVELS.items():

@@ -25,27 +25,27 @@ from penumbra.tests.bench.lib import things
 from penumbra.tests.bench.lib.results import Result, marked
 
 LIMBS = 2
-"""Limbs a row. Chosen for time: five minutes an array."""
+"""Number of limbs per row, chosen for time: five minutes per array."""
 GAPS = (0.02, 0.05, 0.10, 0.15)
 LIVES = ("seen", "away", "silent")
-"""What an estimator goes through before: a camera sees a limb, nothing is near, no voltages come."""
+"""The possible lives of an estimator before: a camera sees a limb, nothing is near, no voltages come."""
 WARMER_K = (0.0, 10.0)
-"""By how much the boards are warmer in the end [K]; after these ten minutes it is 86 % of it."""
+"""Final warming [K] of the boards, of which 86 % are reached after LIFE_S."""
 LIFE_S, SILENT_S = 600.0, 3600.0
-"""Lengths [s] of these lives."""
+"""Durations [s] of a life, and of the silent one."""
 EVERY_S = 0.2
-"""Interval [s] of the windows of a life. Chosen for time: the skin gives ten times as many, and learning only gets harder."""
+"""Interval [s] of the windows of a life, chosen for time: with the skin's rate, ten times as high, learning would be easier."""
 REACH = np.array([0.05, 0.03, 0.065])
 CYCLES = np.array([3, 1, 2])
-"""A seen limb's way: amplitudes [m] along, across and away from 2 to 15 cm, and their cycles in WAY_S."""
+"""Motion of a seen limb: amplitudes [m] along, across and away (from 2 to 15 cm), and their cycles in WAY_S."""
 WAY_S, KNOT_S = 12.0, 0.1
-"""Period of this way, and interval in which fields are solved on it [s]."""
+"""Period of this motion, and interval at which fields are solved on it [s]."""
 WINDOW_S, SAMPLES = 0.02, 20
-"""Length [s] of a window, and samples in it."""
+"""Length [s] of a window, and number of samples in it."""
 RESTS_S, LAST_SEEN_S, SETTLED_S = 4.0, 0.1, 1.0
 """Times [s] for which the limb rests, for which the camera still sees it, and after which errors count."""
 SEEN_LASTS_S = 1.0
-"""Time constant [s] of one half of what the camera's pose is off by; the other half, in variances, stays."""
+"""Time constant [s] of one half of the variance of the camera's error; the other half is constant."""
 SIGMA: Array = np.repeat(things.SEEN_SIGMA, 3)
 NEES_GOAL = (0.5, 2.0)
 NAMES = ("axial", "lateral", "height", "roll", "pitch", "yaw")
@@ -53,7 +53,7 @@ SHOWN = ("lateral", "height", "axial")
 
 
 class Rig(things.Pads, Protocol):
-    """What is used of a benchmark's rig beside `things.Pads`."""
+    """The attributes of a benchmark's rig that are used in addition to `things.Pads`."""
 
     name: str
     cell: Any
@@ -61,7 +61,7 @@ class Rig(things.Pads, Protocol):
 
 
 class _Life:
-    """An estimator's life with one limb: what is drawn, and the windows' clock."""
+    """An estimator's life with one limb: pose, size and motion of the limb, and warming of the electrodes."""
 
     def __init__(self, rig: Rig, seed: int, k: int):
         self.rig, self.seed, self.k = rig, seed, k
@@ -77,17 +77,17 @@ class _Life:
         return self.rig.place(np.random.default_rng([self.seed, 300, self.k]), gap, 8)
 
     def at(self, t: float) -> Array:
-        """The pose (4, 4) on its way."""
+        """The limb's pose (4, 4) at a time [s] of its motion."""
         step = (REACH * np.sin(2.0 * np.pi * CYCLES * t / WAY_S)) @ self.rig.axes(self.T, 8)[:3, :3]
         return rigid.perturb(self.T, np.append(step, np.zeros(3)))
 
     def volts(self, signal: Array, kelvin: float, rng: np.random.Generator) -> Array:
-        """Mean voltages (n,) of a window with these true signals (n,) [V] on boards that are so much warmer."""
+        """Mean voltages (n,) of a window with these true signals (n,) [V] on boards that are warmer by `kelvin`."""
         clean = self.rig.voltages(np.tile(signal, (SAMPLES, 1)), rng).mean(axis=0)
         return self.warming.apply(clean[None], self.rig.skin.a3, [kelvin])[0]
 
     def born(self, rng: np.random.Generator) -> Estimator:
-        """An estimator that expects the limb somewhere before the pads."""
+        """A new estimator that expects the limb somewhere before the pads."""
         home = rigid.perturb(self.T, things.HOME_SPREAD * rng.standard_normal(6))
         return self.rig.estimator(home, things.HOME_SPREAD)
 
@@ -114,7 +114,8 @@ class _Life:
         return estimator, LIFE_S
 
     def rest(self, estimator: Estimator, age_s: float, gap: float, warmer: float) -> dict[str, Any]:
-        """What a limb that rests at a gap is taken for: errors (w, 6) by NAMES, NEES published and of the observer."""
+        """The results of a limb that rests at a gap: errors (w, 6) by NAMES, NEES of the published and of the observer's
+        poses."""
         rig, rng = self.rig, np.random.default_rng([self.seed, 303, self.k, int(1e4 * gap)])
         T, _ = self.place(gap)
         signal, axes = rig.signal(self.body, T, 8), rig.axes(T, 8)
@@ -147,7 +148,7 @@ class _Life:
 
 
 def measure(rig: Rig, seed: int, limbs: int, progress: Progress) -> list[dict[str, Any]]:
-    """Rows by life, warmth and gap, of so many limbs."""
+    """Rows by life, warming and gap, over `limbs` limbs."""
     found: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
     task = progress.add_task(f"{rig.name}: drift", total=limbs * len(LIVES) * len(WARMER_K))
     for k in range(limbs):
@@ -182,7 +183,7 @@ def _row(array: str, life: str, warmer: float, gap: float, rests: list[dict[str,
 
 
 def table(result: Result) -> Table:
-    """Errors and NEES by array, life, warmth and gap."""
+    """Errors and NEES by array, life, warming and gap."""
     names = [f"{name} {'mm' if name in SHOWN else 'deg'}" for name in (*SHOWN, "pitch", "yaw")]
     low, high = NEES_GOAL
     out = Table(

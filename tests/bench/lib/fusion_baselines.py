@@ -1,6 +1,6 @@
-"""What the observers are compared with, on the same messages: no model at all, and a smoother of other people.
+"""Baselines for the observers, on the same messages: methods without a model, and a third-party smoother.
 
-Each takes the messages as they arrive and says where the limb is now.
+Each takes the messages as they arrive and gives the limb's current pose.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.tests.bench.lib.fusion_runs import PERIOD_S, Message
 
 FRESH_S = 0.25
-"""A measurement older than this counts only where there is no newer one: `services.fusion.estimate.Limits.tracking_age`."""
+"""Age [s] above which a measurement counts only where there is no newer one: `services.fusion.estimate.Limits.tracking_age`."""
 
 
 class Newest:
@@ -52,9 +52,10 @@ class Newest:
 class FixedLagSmoother:
     """gtsam's incremental fixed-lag smoother on position, rotation and velocity.
 
-    A constant linear velocity with white acceleration and a rotation with white rate between nodes at the senses' stamps, which
-    are known before the measurements arrive: a late one is attached to its node. gtsam's priors want a full information: the roll
-    that a sense does not observe is taken from the smoother itself, with next to no weight. Errors are white to it.
+    Between nodes it assumes a constant linear velocity with white acceleration, and a rotation with white rate. Nodes lie at the
+    senses' stamps, which are known before the measurements arrive: a late one is attached to its node. gtsam's priors need full
+    information: a roll that a sense does not observe is taken from the smoother itself, with next to no weight. It models errors
+    as white.
 
     lag : how far back measurements are taken and poses smoothed [s].
     acceleration, turning : densities of the white acceleration [m^2/s^3] and the white angular rate [rad^2/s].
@@ -71,7 +72,7 @@ class FixedLagSmoother:
         inflation: tuple[float, float] = (4.0, 2.0),
     ):
         parameters = gtsam.ISAM2Params()
-        parameters.setFactorization("QR")  # a roll without measurements is not always positive definite to Cholesky
+        parameters.setFactorization("QR")  # without a measured roll, Cholesky may find a matrix not positive definite
         self._smoother = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._acceleration, self._turning = acceleration, turning
         self._weight = dict(zip(PERIOD_S, (1.0 / each for each in inflation), strict=True))
@@ -116,7 +117,7 @@ class FixedLagSmoother:
         return gtsam.NavState(self._last.attitude(), self._last.position() + dt * self._last.velocity(), self._last.velocity())
 
     def _motion(self, dt: float) -> gtsam.noiseModel.Base:
-        """Of rotation, position and velocity: white acceleration over a step."""
+        """Noise of rotation, position and velocity over a step [s]: white rate and white acceleration."""
         Q, one = np.zeros((9, 9)), np.eye(3)
         Q[:3, :3] = self._turning * dt * one
         Q[3:6, 3:6] = self._acceleration * dt**3 / 3.0 * one
@@ -128,7 +129,7 @@ class FixedLagSmoother:
         known = new.atNavState(tick) if new.exists(tick) else self._smoother.calculateEstimateNavState(tick)
         T, information = message.T, self._weight[message.source] * message.information
         axis = T[:3, 0]
-        if axis @ information[3:, 3:] @ axis < 1e-6 * information[3:, 3:].trace():  # the roll is made up
+        if axis @ information[3:, 3:] @ axis < 1e-6 * information[3:, 3:].trace():  # the roll is not measured
             before = known.attitude().matrix()[:, 0]
             across = np.cross(before, axis)
             angle = np.arctan2(np.linalg.norm(across), before @ axis)

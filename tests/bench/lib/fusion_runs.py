@@ -3,8 +3,8 @@
 Nothing is drawn from the filter's own model. A limb makes minimum-jerk reaches with rests (`sim.world.motion`). A sense's errors
 lie along its own axes, the camera's ray or the limb, and their share that lasts and the time it lasts are drawn anew for every
 run, around what the filter assumes: vision a share of 0.6 to 0.9 and 0.5 to 2 s (0.75 and 1 s assumed), the skin 0.1 to 0.4 and
-0.15 to 0.6 s (0.2 and 0.3 s). On top comes what no covariance tells, the calibration: constant over a run, in every direction of
-a standard deviation of 0.5 mm and 0.3 degrees.
+0.15 to 0.6 s (0.2 and 0.3 s). In addition there is an error of calibration, which no covariance contains: constant over a run,
+with a standard deviation of 0.5 mm and 0.3 degrees in every direction.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from penumbra.sim.world.motion import PEAK, LimbMotion, Reach
 T0_NS = 1_700_000_000_000_000_000
 PERIOD_S = {"vision": 0.05, "haptic": 0.02}
 DELAY_S = {"vision": (0.04, 0.06), "haptic": (0.003, 0.003)}
-"""From a measurement's stamp until it arrives."""
+"""Bounds of the delay [s] from a measurement's stamp to its arrival."""
 LASTING = {"vision": (0.6, 0.9), "haptic": (0.1, 0.4)}
 TIME_CONSTANT_S = {"vision": (0.5, 2.0), "haptic": (0.15, 0.6)}
 CALIBRATION = np.repeat([0.0005, np.radians(0.3)], 3)
 RADIUS_M, RANGE_M = 0.04, 0.15
-"""Of the forearm; and of the skin: the gap up to which it says something."""
+"""Radius of the forearm [m], and range of the skin [m]."""
 NEAR, FAR = (0.07, 0.17), (0.22, 0.35)
-"""Heights [m] of the limb's axis above the skin: always in its range, never."""
+"""Bounds of the height [m] of the limb's axis above the skin: always in its range, and never."""
 WRONG_S, WRONG_M = (10.0, 11.0), 0.1
 AWAY_SPEED, DRIFT_SPEED, WRONG_TURN = 0.3, 0.1, 0.8
-"""Of a sense that goes on becoming more wrong [m/s], from an offset and from nothing; and how far one is turned [rad]."""
+"""Speeds [m/s] at which a wrong sense drifts away, from an offset and from zero, and angle [rad] by which one is turned."""
 FAST_SPEED, FAST_ACCELERATION, FAST_TURN = 2.0, 50.0, 6.0
-"""Peaks of a fast hand [m/s, m/s^2, rad/s]."""
+"""Peak speed, acceleration and angular rate of a fast hand [m/s, m/s^2, rad/s]."""
 CAMERA = rigid.look_at([0.35, -1.15, 0.90], [0.05, 0.0, 0.15])[:3, 3]
 
 
 def ns(seconds: float) -> int:
-    """A stamp."""
+    """The stamp [ns] of a time [s] of a run."""
     return T0_NS + round(seconds * 1e9)
 
 
 @dataclass(frozen=True)
 class Message:
-    """One measurement: when it arrives and is taken [s], of which sense, its pose (4, 4), its information (6, 6), and the share
-    that is hidden from a camera."""
+    """One measurement: its arrival and stamp [s], its sense, its pose (4, 4), its information (6, 6), and the share that is
+    hidden from the camera (None for the skin)."""
 
     arrival: float
     stamp: float
@@ -64,7 +64,7 @@ class Situation:
     scored : whether errors count at a time.
     rolls : whether the roll is observed at a time; where it is not, errors are taken along the five other directions.
     heights : of the limb above the skin, None: all of the cell's region.
-    feels : whether the skin says something at a time, where the limb is in range.
+    feels : whether the skin measures at a time, where the limb is in range.
     """
 
     hidden: Callable[[float, float], float]
@@ -77,11 +77,11 @@ class Situation:
 
 
 SETTLED_S = 2.0
-"""Before, errors do not count: the observer has just begun."""
+"""Time [s] before which errors do not count, as the observer has just begun."""
 GONE = ((2.5, 3.0), (5.0, 6.0), (8.0, 9.5), (11.5, 13.5), (15.5, 16.0), (18.0, 19.5))
-"""When nothing is seen or felt [s]."""
+"""Intervals [s] in which nothing is seen or felt."""
 HANDOVER_S, OVERLAP_S = 3.0, 0.3
-"""The senses take turns; both are there at the end of a turn."""
+"""Time [s] for which one sense measures before the other takes over, and time [s] for which both do."""
 ROLL_FORGOTTEN_S = 0.5
 
 
@@ -117,11 +117,11 @@ SITUATIONS = {
     "one sense wrong": Situation(lambda t, phase: 0.05, _settled, heights=NEAR, wrong=True),
     "fast hand": Situation(lambda t, phase: 0.05, _settled, fast=True),
 }
-"""The six of the goals and one beyond them: a hand at up to 2 m/s and 50 m/s^2."""
+"""The six situations of the goals, and one beyond them: a hand at up to 2 m/s and 50 m/s^2."""
 
 
 class FastHand:
-    """Reaches at the fastest that a hand does, with rests; the interface of `sim.world.motion.LimbMotion`."""
+    """Reaches as fast as a hand moves, with rests; it has the interface of `sim.world.motion.LimbMotion`."""
 
     def __init__(self, region: cells.Motion, seconds: float, rng: np.random.Generator):
         low, high = np.array([*region.low, *region.rpy_low]), np.array([*region.high, *region.rpy_high])
@@ -161,7 +161,7 @@ class Senses:
         return axes @ (sigma * unit) + self._calibration[source]
 
     def seen(self, T: Array, hidden: float) -> tuple[Array, Array]:
-        """Pose and information of a camera, of a limb at T: uncertain along the ray, and more so the more is hidden."""
+        """A camera's pose and information of a limb at T: uncertain along the ray, and the more so the more is hidden."""
         grown = np.exp(1.5 * hidden)
         sigma = grown * np.array([0.008, 0.002, 0.002, 0.06, 0.025, 0.025])
 
@@ -173,7 +173,8 @@ class Senses:
         return measured, (A / np.square(sigma)) @ A.T
 
     def felt(self, T: Array) -> tuple[Array, Array]:
-        """Pose and information of the skin: uncertain with the gap, and along the limb; its roll is made up."""
+        """The skin's pose and information of a limb at T: uncertain with the gap, and along the limb; the roll is not
+        measured."""
         gap = float(np.clip(T[2, 3] - RADIUS_M, 0.02, RANGE_M))
         worse = np.exp(np.interp(gap, [0.02, RANGE_M], np.log([1.0, 12.0])))
         sigma = worse * np.array([0.003, 0.001, 0.0012, 0.0, 0.006, 0.01])
@@ -195,7 +196,7 @@ class Run:
 
 
 def drawn(name: str, seed: int, index: int, seconds: float) -> Run:
-    """Run `index` of a situation; in one with a wrong sense, before it is made wrong."""
+    """Run `index` of a situation, before `wronged` makes a sense wrong."""
     situation = SITUATIONS[name]
     rng = np.random.default_rng([seed, list(SITUATIONS).index(name), index])
     at = _limb(situation, seconds, rng)
@@ -220,7 +221,7 @@ def silenced(run: Run, index: int) -> Run:
 
 
 def jumped(name: str, seed: int, index: int, seconds: float) -> Run:
-    """A run of a situation whose limb goes on, from half its time, where that of another run is."""
+    """A run of a situation whose limb jumps to that of another run at half its time."""
     first, second = (drawn(name, seed, i, seconds) for i in (2 * index, 2 * index + 1))
     middle = seconds / 2.0
     messages = [m for m in first.messages if m.stamp < middle] + [m for m in second.messages if m.stamp >= middle]
@@ -234,8 +235,8 @@ def _is_wrong(m: Message, index: int) -> bool:
 
 @dataclass(frozen=True)
 class Wrong:
-    """How a sense is wrong, beside its own errors: off by so much at first [m], farther by so much [m/s], turned by so much
-    [rad], and whether it goes on saying the first pose that it was wrong with."""
+    """How a sense is wrong, in addition to its own errors: offset at first [m], speed at which it grows [m/s], turn [rad], and
+    whether the sense keeps reporting its first wrong pose (`stands`)."""
 
     offset: float = 0.0
     speed: float = 0.0
@@ -271,7 +272,7 @@ def wronged(run: Run, seed: int, index: int, way: Wrong = OFFSET) -> Run:
 
 
 def delayed(run: Run, delay: Callable[[], float]) -> Run:
-    """The same run with every measurement as late [s] as `delay` says."""
+    """The same run with every measurement delayed by a call of `delay` [s]."""
     in_order = sorted(run.messages, key=lambda m: (m.stamp, list(PERIOD_S).index(m.source)))
     messages = [replace(m, arrival=m.stamp + delay()) for m in in_order]
     return replace(run, messages=sorted(messages, key=lambda m: m.arrival))

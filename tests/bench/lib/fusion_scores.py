@@ -1,6 +1,6 @@
-"""How runs of the benchmark of fusion are played to the observer and its rivals, and what is scored of each.
+"""Plays runs of the fusion benchmark to the observer and its baselines, and scores them.
 
-What the scores mean is told in `tests.bench.fusion`, which draws the runs and sums them up.
+`tests.bench.fusion`, which draws the runs and summarises them, explains the scores.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from penumbra.tests.bench.lib import fusion_runs as runs
 from penumbra.tests.bench.lib.fusion_baselines import FixedLagSmoother, Newest
 
 HOME, SPREAD = rigid.from_rpy([0.0, 0.0, 0.2], [0.0, 0.0, 0.0]), (0.12, 0.4)
-"""Of the cell `table`."""
+"""Home and spread of the target in the cell `table`."""
 INSTANTS_S = 0.11
-"""Between moments that are scored: it walks through all phases of both senses' periods."""
+"""Interval [s] between scored moments: it passes through all phases of both senses' periods."""
 LATE_S = {"0": (0.0, 0.0), "50": (0.05, 0.05), "200": (0.2, 0.2), "shuffled": (0.0, 0.2)}
 CONFIDENCE = 0.95
 THREE_SIGMA = 0.9973
 """Share of normal errors within three standard deviations."""
 NOTICED_S, GUESSED_S = 0.1, 0.5
-"""Within what time a jump is to be noticed, and a limb that nothing measures is to be known still."""
+"""Times [s] within which a jump must be noticed, and for which a limb that nothing measures must still be known."""
 PUBLISHED_HZ = 200.0
 BASELINES = ("oracle", "average", "gtsam", "paper")
 SLOW, SLOW_EVERY = ("gtsam", "paper"), 4
@@ -44,7 +44,7 @@ SOURCES = tuple(sense.name for sense in SENSES)
 class Scores:
     """One run: at scored instants [s] (k,) the errors [m] of the observer and of each baseline that was played, the NEES and its
     degrees of freedom, and its state; of every accepted measurement its stamp [s], NIS and degrees of freedom (n,); by source the
-    errors [m] of the measurements and of the observer at their stamps (m, 2); how many were refused."""
+    errors [m] of the measurements and of the observer at their stamps (m, 2); the number of refused measurements."""
 
     times: Array
     errors: dict[str, Array]
@@ -63,7 +63,7 @@ def normalised(truth: Array, T: Array, covariance: NDArray[np.floating[Any]], ro
     axis, five directions."""
     error = rigid.pose_error(truth, T)
     if not rolls:
-        turn = np.cross(T[:3, 0], truth[:3, 0])  # of the axis alone: what a roll of tens of degrees turns is no error of it
+        turn = np.cross(T[:3, 0], truth[:3, 0])  # of the axis alone: a roll of tens of degrees is no error of it
         error[3:] = rigid.axis_angle_error(truth, T) * turn / max(float(np.linalg.norm(turn)), 1e-12)
         axes = np.eye(6)
         axes[3:, 3:] = T[:3, :3]
@@ -94,7 +94,7 @@ def consistency(times: Array, values: Array, dof: Array, count: int) -> dict[str
 
 
 class Player:
-    """Hands the messages of a run to whoever wants them, as they arrive."""
+    """Passes the messages of a run to `takers` in the order of arrival."""
 
     def __init__(self, run: runs.Run, takers: Iterable[Callable[[runs.Message], object]]):
         self._messages, self._takers, self._next = run.messages, list(takers), 0
@@ -163,8 +163,8 @@ def scored(name: str, seed: int, index: int, seconds: float) -> Scores:
 
 
 def innovations(run: runs.Run) -> tuple[Array, Array, Array]:
-    """Stamps [s], NIS and degrees of freedom of all accepted measurements of a settled observer, each as its sense said it and in
-    the order of the stamps: what comes late is judged once, with all that was before it."""
+    """Stamps [s], NIS and degrees of freedom of all accepted measurements of a settled observer, each as its sense reported
+    it and in the order of the stamps: a late one is judged once, with all earlier ones known."""
     observer, found = ErrorStateObserver(HOME, SPREAD), []
     for m in runs.delayed(run, lambda: 0.0).messages:
         accepted = taking(observer)(m)
@@ -175,8 +175,8 @@ def innovations(run: runs.Run) -> tuple[Array, Array, Array]:
 
 
 def shift(seed: int, index: int, seconds: float) -> tuple[float, float]:
-    """How far [m] a wrong sense moves the pose at most, beside the same run in which it is right, and how far the same sense does
-    that is silent for as long."""
+    """Largest displacement [m] of the pose by a wrong sense, against the same run in which it is right, and by the same sense
+    when it is silent for as long."""
     right, times = _beside(seed, index, seconds)
     wrong, silent = runs.wronged(right, seed, index), runs.silenced(right, index)
     track, moved, missed = (_poses(run, times) for run in (right, wrong, silent))
@@ -185,8 +185,8 @@ def shift(seed: int, index: int, seconds: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Way:
-    """What a sense does that is wrong in one way: how far it moves the pose at most [m]; how many poses there were from then on,
-    how many of them were called tracking, and how many of these were beyond three sigma."""
+    """The effect of a sense that is wrong in one way: largest displacement of the pose [m]; number of poses from then on, of
+    those called tracking, and of the latter beyond three sigma."""
 
     moved: float
     poses: int
@@ -195,11 +195,11 @@ class Way:
 
 
 SILENT = "silent"
-"""The way of a sense that says nothing for as long as others are wrong."""
+"""Name of the way in which a sense is silent instead of wrong."""
 
 
 def ways(seed: int, index: int, seconds: float) -> dict[str, Way]:
-    """One run for each way in which a sense is wrong, and one in which it is silent, beside that in which it is right."""
+    """One run for each way in which a sense is wrong, and one in which it is silent, against that in which it is right."""
     right, times = _beside(seed, index, seconds)
     track = _poses(right, times)
     played = {name: runs.wronged(right, seed, index, way) for name, way in runs.WAYS.items()}
@@ -219,7 +219,7 @@ def _beside(seed: int, index: int, seconds: float) -> tuple[runs.Run, list[float
 
 
 def _poses(run: runs.Run, times: list[float]) -> list[Estimate]:
-    """What the observer says at some moments [s] of a run."""
+    """The observer's estimates at some moments [s] of a run."""
     observer = ErrorStateObserver(HOME, SPREAD)
     player, found = Player(run, [taking(observer)]), []
     for now in times:
@@ -235,8 +235,8 @@ def _apart(one: list[Estimate], other: list[Estimate]) -> float:
 
 @dataclass(frozen=True)
 class Jump:
-    """One jump: until when it was noticed [s]; of the poses called tracking after NOTICED_S, how many there were, and how many
-    beyond three sigma; until when the pose was right and called tracking again [s]."""
+    """One jump: time until it was noticed [s]; number of poses called tracking after NOTICED_S, and of those beyond three sigma;
+    time until the pose was right and called tracking again [s]."""
 
     noticed: float
     tracked: int
@@ -245,7 +245,7 @@ class Jump:
 
 
 def jump(seed: int, index: int, seconds: float) -> Jump:
-    """One run that goes on as another one after half its time, seen by the skin as well in every other one."""
+    """One run with a jump at half its time; in every other run the skin feels the limb as well."""
     run = runs.jumped("one sense wrong" if index % 2 else "visible", seed, index, seconds)
     observer, begin = ErrorStateObserver(HOME, SPREAD), seconds / 2.0
     player, rows = Player(run, [taking(observer)]), []
@@ -266,8 +266,8 @@ def jump(seed: int, index: int, seconds: float) -> Jump:
 
 @dataclass(frozen=True)
 class Lateness:
-    """Errors [m] of a run with late measurements: of the pose as of the newest stamp that has arrived, and as of now; and how far
-    [m] the poses as of a stamp, once all up to it has arrived, are at most from those of a run without lateness."""
+    """Errors [m] of a run with late measurements: of the pose as of the newest stamp that has arrived, and as of now; and the
+    largest distance [m] of the poses as of a stamp, once all up to it has arrived, from those of the run without delays."""
 
     newest: Array
     now: Array
@@ -275,7 +275,7 @@ class Lateness:
 
 
 def late(seed: int, index: int, seconds: float) -> dict[str, Lateness]:
-    """One visible run for each lateness."""
+    """One run of the situation `visible` for each entry of LATE_S."""
     drawn = runs.drawn("visible", seed, index, seconds)
     longest = max(bounds[1] for bounds in LATE_S.values())
     times = [t for t in instants(drawn) if t + longest < seconds]

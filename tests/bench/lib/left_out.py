@@ -24,9 +24,9 @@ from penumbra.tests.bench.lib.results import Result
 
 GAPS = (0.02, 0.05, 0.10, 0.15, 0.20)
 POSES = 6
-"""Poses of the forearm at each gap."""
+"""Number of poses of the forearm at each gap."""
 PAD, BESIDE = "p1", ("p2", "p5", "p6")
-"""The pad in whose place the others' effect is solved, and these others."""
+"""The pad at which the effect of neighbouring boards is solved, and these boards."""
 SHIFT, TURN = (0.06, 0.03), (0.3, 0.12, 0.26)
 """Bounds of the forearm's displacement along and across from the pads' middle [m], and of its roll, pitch and yaw [rad]."""
 PERSON = ("upper arm", "upper arm and torso")
@@ -34,7 +34,7 @@ BOARDS = ("three boards beside, not driven", "three boards beside, driven togeth
 
 
 def measure(cell: cells.Cell, seed: int, progress: Progress) -> list[dict[str, Any]]:
-    """Rows by what is left out and gap: what its presence changes in the signals, as shares of them."""
+    """Rows by omitted part and gap: relative changes of the signals by its presence."""
     target = next(iter(cell.targets))
     assert cell.sim is not None, f"cell {cell.name}: expected a `sim` section"
     person, skin = Person(cell, cell.sim, cell.targets[target]), Skin(cell)
@@ -78,7 +78,7 @@ def _row(name: str, gap: float, share: Array) -> dict[str, Any]:
 
 
 def table(result: Result) -> Table:
-    """Medians and ranges of what is left out, by gap."""
+    """Medians and ranges of the changes by omitted parts, by gap."""
     out = Table(
         *("left out", *(f"{100 * gap:g} cm" for gap in GAPS)),
         title="What the runtime field model leaves out, share of the signal: median (5 % to 95 %)",

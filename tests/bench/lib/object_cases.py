@@ -1,4 +1,4 @@
-"""Photographs of objects with true poses in folders, and how `search refine` and `search track` do on them.
+"""Photographs of objects with true poses in folders, and scores of `search refine` and `search track` on them.
 
 A folder of a case holds `mesh.ply` (metres), `camera.json`, `truth.json` and `rgb.png`, and may hold `mask.png` or else
 `mask_guided.png`. `truth.json` has `camera_from_object` of `rgb.png`, and for a sequence `frames`: a list with `file` and
@@ -27,16 +27,17 @@ from penumbra.shared.geometry.rigid import Array, apply, perturb
 STARTS = ((20.0, 0.03), (30.0, 0.05))
 """Rotation [deg] and distance [m] of the starts from the truth, each exactly, in random directions."""
 CONVERGED = 0.1
-"""A pose has converged whose mean distance of the mesh's points from the true pose's is below this share of the diameter (ADD;
-for a symmetric object the distance to the nearest point, ADD-S: Hinterstoisser et al. 2012, doi:10.1007/978-3-642-37331-2_42)."""
+"""A pose has converged if the mean distance of the mesh's points from those of the true pose is below this share of the diameter
+(ADD; for a symmetric object the distance to the nearest point, ADD-S: Hinterstoisser et al. 2012,
+doi:10.1007/978-3-642-37331-2_42)."""
 MASKS = ("mask.png", "mask_guided.png")
-"""Names of a mask, the first of which there is counts."""
+"""Possible names of a mask; the first that exists is used."""
 SURE = ("tracking", "occluded")
-"""States that say that the pose is right."""
+"""States that claim a right pose."""
 
 
 def moved(T: Array, degrees: float, metres: float, rng: np.random.Generator) -> Array:
-    """The pose beside T: turned and shifted by exactly this, in random directions."""
+    """T turned and shifted by exactly these amounts, in random directions."""
     axis, way = rng.normal(size=3), rng.normal(size=3)
     error = np.concatenate([metres * way / np.linalg.norm(way), np.radians(degrees) * axis / np.linalg.norm(axis)])
     return perturb(T, error)
@@ -44,8 +45,8 @@ def moved(T: Array, degrees: float, metres: float, rng: np.random.Generator) -> 
 
 @dataclass(frozen=True)
 class Case:
-    """A folder: its reader of images, mesh, `vertices` (n, 3) [m] of the mesh, their largest distance [m], T_camera_object of
-    rgb.png and of the frames of a sequence."""
+    """The content of a folder: reader of images, mesh, `vertices` (n, 3) [m] of the mesh, their largest distance [m],
+    T_camera_object of rgb.png and of the frames of a sequence."""
 
     name: str
     folder: Path
@@ -65,7 +66,7 @@ class Case:
         return float(np.linalg.norm(apply(T, self.vertices) - apply(truth, self.vertices), axis=1).mean()) / self.diameter
 
     def rng(self, *seed: int) -> np.random.Generator:
-        """Draws that depend on the case's name and not on the other cases."""
+        """A random generator that depends on the case's name and not on the other cases."""
         return np.random.default_rng((zlib.crc32(self.name.encode()), *seed))
 
 
@@ -99,7 +100,7 @@ def timed(call: Any, *arguments: Any) -> tuple[ObjectEstimate, float]:
 
 
 def refined(case: Case, seed: int, starts: int) -> Iterator[dict[str, Any]]:
-    """A row for the mask with the picture, if there is a mask, and for the picture alone, and for each of STARTS."""
+    """Rows for each of STARTS: with mask and picture, if there is a mask, and with the picture alone."""
     picture = case.files.picture(case.folder / "rgb.png")
     masks: dict[str, NDArray[np.bool_] | None] = {"mask+picture": case.files.mask(case.mask)} if case.mask else {}
     for name, mask in {**masks, "picture": None}.items():
@@ -124,10 +125,10 @@ def refined(case: Case, seed: int, starts: int) -> Iterator[dict[str, Any]]:
 
 
 def tracked(case: Case, seed: int, starts: int) -> dict[str, Any]:
-    """The row of a sequence, of the picture alone, from the nearer of STARTS.
+    """The row of a sequence, with the picture alone, from the nearer of STARTS.
 
-    `right`: share of the frames that are tracked, and right; `recovery_frames`: the longest run of frames that are not, beginning
-    with the start's.
+    `right`: share of the frames that are tracked and right; `recovery_frames`: the longest run of frames that are not, including
+    those after the start.
     """
     pictures = [case.files.picture(path) for path, _ in case.frames]
     right, wrong, ms_all, longest = [], [], [], 0

@@ -21,12 +21,12 @@ GOAL = 0.75
 
 
 def window_about(target: NDArray[np.bool_]) -> Window:
-    """The window that the service would look at around an arm whose pixels (h, w) are known."""
+    """The window that the service would choose around an arm with these pixels (h, w)."""
     height, width = target.shape
     rows, columns = np.flatnonzero(target.any(1)), np.flatnonzero(target.any(0))
     padded = np.pad(target.astype(np.uint8), 1)  # beyond the picture there is no arm
     arm_px = 2.0 * float(cv2.distanceTransform(padded, cv2.DIST_L2, 5).max())
-    margin = MARGIN_M * arm_px / ARM_M  # of a depth that only the arm's width tells
+    margin = MARGIN_M * arm_px / ARM_M  # the depth is known only from the arm's width
     picture = Window(0, 0, width, height)
     low, high = np.array([columns[0], rows[0]]) - margin, np.array([columns[-1], rows[-1]]) + margin
     return window_of(picture, low, high, arm_px) or whole_frame(picture)
@@ -42,7 +42,7 @@ def measure(segmenter: inference.Segmenter, frames: Iterable[Frame], overlays: P
         if not truth.any():
             continue
         window = window_about(truth)
-        for k in range(files.SETTLE):  # a gap before each picture, after which the state is forgotten
+        for k in range(files.SETTLE):  # a gap in time before each picture, after which the state is forgotten
             part = segmenter(image, window, index * 10**10 + k * files.PERIOD_NS)
         mask = np.full(labels.shape, Label.BACKGROUND, np.uint8)
         mask[window.y0 : window.bottom, window.x0 : window.right] = part.repeat(window.scale, 0).repeat(window.scale, 1)

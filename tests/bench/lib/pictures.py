@@ -19,7 +19,7 @@ from penumbra.tests.bench.lib import curves
 
 INK, PALE, GRID = "#1c2530", "#8a94a0", "#dfe4e9"
 OURS, VISION, RIVAL, RIVAL_FUSED, PAPER = "#1257a8", "#5aa2e0", "#c8433a", "#e59b3c", "#7d8590"
-"""Fused; our vision; PoseCNN; PoseCNN with the skin; the paper's numbers or method."""
+"""Colours of fused, our vision, PoseCNN, PoseCNN with the skin, and the paper's numbers or method."""
 NAMES = {"procnet": "ProcNet, ours", "posecnn": "PoseCNN", "faithful": "paper's search"}
 COLOURS = {"procnet": OURS, "posecnn": RIVAL, "faithful": PAPER}
 DPI = 130
@@ -44,7 +44,7 @@ def _dress(axes: Axes, xlabel: str, ylabel: str, title: str = "") -> None:
 
 
 def _plain(axes: Axes, ticks: Sequence[float]) -> None:
-    """A logarithmic scale whose ticks are these numbers, written as such."""
+    """Sets a logarithmic scale with these ticks, labelled as plain numbers."""
     axes.set_yscale("log")
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
@@ -100,7 +100,7 @@ def vision_by_distance(data: dict[str, Any], path: Path) -> None:
 
 
 def _focal_lengths(axes: Axes) -> None:
-    """Writes over each range of distances [m] with how many pixels it is seen."""
+    """Writes the focal length [px] over each range of distances [m]."""
     focal: dict[float, tuple[float, float]] = {}
     for distance, (near, far) in DISTANCE_M.items():
         length = FOCAL_PX / BINNING[distance]

@@ -1,7 +1,8 @@
-"""Household objects with prints: meshes with colours, and pictures of them in other light, before things of many colours.
+"""Household objects with prints: meshes with colours, and pictures of them in other light, before a colourful background.
 
-The colours are patches about random points of the surface, as on packages, and two large areas. A picture is of other light than
-the mesh's colours: a lamp to the side, a tint, another gamma, noise and blur; the mesh is up to 1 % too large or small.
+The colours are patches about random points of the surface, as on packages, and two large areas. A picture has other light than
+the mesh's colours: a lamp to the side, a tint, another gamma, noise and blur. The scale of the mesh is wrong by 0.5 % (one
+standard deviation).
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from penumbra.shared.geometry.rigid import Array, apply
 from penumbra.shared.perception.intrinsics import Intrinsics
 
 SUBDIVIDED = 0.0025
-"""Largest edge [m] of a printed mesh: the colours of its corners are the print."""
+"""Maximum edge [m] of a printed mesh: the colours of its vertices are the print."""
 PATCHES = 40
 """Number of patches of a print."""
 MISPLACED = 0.001
-"""Standard deviation [m] of where a scan puts a print on the surface."""
+"""Standard deviation [m] of the displacement of a print on the surface in a scan."""
 MAKERS: dict[str, Callable[[], trimesh.Trimesh]] = {
     "box": lambda: trimesh.creation.box((0.06, 0.158, 0.21)),
     "flat box": lambda: trimesh.creation.box((0.03, 0.085, 0.073)),
@@ -38,8 +39,8 @@ MAKERS: dict[str, Callable[[], trimesh.Trimesh]] = {
 
 @dataclass(frozen=True)
 class Printed:
-    """A trimesh with coloured vertices as a user has it, the true colours (n, 3) of its vertices, and what `search refine`
-    makes of it with its colours and without."""
+    """A trimesh with coloured vertices as a user has it, the true colours (n, 3) of its vertices, and the objects of
+    `search refine` with its colours (`rigid`) and without (`plain`)."""
 
     mesh: trimesh.Trimesh
     colours: NDArray[np.uint8]
@@ -53,7 +54,7 @@ class Printed:
 
 
 def printed(name: str, seed: int) -> Printed:
-    """One of MAKERS with a print."""
+    """An object of MAKERS with a print."""
     rng = np.random.default_rng(seed)
     body = MAKERS[name]()
     vertices, faces = trimesh.remesh.subdivide_to_size(body.vertices, body.faces, SUBDIVIDED, max_iter=12)

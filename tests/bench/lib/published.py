@@ -1,5 +1,5 @@
-"""The pages of docs/results, their tables made of the committed results. `python -m penumbra.tests.bench.lib.published` writes
-them; a test compares.
+"""The pages of docs/results, with tables generated from the committed results. `python -m penumbra.tests.bench.lib.published`
+writes them; a test compares.
 
 docs/results/data/NAME.json is what `penumbra bench BENCHMARK --json` wrote; NAME is the benchmark's, with -WORD where there are
 several results of one. A page has a region of that name between two marks. A region without a file keeps its text, which was
@@ -20,11 +20,11 @@ DATA = PAGES / "data"
 REGION = re.compile(r"(<!-- ([\w-]+): begin -->\n\n)(.*?)(\n\n<!-- \2: end -->)", re.DOTALL)
 MARK = re.compile(r"<!-- ([\w-]+): (begin|end) -->")
 BY_HAND = re.compile(r"Measured at [0-9a-f]{7,} or before \(\d{4}-\d\d-\d\d\), copied by hand\.")
-"""What a region without a file says of itself."""
+"""The note that a region without a file must contain."""
 
 
 def regions(page: str) -> dict[str, str]:
-    """The texts of a page's regions by name. Raises ValueError for a mark without its other one."""
+    """The texts of a page's regions by name. Raises ValueError for a mark without its counterpart."""
     found = {match[2]: match[3] for match in REGION.finditer(page)}
     if (marks := len(MARK.findall(page))) != 2 * len(found):
         raise ValueError(
@@ -35,8 +35,8 @@ def regions(page: str) -> dict[str, str]:
 
 
 def text(path: Path) -> str:
-    """The region of a result: how it was measured, and all that the benchmark shows of it. Raises ValueError for a file that no
-    benchmark wrote."""
+    """The text of a result's region: how it was measured, and all that the benchmark shows of it. Raises ValueError for a file
+    that no benchmark wrote."""
     result: Result = json.loads(path.read_text())
     benchmark = path.stem.partition("-")[0]
     if "run" not in result:
@@ -45,7 +45,7 @@ def text(path: Path) -> str:
 
 
 def told(run: Result) -> str:
-    """A line on a run: command, commit, date, seed, machine."""
+    """A line that describes a run: command, commit, date, seed, machine."""
     commit = "outside a checkout" if run["commit"] is None else f"commit {run['commit']}{' with changes' * run['modified']}"
     date = run["date"].replace("T", " ").replace("Z", " UTC")
     machine = f"{run['processor']}, {run['cores']} cores, Python {run['python']}"
@@ -53,7 +53,7 @@ def told(run: Result) -> str:
 
 
 def filled(page: str, data: Path = DATA) -> str:
-    """A page with the regions made anew whose results are in a folder. Raises ValueError."""
+    """A page with its regions regenerated where their results are in a folder. Raises ValueError."""
     known = {name: text(data / f"{name}.json") for name in regions(page) if (data / f"{name}.json").exists()}
     return REGION.sub(lambda match: f"{match[1]}{known.get(match[2], match[3])}{match[4]}", page)
 

@@ -1,4 +1,5 @@
-"""What all benchmarks share: the flag --json and its file, what is told of a run, and tables on the screen and as Markdown.
+"""Common parts of all benchmarks: the flag --json and its file, the description of a run, and tables on the screen and as
+Markdown.
 
 A benchmark has a function `tables` that makes all that is shown of a result, of its JSON alone. The screen and the pages of
 docs/results (`tests.bench.lib.published`) show the same parts.
@@ -26,9 +27,9 @@ from rich.text import Text
 from penumbra.services import flags
 
 ROOT = Path(__file__).resolve().parents[3]
-"""Of the checkout."""
+"""Root folder of the checkout."""
 WIDTH = 250
-"""Columns of what is shown where it goes to a file: the widest table needs them."""
+"""Width [columns] of output that does not go to a terminal: the widest table needs it."""
 
 Result = dict[str, Any]
 Part = Table | str
@@ -40,7 +41,7 @@ Tables = Callable[[Result], Sequence[Part]]
 
 
 def file(text: str) -> Path:
-    """Type of a flag: a file that can be written. Raises ValueError; a benchmark may take an hour until it writes."""
+    """Type of a flag: a file that can be written. Raises ValueError at once: a benchmark may take an hour until it writes."""
     path = Path(text)
     if path.exists() and not path.is_file():
         raise ValueError(f"expected the name of a file, got {text!r}, which is something else; choose another name")
@@ -51,7 +52,7 @@ def file(text: str) -> Path:
 
 
 def folder(text: str) -> Path:
-    """Type of a flag: a folder that can be written, which is made where there is none. Raises ValueError."""
+    """Type of a flag: a folder that can be written; it is created where there is none. Raises ValueError."""
     path = Path(text)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -71,21 +72,21 @@ def _write_to(path: Path) -> None:
 
 
 def write(path: Path, data: Any) -> None:
-    """Writes JSON: the file is the old one or the new one at any time, never a part of it."""
+    """Writes JSON atomically: the file is always the old one or the new one, never a part of it."""
     partial = path.with_name(f"{path.name}.part")
     partial.write_text(json.dumps(data, indent=1) + "\n")
     partial.replace(path)
 
 
 class Report:
-    """The result of the benchmark that runs, and the file that it goes to, if any. result: None until one is saved."""
+    """The result of the running benchmark, and the file for it, if any. result: None until one is saved."""
 
     def __init__(self, path: Path | None):
         self.run, self._path = run(), path
         self.result: Result | None = None
 
     def save(self, result: Result) -> None:
-        """Keeps a result with the key `run`, in the file too. May be called again, when there is more of it."""
+        """Keeps a result with the key `run`, also in the file. May be called again with more of it."""
         self.result = json.loads(json.dumps({**result, "run": self.run}))
         if self._path:
             write(self._path, self.result)
@@ -118,12 +119,12 @@ def benchmark(
     return make
 
 
-# ---- what is told of a run
+# ---- description of a run
 
 
 def run() -> dict[str, Any]:
-    """Of the command that runs: how it was called, what ran, when and on what. commit: None outside a checkout; modified: whether
-    the checkout differs from it, but for its documents."""
+    """Describes the running command: how it was called, what ran, when and on what. commit: None outside a checkout; modified:
+    whether the checkout differs from it, apart from documents."""
     context = click.get_current_context()
     commit = _git("rev-parse", "--short", "HEAD") if _git("rev-parse", "--show-toplevel") == str(ROOT) else None
     return {
@@ -139,18 +140,18 @@ def run() -> dict[str, Any]:
 
 
 def command_line(name: str, words: Sequence[str]) -> str:
-    """A command as it was typed; of paths the last part alone."""
+    """A command as it was typed, with paths reduced to their last part."""
     return shlex.join([*name.split(), *(re.sub(r"[^\s=]*/(?=[^/])", "", word) for word in words)])
 
 
 def processor() -> str:
-    """The processor's model, or its architecture where the system does not tell."""
+    """The processor's model, or its architecture where the system does not report it."""
     found = re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     return found[1].strip() if found else platform.machine()
 
 
 def _git(*words: str) -> str | None:
-    """What git says about the checkout; None where there is no git, or no checkout."""
+    """The output of git about the checkout; None where there is no git, or no checkout."""
     try:
         done = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
@@ -193,7 +194,7 @@ def _cell(cell: Any) -> str:
 
 
 def _line(text: Any) -> str:
-    """Markup of rich as Markdown: whatever has a style is bold."""
+    """Markup of rich as Markdown: text with any style is bold."""
     text = text if isinstance(text, Text) else Text.from_markup(text)
     out, done = "", 0
     for span in sorted(text.spans, key=lambda span: span.start):

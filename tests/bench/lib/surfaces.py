@@ -1,7 +1,7 @@
 """Points of surfaces and contact (`services.haptics.surface_points`, `.contact`) against the full boundary-element field.
 
-Things of several shapes, none of which the statistics of shapes were measured on, come to rest at a gap before the pads; each is
-one window. What is true is the distance to the panels of which the field is made.
+Things of several shapes, on none of which the statistics of shapes were measured, come to rest at a gap before the pads; each is
+one window. The true distance is that to the panels of the field model.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CLOSE = (0.003, 0.004, 0.005, 0.007, 0.010, 0.015)
 """Gaps [m] of the rows of distances, and of contact: the boundary elements hold from 3 mm on (finer panels change the signals of
 a forearm by 8 % there, by 11 % at 2 mm; nearer, the charges of limb and pad no longer converge)."""
 WINDOW = 20
-"""Samples of a window, as `penumbra haptics` has them."""
+"""Number of samples in a window, as in `penumbra haptics`."""
 NEES_BAND = (0.5, 2.0)
 """Goal for the squared error over its variance: standard deviations right within a factor of 1.4."""
 ENDS = {"limb, elbow first": 1.0, "limb, hand first": -1.0}
@@ -51,13 +51,13 @@ BODIES: dict[str, tuple[Callable[[], trimesh.Trimesh], float]] = {
 }
 KINDS = ("limb", *ENDS, *BODIES)
 CLEAR = 0.02
-"""Distance [m] that a thing keeps from links behind pads where its gap to the boards is larger."""
+"""Minimum distance [m] of a thing from links behind pads where its gap to the boards is larger."""
 THINGS = 2
-"""Things of each kind, of different sizes."""
+"""Number of things of each kind, of different sizes."""
 TRIES = 40
-"""Places that are drawn until a thing is clear of what is behind the pads."""
+"""Maximum number of places that are drawn until a thing is clear of what is behind the pads."""
 PANELS = (30, 20)
-"""Rows and columns of a thing's panels."""
+"""Numbers of rows and columns of a thing's panels."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Thing:
 
 
 def thing(rig: Rig, kind: str, seed: int, k: int) -> Thing:
-    """The k-th one, of random size. Its surface is that of the panels of which the field is made."""
+    """The k-th thing of a kind, of random size. Its surface consists of the field's panels."""
     rng = np.random.default_rng([seed, 700, KINDS.index(kind), k])
     if kind in BODIES:
         make, ground = BODIES[kind]
@@ -112,7 +112,7 @@ def _clearance(one: Thing, T: Array, points: Array) -> float:
 
 
 def _lying(rig: Rig, one: Thing, rng: np.random.Generator) -> Array:
-    """A random pose 10 cm before the pads, of limbs that point at them with their end there."""
+    """A random pose 10 cm before the pads; limbs that point at the pads have their end there."""
     T, _ = rig.place(rng, 0.1, 8)
     if one.kind not in ENDS:
         return T
@@ -133,7 +133,7 @@ def _window(rig: Rig, signal: Array, rng: np.random.Generator) -> tuple[Array, N
 
 
 def scene(rig: Rig, one: Thing, gap: float, seed: int, k: int) -> dict[str, Any]:
-    """One window: true and reported distances, errors of the points and their covariances, pads that feel nothing, contact."""
+    """One window: true and reported distances, errors of the points and their covariances, smallest true distance, contact."""
     rng = np.random.default_rng([seed, 701, KINDS.index(one.kind), round(1e4 * gap), k])
     surface, T = one.surface, placed(rig, one, gap, rng)
     amplitude, samples, pressed = _window(rig, rig.signal(one.body, T, 8), rng)
@@ -152,7 +152,7 @@ def scene(rig: Rig, one: Thing, gap: float, seed: int, k: int) -> dict[str, Any]
 
 
 def row(rig: Rig, own: list[Thing], gap: float, seed: int) -> dict[str, Any]:
-    """What the points of a window of each thing of a kind are worth: of the nearest point of each, and of all."""
+    """Accuracy of the points in a window of each thing of a kind: of the nearest point of each, and of all."""
     scenes = [each for k, one in enumerate(own) if len((each := scene(rig, one, gap, seed, k))["found"])]
     out: dict[str, Any] = {"array": rig.name, "kind": own[0].kind, "gap_m": gap, "windows": len(own), "felt": len(scenes)}
     if not scenes:
@@ -177,15 +177,15 @@ def row(rig: Rig, own: list[Thing], gap: float, seed: int) -> dict[str, Any]:
 
 
 def contact_row(rig: Rig, own: list[Thing], gap: float, seed: int) -> dict[str, Any]:
-    """How many windows of things of a kind at a small gap are called a touch."""
+    """Share of the windows of things of a kind at a small gap that are called a touch."""
     called = [scene(rig, one, gap, seed, k)["contact"] for k, one in enumerate(own)]
     touch = called.count("touch") / len(own)
     return {"array": rig.name, "kind": own[0].kind, "gap_m": gap, "windows": len(own), "touch": round(touch, 3)}
 
 
 def approach(rig: Rig, seed: int, k: int) -> dict[str, Any]:
-    """A limb that comes from 5 cm to 3 mm, rests there for a second and leaves: steps and errors of the track's pose [m], and the
-    gaps [m] at which the touch begins and ends."""
+    """A limb that comes from 5 cm to 3 mm, rests there for a second and leaves: steps and errors of the track's position [mm],
+    and the gaps [mm] at which the touch begins and ends."""
     rng = np.random.default_rng([seed, 800, k])
     one = thing(rig, "limb", seed, k)
     T = placed(rig, one, CLOSE[0], rng)
@@ -222,7 +222,7 @@ def approach(rig: Rig, seed: int, k: int) -> dict[str, Any]:
 
 
 def microseconds(rig: Rig, seed: int) -> float:
-    """Median time [us] that the points of a window take, a limb before all pads."""
+    """Median time [us] that computing the points of a window takes, with a limb before all pads."""
     rng = np.random.default_rng([seed, 900])
     one, points = thing(rig, "limb", seed, 0), rig.points
     signal = rig.signal(one.body, placed(rig, one, 0.03, rng), 8)
@@ -235,7 +235,7 @@ def microseconds(rig: Rig, seed: int) -> float:
 
 
 def measure(rig: Rig, seed: int, count: int, progress: Progress) -> dict[str, Any]:
-    """All rows of an array, so many windows each."""
+    """All rows of an array, `count` windows each."""
     task = progress.add_task(f"{rig.name}: surfaces", total=len(KINDS) * (len(GAPS) + len(CLOSE)))
     rows, contacts = [], []
     for kind in KINDS:

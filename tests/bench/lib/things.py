@@ -1,7 +1,7 @@
-"""What comes near a skin and is a limb or something else: bodies of both, and their ways past the pads.
+"""Limbs and other things that come near a skin: their bodies, and their paths past the pads.
 
 A thing comes from 20 cm along the pads' normal to a gap of 2 to 10 cm. There it stays, or slides past. Voltages come from the
-full boundary-element model. Sizes, places and ways are random; of every second thing the way ends in rest.
+full boundary-element model. Sizes, places and paths are random; every second thing comes to rest.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from penumbra.tests.bench.lib.results import Result, marked
 LIMBS = ("limb", "limb, hand first")
 """Kinds that are limbs: forearm and hand across the middle of the pads, and with the hand alone before them."""
 FAR_M, NEAREST_M = 0.20, (0.02, 0.10)
-"""Gap at which a thing begins its way, and bounds of that at which the way leads past the pads [m]."""
+"""Gap at which a path begins, and bounds of the gap at which it leads past the pads [m]."""
 APPROACH, SLIDE = (0.15, 0.35), (0.1, 0.3)
 """Bounds of the speeds [m/s] towards the pads and past them."""
 PAST_S = 1.0
 """Time [s] for which a thing is at its smallest gap."""
 KNOT_S = 0.05
-"""Interval [s] in which fields are solved: between them a spline has the signals."""
+"""Interval [s] at which fields are solved; in between a spline interpolates the signals."""
 FAINT = 1e-4
-"""[V]: signals above it are interpolated in their logarithm, smaller ones as they are."""
+"""Signal [V] above which the logarithm is interpolated, and below which the signal itself is."""
 LENGTH, GIRTH = (-0.1, 0.1), (-0.27, 0.11)
 """Bounds of a limb's log sizes: from the 5th percentile of women to the 95th of men (ANSUR II)."""
 PANELS = (24, 16)
-"""Rows and columns of panels of a thing."""
+"""Numbers of rows and columns of a thing's panels."""
 SCALE = (-0.2, 0.2)
-"""Bounds of the log of a thing's size, beside the one that is given here."""
+"""Bounds of the log of a thing's size, relative to that of OBJECTS."""
 
 
 def _rod(radius: float, length: float) -> trimesh.Trimesh:
@@ -66,23 +66,23 @@ OBJECTS: dict[str, tuple[Callable[[], trimesh.Trimesh], float, float | None]] = 
     "bottle of water": (lambda: _rod(0.035, 0.20), FLOATING, None),
     "plastic block": (lambda: _block(0.12, 0.08, 0.05), FLOATING, 3.0),
 }
-"""Mesh, capacitance to ground [pF] and permittivity of what is no limb. The tube is as long and thick as a forearm. Tap water
-conducts at 100 kHz, and its bottle is thin."""
+"""Mesh, capacitance to ground [pF] and permittivity of things that are no limbs. The tube is as long and thick as a forearm. Tap
+water conducts at 100 kHz, and its bottle is thin."""
 
 
 SEEN = ("limb, seen", "limb, hand first, seen")
-"""The same, after a camera has seen them until they arrive at the pads."""
+"""The kinds of LIMBS when a camera sees them until they arrive at the pads."""
 KINDS = (*LIMBS, *SEEN, *OBJECTS)
 SEEN_SIGMA = (0.005, 0.05)
-"""Standard deviations [m, rad] of what the camera sees. Chosen: those of a fused pose that a camera has a part in."""
+"""Standard deviations [m, rad] of the camera's pose: chosen as those of a fused pose that uses a camera."""
 WINDOW_S, SAMPLES = 0.01, 10
-"""Length [s] of a window, and samples in it."""
+"""Length [s] of a window, and number of samples in it."""
 HOME_SPREAD = np.repeat([0.12, 0.4], 3)
-"""Standard deviations [m, rad] of where the target is expected: those of the built-in cells."""
+"""Standard deviations [m, rad] of the target about its home, as in the built-in cells."""
 TAKEN_GOAL, REFUSED_GOAL_S = 0.01, 0.1
-"""Goals: share of objects called a limb, and time [s] for which a limb is called an object."""
+"""Goals: maximum share of objects called a limb, and maximum time [s] for which a limb is called an object."""
 LATE_S = 0.5
-"""Time [s] after a thing is first felt from which it must not be called what it is not."""
+"""Time [s] after a thing is first felt from which on it must not be misclassified."""
 
 
 class Pads(Protocol):
@@ -95,10 +95,10 @@ class Pads(Protocol):
     home: Array
 
     def estimator(self, home: Array, spread: Array) -> Estimator:
-        """A fresh one that expects the target at home (4, 4), known to spread (6,)."""
+        """A new estimator that expects the target at home (4, 4), with standard deviations spread (6,)."""
 
     def samples(self, count: int) -> NDArray[np.int64]:
-        """Samples (n,) in a window on so many pads."""
+        """Numbers of samples (n,) in a window on `count` pads."""
 
     def voltages(self, signal: Array, rng: np.random.Generator) -> Array:
         """Samples (s, n) [V] of signals (s, n)."""
@@ -115,7 +115,7 @@ class Pads(Protocol):
 
 @dataclass(frozen=True)
 class Pass:
-    """A thing's way. arrival_s: when it is at its smallest gap; stamps_s (w,): middles of the windows; signals (w, n) [V]: the
+    """A thing's path. arrival_s: when it is at its smallest gap; stamps_s (w,): middles of the windows; signals (w, n) [V]: the
     true ones; gaps (w,) [m]; poses (w, 4, 4)."""
 
     arrival_s: float
@@ -126,7 +126,7 @@ class Pass:
 
 
 def passing(rig: Pads, kind: str, seed: int, k: int) -> Pass:
-    """The k-th way of one of KINDS, in windows of WINDOW_S."""
+    """The k-th path of one of KINDS, in windows of WINDOW_S."""
     rng = np.random.default_rng([seed, 500, KINDS.index(kind), k])
     T, size = rig.place(rng, 0.05, 8)
     if kind in OBJECTS:
@@ -140,7 +140,7 @@ def passing(rig: Pads, kind: str, seed: int, k: int) -> Pass:
         body = field.limb(rig.mesh, *np.exp(size))
     surface, axes = Surface(vertices, faces), rig.axes(T, 8)[:3, :3]
     if "hand first" in kind:
-        T[:3, 3] += (rng.uniform(0.02, 0.10) - vertices[:, 0].max()) * axes[0]  # so far past the pads' middle
+        T[:3, 3] += (rng.uniform(0.02, 0.10) - vertices[:, 0].max()) * axes[0]  # the hand's end lies past the pads' middle
     electrodes = rig.skin.positions(rig.pads)
 
     def gap(pose: Array) -> float:
@@ -171,8 +171,8 @@ def passing(rig: Pads, kind: str, seed: int, k: int) -> Pass:
 
 
 def row(rig: Pads, mounting: str, kind: str, seed: int, passes: int) -> dict[str, Any]:
-    """What things of a kind are called: shares of passes and of windows later than LATE_S after something is felt, the longest
-    time as an object, and the median time until it is decided, None where it never is."""
+    """Classification of things of a kind: shares of passes and of windows called a limb later than LATE_S after first being felt,
+    the longest time as an object, and the median time until a decision, None where there never is one."""
     taken, windows, refused_s, decided_s, as_object = [], [], 0.0, [], []
     for k in range(passes):
         states = np.array(_called(rig, kind, seed, k))
@@ -201,7 +201,7 @@ def row(rig: Pads, mounting: str, kind: str, seed: int, passes: int) -> dict[str
 
 
 def _called(rig: Pads, kind: str, seed: int, k: int) -> list[str]:
-    """The states of a way's windows."""
+    """The estimator's states in the windows of a path."""
     rng = np.random.default_rng([seed, 501, KINDS.index(kind), k])
     found, estimator = passing(rig, kind, seed, k), rig.estimator(rig.home, HOME_SPREAD)
     sigma = np.repeat(SEEN_SIGMA, 3)
@@ -217,7 +217,7 @@ def _called(rig: Pads, kind: str, seed: int, k: int) -> list[str]:
 
 
 def table(result: Result) -> Table:
-    """What a thing that passes is taken for."""
+    """The classification of things that pass."""
     table = Table(
         *("array", "thing", "passes", "called a limb later than 0.5 s", "its windows", "called an object", "longest, s"),
         *("never decided", "decided after, s"),

@@ -2,8 +2,8 @@
 
 A trial (`sim.sets.trial`) is rendered once and then replayed (`services.replay.chain`) through three chains: ours, PoseCNN in
 place of our vision, and the paper's own method throughout. A frame's vision is the pose of that frame, if its state is tracking.
-What was fused is the pose at the frame's exposure, asked for as soon as the frame's vision has been taken in: the paper knows no
-delays. `live` is what was published nearest to the exposure, before anything was known of the frame. Poses that are lost do not
+A frame's fused pose is the one at its exposure, requested as soon as the frame's vision has been used: the paper considers no
+delays. `live` is the pose published nearest to the exposure, before anything was known of the frame. Poses that are lost do not
 count.
 """
 
@@ -28,7 +28,7 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.sim.sets.trial import HIDDEN, LEAD_S, SECONDS, Setting, Trial
 
 EPOCH_NS = 10**18
-"""Time zero of a trial."""
+"""Stamp [ns] of time zero of a trial."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ CHAINS = {
 """procnet: ours. faithful: the paper's search, network and observer."""
 
 Played = dict[str, Any]
-"""What `played` gives: it is stored as JSON."""
+"""The result of `played`, which is stored as JSON."""
 ERRORS = ("cm", "lateral_cm", "depth_cm", "axis_deg", "roll_deg", "attitude_deg")
-"""Of a pose: distance of the object's centre [cm], its parts across and along the line of sight, of the limb's axis, of the twist
-about it, of the whole rotation [deg]."""
+"""Errors of a pose: distance of the object's centre [cm], its parts across and along the line of sight, of the limb's axis, of
+the twist about it, of the whole rotation [deg]."""
 
 
 def centroid(mesh: Mesh) -> Array:
-    """The centre of mass (3,) [m] of a closed mesh: what the paper's errors are of."""
+    """The centre of mass (3,) [m] of a closed mesh, the point to which the paper's errors refer."""
     corners = mesh.vertices[mesh.faces]
     volumes = np.linalg.det(corners)
     return np.asarray(volumes @ corners.sum(axis=1) / (4.0 * volumes.sum()))
@@ -88,7 +88,7 @@ def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple
     fused poses."""
     world, camera = trial.world, trial.camera
     messages = list(trial.record(seconds))
-    ends_ns = EPOCH_NS + round(seconds * 1e9)  # nothing says any more what is in a frame exposed at the very end
+    ends_ns = EPOCH_NS + round(seconds * 1e9)  # no truth follows a frame that is exposed at the very end
     stamps = [m.stamp_ns for topic, _, m in messages if topic is topics.FRAME and m.stamp_ns < ends_ns]
     truths = [m for topic, _, m in messages if topic is topics.TRUTH and isinstance(m, Truth)]
     centre = centroid(world.person.meshes[0])
@@ -104,7 +104,7 @@ def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple
         chain = CHAINS[name]
         arguments = {service: list(flags) for service, flags in chain.arguments.items()}
         replay, asked = Replay(trial.cell, chain.services, arguments), dict[int, FusedPose]()
-        if "fusion" not in chain.arguments:  # the paper's observer has no past
+        if "fusion" not in chain.arguments:  # the paper's observer keeps no past poses
             replay.listen(topics.VISION, {}, partial(_ask, replay, asked))
         heard = replay.run(messages)
         vision = {item.message.stamp_ns: item.message for item in heard if item.topic is topics.VISION}
@@ -131,7 +131,7 @@ def played(trial: Trial, seconds: float = SECONDS, chains: Iterable[str] = tuple
 
 
 def _ask(replay: Replay, asked: dict[int, FusedPose], pose: VisionPose, names: dict[str, str]) -> None:
-    """Asks for the fused pose at a frame's exposure, now that its vision is known."""
+    """Requests the fused pose at a frame's exposure, once the frame's vision is known."""
     answer, _ = replay.ask(topics.current_pose(replay.cell.name, pose.target), stamp_ns=str(pose.stamp_ns))
     asked[pose.stamp_ns] = decode(FusedPose, answer)
 
@@ -144,12 +144,12 @@ def is_scored(played: Played) -> np.ndarray:
 
 
 def _after(truths: list[Truth], stamp_ns: int) -> Truth:
-    """The first truth at or after a frame: it knows what that frame shows."""
+    """The first truth at or after a frame, which contains the share hidden in that frame."""
     return next((truth for truth in truths if truth.stamp_ns >= stamp_ns), truths[-1])
 
 
 def _pose(pose: FusedPose) -> list[float]:
-    """Position [m] and quaternion, stored."""
+    """Position [m] and quaternion of a pose, rounded for storage."""
     return np.round([*pose.position, *pose.orientation], 6).tolist()
 
 

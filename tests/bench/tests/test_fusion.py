@@ -102,12 +102,12 @@ def test_the_senses_err_as_their_information_says(name: str) -> None:
         run = runs.drawn(name, 5, index, 8.0)
         for m in run.messages[::4]:
             e = rigid.pose_error(run.at(m.stamp), m.T)
-            if m.source == "haptic":  # its roll is made up: the error of the axis alone
+            if m.source == "haptic":  # its roll is not measured: the error of the axis alone
                 e[3:] = np.cross(m.T[:3, 0], run.at(m.stamp)[:3, 0])
             ratios[m.source].append(float(e @ m.information @ e) / (6 if m.source == "vision" else 5))
     for source, found in ratios.items():
         if found:
-            # calibration, which no information tells, adds a few per cent; errors that last leave few independent values
+            # calibration, which no information contains, adds a few per cent; errors that last leave few independent values
             assert 0.8 < np.mean(found) < 1.35, source
 
 

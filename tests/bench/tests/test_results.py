@@ -1,4 +1,4 @@
-"""What the benchmarks share: their files, what is told of a run, the same tables on the screen and on a page."""
+"""Common parts of the benchmarks: their files, the description of a run, the same tables on the screen and on a page."""
 
 import json
 import os
@@ -38,7 +38,7 @@ def git(*words: str, cwd: Path) -> str:
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """A small checkout that the run is told to be of."""
+    """A small checkout to which the run is attributed."""
     folder = tmp_path.resolve() / "checkout"
     (folder / "docs").mkdir(parents=True)
     (folder / "code.py").write_text("1")

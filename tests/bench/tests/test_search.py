@@ -71,14 +71,14 @@ def test_an_efficient_estimator_has_the_errors_of_its_information():
 
 @pytest.fixture(scope="module")
 def drawn() -> list[search.Result]:
-    """Estimates whose errors are drawn from the covariances that they tell, but for the roll."""
+    """Estimates whose errors are drawn from their own covariances, except for the roll."""
     rng = np.random.default_rng(5)
     shot = shots.shot(44, 0, 320, 240, images=False)
     results = []
     for _ in range(400):
         root = rng.normal(size=(6, 6)) * np.repeat([0.003, 0.02], 3)[:, None]
         error = root @ rng.normal(size=6)
-        error[3:] += rng.normal() * shot.T_world_target[:3, 0]  # a roll that no covariance tells
+        error[3:] += rng.normal() * shot.T_world_target[:3, 0]  # a roll that no covariance contains
         T = rigid.perturb(shot.T_world_target, -error)
         results.append(search.Result(Searched(T, root @ root.T, 0.95, 0.0, "tracking", T), shot, 1.0))
     return results

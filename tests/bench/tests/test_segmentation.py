@@ -23,7 +23,7 @@ def test_recovery_is_counted_from_half_free_again_to_the_overlap_of_before():
     unseen = [0.3] * 13 + iou[13:]
     assert segmentation.recoveries(hidden, unseen) == [None]  # nothing to return to
     assert segmentation.recoveries(hidden[:22], iou[:22]) == [None]  # the film ends
-    assert segmentation.recoveries(hidden, iou[:20] + [0.1] * 7) == [6]  # never: as long as it was watched, and one more
+    assert segmentation.recoveries(hidden, iou[:20] + [0.1] * 7) == [6]  # never: one more than the frames watched
     twice = segmentation.recoveries(hidden + hidden[1:], iou + iou[1:])
     assert twice == [4, 4]
 
