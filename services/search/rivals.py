@@ -14,8 +14,9 @@ forearms are compared alone.
 
 One is compared in a picture: eight times as many in the first ones would have a limb that was just found wait, and it would be
 elsewhere by then. The mirror image comes first, as it is the farthest away: a limb found again with the wrong tilt is 10 cm off.
-Where all are refuted, pictures go by without: a comparison costs as much as the pose itself. A limb that is not quite the mesh
-has its mirror image as a rival in each picture (`against_mirror`).
+Once all were compared, the one that is refuted least comes every second time, and the refuted ones wait while others are left, so
+that a rival that is right wins within a few pictures. Where all are refuted, pictures go by without: a comparison costs as much
+as the pose itself. A limb that is not quite the mesh has its mirror image as a rival in each picture (`against_mirror`).
 """
 
 from __future__ import annotations
@@ -79,6 +80,7 @@ class Rivals:
     def forget(self) -> None:
         """Begin anew, as with another limb."""
         self._next = 0
+        self._is_least_due = False
         self._begin()
 
     def _begin(self) -> None:
@@ -101,12 +103,12 @@ class Rivals:
         if self._before is not None and _angle(self._before, best.T) > JUMPED_RAD:
             other = _fitted(self._before, best, shown)
             excess = _excess(other, best, shown) + unlikelier(other)
-            if other.sharp and excess < (PREFERRED if None in self._evidence else -PREFERRED):
+            if other.sharp and excess < (PREFERRED if None in self._evidence else 0.0):
                 best = other
             else:
                 self._begin()
         if self._is_due(stamp_ns):
-            which, self._next = self._next, (self._next + 1) % RIVALS
+            which = self._chosen()
             other = _fitted(_start(best, which), best, shown)
             evidence = KEPT * (self._evidence[which] or 0.0) + min(_excess(other, best, shown), MOST)
             excess = evidence + unlikelier(other)
@@ -133,6 +135,18 @@ class Rivals:
             return False
         self._compared_ns = stamp_ns
         return True
+
+    def _chosen(self) -> int:
+        """The rival to compare: the next one that is not refuted, but once all were compared every second time the one that is
+        refuted least."""
+        evidence = [-math.inf if known is None else known for known in self._evidence]
+        self._is_least_due = not self._is_least_due
+        if self._is_least_due and -math.inf < min(evidence) < REFUTED:
+            return evidence.index(min(evidence))
+        in_turn = [(self._next + k) % RIVALS for k in range(RIVALS)]
+        which = next((k for k in in_turn if evidence[k] < REFUTED), self._next)
+        self._next = (which + 1) % RIVALS
+        return which
 
     def _doubt(self, best: Fit, T: Array, covariance: Array, excess: float) -> Array:
         """What a rival adds (`_added`), along the limb's axes."""

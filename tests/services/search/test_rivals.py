@@ -50,11 +50,12 @@ def taken(by: float, pictures: int) -> list[float]:
     return [roll(rivals.contested(shown(HERE, 1, 1.0), PICTURE_NS * i, shown, lambda fit: 0.0)) for i in range(1, pictures + 1)]
 
 
-@pytest.mark.parametrize(("by", "rounds"), [(25.0, 1), (12.0, 2), (8.0, 4)])
-def test_what_pictures_say_of_a_rival_adds_up(by, rounds):
-    said = np.abs(taken(by, RIVALS * (rounds + 1)))
-    assert said[: RIVALS * (rounds - 1)].max(initial=0.0) < 0.1
-    assert said[RIVALS * (rounds - 1) :].max() == pytest.approx(TURNS[3], abs=0.01)
+@pytest.mark.parametrize(("by", "comparisons"), [(25.0, 1), (12.0, 2), (8.0, 4)])
+def test_what_pictures_say_of_a_rival_adds_up_and_the_one_that_they_prefer_is_compared_every_second_time(by, comparisons):
+    said = np.abs(taken(by, 2 * RIVALS))
+    first = int(np.argmax(said > 0.1))
+    assert said[first] == pytest.approx(TURNS[3], abs=0.01)
+    assert first == (1 + 3 if comparisons == 1 else RIVALS + 2 * (comparisons - 2))
 
 
 def test_noise_that_prefers_now_the_one_and_now_the_other_changes_nothing():
