@@ -1,1 +1,1 @@
-"""The ground floor: what every process needs. Topics, messages, bus, cell description, geometry, service runtime."""
+"""Code that all processes share: topics, messages, bus, cell description, geometry, service runtime."""

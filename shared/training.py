@@ -1,8 +1,8 @@
-"""How networks are trained: a trainer with checkpoints, the loop over steps or minutes of all runs.
+"""Training of networks: a trainer with checkpoints, and the loop over steps or minutes of all runs.
 
-A training may last days, in the background of other work: time counts as the processor's, so that a process that is stopped
-(SIGSTOP) or waits loses nothing, checkpoints are replaced whole, and beside the exact checkpoint a compact one can be written,
-small enough to travel with the sources from one machine to the next.
+A training may run for days, in the background of other work. Time is processor time, so that a process that is stopped (SIGSTOP)
+or waits loses nothing. Checkpoints are replaced atomically. Beside the exact checkpoint a compact one can be written, small
+enough to travel with the sources from one machine to the next.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 
 class Data(Protocol):
-    """What is learned from; something may be making more of it."""
+    """Training data, possibly with a generator in the background."""
 
     def close(self) -> None:
-        """Make no more."""
+        """Stop generating data."""
 
 
 D = TypeVar("D", bound=Data)
@@ -36,11 +36,11 @@ N = TypeVar("N", bound=torch.nn.Module)
 
 
 class Trainer(ABC, Generic[N, D]):
-    """A network `net` that learns from data, its optimiser, and the running average of its weights, which is exported.
+    """A network `net` with its data, its optimiser, and the running average of its weights, which is exported.
 
-    SETTINGS: the dataclass of the network's settings. step, minutes (of the processor's time): so many so far, over all runs.
-    steps: how many there will be, None where minutes end the training. warm_from: the step at which the optimiser was empty.
-    started_from: the entry in the card of the weights that it began with, None where it began with none.
+    SETTINGS: the dataclass of the network's settings. step, minutes (of processor time): progress over all runs. steps: total
+    number of steps, None where minutes end the training. warm_from: step at which the optimiser was empty. started_from: entry in
+    the card of the weights that the training started from, None where it started from none.
     """
 
     SETTINGS: ClassVar[type]
@@ -54,11 +54,11 @@ class Trainer(ABC, Generic[N, D]):
 
     @abstractmethod
     def train_step(self, data: D, progress: float) -> dict[str, float]:
-        """A step at a share of the whole training in [0, 1]; returns the parts of its loss."""
+        """Trains one step. progress: share of the whole training, in [0, 1]. Returns the parts of the loss."""
 
     def descend(self, total: torch.Tensor, rate: float, clip: float, averaging: float) -> None:
-        """A step down the gradient of a loss, its norm clipped; the average keeps a share `averaging`, less in the beginning. A
-        group of the optimiser's that has a "share" learns at that share of the rate."""
+        """Takes a gradient step on a loss, with clipped norm. The average keeps a share `averaging`, less in the beginning. A
+        parameter group of the optimiser with a "share" learns at that share of the rate."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate * group.get("share", 1.0)
         self.optimizer.zero_grad()
@@ -72,8 +72,8 @@ class Trainer(ABC, Generic[N, D]):
         get_ema_multi_avg_fn(keep)(means, values, None)
 
     def save(self, path: Path, is_compact: bool = False) -> None:
-        """Writes a checkpoint from which `restore` goes on: exactly, or, `is_compact`, of a quarter of the size, in half
-        precision and without the optimiser's moments, which Adam gathers again within its first hundred steps."""
+        """Writes a checkpoint from which `restore` continues exactly. With `is_compact` it has a quarter of the size: half
+        precision, and no moments of the optimiser, which Adam accumulates again within its first hundred steps."""
 
         def stored(net: torch.nn.Module) -> dict[str, torch.Tensor]:
             values = net.state_dict()
@@ -96,7 +96,7 @@ class Trainer(ABC, Generic[N, D]):
 
     @classmethod
     def restore(cls, path: Path, schedule: Any) -> Self:
-        """The trainer of a checkpoint, exact or compact; network and seed are the checkpoint's."""
+        """The trainer of a checkpoint, exact or compact. Network and seed come from the checkpoint."""
         content = torch.load(path, map_location="cpu", weights_only=True)
         trainer = cls(cls.SETTINGS(**content["settings"]), schedule, content["seed"])  # type: ignore[call-arg]
         trainer.net.load_state_dict(content["net"])
@@ -111,8 +111,8 @@ class Trainer(ABC, Generic[N, D]):
 
 
 def one_cycle(progress: float, rise: float) -> float:
-    """The learning rate of the one-cycle policy (Smith 2018, arXiv:1708.07120) as a share of its peak, at a progress in [0, 1];
-    it rises until the progress `rise`."""
+    """Learning rate of the one-cycle policy (Smith 2018, arXiv:1708.07120) as a share of its peak, at a progress in [0, 1]. It
+    rises until the progress `rise`."""
     if progress < rise:
         return 0.05 + 0.95 * progress / rise
     fall = min((progress - rise) / (1.0 - rise), 1.0)
@@ -120,7 +120,7 @@ def one_cycle(progress: float, rise: float) -> float:
 
 
 def recoloured(picture: NDArray[np.float32], rng: np.random.Generator, amount: float) -> NDArray[np.float32]:
-    """A picture (..., 3) in [0, 1] with brightness, contrast, saturation and tint changed at random by up to `amount`."""
+    """A picture (..., 3) in [0, 1] with random changes of brightness, contrast, saturation and tint of up to `amount`."""
     brightness, contrast, saturation = 1.0 + amount * rng.uniform(-1.0, 1.0, 3)
     gain = (brightness * (1.0 + 0.25 * amount * rng.uniform(-1.0, 1.0, 3))).astype(np.float32)
     grey = picture.mean(axis=-1, keepdims=True)
@@ -131,21 +131,21 @@ def recoloured(picture: NDArray[np.float32], rng: np.random.Generator, amount: f
 
 
 def trapezoid(progress: float, steps: int, warm_up: int, cool_down: float) -> float:
-    """The learning rate as a share of its peak: up over the `warm_up` steps after the optimiser's first, then constant, and down
-    over the last share `cool_down` of the progress in [0, 1]. Unlike a cycle it may be made longer while it runs, and the
+    """Learning rate as a share of its peak: it rises over the `warm_up` steps after the optimiser's first, is constant, and falls
+    over the last share `cool_down` of the progress in [0, 1]. Unlike a cycle, it can be extended during the training, and the
     averaged weights are good at any time (Hägele et al. 2024, arXiv:2405.18392)."""
     return min((steps + 1) / warm_up, 1.0) * max(min((1.0 - progress) / cool_down, 1.0), 0.005)
 
 
 def begun(options: SimpleNamespace) -> Path | None:
-    """The checkpoint to go on from, None where none is asked for or there is none."""
+    """Checkpoint to continue from; None where the options do not ask for it or there is none."""
     places = (options.checkpoint, options.compact) if options.resume else ()
     return next((path for path in places if path is not None and path.is_file()), None)
 
 
 def complete(trainer: Trainer[Any, D], data: D, options: SimpleNamespace) -> bool:
-    """Trains as the flags of `services.flags.training` ask, on one thread, and closes the data. False where Ctrl-C or SIGTERM
-    ended it: the checkpoint is written then, and the log says how to go on."""
+    """Trains as specified by the flags of `services.flags.training`, on one thread, and closes the data. False where Ctrl-C or
+    SIGTERM ended it; then the checkpoint is written, and the output says how to continue."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     torch.set_num_threads(1)
     try:
@@ -160,7 +160,7 @@ def complete(trainer: Trainer[Any, D], data: D, options: SimpleNamespace) -> boo
 
 
 def save(trainer: Trainer[Any, Any], checkpoint: Path, compact: Path | None) -> None:
-    """Writes the exact checkpoint, and the compact one where it is asked for."""
+    """Writes the exact checkpoint, and the compact one where it is requested."""
     trainer.save(checkpoint)
     if compact is not None:
         trainer.save(compact, is_compact=True)
@@ -175,8 +175,8 @@ def run(
     compact: Path | None = None,
     save_every_s: float = 120.0,
 ) -> dict[str, float]:
-    """Train up to so many steps, or minutes (over all runs); shows a progress bar, or, without a terminal, prints a line with
-    every checkpoint. Returns the loss's parts, smoothed."""
+    """Trains up to a number of steps, or of minutes (over all runs). Shows a progress bar, or, without a terminal, prints a line
+    with every checkpoint. Returns the parts of the loss, smoothed."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     total = steps if steps is not None else int(minutes * 60)
     trainer.steps = steps

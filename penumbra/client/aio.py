@@ -1,4 +1,4 @@
-"""The client for `async` programs: `aconnect`, its cell and its poses. Only they import asyncio."""
+"""The client for `async` programs: `aconnect`, its cell and its poses. Only this module imports asyncio."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class AsyncPoses(Subscription):
 
     async def __anext__(self) -> Pose:
         loop = asyncio.get_running_loop()
-        await asyncio.sleep(0)  # other tasks have their turn also where a pose is always ready
+        await asyncio.sleep(0)  # lets other tasks run even if a pose is always ready
         try:
             async with asyncio.timeout(self._timeout):
                 while True:
@@ -54,8 +54,8 @@ class AsyncPoses(Subscription):
 
 
 class AsyncCell(CellBase):
-    """A running cell, as `penumbra.aconnect` gives it, for one event loop. What is not listed is as in `Cell`: names, and
-    sensors, whose publishing does not block."""
+    """A running cell, as returned by `penumbra.aconnect`, for one event loop. Members that are not listed are as in `Cell`:
+    names, and sensors, whose publishing does not block."""
 
     def poses(self, target: str | None = None, *, timeout: float | None = None) -> AsyncPoses:
         """As `Cell.poses`, for `async for`."""
@@ -104,5 +104,5 @@ def _discard(searched: asyncio.Future[tuple[zenoh.Session, bus.Connection, Outli
 
 
 def _call(loop: asyncio.AbstractEventLoop, function: Callable[[], object]) -> None:
-    with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+    with contextlib.suppress(RuntimeError):  # the loop is closed: no task waits any more
         loop.call_soon_threadsafe(function)

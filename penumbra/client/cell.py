@@ -1,4 +1,4 @@
-"""A running cell as a program sees it: what is in it, its poses, how it fares, and its sensors to publish from."""
+"""A running cell as a program sees it: its parts, its poses, its health, and its sensors for publishing."""
 
 from __future__ import annotations
 
@@ -20,19 +20,18 @@ from penumbra.shared.contract.outline import Outline
 from penumbra.shared.runtime import bus, running
 
 FRAMES_UNDER_WAY = 3
-"""Images of each camera in shared memory: one that is written and two that are read."""
+"""Number of images of each camera in shared memory: one that is written and two that are read."""
 PUBLISH_S = 3.0
-"""How long the first message of a program waits for the router."""
+"""Maximum time [s] that a program's first message waits for the router."""
 
 Sensor = TypeVar("Sensor", Camera, Robot, Pad)
 
 
 class CellBase:
-    """What `Cell` and `AsyncCell` have in common. session: to read with. connection: how it was opened. outline: what is in the
-    cell.
+    """Common part of `Cell` and `AsyncCell`. session: for reading. connection: how it was opened. outline: summary of the cell.
 
-    Sensors publish in a second session, which the first message opens: on a secured bus it shows the certificate of a driver, and
-    its shared memory has room for the cameras' images. A program that only reads needs neither.
+    Sensors publish in a second session, which the first message opens. On a secured bus that session shows the certificate of a
+    driver, and its shared memory has room for the cameras' images. A program that only reads needs neither.
     """
 
     def __init__(self, session: zenoh.Session, connection: bus.Connection, outline: Outline):
@@ -67,12 +66,12 @@ class CellBase:
 
     @property
     def frame(self) -> str:
-        """The name of the fixed frame that poses are given in."""
+        """The name of the fixed frame of all poses."""
         return self._outline.frame
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """Names of what is tracked."""
+        """Names of the targets."""
         return self._outline.targets
 
     @property
@@ -123,7 +122,7 @@ class CellBase:
         return known[name]
 
     def _target(self, name: str | None) -> str:
-        """The name of a target, checked; the first one where it is None."""
+        """Checked name of a target; the first one where it is None."""
         if name is None:
             return self.targets[0]
         if name not in self.targets:
@@ -136,7 +135,7 @@ class CellBase:
         return Stream(self._publishing_session, topic, key, f"{kind} {name}", max(topic.rate_hz, rate_hz))
 
     def _publishing_session(self) -> zenoh.Session:
-        """The session that sensors publish in. Raises bus.BusError."""
+        """Session in which sensors publish. Raises bus.BusError."""
         with self._opening:
             if self._closing.is_set():
                 raise bus.BusError(f"cell {self.name} is closed: publish inside of `with penumbra.connect() as cell`")
@@ -148,7 +147,7 @@ class CellBase:
             return self._publishing
 
     def _why_silent(self) -> str:
-        """Why no pose may come, in words."""
+        """Reason why no poses arrive, as text."""
         if not self._session.info.routers_zid():
             return f"the router at {self._connection.where} does not answer; poses go on when it is back"
         return f"nobody publishes it in cell {self.name}: is `penumbra fusion` running?"
@@ -173,17 +172,17 @@ class CellBase:
 
 
 class Cell(CellBase):
-    """A running cell, as `penumbra.connect` returns it. Threads may share it, but not one sensor or one iterator over poses."""
+    """A running cell, as returned by `penumbra.connect`. Threads may share it, but not one sensor or one iterator over poses."""
 
     def poses(self, target: str | None = None, *, timeout: float | None = None) -> Poses:
-        """Iterates over the poses of a target. Each is the newest at the moment it is taken: fusion publishes 200 a second, and a
-        slow reader skips some. There are poses also while the target is lost; see their `state`. When the router or fusion ends
-        and starts again, the poses resume.
+        """Iterates over the poses of a target. Each is the newest at the moment it is taken: fusion publishes 200 per second, and
+        a slow reader skips some. Poses are also published while the target is lost; see their `state`. When the router or fusion
+        ends and starts again, the poses resume.
 
         Args:
             target: Its name. Default: the cell's first.
-            timeout: How long to wait for each pose [s]; then the iterator raises TimeoutError, which says why there is none. None
-                waits without end.
+            timeout: Maximum wait for each pose [s]. After it the iterator raises TimeoutError, which says why there is none.
+                None waits forever.
 
         Raises:
             LookupError: The cell has no target of this name.
@@ -195,14 +194,14 @@ class Cell(CellBase):
         """Asks fusion for the pose of a target. The answer uses all measurements that fusion has received so far.
 
         Args:
-            at: A moment of about the last second [ns since the epoch], such as the stamp of an image. None: now.
+            at: A time within about the last second [ns since the epoch], such as the stamp of an image. None: now.
             target: Its name. Default: the cell's first.
-            timeout: How long to wait for the answer [s].
+            timeout: Maximum wait for the answer [s].
 
         Raises:
             TimeoutError: Nobody answered; the text says why.
             LookupError: The cell has no target of this name.
-            ValueError: The moment is outside of fusion's history.
+            ValueError: The time is outside of fusion's history.
         """
         return self._ask_pose(at, target, timeout)
 

@@ -1,4 +1,4 @@
-"""Finding a running cell: its router by an endpoint, and the cell by what fusion answers on `topics.description`."""
+"""Finds a running cell: its router by an endpoint, and the cell by fusion's answer on `topics.description`."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.connection import connect_by_environment, secure_by_environment
 
 ANSWER_S = 1.0
-"""Longest wait [s] for the answer to one query for the description."""
+"""Maximum wait [s] for the answer to one query for the description."""
 AGAIN_S = 0.1
-"""Time [s] between two queries while the cell does not answer yet."""
+"""Time [s] between two queries until the cell answers."""
 PATIENCE_S = 3.0
 
 
@@ -35,12 +35,12 @@ def connect(
     """Connects to a running cell; use it in `with`.
 
     Args:
-        cell: Name of the cell, or its YAML file. Default: `$PENUMBRA_CELL`, else the only cell that runs at the router.
-        endpoint: Of the router, as `tcp/192.168.0.7:7447`; several are separated by spaces. Default: `$PENUMBRA_CONNECT`, else
-            this machine.
+        cell: Name of the cell, or its YAML file. Default: `$PENUMBRA_CELL`, else the only cell at the router.
+        endpoint: Endpoint of the router, such as `tcp/192.168.0.7:7447`; separate several by spaces. Default:
+            `$PENUMBRA_CONNECT`, else this machine.
         secure: Folder of certificates of `penumbra certs`; needs `ca`, `viewer` and, to publish, `driver`. Default:
             `$PENUMBRA_SECURE`, else without certificates.
-        timeout: How long to wait for the router and the cell [s], by default 3 s. A program that starts with the machine
+        timeout: Maximum wait for the router and the cell [s], by default 3 s. A program that starts with the machine
             may use `math.inf`.
 
     Raises:
@@ -51,7 +51,7 @@ def connect(
 
 @dataclass(frozen=True)
 class Search:
-    """The search for a cell of this name (None: for the only one). stopping: ends it early."""
+    """Search for a cell by name; None accepts the only cell. stopping: ends the search early."""
 
     cell: str | None
     connection: bus.Connection
@@ -68,7 +68,7 @@ class Search:
         return cls(_name(cell or os.environ.get("PENUMBRA_CELL")), connection, timeout, threading.Event())
 
     def run(self) -> tuple[zenoh.Session, bus.Connection, Outline]:
-        """The session, how it was opened, and what is in the cell. Raises bus.BusError."""
+        """Returns the session, its connection, and the summary of the cell. Raises bus.BusError."""
         deadline = time.monotonic() + self.timeout
         session = bus.open_session(self.connection, self.stopping, lambda: None, self.timeout)
         try:
@@ -95,7 +95,7 @@ class Search:
                 raise bus.BusError(self._nobody(session))
 
     def _nobody(self, session: zenoh.Session) -> str:
-        """Why there is no answer, in words."""
+        """Reason why there is no answer, as text."""
         services: dict[str, set[str]] = {}
         for reply in session.liveliness().get(topics.alive("*"), timeout=ANSWER_S):
             if reply.ok is not None:
@@ -113,7 +113,7 @@ class Search:
 
 
 def _name(cell: str | Path | None) -> str | None:
-    """The name of a cell that is given by its name or its YAML file. Raises BusError for what is neither."""
+    """Name of a cell that is given by its name or its YAML file. Raises BusError for any other text."""
     if cell is None or not str(cell):
         return None
     if Path(cell).suffix in (".yaml", ".yml"):

@@ -1,4 +1,4 @@
-"""The pose of a target as a program gets it."""
+"""The pose of a target, as the client returns it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from penumbra.shared.geometry.rigid import Array
 
 State = Literal["tracking", "coasting", "lost"]
 """`tracking`: a sense measures the target, and three standard deviations of its position are within the `tracking_bound` of the
-cell file. `coasting`: nothing measures it now, the newest measurement contradicts the pose, or the pose is less certain than that
-bound. `lost`: nothing is known any more."""
+cell file. `coasting`: no sense measures the target now, the newest measurement contradicts the pose, or the pose is less certain
+than that bound. `lost`: the pose is unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +25,10 @@ class Pose:
 
     Attributes:
         target: Name of the target.
-        frame: Name of the fixed frame that everything is given in.
-        stamp_ns: The moment, in nanoseconds since the epoch.
-        state: `tracking`, `coasting` or `lost`. The numbers of a lost pose are where the target is expected at first.
+        frame: Name of the fixed frame of all quantities.
+        stamp_ns: The time of the pose, in nanoseconds since the epoch.
+        state: `tracking`, `coasting` or `lost`. Do not use the numbers of a lost pose: they are the target's home
+            or an extrapolation.
         T: (4, 4), T_frame_target: maps coordinates of the target to the frame [m].
         orientation: (4,), the same rotation as a unit quaternion x, y, z, w.
         velocity: (6,), linear [m/s] and angular [rad/s], along the axes of the frame.

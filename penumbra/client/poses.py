@@ -1,7 +1,7 @@
-"""Waiting for poses: the newest one wins, and what nobody takes is not even decoded.
+"""Subscription to poses. Only the newest pose is kept, and only poses that are taken are decoded.
 
-Zenoh hands a sample to a callback in a thread of its own. The callback only replaces what is in a slot and wakes the reader, so a
-slow reader holds up nobody and finds the newest pose, never a queue.
+Zenoh hands a sample to a callback in a thread of its own. The callback only replaces the content of a slot and wakes the reader,
+so a slow reader delays nobody and finds the newest pose, never a queue.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from penumbra.shared.contract.topics import FUSED
 
 _LOG = logging.getLogger("penumbra.client")
 SET_BACK_NS = int(FUSED.oldest_s * 1e9)
-"""Where stamps go back by more than this, the publisher's clock was set back: what follows is not late."""
+"""If stamps go back by more than this [ns], the publisher's clock was set back, and the pose is not late."""
 
 
 class Slot:
-    """Holds the newest sample. Any thread puts, one thread or one event loop takes."""
+    """Holds the newest sample. Any thread may put, one thread or one event loop takes."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -42,14 +42,14 @@ class Slot:
             self._rouse()
 
     def close(self) -> None:
-        """No sample follows."""
+        """Ends the waiting: no sample follows."""
         with self._changed:
             self.is_closed = True
             self._rouse()
 
     def wait(self, deadline: float | None) -> zenoh.Sample | None:
-        """Takes the sample, as soon as there is one; None once the slot is closed. Raises TimeoutError when the deadline (of the
-        monotonic clock, None for none) has passed."""
+        """Waits for the sample and takes it; None once the slot is closed. Raises TimeoutError when the deadline (monotonic time,
+        None for none) has passed."""
         with self._changed:
             while self._sample is None and not self.is_closed:
                 left = None if deadline is None else deadline - time.monotonic()
@@ -59,7 +59,7 @@ class Slot:
             return self._taken()
 
     def take(self, wake: Callable[[], object]) -> zenoh.Sample | None:
-        """Takes the sample; where there is none, `wake` is called once, by another thread, when something changes."""
+        """Takes the sample. If there is none, `wake` is called once, from another thread, at the next change."""
         with self._changed:
             if self._sample is None and not self.is_closed:
                 self._wake = wake
@@ -77,7 +77,7 @@ class Slot:
 
 
 class Subscription:
-    """One target's poses. key: their key. why_silent: says why none may come, in words."""
+    """Poses of one target. key: their key. why_silent: returns the reason why no poses arrive, as text."""
 
     def __init__(self, session: zenoh.Session, key: str, timeout: float | None, why_silent: Callable[[], str]):
         self._slot, self._timeout, self._why_silent = Slot(), timeout, why_silent
@@ -85,7 +85,7 @@ class Subscription:
         self._logged: set[str] = set()
         self._refusal = ""
         subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(self._slot.put, self._slot.close))
-        # with a callback it would live as long as the session
+        # a subscriber with a callback lives as long as the session unless it is undeclared
         self._end = weakref.finalize(self, _undeclare, subscriber)
         self._end.atexit = False
 
@@ -95,8 +95,8 @@ class Subscription:
         self._slot.close()
 
     def _pose_of(self, sample: zenoh.Sample) -> Pose | None:
-        """The pose in a sample; None for a message that was refused, and for one that is not newer than the last: while fusion's
-        replicas take over from each other, both publish."""
+        """The pose in a sample; None for a message that was refused, and for one that is not newer than the last. Both replicas
+        of fusion publish while one takes over from the other."""
         try:
             message = decode(FusedPose, sample.payload.to_bytes())
         except BadMessage as error:

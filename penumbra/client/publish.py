@@ -1,7 +1,7 @@
-"""Measurements of a program's own sensors, checked and sent onto the bus.
+"""Publishing of a program's own measurements, with checks.
 
-A stamp is the moment of the measurement in integer nanoseconds since the epoch, as `time.time_ns()` returns it; None means now.
-What readers would refuse raises ValueError here: a wrong shape, dtype, range or stamp, and too many messages a second.
+A stamp is the time of the measurement in integer nanoseconds since the epoch, as `time.time_ns()` returns it; None means now.
+Messages that readers would refuse raise ValueError here: a wrong shape, dtype, range or stamp, and too many messages per second.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from penumbra.shared.runtime.guard import RATE_TIMES, Bucket
 from penumbra.shared.runtime.sender import Sender
 
 LARGEST_ANGLE = 100.0
-"""Joint angles [rad] beyond this, sixteen turns, are taken for degrees."""
+"""Joint angle [rad] above which degrees are assumed: sixteen turns."""
 PERIOD_NS = 1_000_000
-"""Time [ns] between samples of a pad without stamps of their own: sensing boards give a thousand a second."""
+"""Default time [ns] between samples of a pad without stamps: sensing boards give a thousand per second."""
 UNEVEN = 0.5
-"""How far a row's stamp may be from an even spacing, in periods."""
+"""Maximum deviation of a row's stamp from an even spacing, in periods."""
 
 
 class Stream:
-    """One key that this program may publish on, from one thread at a time. session: returns the session, opened when the first
-    message is sent. name: of the sensor. rate_hz: how often the cell expects it."""
+    """One key on which this program may publish, from one thread at a time. session: returns the session, which is opened when
+    the first message is sent. name: of the sensor. rate_hz: expected rate of the cell."""
 
     def __init__(self, session: Callable[[], zenoh.Session], topic: Topic, key: str, name: str, rate_hz: float):
         self._session, self._topic, self._key, self.name = session, topic, key, name
@@ -52,8 +52,8 @@ class Stream:
             )
 
     def send(self, message: Message) -> None:
-        """Checks the stamp and the rate, and sends. Raises ValueError, and BusError where the cell is closed or, at the first
-        message, no router is there."""
+        """Checks the stamp and the rate, and sends. Raises ValueError, and BusError where the cell is closed or no router is
+        found for the first message."""
         self.check(message.stamp_ns)
         if not self._bucket.take(time.monotonic()):
             raise ValueError(
@@ -77,9 +77,9 @@ class Camera:
         name: Its name in the cell.
         width: Columns of an image [px].
         height: Rows of an image [px].
-        rate_hz: Images per second that the cell expects.
+        rate_hz: Expected images per second.
         K: (3, 3), intrinsic matrix [px].
-        T_world_camera: (4, 4), where the optical frame is (x right, y down, z forward).
+        T_world_camera: (4, 4), pose of the optical frame (x right, y down, z forward).
     """
 
     name: str
@@ -94,13 +94,13 @@ class Camera:
         """Sends an image.
 
         Args:
-            image: uint8 (height, width, 3), channels in the order red, green, blue. OpenCV has them the other way round:
+            image: uint8 (height, width, 3), channels in the order red, green, blue. OpenCV has the opposite order:
                 `cv2.cvtColor(image, cv2.COLOR_BGR2RGB)`.
             stamp_ns: The middle of the exposure [ns since the epoch]. None: now.
 
         Raises:
             ValueError: The image or the stamp is not as expected, or images come too often. The text says what to do.
-            BusError: The cell is closed, or no router is there at the first message.
+            BusError: The cell is closed, or no router is found for the first message.
         """
         expected = (self.height, self.width, 3)
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != expected:
@@ -129,11 +129,11 @@ class Robot:
 
         Args:
             q: Angles [rad] in the order of `joints`.
-            stamp_ns: When they were measured [ns since the epoch]. None: now.
+            stamp_ns: Time of the measurement [ns since the epoch]. None: now.
 
         Raises:
             ValueError: Angles or stamp are not as expected, or messages come too often. The text says what to do.
-            BusError: The cell is closed, or no router is there at the first message.
+            BusError: The cell is closed, or no router is found for the first message.
         """
         angles = _floats(f"robot {self.name}", q)
         if angles.shape != (len(self.joints),):
@@ -152,7 +152,7 @@ class Pad:
     Attributes:
         name: Its name in the cell.
         electrodes: Their names, in the order of the columns of voltages.
-        limit_V: The largest amplitude that its converter can give [V].
+        limit_V: The reference of its converter [V], the maximum accepted amplitude.
     """
 
     name: str
@@ -161,16 +161,16 @@ class Pad:
     _stream: Stream = field(repr=False)
 
     def publish(self, volts: ArrayLike, stamps_ns: ArrayLike | None = None) -> None:
-        """Sends amplitudes of the electrodes. Readers accept 250 messages per second of a pad: send faster samples in batches.
+        """Sends amplitudes of the electrodes. Readers accept 250 messages per second from a pad: send faster samples in batches.
 
         Args:
             volts: Amplitudes [V]: one row (electrodes,), or a batch (samples, electrodes) with the oldest row first.
-            stamps_ns: A stamp [ns since the epoch] for each row, evenly spaced. None: the last row is of now, and rows are a
-                millisecond apart. A single row has the period since the row before it.
+            stamps_ns: A stamp [ns since the epoch] for each row, evenly spaced. None: the last row was measured now, and the rows
+                are a millisecond apart. The period of a single row is the time since the row before it.
 
         Raises:
             ValueError: Amplitudes or stamps are not as expected, or messages come too often. The text says what to do.
-            BusError: The cell is closed, or no router is there at the first message.
+            BusError: The cell is closed, or no router is found for the first message.
         """
         what = f"pad {self.name}"
         rows = np.atleast_2d(_floats(what, volts))
@@ -186,7 +186,7 @@ class Pad:
         self._stream.send(Voltages(stamp_ns=stamp_ns, period_ns=period_ns, volts=rows.astype(np.float32)))
 
     def _times(self, stamps_ns: ArrayLike | None, count: int, last_ns: int | None) -> tuple[int, int]:
-        """The stamp of the last row and the period [ns] of so many rows; last_ns: the stamp before them."""
+        """Stamp of the last row and period [ns] of `count` rows; last_ns: the stamp before them."""
         if stamps_ns is None:
             stamps = time.time_ns() - PERIOD_NS * np.arange(count - 1, -1, -1, dtype=np.int64)
         else:
@@ -221,7 +221,7 @@ def _stamp(name: str, stamp_ns: int | None) -> int:
 
 
 def _floats(what: str, values: ArrayLike) -> Array:
-    """The values as float64. Raises ValueError where one is no finite number."""
+    """The values as float64. Raises ValueError where one is not a finite number."""
     try:
         array = np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:

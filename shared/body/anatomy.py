@@ -14,22 +14,25 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import Label
 
 EXTENT = (0.02, 3.0)
-"""Smallest and largest length [m] of a limb."""
+"""Minimum and maximum length [m] of a limb's mesh, its longest side."""
 MOST_FACES = 4000
-"""Number of triangles that a mesh of a user's is simplified to: finer ones are smaller than a pixel."""
+"""Maximum number of triangles of a user's mesh after simplification. Finer ones are smaller than a pixel."""
 SIZE = np.array([0.0, -0.08])
 """Log length and log girth of an average limb, relative to the target's mesh."""
 SIZE_SPREAD = np.array([0.06, 0.11])
-"""Standard deviations of log length and log girth between people: the 5th percentile woman to the 95th man (ANSUR II) lie at log
-girths of -0.27 to 0.11."""
+"""Standard deviations of log length and log girth between people. From the 5th percentile of women to the 95th of men, the log
+girth runs from -0.27 to 0.11 (ANSUR II)."""
 SIZE_MEASURED = np.array([0.015, 0.03])
-"""The same standard deviations for a person whose size the cell file states, around the stated size."""
+"""Standard deviations of log length and log girth around the size that the cell file states for a person."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh: `vertices` (n, 3) float64 [m], `faces` (m, 3) int32 seen counter-clockwise from outside, `labels` (m,)
-    uint8 class of each face."""
+    """A triangle mesh.
+
+    vertices: (n, 3) float64 [m]. faces: (m, 3) int32, counter-clockwise seen from outside. labels: (m,) uint8, class of each
+    face.
+    """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
@@ -39,7 +42,7 @@ class Mesh:
 def loft(
     centres: NDArray[np.float64], half_y: NDArray[np.float64], half_z: NDArray[np.float64], segments: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """A closed tube through elliptical sections in the y-z plane: centres (k, 3), half axes (k,) [m]."""
+    """Closed tube through elliptical sections in the y-z plane: centres (k, 3), half axes (k,) [m]."""
     angle = np.arange(segments) * 2 * np.pi / segments
     ring = np.stack([np.zeros(segments), np.cos(angle), np.sin(angle)], axis=1)
     k = len(centres)
@@ -58,8 +61,8 @@ def loft(
 
 
 def half_axes(circumference: ArrayLike, flatness: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Half axes (wide, thin) [m] of the ellipse with this circumference whose thin axis is `flatness` times the wide one
-    (Ramanujan's first formula)."""
+    """Half axes (wide, thin) [m] of an ellipse with this circumference [m]. `flatness` is the ratio of the thin to the wide axis.
+    (Ramanujan's first formula.)"""
     k = np.asarray(flatness, float)
     wide = np.asarray(circumference, float) / (np.pi * (3 * (1 + k) - np.sqrt((3 + k) * (1 + 3 * k))))
     return wide, k * wide
@@ -82,7 +85,7 @@ def _join(*parts: tuple[NDArray[np.float64], NDArray[np.int32], Label]) -> Mesh:
 def forearm_mesh(body: cells.Body) -> Mesh:
     """Forearm with hand, thumb on +y. Origin midway between elbow and wrist on the axis, x towards the hand, z dorsal."""
     length = body.forearm_length
-    # The muscle's belly lies a quarter of the way from the elbow, the wrist is flatter than the belly.
+    # The muscle belly lies at a quarter of the length from the elbow; the wrist is flatter than the belly.
     at = np.array([0.0, 0.06, 0.25, 0.45, 0.65, 0.85, 1.0])
     around = (
         np.interp(at, [0.0, 0.06, 0.25, 0.45, 0.65, 0.85, 1.0], [0.78, 0.92, 1.0, 0.93, 0.76, 0.6, 0.0])
@@ -117,7 +120,7 @@ def upper_arm_mesh(body: cells.Body) -> Mesh:
 
 
 def torso_mesh(body: cells.Body) -> Mesh:
-    """Trunk, neck and head, z up, facing +x; origin at the right shoulder joint, so the trunk stands on the +y side."""
+    """Trunk, neck and head, z up, facing +x. The origin is the right shoulder joint, so the trunk lies on the +y side."""
     h, half = body.shoulder_height, body.chest_breadth / 2
     z = np.array([-1.0, -0.75, -0.35, -0.05, 0.07, 0.12, 0.24, 0.32, 0.47, 0.6, 0.63]) * h
     wide = np.array([1.05, 0.95, 1.08, 1.2, 0.95, 0.38, 0.36, 0.5, 0.54, 0.4, 0.15]) * half
@@ -129,7 +132,7 @@ def torso_mesh(body: cells.Body) -> Mesh:
 
 
 def target_mesh(target: cells.Target, cell: cells.Cell) -> Mesh:
-    """The mesh of a target in its size: of the parametric forearm, or the user's own file (metres, x along the limb). Raises
+    """Mesh of a target, scaled by its size: the parametric forearm, or the user's own file (metres, x along the limb). Raises
     CellError."""
     mesh, size = _mesh(target, cell), target.size
     return mesh if size is None else replace(mesh, vertices=mesh.vertices * (size.length, size.girth, size.girth))
@@ -143,7 +146,7 @@ def _mesh(target: cells.Target, cell: cells.Cell) -> Mesh:
 
 
 def _few(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """`read`, with at most MOST_FACES triangles; once per file and process."""
+    """As `read`, with at most MOST_FACES triangles; cached per file and process."""
     try:
         return _simplified(path, path.stat().st_mtime_ns)
     except OSError as error:
@@ -159,12 +162,12 @@ def _simplified(path: Path, changed_ns: int) -> tuple[NDArray[np.float64], NDArr
 
 
 def read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Vertices (n, 3) [m] and faces (m, 3) of a limb's mesh file, as they are. Raises CellError."""
+    """Vertices (n, 3) [m] and faces (m, 3) of a limb's mesh file, unchanged. Raises CellError."""
     import trimesh
 
     try:
         mesh = trimesh.load_mesh(path)
-    except Exception:  # trimesh's readers raise whatever they meet, in words about themselves
+    except Exception:  # trimesh's readers raise any exception, with texts about their internals
         what = f"expected a triangle mesh (STL, OBJ, PLY, GLB or OFF), got {path}, which cannot be read as {path.suffix or 'one'}"
         raise cells.CellError(f"{what}; export it again") from None
     vertices, faces = np.asarray(getattr(mesh, "vertices", ()), np.float64), np.asarray(getattr(mesh, "faces", ()), np.int32)

@@ -22,13 +22,13 @@ from penumbra.shared.geometry.rigid import Array
 class RobotModel:
     """A robot of the cell.
 
-    joints: names of the joints that move, in the order of every `q`; lower, upper: their limits (n,), infinite where the URDF
-    sets none. links: names of all links, a parent before its children; parents: the index of each link's parent, -1 for the base.
-    description: what the URDF says.
+    joints: names of the moving joints, in the order of every `q`; lower, upper: their limits (n,), infinite where the URDF sets
+    none. links: names of all links, a parent before its children; parents: index of the parent of each link, -1 for the base.
+    description: the parsed URDF.
 
-    A moving joint that the cell does not name is held where it is as near to zero as its limits allow.
+    A moving joint that the cell does not name is fixed at the position nearest to zero that its limits allow.
 
-    Raises CellError where the URDF cannot be read or does not have a joint.
+    Raises CellError where the URDF cannot be read or lacks one of the joints.
     """
 
     def __init__(self, robot: cells.Robot, folder: Path = Path(".")):
@@ -66,21 +66,21 @@ class RobotModel:
 
     @property
     def T_parent_link(self) -> Array:
-        """(n, 4, 4) of all links where the cell's joints are at zero; of the base: T_world_base."""
+        """T_parent_link (n, 4, 4) of all links with the cell's joints at zero; for the base T_world_base."""
         return self._origin
 
     @functools.cached_property
     def meshes(self) -> dict[str, Mesh]:
-        """The collision mesh of each link that has one, in the link's frame. Kinematics need none: made when asked for.
+        """Collision mesh of each link that has one, in the link's frame. Loaded on first access, because kinematics need no mesh.
 
         Raises CellError where a mesh file cannot be read.
         """
         return {link.name: _mesh(link.solids, self.description.path) for link in self.description.links if link.solids}
 
     def link_transforms(self, q: ArrayLike) -> dict[str, Array]:
-        """T_world_link (..., 4, 4) of every link at joint angles [rad] or displacements [m] q (..., n).
+        """T_world_link (..., 4, 4) of every link, for joint angles [rad] or displacements [m] q (..., n).
 
-        Raises ValueError where q has not one value per joint.
+        Raises ValueError where q does not have one value per joint.
         """
         q = np.asarray(q, dtype=float)
         if q.shape[-1:] != (len(self.joints),):
@@ -95,7 +95,7 @@ class RobotModel:
 
 
 def robot_models(cell: cells.Cell) -> dict[str, RobotModel]:
-    """The model of every robot of the cell. Raises CellError, also where a pad sits on a link that its robot has not."""
+    """Models of all robots of the cell. Raises CellError, also where a pad sits on a link that its robot does not have."""
     models = {name: _model(robot, cell.folder) for name, robot in cell.robots.items()}
     for name, pad in cell.pads.items():
         robot, _, link = pad.link.partition("/")
@@ -108,12 +108,13 @@ def robot_models(cell: cells.Cell) -> dict[str, RobotModel]:
 
 @functools.lru_cache(maxsize=8)
 def _model(robot: cells.Robot, folder: Path) -> RobotModel:
-    """Read once: everything of a process may use the same model and its meshes."""
+    """Model of a robot, cached: all parts of a process share the model and its meshes."""
     return RobotModel(robot, folder)
 
 
 def _generator(joint: urdf.Joint) -> Array:
-    """The derivative (4, 4) of the joint's motion at zero: [axis]x for a turn, the axis as translation for a slide."""
+    """Derivative (4, 4) of the joint's motion at zero: [axis]x for a revolute joint, the axis as translation for a prismatic
+    one."""
     out = np.zeros((4, 4))
     if joint.kind == "prismatic":
         out[:3, 3] = joint.axis
@@ -141,8 +142,8 @@ def _solid(solid: urdf.Solid, path: Path) -> tuple[Array, Array]:
 
 
 def _plain_obj(file: Path) -> tuple[Array, Array] | None:
-    """Vertices and faces of an OBJ file of nothing but `v x y z` and `f a b c`, as those of the built-in robot are; None for any
-    other file. trimesh would read them too, but its import costs 0.4 s of CPU."""
+    """Vertices and faces of an OBJ file that contains only `v x y z` and `f a b c`, such as those of the built-in robot; None for
+    any other file. trimesh would read them too, but its import costs 0.4 s of CPU."""
     if file.suffix.lower() != ".obj":
         return None
     lines = [line.split() for line in file.read_text(errors="replace").splitlines() if line.strip() and not line.startswith("#")]
@@ -161,7 +162,7 @@ def _mesh_file(file: Path, place: str) -> tuple[Array, Array]:
 
     try:
         mesh = trimesh.load_mesh(file)
-    except Exception as error:  # trimesh's readers raise whatever they meet
+    except Exception as error:  # trimesh's readers raise any exception
         raise cells.CellError(f"{place}: expected a mesh that trimesh reads (STL, OBJ, PLY, GLB), got {file}: {error}") from None
     if not len(getattr(mesh, "faces", ())):
         raise cells.CellError(f"{place}: expected a mesh with triangles, got none in {file}")

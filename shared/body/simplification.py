@@ -1,4 +1,4 @@
-"""Meshes with too many triangles, and with holes."""
+"""Simplification of meshes, and detection of holes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from penumbra.shared.geometry.rigid import Array
 Faces = NDArray[np.int32]
 
 SCALE = 1000.0
-"""Largest side of a mesh while it is simplified: the order in which edges go depends on an absolute distance."""
+"""Largest side of a mesh during simplification: the order of the edge collapses depends on an absolute distance."""
 
 
 def simplified(vertices: Array, faces: Faces, most: int) -> tuple[Array, Faces]:
-    """Vertices (n, 3) and faces (m, 3) of nearly the same surface with about `most` triangles, by edge collapse with quadric
-    errors (Garland, Heckbert 1997, doi:10.1145/258734.258849)."""
+    """Vertices (n, 3) and faces (m, 3) of nearly the same surface with about `most` triangles. Edge collapse with quadric errors
+    (Garland, Heckbert 1997, doi:10.1145/258734.258849)."""
     import fast_simplification
 
     middle, scale = vertices.mean(axis=0), SCALE / float(np.ptp(vertices, axis=0).max())
@@ -24,7 +24,7 @@ def simplified(vertices: Array, faces: Faces, most: int) -> tuple[Array, Faces]:
 
 
 def open_edges(faces: Faces) -> int:
-    """Number of edges with an odd number of triangles (m, 3): none of closed surfaces, also where two of them touch."""
+    """Number of edges with an odd number of triangles (m, 3): zero for closed surfaces, also where two of them touch."""
     ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1).astype(np.int64)
     _, count = np.unique(ends[:, 0] << 32 | ends[:, 1], return_counts=True)
     return int(np.count_nonzero(count % 2))

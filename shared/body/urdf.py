@@ -1,7 +1,7 @@
-"""A robot's URDF: its tree of links and joints, limits, masses and collision shapes (http://wiki.ros.org/urdf/XML).
+"""Reader for a robot's URDF: its tree of links and joints, limits, masses and collision shapes (http://wiki.ros.org/urdf/XML).
 
-It is read with the standard library's XML parser. yourdfpy would import trimesh, 0.4 s of CPU in every process that only wants
-the kinematics, and keeps no line numbers for errors. Visual shapes, materials, transmissions and mimics are not read.
+It uses the XML parser of the standard library. yourdfpy would import trimesh, 0.4 s of CPU in every process that needs only the
+kinematics, and it keeps no line numbers for errors. Visual shapes, materials, transmissions and mimics are not read.
 """
 
 from __future__ import annotations
@@ -26,14 +26,17 @@ MESH_SCALE = "1 1 1"
 
 
 class UrdfError(ValueError):
-    """A URDF that cannot be used; the text names the file, the line, what was expected and what was found."""
+    """A URDF that cannot be used. The text names the file, the line, what was expected and what was found."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A collision shape. size: the scale (3,) of a mesh, the edges (3,) [m] of a box, the radius [m] of a sphere, the radius and
-    the length along z [m] of a cylinder or a capsule (without its caps); file: of a mesh; T_link_solid (4, 4); line: of the URDF
-    that describes it."""
+    """A collision shape.
+
+    size: the scale (3,) of a mesh, the edges (3,) [m] of a box, the radius [m] of a sphere, the radius and the length along z [m]
+    of a cylinder or a capsule (without its caps). file: of a mesh, else None. T_link_solid: (4, 4). line: of its description in
+    the URDF.
+    """
 
     kind: SolidKind
     size: tuple[float, ...]
@@ -44,7 +47,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Link:
-    """mass [kg], None where the URDF has no `inertial`; centre (3,) of the mass [m] in the link's frame."""
+    """A link. mass [kg]: None where the URDF has no `inertial`; centre (3,): of mass [m], in the link's frame."""
 
     name: str
     solids: tuple[Solid, ...]
@@ -52,7 +55,7 @@ class Link:
     centre: Array
 
     def shapes(self) -> list[list[Any]]:
-        """Its collision shapes as JSON can hold them, for comparisons: the same wherever their files lie."""
+        """Collision shapes as JSON values, for comparisons. They do not depend on the location of the mesh files."""
         return [
             [
                 solid.kind,
@@ -66,8 +69,8 @@ class Link:
 
 @dataclass(frozen=True)
 class Joint:
-    """T_parent_child (4, 4) at zero; axis (3,) in the child's frame, a unit vector; lower, upper [rad or m], infinite where the
-    URDF sets none; effort [Nm or N] and velocity [rad/s or m/s], infinite where it sets none; damping [Nm s/rad or N s/m]."""
+    """A joint. T_parent_child (4, 4): at zero; axis (3,): unit vector in the child's frame; lower, upper [rad or m], effort [Nm
+    or N] and velocity [rad/s or m/s]: limits, infinite where the URDF sets none; damping [Nm s/rad or N s/m]."""
 
     name: str
     kind: JointKind
@@ -89,23 +92,23 @@ class Joint:
 
 @dataclass(frozen=True)
 class Urdf:
-    """links: the base first, then depth first in the order of the file; joints: joint i carries links[i + 1]."""
+    """A robot. links: the base first, then depth first in the order of the file; joints: joint i carries links[i + 1]."""
 
     path: Path
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
 
     def link(self, name: str) -> Link:
-        """A link by its name. Raises KeyError."""
+        """The link with this name. Raises KeyError."""
         return {link.name: link for link in self.links}[name]
 
     @property
     def moving(self) -> tuple[str, ...]:
-        """The names of the joints that move."""
+        """Names of the joints that move."""
         return tuple(joint.name for joint in self.joints if joint.moves)
 
     def fault(self, joints: tuple[str, ...]) -> str:
-        """What is wrong with a choice of joints: empty where all of them move and none is named twice."""
+        """Describes what is wrong with a choice of joints; empty where all of them move and none is named twice."""
         unknown = [name for name in joints if name not in self.moving]
         if unknown:
             return f"no moving joint {', '.join(unknown)} in {self.path}: it has {', '.join(self.moving) or 'none'}"
@@ -114,7 +117,7 @@ class Urdf:
 
 
 def read(path: Path) -> Urdf:
-    """The robot of a file. Raises UrdfError."""
+    """Reads the robot from a file. Raises UrdfError."""
     return _Reader(path).robot()
 
 
@@ -154,7 +157,7 @@ class _Reader:
         return Urdf(self.path, tuple(links[name] for name in order), tuple(joints[name] for name in order[1:]))
 
     def _base(self, links: dict[str, Link], joints: dict[str, Joint]) -> str:
-        """The link that no joint carries."""
+        """The link that is no joint's child."""
         for joint in joints.values():
             for name in (joint.parent, joint.child):
                 if name not in links:
@@ -167,12 +170,12 @@ class _Reader:
         return bases[0]
 
     def _connected(self, order: list[str], joints: dict[str, Joint]) -> None:
-        """Raises UrdfError for links that hang on themselves and not on the base."""
+        """Raises UrdfError for links that form a cycle and are not connected to the base."""
         if loose := next((joint for joint in joints.values() if joint.child not in order), None):
             raise UrdfError(f"{self.path}:{loose.line}: {_cycle(loose.child, joints)}")
 
     def _named(self, tag: str) -> list[ElementTree.Element]:
-        """The robot's links or joints, each with a name of its own; no two joints carry the same link."""
+        """Elements of the robot's links or joints. Each has a unique name, and no two joints have the same child link."""
         elements = self._root.findall(tag)
         self._unique(elements, [self._attribute(element, "name") for element in elements], "name")
         if tag == "joint":
@@ -216,8 +219,8 @@ class _Reader:
         return Solid(shape.tag, size, file, self._origin(collision), self._lines[shape])
 
     def _mesh_file(self, mesh: ElementTree.Element) -> Path:
-        """The file of a mesh: `file://PATH`, a path beside the URDF, or `package://PACKAGE/PATH` with PACKAGE one of the folders
-        around the URDF, or left out."""
+        """The file of a mesh: `file://PATH`, a path relative to the URDF, or `package://PACKAGE/PATH`. PACKAGE is the name of a
+        folder around the URDF, or is left out."""
         name = self._attribute(mesh, "filename")
         if name.startswith("package://"):
             rest = name.removeprefix("package://")
@@ -277,7 +280,7 @@ class _Reader:
         return value
 
     def _numbers(self, element: ElementTree.Element | None, name: str, count: int, default: str = "") -> tuple[float, ...]:
-        """`count` finite numbers of an attribute, or the default where element or attribute are missing."""
+        """`count` finite numbers of an attribute. The default stands in for a missing element or attribute."""
         text = default if element is None else element.get(name, default)
         try:
             numbers = tuple(float(word) for word in text.split())
@@ -293,7 +296,7 @@ class _Reader:
 
 
 def _cycle(link: str, joints: dict[str, Joint]) -> str:
-    """The way from a link up its parents to where it comes back to itself."""
+    """Error text with the cycle that a link and its parents form."""
     way = [link]
     while way[-1] not in way[:-1]:
         way.append(joints[way[-1]].parent)

@@ -1,1 +1,1 @@
-"""One description of the cell, and the cells that come with Penumbra in `built_in/`."""
+"""The cell file: its model, its validation, and the cells that come with Penumbra in `built_in/`."""

@@ -1,7 +1,7 @@
-"""One description of the cell: cameras, robots, pads, targets and frames, read from one YAML file.
+"""Model of the cell file: cameras, robots, pads, targets and frames, read from one YAML file.
 
 A user with another robot, mesh, camera or skin edits only that file. It is validated when it is loaded; a fault is reported with
-its line. `penumbra check` looks at what takes longer too: meshes, field models, networks, and what cameras and pads can reach.
+its line. `penumbra check` also covers what takes longer: meshes, field models, networks, and what cameras and pads can reach.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from penumbra.shared.geometry.lens import COEFFICIENTS, Lens
 FAULTS = 20
 """Maximum number of faults in the text of an error."""
 MOST_PIXELS = Frame.MAX_BYTES // 3 - 1000
-"""Of a picture in three colours, with room for the rest of its message."""
+"""Maximum number of pixels of an RGB picture, with room for the rest of its message."""
 SAME = 1e-6
-"""Points nearer to each other than this [m] are one."""
+"""Distance [m] below which two points count as equal."""
 
 
 class Placement(Model):
@@ -146,14 +146,14 @@ class Robot(Model):
 
 
 class Size(Model):
-    """Factors by which a target's mesh is stretched."""
+    """Scale factors of a target's mesh."""
 
     length: Annotated[Number, Field(ge=0.2, le=5)] = Field(default=1.0, description="along its x axis")
     girth: Annotated[Number, Field(ge=0.2, le=5)] = Field(default=1.0, description="across its x axis")
 
 
 class Target(Model):
-    """What is tracked."""
+    """A target to be tracked."""
 
     mesh: str = Field(
         description="body:forearm, the parametric forearm with hand, or a mesh file beside the cell file, in metres, its x axis "
@@ -237,7 +237,7 @@ class Motion(Model):
 
 
 class Payload(Model):
-    """What a robot carries: a point mass."""
+    """The load of a robot: a point mass."""
 
     mass: Annotated[Number, Field(gt=0, le=1000)] = Field(description="of the load [kg]")
     link: str = Field(description="the link that carries it")
@@ -245,7 +245,7 @@ class Payload(Model):
 
 
 class Sim(Model):
-    """What only the emulator needs."""
+    """Settings of the emulator."""
 
     motion: Motion = Field(description="where and how fast the target moves")
     shoulder: Vector3 = Field(description="where the person's right shoulder would be if the arm were long enough [m]")
@@ -263,7 +263,7 @@ class Sim(Model):
 
 
 class Cell(Model):
-    """A work cell. Everything is in metres, radians and volts, in the world frame unless it says otherwise."""
+    """A work cell. Unless stated otherwise, units are metres, radians and volts, and coordinates are in the world frame."""
 
     name: Name = Field(description="of the cell; part of every topic's key")
     frame: Name = Field(default="world", description="name of the world frame in messages")
@@ -324,8 +324,8 @@ class Cell(Model):
         return [(f"targets.{name}.mesh", f"expected a mesh, got no file {path}; {remedy}") for name, path in missing.items()]
 
     def _robot_faults(self) -> list[tuple[str, str]]:
-        """Faults of URDFs that cannot be read, and of joints, limits, and links of pads and payloads that a robot does not
-        have."""
+        """Faults of URDFs that cannot be read, of joints and limits, and of links that pads or payloads name and the robot does
+        not have."""
         faults: list[tuple[str, str]] = []
         links: dict[str, tuple[str, ...]] = {}
         limits: list[tuple[str, float, float]] = []
@@ -366,21 +366,21 @@ class Cell(Model):
 
     @property
     def sources(self) -> dict[str, CameraSource]:
-        """Where pictures come from, by camera, where the file says so."""
+        """Sources of pictures by camera, where the file gives one."""
         return {name: camera.source for name, camera in self.cameras.items() if camera.source is not None}
 
     @property
     def joint_sources(self) -> dict[str, JointSource]:
-        """Where joints come from, by robot, where the file says so."""
+        """Sources of joint positions by robot, where the file gives one."""
         return {name: robot.source for name, robot in self.robots.items() if robot.source is not None}
 
     def one(self, kind: Literal["cameras", "robots", "pads", "targets"], name: str | None) -> str:
-        """The name of a camera, robot, pad or target, checked; None means the first one. Raises CellError."""
+        """Checked name of a camera, robot, pad or target; None means the first one. Raises CellError."""
         return names.one(self.name, kind[:-1], getattr(self, kind), name)
 
 
 def _bound_faults(sim: Sim, limits: Sequence[tuple[str, float, float]]) -> list[tuple[str, str]]:
-    """Faults of the emulator's bounds of joints, given each one's name and limits in the URDF."""
+    """Faults of the emulator's joint bounds. limits: name and URDF limits of each joint."""
     wrong = [name for name in ("joints_low", "joints_high") if len(getattr(sim, name)) != len(limits)]
     if wrong:
         names = ", ".join(joint for joint, _, _ in limits) or "no robot moves"
@@ -401,7 +401,7 @@ def _bound_faults(sim: Sim, limits: Sequence[tuple[str, float, float]]) -> list[
 
 @dataclass(frozen=True)
 class Reading:
-    """What a cell file says: `cell` is None where it has faults."""
+    """Result of reading a cell file; `cell` is None where the file has faults."""
 
     document: Document
     cell: Cell | None
@@ -409,8 +409,8 @@ class Reading:
 
 
 def read(cell: str | Path) -> Reading:
-    """A built-in name (`table`, `arm`) or a YAML file, with all faults that the file itself has. Raises CellError where there is
-    no such file, or none of YAML."""
+    """Reads a built-in cell (`table`, `arm`) or a YAML file, and collects all faults of that file. Raises CellError where the
+    file does not exist or is not YAML."""
     path = source(cell)
     found = document.read(path)
     if not isinstance(found.data, Mapping):
@@ -428,7 +428,7 @@ def read(cell: str | Path) -> Reading:
 
 
 def load(cell: str | Path) -> Cell:
-    """The cell of a built-in name (`table`, `arm`) or of a YAML file. Raises CellError with file, line and reason."""
+    """Loads a built-in cell (`table`, `arm`) or a YAML file. Raises CellError with file, line and reason."""
     reading = read(cell)
     if reading.cell is None:
         more = len(reading.faults) - FAULTS
@@ -438,7 +438,7 @@ def load(cell: str | Path) -> Cell:
 
 
 def urdf_path(robot: Robot, folder: Path) -> Path:
-    """The URDF of a robot of a cell in a folder. Raises CellError where there is none."""
+    """URDF of a robot; folder: that of the cell file. Raises CellError where there is none."""
     for path in (folder / robot.urdf, BUILT_IN / robot.urdf):
         if is_file(path):
             return path

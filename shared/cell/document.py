@@ -34,12 +34,12 @@ SYNTAX = (
     (r"found unhashable key|unacceptable key", "expected a plain name as a key; remove the brackets or braces before the colon"),
     (r"found character .* that cannot start any token", "expected a value; put a text that begins with this character in quotes"),
 )
-"""Problems of the YAML parser, each with what to do. PyYAML's own words name its internal states."""
+"""Patterns of PyYAML's errors, each with a remedy. PyYAML's own texts name its internal states."""
 
 
 @dataclass(frozen=True)
 class Document:
-    """What a YAML file holds: its values, and the nodes that they were made from. duplicates: faults of keys given twice."""
+    """Content of a YAML file: its values, and the nodes that they were made from. duplicates: faults of keys given twice."""
 
     path: Path
     data: Any
@@ -47,7 +47,7 @@ class Document:
     duplicates: tuple[Fault, ...]
 
     def line(self, location: Sequence[str]) -> int:
-        """The line of the deepest value on the way to a place."""
+        """Line of the deepest existing value on the path to a place."""
         node = self.tree
         if node is None:
             return 1
@@ -72,8 +72,8 @@ class Document:
 
 
 def read(path: Path) -> Document:
-    """A YAML file. Raises CellError with file and line where it is none, or holds more than a cell needs: a short file may name
-    lists of lists of lists that fill any memory."""
+    """Reads a YAML file. Raises CellError with file and line where it is not YAML, or holds more than a cell needs: nested
+    references in a short file may expand to more than fits into memory."""
     try:
         with path.open("rb") as file:
             text = file.read(MAX_BYTES + 1)
@@ -91,7 +91,7 @@ def read(path: Path) -> Document:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise CellError(str(Fault(path, mark.line + 1 if mark else 1, "", f"{_words(error)} (not YAML)"))) from None
-    except Exception as error:  # PyYAML raises many kinds of errors for a scalar that is not what it says
+    except Exception as error:  # PyYAML raises many kinds of errors for a scalar that does not match its tag
         line = text[: error.start].count(b"\n") + 1 if isinstance(error, UnicodeDecodeError) else 1
         if isinstance(error, UnicodeDecodeError):
             reason = f"expected UTF-8, got the byte 0x{text[error.start]:02x}; save the file as UTF-8"
@@ -114,8 +114,8 @@ def _words(error: yaml.MarkedYAMLError) -> str:
 
 
 def _count_nodes(node: yaml.Node | None, known: dict[int, int | None]) -> int:
-    """Nodes in a tree, those that are referred to counted each time. Raises ValueError for more than MAX_NODES, and where one
-    contains itself."""
+    """Number of nodes in a tree; an aliased node counts at each reference. Raises ValueError for more than MAX_NODES, and where a
+    node contains itself."""
     if not isinstance(node, yaml.CollectionNode):
         return 1
     if id(node) not in known:
@@ -132,7 +132,7 @@ def _count_nodes(node: yaml.Node | None, known: dict[int, int | None]) -> int:
 
 
 def _duplicates(path: Path, tree: yaml.Node | None) -> tuple[Fault, ...]:
-    """The keys that a map has twice. YAML parsers silently keep the last."""
+    """Faults of keys that a map has twice. YAML parsers silently keep the last one."""
     out: list[Fault] = []
     seen: set[int] = set()
     pending: list[tuple[yaml.Node | None, tuple[str, ...]]] = [(tree, ())]

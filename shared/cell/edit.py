@@ -1,4 +1,4 @@
-"""Changes of a cell file that leave the rest of its text alone: comments, order and layout belong to the person who wrote it."""
+"""Edits of a cell file that preserve the rest of its text: comments, order and layout belong to the user."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from penumbra.shared.cell.names import BUILT_IN, source
 
 
 def destination(cell: str | Path, out: Path | None) -> Path:
-    """The file that a changed cell goes into. Raises CellError for a built-in cell without `out`."""
+    """Path that a changed cell is written to. Raises CellError for a built-in cell without `out`."""
     path = source(cell)
     if out is None and path.parent == BUILT_IN:
         raise CellError(f"the built-in cell {cell} is not overwritten: give --out FILE, and use that with --cell")
@@ -25,10 +25,12 @@ def destination(cell: str | Path, out: Path | None) -> Path:
 
 
 def with_values(path: Path, place: Sequence[str], values: Mapping[str, str], instead: Mapping[str, str] | None = None) -> str:
-    """The text of a cell file in which the map at a place has these values, each given as YAML. A key that is there gets its new
-    value where it stands, and comments within the old one are lost; a new key follows the one that comes before it in `values`.
-    instead: by a new key, the one whose place it takes. Raises CellError where the file is no YAML, has no such map, or has it by
-    an alias."""
+    """Text of a cell file after setting values, each given as YAML, in the map at a place. An existing key keeps its position,
+    and comments within its old value are lost. A new key follows the key that comes before it in `values`.
+
+    instead: by new key, the existing key that it replaces. Raises CellError where the file is not YAML, has no such map, or
+    refers to it by an alias.
+    """
     found, text = document.read(path), path.read_text()
     for key, value in values.items():
         at = list(values).index(key)
@@ -44,14 +46,15 @@ def with_values(path: Path, place: Sequence[str], values: Mapping[str, str], ins
 
 
 def difference(path: Path, text: str) -> str:
-    """What a new text changes in a file, as a unified diff; empty where nothing."""
+    """Unified diff between a file and its new text; empty where they are equal."""
     before = path.read_text().splitlines(keepends=True) if path.exists() else []
     lines = difflib.unified_diff(before, text.splitlines(keepends=True), str(path), str(path), n=1)
     return "".join(lines)
 
 
 def write(path: Path, text: str) -> None:
-    """Replaces a cell file, at once, by a text that loads. Raises CellError where it does not, or cannot be written."""
+    """Replaces a cell file atomically with a text that loads. Raises CellError where the text does not load or cannot be
+    written."""
     draft = path.with_name(f".{path.name}.{os.getpid()}.yaml")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -93,13 +96,14 @@ def _map(found: Document, place: Sequence[str]) -> yaml.MappingNode:
 
 
 def _refuse_alias(found: Document, place: Sequence[str], key: yaml.Node, value: yaml.Node) -> None:
-    """What an alias stands for is written elsewhere, and may stand for more."""
+    """Raises CellError for an alias: its text stands elsewhere, and may have other uses."""
     if value.start_mark.index < key.end_mark.index:
         raise CellError(str(found.fault(list(place), f"expected the value of {key.value} itself, got an alias; write it out")))
 
 
 def _end(node: yaml.Node) -> int:
-    """Where a value's text ends. YAML lets a block end where the next key begins, after comments that are not its own."""
+    """Index at which a value's text ends. PyYAML ends a block where the next key begins, after comments that do not belong to
+    it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(node, yaml.MappingNode) else last)
@@ -107,7 +111,7 @@ def _end(node: yaml.Node) -> int:
 
 
 def _changed(found: Document, text: str, place: Sequence[str], key: str, value: str, before: str, instead: str) -> str:
-    """The text with one value more, or another one."""
+    """The text with one value added or replaced."""
     node = _map(found, place)
     pairs = {name.value: (name, each) for name, each in node.value}
     old = key if key in pairs else instead

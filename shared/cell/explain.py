@@ -1,4 +1,4 @@
-"""Errors of pydantic in the words of a cell file: the place, what was expected, what was found, and what to do."""
+"""Translates pydantic's errors into the terms of a cell file: the place, what was expected, what was found, and what to do."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from penumbra.shared.cell.faults import Faulty, close_to, meant, short
 from penumbra.shared.geometry import lens
 
 UNITS = {"[m]": "metres", "[rad]": "radians", "[px]": "pixels"}
-"""Units that a number out of range is often not in."""
+"""Units to suggest in an error about a number out of range."""
 
 
 def explain(model: type[BaseModel], errors: Sequence[Any]) -> list[tuple[list[str], str]]:
-    """Errors of pydantic as (place, reason), several where a validator has found several. A key is not missing where a mistyped
-    one stands for it."""
+    """Translates pydantic's errors into (place, reason), several where a validator found several. A key is not missing where a
+    mistyped one explains it."""
     out: list[tuple[list[str], str]] = []
     mistyped: set[tuple[str, ...]] = set()
     for error in sorted(errors, key=lambda error: error["type"] != "extra_forbidden"):
@@ -90,13 +90,13 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def known_keys(model: type[BaseModel], location: Sequence[str]) -> list[str]:
-    """The keys that may stand at a place; none where they are names of the user's."""
+    """Keys that the model allows at a place; none where the user chooses the names."""
     found = _model(_annotation(model, location))
     return [] if found is None else [name for name, field in found.model_fields.items() if not field.exclude]
 
 
 def _about(model: type[BaseModel], location: Sequence[str]) -> str:
-    """What a value is, and its unit, in brackets."""
+    """Description of a value with its unit, in brackets."""
     path = list(location)
     while path and path[-1].isdigit():  # an element of a list
         path.pop()
@@ -106,7 +106,7 @@ def _about(model: type[BaseModel], location: Sequence[str]) -> str:
 
 
 def _annotation(model: type[BaseModel], location: Sequence[str]) -> Any:
-    """The type of what stands at a place; None where nothing may stand there."""
+    """Type of the value at a place; None where no value may stand there."""
     found: Any = model
     for part in location:
         inner = _model(found)
@@ -128,7 +128,7 @@ def _annotation(model: type[BaseModel], location: Sequence[str]) -> Any:
 
 
 def _bare(annotation: Any) -> Any:
-    """A type without what is noted about it, and without None."""
+    """A type without its Annotated metadata and without None."""
     if typing.get_origin(annotation) is typing.Annotated:
         return _bare(typing.get_args(annotation)[0])
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
@@ -142,7 +142,7 @@ def _model(annotation: Any) -> type[BaseModel] | None:
 
 
 def _length(annotation: Any) -> int | None:
-    """The length of a list that always has the same; None of any other type."""
+    """Length of a list of fixed length; None for any other type."""
     arguments = typing.get_args(_bare(annotation))
     return None if typing.get_origin(_bare(annotation)) is not tuple or arguments[-1] is Ellipsis else len(arguments)
 

@@ -1,4 +1,4 @@
-"""What is wrong with a cell file, in words: file, line, place, what was expected, what was found, and what to do."""
+"""Faults of a cell file as text: file, line, place, what was expected, what was found, and what to do."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 
 class CellError(ValueError):
-    """A cell file that cannot be used; the text names the file, the line, what was expected and what was found."""
+    """A cell file that cannot be used. The text names the file, the line, what was expected and what was found."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """place: the keys on the way to it, joined by dots; empty where it concerns the whole file. A warning does not prevent a
-    start."""
+    """A fault of a cell file. place: the keys that lead to it, joined by dots; empty where it concerns the whole file. A warning
+    does not prevent a start."""
 
     path: Path
     line: int
@@ -29,7 +29,7 @@ class Fault:
 
 
 class Faulty(ValueError):
-    """What a validator of a model raises: places below the model, each with what was expected and found there."""
+    """Raised by a model's validator: places below the model, each with what was expected and found there."""
 
     def __init__(self, faults: Iterable[tuple[str, str]]):
         self.faults = tuple(faults)
@@ -37,26 +37,26 @@ class Faulty(ValueError):
 
 
 def refuse(faults: Sequence[tuple[str, str]]) -> None:
-    """Raises Faulty where there are any."""
+    """Raises Faulty where there are faults."""
     if faults:
         raise Faulty(faults)
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """`; did you mean NAME`, where one of the known names resembles it."""
+    """The hint `; did you mean NAME` where a known name resembles this one; else empty."""
     close = close_to(name, known)
     return f"; did you mean {close}" if close else ""
 
 
 def close_to(name: str, known: Iterable[str]) -> str:
-    """The one of the known names that resembles a name; empty where none does."""
+    """The known name that resembles a name; empty where none does."""
     known = list(known)
     close = difflib.get_close_matches(name[:60], known, 1, 0.6) or [each for each in known if each.lower() == name.lower()]
     return close[0] if close else ""
 
 
 def short(value: Any) -> str:
-    """A value in an error, in few characters. Python does not print very long integers at all."""
+    """A value in an error, shortened. Python refuses to print very long integers."""
     if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 64:
         return f"an integer of {value.bit_length()} bits"
     if isinstance(value, bool):

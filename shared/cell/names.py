@@ -1,5 +1,5 @@
-"""Where a cell file is, what the cell is called and what it tracks. Commands that only ask a running cell read no more: the model
-of a whole cell takes longer to import than they take to run."""
+"""Path of a cell file, and the names of the cell and its targets. Commands that only query a running cell read no more than this,
+because importing the model of a whole cell takes longer than they run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from penumbra.shared.cell.faults import CellError
 
 BUILT_IN = Path(__file__).parent / "built_in"
 NAME = r"^[A-Za-z0-9_-]{1,64}$"
-"""What a name in a cell file may be: it becomes a part of keys and of files' names."""
+"""Pattern of a name in a cell file. Names become parts of keys and of file names."""
 
 
 @dataclass(frozen=True)
@@ -24,16 +24,16 @@ class Names:
     targets: tuple[str, ...]
 
     def target(self, name: str | None) -> str:
-        """The name of a target, checked; None means the first one. Raises CellError."""
+        """Checked name of a target; None means the first one. Raises CellError."""
         return one(self.name, "target", self.targets, name)
 
 
 def read(cell: str | Path) -> Names:
-    """The names of a built-in cell or a YAML file. Raises CellError where there is no such file, or where they are not in it."""
+    """Names of a built-in cell or a YAML file. Raises CellError where there is no such file, or it lacks the names."""
     match document.read(source(cell)).data:
         case {"name": str(name), "targets": {**targets}} if targets and all(_is_name(each) for each in (name, *targets)):
             return Names(name, tuple(map(str, targets)))
-    from penumbra.shared.cell import description  # says what is wrong with the file
+    from penumbra.shared.cell import description  # it reports the faults of the file
 
     whole = description.load(cell)
     return Names(whole.name, tuple(whole.targets))
@@ -44,7 +44,7 @@ def _is_name(value: object) -> bool:
 
 
 def one(cell: str, kind: str, known: Iterable[str], name: str | None) -> str:
-    """The name of a part of a cell, checked; None means the first one. Raises CellError."""
+    """Checked name of a part of a cell; None means the first one. Raises CellError."""
     names = list(known)
     if name is None and names:
         return names[0]
@@ -54,7 +54,7 @@ def one(cell: str, kind: str, known: Iterable[str], name: str | None) -> str:
 
 
 def source(cell: str | Path) -> Path:
-    """The YAML file of a built-in name (`table`, `arm`) or path. Raises CellError where there is none."""
+    """YAML file of a built-in name (`table`, `arm`) or path. Raises CellError where there is none."""
     path = BUILT_IN / f"{cell}.yaml"
     if not is_file(path):
         path = Path(cell)
@@ -65,7 +65,7 @@ def source(cell: str | Path) -> Path:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file is there; none is where the name cannot be one."""
+    """Whether a file exists; false for a name that the file system does not allow."""
     try:
         return path.is_file()
     except (OSError, ValueError):

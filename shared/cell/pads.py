@@ -1,4 +1,4 @@
-"""The part of a cell file that describes the skin: designs of pads, and where pads sit."""
+"""Model of the skin in a cell file: designs of pads, and the placement of pads."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from penumbra.shared.geometry import rigid
 
 
 class Nominal(Model):
-    """An electrode's response as designed, on its pad's gap d [m] to a forearm that lies across: a1 / (1 + a2 d^2) [V]."""
+    """Designed response [V] of an electrode to a forearm that lies across the pad at the gap d [m]: a1 / (1 + a2 d^2)."""
 
     a1: Positive = Field(description="amplitude at contact [V]")
     a2: Positive = Field(description="decay with the gap [1/m^2]")
@@ -77,7 +77,8 @@ class Ring(Model):
 
 
 class Chain(Model):
-    """From a change of capacitance to an amplitude. The amplifier works around half of the reference, so amplitudes end there."""
+    """From a change of capacitance to an amplitude. The amplifier works around half of the converter's reference, so amplitudes
+    end there."""
 
     excitation_V: Annotated[Number, Field(gt=0, le=1e4)] = Field(description="amplitude of the excitation [V]")
     frequency_hz: Annotated[Number, Field(gt=0, le=1e9)] = Field(description="of the excitation [Hz]")
@@ -87,12 +88,12 @@ class Chain(Model):
 
     @cached_property
     def sensitivity(self) -> float:
-        """Volts of amplitude per femtofarad."""
+        """Amplitude per change of capacitance [V/fF]."""
         return self.excitation_V * 2.0 * np.pi * self.frequency_hz * self.feedback_ohm * 1e-15
 
 
 class Rest(Model):
-    """An amplitude as designed, with nothing near."""
+    """Designed amplitude without an object near."""
 
     a3: NotNegative = Field(description="offset [V]")
     polarity: Literal[-1, 1] = Field(default=1, description="whether it rises (1) or falls (-1) where something comes near")
@@ -100,8 +101,8 @@ class Rest(Model):
 
 
 class Law(Model):
-    """An electrode's calibrated response, the paper's law (eq. sensor_approx): v = a3 + polarity * a1 / (1 + a2 d^2), d the gap
-    to the skin [m]."""
+    """Calibrated response of an electrode, the paper's law (eq. sensor_approx): v = a3 + polarity * a1 / (1 + a2 d^2), where d is
+    the gap to the skin [m]."""
 
     a1: Positive = Field(description="amplitude at contact [V]")
     a2: Positive = Field(description="decay with the gap [1/m^2]")
@@ -136,7 +137,7 @@ class PadType(Model):
         return self
 
     def law(self, electrode: str) -> Law:
-        """An electrode's law as designed."""
+        """The designed law of an electrode."""
         nominal = self.electrodes[electrode].law
         return Law(a1=nominal.a1, a2=nominal.a2, a3=self.rest.a3, polarity=self.rest.polarity, noise=self.rest.noise)
 

@@ -1,4 +1,4 @@
-"""Every key of a cell file as Markdown, from the model. `python -m penumbra.shared.cell.reference docs/own-cell.md` writes it
+"""All keys of a cell file in Markdown, from the model. `python -m penumbra.shared.cell.reference docs/own-cell.md` writes them
 into that page; a test compares."""
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ NUMBERS = {"float": "number", "int": "whole number", "str": "text", "bool": "tru
 
 
 def markdown() -> str:
-    """A table for each map of a cell file, in the order of the file."""
+    """One table for each map of a cell file, in the order of the file."""
     sections: dict[type[BaseModel], list[str]] = {}
     _collect(Cell, "", sections)
     return "\n\n".join(_section(model, places) for model, places in sections.items())
 
 
 def inserted(page: str) -> str:
-    """A page with the tables between its marks. Raises ValueError where it has none."""
+    """The page with the tables between its marks. Raises ValueError where a mark is missing."""
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
@@ -36,7 +36,7 @@ def inserted(page: str) -> str:
 
 
 def _collect(model: type[BaseModel], place: str, out: dict[type[BaseModel], list[str]]) -> None:
-    """The models below one, each with the places where it stands."""
+    """Collects a model and all models below it, with the places of each."""
     out.setdefault(model, []).append(place)
     for name, field in model.model_fields.items():
         for inner, below in _models(field.annotation):
@@ -92,7 +92,7 @@ def _words(annotation: Any, limits: str = "") -> str:
 
 
 def _bare(annotation: Any) -> tuple[Any, str]:
-    """A type without its notes and without None, and its limits."""
+    """A type without its metadata and without None, and its limits."""
     limits = ""
     while typing.get_origin(annotation) in (typing.Annotated, typing.Union, types.UnionType):
         arguments = typing.get_args(annotation)
@@ -105,7 +105,7 @@ def _bare(annotation: Any) -> tuple[Any, str]:
 
 
 def _limits(notes: Any) -> str:
-    """Bounds as people write them: above 0, up to 5."""
+    """Bounds in words: above 0, up to 5."""
     found: dict[str, float] = {}
     for note in notes:
         for each in (note, *getattr(note, "metadata", ())):

@@ -1,4 +1,4 @@
-"""Where pictures and joints come from, as a cell file says it: KIND:PLACE."""
+"""Sources of pictures and joint positions in a cell file, written as KIND:PLACE."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from penumbra.shared.cell.fields import Model, Number
 
 
 class Source(Model):
-    """KINDS: what `url` begins with, before its first colon; FORMS: how it is written; ADAPTER: an example of a class."""
+    """A source. KINDS: allowed prefixes of `url`, before its first colon; FORMS: allowed forms; ADAPTER: an example of a
+    class."""
 
     KINDS: ClassVar[tuple[str, ...]]
     FORMS: ClassVar[str]
@@ -36,7 +37,7 @@ class Source(Model):
 
     @property
     def place(self) -> str:
-        """What follows the kind and its colon."""
+        """The URL after the kind and its colon."""
         return self.url.partition(":")[2]
 
     @property
@@ -47,7 +48,7 @@ class Source(Model):
 
 
 class CameraSource(Source):
-    """Where `penumbra camera` has a camera's pictures from. A camera with a source is left out by the emulator."""
+    """Source from which `penumbra camera` reads a camera's pictures. The emulator leaves out a camera that has a source."""
 
     KINDS = ("v4l2", "rtsp", "rtsps", "file", "folder", "adapter")
     FORMS = "v4l2:/dev/video0, rtsp://HOST/PATH, file:FILM, folder:PICTURES or adapter:MODULE:CLASS"
@@ -81,16 +82,16 @@ class CameraSource(Source):
 
     @property
     def is_played(self) -> bool:
-        """Whether it is played, and not what a camera sees now."""
+        """Whether the pictures are played back, rather than live."""
         return self.kind in ("file", "folder")
 
     def path(self, folder: Path) -> Path:
-        """Where a film or a folder is; folder: of relative paths."""
+        """Path of a film or a folder; folder: base of relative paths."""
         return folder / Path(self.place).expanduser()
 
 
 class JointSource(Source):
-    """Where `penumbra robot` has a robot's joints from."""
+    """Source from which `penumbra robot` reads a robot's joint positions."""
 
     KINDS = ("ur", "panda", "adapter")
     FORMS = "ur:ADDRESS, panda:ADDRESS or adapter:MODULE:CLASS"

@@ -1,1 +1,1 @@
-"""What every process agrees on: topics, messages, who may say what, and the names of classes and processes."""
+"""Interfaces between processes: topics, messages, access rights, and the names of classes and processes."""

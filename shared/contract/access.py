@@ -1,8 +1,8 @@
-"""Who may say what on a secured bus: the router's rules, from the tables of topics and of processes.
+"""Access control on a secured bus: the router's rules, from the tables of topics and processes.
 
-A certificate's common name is the name of its holder. Sensors and methods publish what the table says, report no health but
-their own, and read everything; a viewer only reads and asks; an operator also steers the emulator, the launcher and the
-recorder. What no rule allows, the router drops, without an answer to the sender.
+A certificate's common name is the name of its holder. Sensors and methods publish what the table assigns to them, report only
+their own health, and read everything. A viewer only reads and queries. An operator also controls the emulator, the launcher and
+the recorder. The router drops what no rule allows, without an answer.
 """
 
 from __future__ import annotations
@@ -16,36 +16,37 @@ from penumbra.shared.contract.topics import TOPICS, Topic
 SERVICES = tuple(process.name for process in processes.REPORTING)
 """Processes that publish, answer and report their own health."""
 ROUTER, OPERATOR, VIEWER = processes.ROUTER.name, "operator", "viewer"
-"""The meeting point, which passes on what other routers have let through, and people's commands."""
+"""The router, which passes on what other routers have admitted, and people's commands."""
 DRIVER = "driver"
-"""A program that publishes from cameras, robots or skins of its own; it reads like a viewer."""
+"""A user's program that publishes for its own cameras, robots or skins; it reads like a viewer."""
 HOLDERS = (*SERVICES, DRIVER, ROUTER, OPERATOR, VIEWER)
 
 ANSWERS = {
     process.name: [topics.QUERYABLES[name].format(cell="*", target="*") for name in process.answers]
     for process in processes.REPORTING
 }
-"""Queryables beside the health, by the process that answers them."""
+"""Queryables beside the health query, by the process that answers them."""
 EVERYTHING = ("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
               "liveliness_token", "liveliness_query", "declare_liveliness_subscriber")  # fmt: skip
 
 
 def holder(service: str, is_router: bool) -> str:
-    """The holder of the certificate that a process shows: what is no service only reads."""
+    """Holder of the certificate that a process shows. A process that is not in HOLDERS is a viewer."""
     if is_router:
         return ROUTER
     return service if service in (*SERVICES, DRIVER, OPERATOR) else VIEWER
 
 
 def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES) -> dict[str, Any]:
-    """Zenoh's `access_control` of a router, as JSON: allowed is what a rule names, on keys that lie within the rule's.
+    """Zenoh's `access_control` of a router, as JSON. A message is allowed if a rule names it and its key lies within the rule's
+    keys.
 
     table: the topics. services: the holders that publish, answer and report their health.
     """
     table, services = tuple(table), tuple(services)
     keys = [topic.at() for topic in table]
     rules = [
-        # a router's own clients are filtered where they come in, so that all may be handed out
+        # messages are filtered on ingress, so everything may leave
         _rule("receive", EVERYTHING, ["penumbra/**"], "egress"),
         _rule("pass on", EVERYTHING, ["penumbra/**"]),
         _rule("read", ["declare_subscriber"], keys),
@@ -79,7 +80,8 @@ def control(table: Iterable[Topic] = TOPICS, services: Iterable[str] = SERVICES)
 
 
 def limits(table: Iterable[Topic] = TOPICS) -> list[dict[str, Any]]:
-    """Zenoh's `low_pass_filter` of a router, as JSON: what is larger than a topic's messages can be does not come in."""
+    """Zenoh's `low_pass_filter` settings of a router, as JSON. The router refuses messages larger than their topic's maximum
+    size."""
     return [
         {
             "id": topic.name,

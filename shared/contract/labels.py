@@ -1,4 +1,4 @@
-"""What a pixel may show: the class indices of every mask (the authors' classes, and what else may stand in the way)."""
+"""Class indices of the pixels of every mask: the authors' classes, and occluders."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Label(IntEnum):
 
 
 TARGET_LABELS = (Label.FOREARM, Label.HAND)
-"""The classes of a forearm with its hand. Networks are trained for them, and their logits calibrated for them; at run time the
-classes of a target are those of the cell file (`labels`)."""
+"""Classes of a forearm with its hand, for which networks are trained and their logits calibrated. At run time the classes of a
+target come from the cell file (`labels`)."""
 COLOURS: dict[Label, tuple[int, int, int]] = {
     Label.ROBOT: (90, 120, 200),
     Label.TORSO: (150, 110, 170),
@@ -26,6 +26,6 @@ COLOURS: dict[Label, tuple[int, int, int]] = {
     Label.HAND: (20, 230, 200),
     Label.OCCLUDER: (200, 60, 60),
 }
-"""The colour [RGB, of 255] of each class where a mask is shown over its picture; the background stays as it is."""
+"""Overlay colour (R, G, B, 0 to 255) of each class; the background is not coloured."""
 UNLABELLED = 255
-"""Value in the masks of training data where the class is not known: losses and scores leave it out."""
+"""Value in the masks of training data for pixels of unknown class. Losses and scores ignore these pixels."""

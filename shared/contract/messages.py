@@ -1,10 +1,10 @@
-"""Every message that crosses the bus, and its wire format.
+"""All messages on the bus, and their wire format.
 
-A message is a frozen `msgspec.Struct`; on the wire it is a MessagePack map of its fields, an array being `[dtype, shape, bytes]`,
-led by the `version` of this format: any MessagePack library reads it. `decode` checks size, version, types, shapes, dtypes,
-ranges, finiteness and stamp. msgspec checks types, ranges and lengths in C, from the declarations below, and stops at the first
-wrong byte, so that no payload fills the memory. The bytes of an image or a mask are copied once where they are encoded, and not
-at all where they are decoded: the array is a read-only view of the payload.
+A message is a frozen `msgspec.Struct`. On the wire it is a MessagePack map of its fields that begins with the `version` of this
+format; an array is `[dtype, shape, bytes]`. Any MessagePack library reads it. `decode` checks size, version, types, shapes,
+dtypes, ranges, finiteness and stamp. msgspec checks types, ranges and lengths in C, from the declarations below, and stops at the
+first wrong byte, so that no payload fills the memory. The bytes of an image or a mask are copied once when they are encoded, and
+never when they are decoded: the array is a read-only view of the payload.
 """
 
 from __future__ import annotations
@@ -24,17 +24,16 @@ import numpy as np
 from msgspec.structs import force_setattr
 
 VERSION = 1
-"""Version of the wire format: it counts up with every change of a message's fields or of their meaning. Every version keeps it
-under `version` in a map, so that a reader of another one recognises it."""
+"""Version of the wire format. It increases with every change of a message's fields or of their meaning. Every version keeps it
+under `version` in a map, so that a reader of another version recognises it."""
 MAX_FUTURE_S = 0.5
-"""A stamp further ahead of the reader's clock than this is refused: clocks of one cell are kept closer than that."""
+"""Maximum time [s] of a stamp ahead of the reader's clock. Clocks of one cell are synchronised more closely."""
 MAX_PAST_S = 5.0
-"""A stamp older than this is refused, where a topic says nothing else: after a network cut the backlog arrives late and says
-nothing about now."""
+"""Default maximum age [s] of a stamp. After a network outage, queued messages arrive late and say nothing about the present."""
 
 
 class BadMessage(ValueError):
-    """A message that was refused. `kind` groups equal faults, so that each is logged once."""
+    """A refused message. `kind` groups equal faults, so that each kind is logged once."""
 
     def __init__(self, kind: str, text: str):
         super().__init__(text)
@@ -42,21 +41,22 @@ class BadMessage(ValueError):
 
 
 LARGEST = 1e12
-"""No quantity of a cell is larger in SI units, and its square is still finite."""
+"""Maximum magnitude of a number: no quantity of a cell is larger in SI units, and its square is still finite."""
 UNIT_TOLERANCE = 1e-3
-"""How far the norm of a quaternion may be from one."""
+"""Maximum deviation of a quaternion's norm from one."""
 ROUNDING = 1e-6
-"""What shares and matrices may be off by rounding, relative."""
+"""Relative tolerance for rounding errors in shares and matrices."""
 SMALL = 64
-"""Largest number of entries for which Python computes a norm as fast as NumPy, and several times faster where NumPy's code is in
-no cache, as with a message every few milliseconds."""
+"""Number of entries up to which Python computes a norm as fast as NumPy. It is several times faster where NumPy's code is not in
+the cache, as with a message every few milliseconds."""
 LONGEST_TEXT, MOST_SOURCES, MOST_PADS = 256, 32, 128
-"""Characters of a name, senses of a pose and pads of a skin: more than any message needs, less than fills a memory."""
+"""Maximum length of a name, of senses in a pose and of pads in a skin: more than any message needs, too little to exhaust
+memory."""
 
 
 @dataclass(frozen=True)
 class Array:
-    """What an array field holds. shape: None is any positive length. check: what else is wrong with the values, by their norm."""
+    """An array field. shape: None stands for any positive length. check: finds further faults of the values, given their norm."""
 
     dtype: np.dtype
     shape: tuple[int | None, ...]
@@ -73,7 +73,7 @@ class Array:
         return True
 
     def read(self, shape: tuple[int, ...], data: bytes | memoryview) -> np.ndarray:
-        """The array (read-only) whose bytes these are, when its values have been looked at. Raises BadMessage."""
+        """Read-only array from its bytes, after a check of its values. Raises BadMessage."""
         if len(data) != self.dtype.itemsize * math.prod(shape):
             wanted = self.dtype.itemsize * math.prod(shape)
             raise BadMessage("array", f"expected {wanted} bytes for {self.dtype} {list(shape)}, got {len(data)}")
@@ -81,7 +81,7 @@ class Array:
         array = flat if len(shape) == 1 else flat.reshape(shape)
         if self.dtype.kind != "f":
             return array
-        # the norm is soon made, and small where all is well; else each number is looked at, also where it is NaN
+        # a small norm, which is cheap to compute, proves that all is well; else each number is checked, also for NaN
         norm = math.hypot(*flat.tolist()) if flat.size <= SMALL else math.sqrt(float(np.vdot(flat, flat)))
         if not norm <= LARGEST and not np.abs(flat).max() <= LARGEST:
             count = int((~(np.abs(flat) <= LARGEST)).sum())
@@ -92,9 +92,9 @@ class Array:
 
 
 def array(dtype: str, *shape: int | None, check: Callable[[np.ndarray, float], str | None] | None = None) -> Any:
-    """The type of [dtype, shape, bytes], of which msgspec lets nothing else through. Images stay in the payload; numbers are
-    copied by msgspec, and so begin at a multiple of their size, as compiled code wants them."""
-    literal: Any = Literal  # of values that are known only here
+    """Type of the wire form [dtype, shape, bytes]; msgspec accepts nothing else. The bytes of an image are a view of the payload.
+    Numbers are copied by msgspec, so that they are aligned to their size, as compiled code requires."""
+    literal: Any = Literal  # its values are known at run time only
     lengths = tuple(Annotated[int, msgspec.Meta(ge=1)] if n is None else literal[n] for n in shape)
     data = memoryview if dtype == "uint8" else bytes
     wire: Any = types.GenericAlias(tuple, (literal[dtype], types.GenericAlias(tuple, lengths), data))
@@ -106,7 +106,7 @@ def not_unit(value: np.ndarray, norm: float) -> str | None:
 
 
 def not_semidefinite(value: np.ndarray, norm: float) -> str | None:
-    if value.tobytes() == value.T.tobytes():  # to the last bit: the usual case, and quickly seen
+    if value.tobytes() == value.T.tobytes():  # identical to the last bit: the usual case, and a cheap test
         if _is_positive_definite(value.tolist()):
             return None
     elif np.abs(value - value.T).max() > ROUNDING * float(np.abs(value).max()):
@@ -116,7 +116,7 @@ def not_semidefinite(value: np.ndarray, norm: float) -> str | None:
 
 
 def _is_positive_definite(rows: list[list[float]]) -> bool:
-    """Whether the Cholesky factor of a symmetric matrix exists. NumPy takes three times longer where its code is in no cache."""
+    """Whether a symmetric matrix has a Cholesky factor. NumPy takes three times as long when its code is not in the cache."""
     factor: list[list[float]] = []
     for i, given in enumerate(rows):
         row: list[float] = []
@@ -159,22 +159,22 @@ Pixel = Annotated[int, msgspec.Meta(ge=-8192, le=8192)]
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="version", tag=VERSION):
-    """What all messages share. `stamp_ns`: time of the measurement (not of its publication), nanoseconds since the epoch."""
+    """Base of all messages. `stamp_ns`: time of the measurement (not of its publication), nanoseconds since the epoch."""
 
     MAX_BYTES: ClassVar[int] = 65_536
     stamp_ns: int
 
 
 class Frame(Message, frozen=True, kw_only=True):
-    """One camera image as the camera took it, row-major RGB, pixel centres at integer coordinates."""
+    """One camera image, not undistorted, row-major RGB, pixel centres at integer coordinates."""
 
     MAX_BYTES: ClassVar[int] = 64_000_000
     image: Image
 
 
 class Mask(Message, frozen=True, kw_only=True):
-    """Class indices (`shared.contract.labels`) of a window of a frame. Mask pixel (r, c) covers `scale` x `scale` image pixels
-    whose first is (y0 + r * scale, x0 + c * scale); outside the window nothing is known. Image pixels are those of the
+    """Class indices (`shared.contract.labels`) of a window of a frame. Mask pixel (r, c) covers `scale` x `scale` image pixels,
+    the first of which is (y0 + r * scale, x0 + c * scale). Outside the window the class is unknown. Image pixels are those of the
     undistorted image (`shared.geometry.lens`)."""
 
     MAX_BYTES: ClassVar[int] = 32_000_000
@@ -185,7 +185,7 @@ class Mask(Message, frozen=True, kw_only=True):
 
 
 class Joints(Message, frozen=True, kw_only=True):
-    """Joint angles [rad] in the order of the robot description."""
+    """Joint angles [rad] or displacements [m] in the order of `joints` in the cell file."""
 
     position: Numbers
 
@@ -198,8 +198,8 @@ class Voltages(Message, frozen=True, kw_only=True):
 
 
 class VisionPose(Message, frozen=True, kw_only=True):
-    """What the camera says. `overlap` in [0, 1] over the pixels that are scored; `hidden`: share of the target's pixels
-    that something covers; `state`: tracking, occluded (too little is seen: do not use) or lost."""
+    """Pose measured by a camera. `overlap`: in [0, 1], over the pixels that are scored; `hidden`: covered share of the target's
+    pixels; `state`: tracking, occluded (too little is visible: do not use) or lost."""
 
     target: Name
     camera: Name
@@ -217,15 +217,15 @@ ContactState = Literal["none", "touch", "grip"]
 
 
 class SurfacePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The point of the nearest surface before a pad, whatever it belongs to.
+    """Nearest surface point in front of a pad, on any object.
 
     Attributes:
-        link: What carries the pad, `world` or ROBOT/LINK.
-        position: Of the point (x, y, z), in the pose's frame [m].
-        distance: From the pad's middle [m].
+        link: Link that carries the pad, `world` or ROBOT/LINK.
+        position: The point (x, y, z), in the pose's frame [m].
+        distance: From the middle of the pad to the point [m].
         along: Standard deviation of the distance, along the line from the pad, which is the surface's normal [m].
         across: Standard deviation of the point across this line [m].
-        gap: Of the surface to the pad's board, wherever that is nearest [m].
+        gap: Smallest distance between the surface and the pad's board [m].
     """
 
     link: Name
@@ -237,17 +237,22 @@ class SurfacePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HapticPose(Message, frozen=True, kw_only=True):
-    """What the skin says. `information` (6 x 6, inverse covariance) is zero along directions that it does not observe. `stamp_ns`
-    is the time that the pose belongs to, `sample_stamp_ns` that of the newest voltage sample in it. `state`: in_range (a limb),
-    unidentified (a limb or something else: the pose is that of the limb that would feel so), object (no limb: the same, without
-    information) or out_of_range (nothing near). Use in_range alone as the target's pose. `surface`: by pad, the nearest point of
-    whatever is there, for each pad that feels something: the `link` that carries the pad, the point's `position` in `frame`, its
-    `distance` from the pad's middle with the standard deviations `along` and `across` the line between them, and the surface's
-    `gap` to the pad's board [m]; no shape is assumed, and the points belong to no target. `contact`: none, touch (a surface is
-    within 5 mm of a pad) or grip (on opposite sides of one link), whatever the `state`, of the pads `touched`. `step`: the
-    translation [m] and the rotation vector [rad], about the frame's axes, that lead to this pose from the one at which its
-    likelihood was linearised: where poses that are uncertain by tens of degrees are put together, that is done about the latter,
-    as fusion does."""
+    """Pose measured by the skin. `information` (6 x 6, inverse covariance) is zero along directions that are not observed.
+    `stamp_ns` is the time of the pose, `sample_stamp_ns` that of the newest voltage sample in it.
+
+    `state`: in_range (a limb), unidentified (a limb or another object: the pose is that of a limb that would give these
+    voltages), object (not a limb: the same pose, with zero information) or out_of_range (nothing near). Use only in_range as the
+    target's pose.
+
+    `surface`: the nearest surface point by pad, for each pad that senses something: the `link` that carries the pad, the point's
+    `position` in `frame`, its `distance` from the middle of the pad with the standard deviations `along` and `across` the line
+    between them, and the `gap` between the surface and the pad's board [m]. No shape is assumed, and the points belong to no
+    target. `contact`: none, touch (a surface came within 5 mm of a pad and is still within 10 mm) or grip (on opposite sides of
+    one link), for the pads `touched`, whatever the `state`.
+
+    `step`: translation [m] and rotation vector [rad], about the frame's axes, from the linearisation point of the likelihood to
+    this pose. Combine poses that are uncertain by tens of degrees at the linearisation point, as fusion does.
+    """
 
     target: Name
     frame: Name
@@ -264,7 +269,7 @@ class HapticPose(Message, frozen=True, kw_only=True):
 
 
 class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One sense as the observer sees it.
+    """Contribution of one sense to a fused pose.
 
     Attributes:
         age_s: Age of its last accepted measurement [s].
@@ -279,10 +284,10 @@ FusedState = Literal["tracking", "coasting", "lost"]
 
 
 class FusedPose(Message, frozen=True, kw_only=True):
-    """The one pose. `velocity`: linear [m/s] and angular [rad/s] along the frame's axes. `state`: tracking (a sense measures the
-    target, and three standard deviations of the position are within the target's `tracking_bound`), coasting (no sense does, the
-    newest measurement contradicts the pose, or it is less certain: do not rely on it within the bound) or lost. `sources` by name
-    (of the table of senses); a sense that has sent nothing is absent."""
+    """The fused pose. `velocity`: linear [m/s] and angular [rad/s] along the frame's axes. `state`: tracking (a sense measures
+    the target, and three standard deviations of the position are within the target's `tracking_bound`), coasting (no sense does,
+    the newest measurement contradicts the pose, or the pose is less certain: do not rely on it within the bound) or lost.
+    `sources`: by name (see the table of senses), without senses that have sent nothing."""
 
     target: Name
     frame: Name
@@ -295,8 +300,8 @@ class FusedPose(Message, frozen=True, kw_only=True):
 
 
 class SmoothedPose(Message, frozen=True, kw_only=True):
-    """The pose afterwards, from the measurements before and after its stamp: in files of `penumbra replay --smooth`, never on the
-    bus. Fields as of FusedPose. `state`: as there, by the measurement that is nearest in time, before or after."""
+    """The pose in hindsight, from measurements before and after its stamp. It occurs in files of `penumbra replay --smooth`,
+    never on the bus. Fields as in FusedPose, but `state` depends on the measurement nearest in time, before or after."""
 
     target: Name
     frame: Name
@@ -308,7 +313,7 @@ class SmoothedPose(Message, frozen=True, kw_only=True):
 
 
 class Truth(Message, frozen=True, kw_only=True):
-    """What the emulator knows. `hidden`: share of the target's pixels covered in the last frame; `gap`: smallest distance
+    """Ground truth of the emulator. `hidden`: covered share of the target's pixels in the last frame; `gap`: smallest distance
     from an electrode to the target's skin [m]."""
 
     target: Name
@@ -324,9 +329,9 @@ M = typing.TypeVar("M", bound=Message)
 
 
 class Codec(typing.Generic[M]):
-    """How messages of a class go over the wire, worked out once from its declarations; `codec` makes it.
+    """Encodes and decodes messages of one class. It is derived once from the class's declarations; get it from `codec`.
 
-    arrays: the fields that hold one. faults: by field, the `kind` of BadMessage for a value that msgspec refuses.
+    arrays: the array fields. faults: by field, the `kind` of BadMessage for a value that msgspec refuses.
     """
 
     def __init__(self, kind: type[M]):
@@ -351,28 +356,28 @@ class Codec(typing.Generic[M]):
         return _ENCODER.encode(message)
 
     def decode(self, payload: bytes) -> M:
-        """As the function `decode`, but for size and stamp."""
+        """As the function `decode`, without the checks of size and stamp."""
         try:
             message = self.decoder.decode(payload)
-        except MemoryError:  # the reader's fault
+        except MemoryError:  # not a fault of the message
             raise
         except Exception as error:
             raise self.refusal(payload, error) from None
-        if not payload.startswith(_LED, 1) and _version(payload) != VERSION:  # msgspec takes a map without a version, too
+        if not payload.startswith(_LED, 1) and _version(payload) != VERSION:  # msgspec also accepts a map without a version
             raise self.refusal(payload, msgspec.ValidationError("no version"))
         for name, spec in self.arrays:
             given = getattr(message, name)
-            if isinstance(given, np.ndarray):  # what stands for a field that was not sent
+            if isinstance(given, np.ndarray):  # the default of a field that was not sent
                 continue
             _, shape, data = given
             try:
-                force_setattr(message, name, spec.read(shape, data))  # nobody else has seen this message
+                force_setattr(message, name, spec.read(shape, data))  # no other code has this message yet
             except BadMessage as error:
                 raise BadMessage(error.kind, f"{self.kind.__name__}.{name}: {error}") from None
         return message
 
     def refusal(self, payload: bytes, error: Exception) -> BadMessage:
-        """Why msgspec did not take a payload. Another release may send other fields: its version is the reason, then."""
+        """Reason why msgspec refused a payload. Another release may send other fields; then the version is the reason."""
         where = self.kind.__name__
         if not isinstance(error, msgspec.ValidationError):
             return BadMessage("msgpack", f"{where}: expected MessagePack, got {payload[:16]!r}… ({error!s:.100})")
@@ -399,7 +404,7 @@ _making = threading.Lock()
 
 @functools.cache
 def _made(kind: type[Message]) -> Codec[Any]:
-    with _making:  # a thread that decodes a class which msgspec is still working out for another one ends the process
+    with _making:  # decoding a class while msgspec still compiles it in another thread crashes the process
         return Codec(kind)
 
 
@@ -408,12 +413,13 @@ codec = typing.cast(Callable[[type[M]], Codec[M]], _made)
 
 
 def encode(message: Message) -> bytes:
-    """The MessagePack bytes of a message. Raises BadMessage where an array has not the declared dtype and shape."""
+    """MessagePack bytes of a message. Raises BadMessage where an array does not have the declared dtype and shape."""
     return codec(type(message)).encode(message)
 
 
 def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: float = MAX_PAST_S) -> M:
-    """The message of this kind in `payload`. With `now_ns`, its stamp must not be older than oldest_s, nor MAX_FUTURE_S ahead.
+    """The message of this kind in `payload`. With `now_ns`, its stamp must be at most oldest_s old and at most MAX_FUTURE_S
+    ahead.
 
     Raises BadMessage that says what was expected and what was received.
     """
@@ -426,7 +432,7 @@ def decode(kind: type[M], payload: bytes, now_ns: int | None = None, oldest_s: f
 
 
 def check_stamp(kind: type[Message], stamp_ns: int, now_ns: int, oldest_s: float) -> None:
-    """Raises BadMessage where the stamp of a message is too far from the reader's clock."""
+    """Raises BadMessage where a message's stamp is too far from the reader's clock."""
     age_s = (now_ns - stamp_ns) * 1e-9
     if age_s > oldest_s:
         raise BadMessage("past", f"{kind.__name__}: expected a stamp at most {oldest_s:g} s old, got {age_s:.3f} s")
@@ -437,7 +443,7 @@ def check_stamp(kind: type[Message], stamp_ns: int, now_ns: int, oldest_s: float
 
 
 class Head(msgspec.Struct, frozen=True, gc=False):
-    """What a reader must know of a message that it does not look at; its other fields are skipped."""
+    """Fields that a reader needs of a message that it does not decode; the other fields are skipped."""
 
     version: Literal[VERSION]  # type: ignore[valid-type]
     stamp_ns: int
@@ -448,7 +454,7 @@ _HEADS = msgspec.msgpack.Decoder(Head)
 
 
 def head(kind: type[Message], payload: bytes) -> Head:
-    """The head of a message of this kind. Raises BadMessage where it has none of this version."""
+    """Head of a message of this kind. Raises BadMessage where the payload is not a message of this version."""
     try:
         return _HEADS.decode(payload)
     except MemoryError:
@@ -458,9 +464,9 @@ def head(kind: type[Message], payload: bytes) -> Head:
 
 
 def _plain(value: Any) -> Any:
-    """An array as [dtype, shape, bytes], and a NumPy scalar as a Python number: msgspec knows neither."""
+    """An array as [dtype, shape, bytes], and a NumPy scalar as a Python number. msgspec supports neither."""
     if type(value) is np.ndarray:
-        # `tobytes` is one call for any layout, but copies, which an image is too large for
+        # `tobytes` is one call for any layout, but it copies, and images are too large for that
         data = np.ascontiguousarray(value).data if value.itemsize == 1 else value.tobytes()
         return _NAMES[value.dtype], value.shape, data
     if isinstance(value, np.generic):
@@ -471,21 +477,21 @@ def _plain(value: Any) -> Any:
 _NAMES = {np.dtype(name): name for name in ("uint8", "float32", "float64")}
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
 _LED = msgspec.msgpack.encode({"version": VERSION})[1:]
-"""How the fields of our messages begin."""
+"""First bytes of the fields of our messages."""
 
 
 class _Version(msgspec.Struct):
-    """The version of a message of any release; what else is in it is skipped and not made into objects."""
+    """The version in a message of any release. Its other fields are skipped, without creating objects."""
 
     version: msgspec.Raw = msgspec.Raw(msgspec.msgpack.encode(None))
 
 
 def _version(payload: bytes) -> Any:
-    """The version that a payload carries, None where it carries none. Raises msgspec.DecodeError where it is no map of names."""
+    """The version in a payload, None where it has none. Raises msgspec.DecodeError where it is not a map of names."""
     raw = msgspec.msgpack.decode(payload, type=_Version).version
     return msgspec.msgpack.decode(raw) if len(raw) <= LONGEST_TEXT else f"something of {len(raw)} bytes"
 
 
 def _short(value: Any) -> str:
-    """A value in a log line, and never more of it than a line holds."""
+    """A value in a log line, shortened."""
     return f"{value!r:.60}"

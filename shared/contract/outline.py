@@ -1,4 +1,4 @@
-"""What a program without the cell file must know of a cell. Fusion answers with it on `topics.description`, as JSON."""
+"""Summary of a cell for programs without the cell file. Fusion answers with it on `topics.description`, as JSON."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class CameraOutline:
 
 @dataclass(frozen=True)
 class PadOutline:
-    """A pad: its electrodes in the order of the columns of its voltages, and the largest amplitude of its converter [V]."""
+    """A pad: its electrodes in the order of the columns of its voltages, and the reference of its converter [V], the limit of
+    voltages."""
 
     electrodes: tuple[str, ...]
     limit_V: float
@@ -38,8 +39,8 @@ class PadOutline:
 
 @dataclass(frozen=True)
 class Outline:
-    """A cell: its name and fixed frame, and its targets, cameras, robots (with their joints, in the order of `Joints.position`)
-    and pads by name, in the order of the cell file. wire_version: of the messages on its bus."""
+    """A cell: its name and fixed frame, and its targets, cameras, robots (joints in the order of `Joints.position`) and pads by
+    name, in the order of the cell file. wire_version: of the messages on its bus."""
 
     name: str
     frame: str
@@ -74,7 +75,7 @@ def of(cell: Cell) -> Outline:
 
 
 def decode(payload: bytes) -> Outline:
-    """The outline in an answer. Raises BadMessage for what is none, and for that of a release with other messages."""
+    """The outline in an answer. Raises BadMessage where it is not one, or comes from a release with other messages."""
     try:
         outline = _DECODER.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

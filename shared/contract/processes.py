@@ -1,4 +1,4 @@
-"""The one table of processes. Launcher, command line, access rules, doctor and metrics are derived from it; import contracts,
+"""Table of all processes. Launcher, command line, access rules, doctor and metrics are derived from it; import contracts,
 Dockerfile and compose file are tested against it.
 
 To add a service, add a row here and a folder `services/NAME` whose `service.py` has NAME, FLAGS and `start`.
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tool:
-    """A command beside a service, such as `penumbra segmentation train`. `about`: its line in the service's help; `function`:
-    `MODULE:NAME` of its `services.flags.Command`; `extra`: what it needs of `pip install -e '.[EXTRA]'`."""
+    """A command of a service, such as `penumbra segmentation train`. `about`: its line in the service's help; `function`:
+    `MODULE:NAME` of its `services.flags.Command`; `extra`: the extras that it needs, as in `pip install -e '.[EXTRA]'`."""
 
     name: str
     about: str
@@ -26,7 +26,7 @@ class Tool:
 
 @dataclass(frozen=True)
 class Flag:
-    """A flag of a service that `penumbra up` takes too and passes on. `choices`: its values, where they are few."""
+    """A flag of a service that `penumbra up` also accepts and passes on. `choices`: its allowed values, empty for any."""
 
     name: str
     about: str
@@ -36,8 +36,8 @@ class Flag:
 
 @dataclass(frozen=True)
 class Starter:
-    """A flag of `penumbra up` that starts a process of which it starts none otherwise. `passes`: the process' own flag that gets
-    its value; `without`: that value, where none is given; `value`: what help calls it."""
+    """A flag of `penumbra up` that starts an optional process. `passes`: the process's own flag that receives the value;
+    `without`: the value where none is given; `value`: its placeholder in the help text."""
 
     name: str
     about: str
@@ -48,11 +48,11 @@ class Starter:
 
 @dataclass(frozen=True)
 class Metric:
-    """A number in a service's own health report that becomes a metric, one per entry of the report.
+    """A metric taken from a service's own section of the health report, one sample per entry.
 
-    `name`: of the metric; `each`: the label that names the entry; `field`: where the number is; `within`: the part of the report
-    that holds the entries, empty for the whole; `values`: the words that the field can be, each of which becomes a gauge of 0
-    or 1; `is_counter`: whether it only grows.
+    `name`: of the metric; `each`: label that names the entry; `field`: key of the number; `within`: part of the report that holds
+    the entries, empty for the whole; `values`: possible texts of the field, each exported as a gauge of 0 or 1; `is_counter`:
+    whether the number only grows.
     """
 
     name: str
@@ -68,14 +68,14 @@ class Metric:
 class Process:
     """One row of the table.
 
-    `about`: the line of `penumbra --help`; `extra`: what it needs of `pip install -e '.[EXTRA]'`; `needs`: the part of the cell
-    without which it has nothing to do; `vision`: the way to see that it belongs to, None where to all; `replicas`: how many
-    `penumbra up` starts; `restart`: whether one that died is started again; `flags`: those that `penumbra up` passes on;
-    `starter`: the flag of `penumbra up` that starts one, where it starts none otherwise;
-    `beside`: whether a second one may run, which shares the streams with the first; `is_required`: whether the cell is cut off
-    without it; `tools`: commands beside the service; `trained_by`: the tool that makes its weights; `answers`: names of the
-    queryables that it answers beside its health (`shared.contract.topics.QUERYABLES`); `metrics`: what of its report becomes
-    metrics; `in_compose`: whether `docker compose` runs it; `imports_sim`: whether its image holds the simulated world.
+    `about`: line of `penumbra --help`; `extra`: the extras that it needs, as in `pip install -e '.[EXTRA]'`; `needs`: part of the
+    cell without which it has nothing to do; `vision`: vision method that it belongs to, None for all; `replicas`: number that
+    `penumbra up` starts; `restart`: whether it is restarted after a crash; `flags`: passed on by `penumbra up`; `starter`: flag
+    of `penumbra up` that starts one, where it is not started by default; `beside`: whether a second instance may run and share
+    the streams with the first; `is_required`: whether the cell is disconnected without it; `tools`: commands of the service;
+    `trained_by`: tool that trains its weights; `answers`: names of the queryables that it answers beside its health
+    (`shared.contract.topics.QUERYABLES`); `metrics`: metrics from its report; `in_compose`: whether `docker compose` runs it;
+    `imports_sim`: whether its image contains the simulated world.
     """
 
     name: str
@@ -98,11 +98,11 @@ class Process:
 
     @property
     def module(self) -> str:
-        """The module that wires it to the bus."""
+        """The module that connects it to the bus."""
         return f"penumbra.services.{self.name}.service"
 
     def is_needed(self, cell: Cell) -> bool:
-        """Whether the cell has what this process works on."""
+        """Whether the cell has the parts that this process works on."""
         return self.needs is None or bool(getattr(cell, self.needs))
 
 
@@ -268,7 +268,7 @@ PROCESSES = (
         "fusion",
         "both poses to the one pose",
         extra="fusion",
-        replicas=2,  # the pose must not pause where one of them dies
+        replicas=2,  # the pose must not pause when one of them dies
         flags=(Flag("observer", "of the fusion", choices=("default", "paper")),),
         answers=("current_pose", "description"),
         metrics=(
@@ -348,21 +348,21 @@ LAUNCHER = Process(
     ),
     in_compose=False,
 )
-"""The launcher is a process on the bus like those that it starts, but not one of them."""
+"""The launcher is a process on the bus like those that it starts, but is not in PROCESSES."""
 
 ROUTER = PROCESSES[0]
 REPORTING = (*(process for process in PROCESSES if process is not ROUTER), LAUNCHER)
-"""Processes with a certificate of their own and what it allows; the router's allows it to pass on everything."""
+"""Processes with a certificate and access rights of their own; the router's certificate lets it pass on everything."""
 VISION = tuple(dict.fromkeys(process.vision for process in PROCESSES if process.vision))
-"""Ways to see: segmentation and search of its masks, or the paper's rival in place of both. The first is the default."""
+"""Vision methods, the default first: segmentation with search on its masks, or the paper's competing method in place of both."""
 
 
 def find(name: str) -> Process | None:
-    """The process of that name, the launcher included; None where there is none."""
+    """The process of this name, the launcher included; None where there is none."""
     return next((process for process in (*PROCESSES, LAUNCHER) if process.name == name), None)
 
 
 def tool(service: str, name: str) -> Tool | None:
-    """The tool of a service; None where it has none of that name."""
+    """The tool of a service by name; None where there is none."""
     process = find(service)
     return next((tool for tool in process.tools if tool.name == name), None) if process else None

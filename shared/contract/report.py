@@ -1,4 +1,4 @@
-"""The health report: the answer of a process to the health query, as JSON on the bus and typed here."""
+"""The health report: a process's answer to the health query, as JSON on the bus and typed here."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import msgspec
 
 @dataclass(frozen=True)
 class TopicReport:
-    """The messages of one key that a process has received or published.
+    """Statistics of the messages on one key that a process has received or published.
 
-    count: good messages. rate_hz: good messages a second. age_s: since the newest measurement [s], None where there was none.
-    delay_s: from the measurement of the last message to its arrival [s], None where that is not known. dropped: messages that
-    their publishers numbered and that never arrived, None where nobody numbers them. bad: refused messages by kind. stale:
-    whether the input is missing.
+    count: good messages. rate_hz: good messages per second. age_s: time since the newest measurement [s], None before the first.
+    delay_s: time from the measurement in the last message to its arrival [s], None where it is unknown. dropped: numbered
+    messages that never arrived, None where no publisher numbers its messages. bad: refused messages by kind. stale: whether the
+    input is missing.
     """
 
     count: int = 0
@@ -33,11 +33,11 @@ class Report:
     """One running instance of a service.
 
     status: ok, starting, degraded or down (`shared.runtime.health`), with its reasons in words. host, pid: where it runs. cell:
-    name of its cell. wire_version: of `shared.contract.messages`. ready: whether the other replicas count on it. hangs: what
-    hangs, in words, empty where nothing does. progress: what it does before it can work and how far it is, as in `compiling 12 of
-    40`; empty where it is ready to work. uptime_s: since it began [s]. cpu: in use [cores]. memory_mb: resident [MB]. replicas:
-    living instances of the service. topics, published: by key. stale: keys of missing inputs. faults: exceptions by kind and
-    place. report: what the service adds, by name.
+    name of its cell. wire_version: of `shared.contract.messages`. ready: whether the other replicas count it as available. hangs:
+    description of what hangs; empty where nothing does. progress: of its preparation, as in `compiling 12 of 40`; empty where it
+    is ready. uptime_s: time since its start [s]. cpu: in use [cores]. memory_mb: resident [MB]. replicas: living instances of the
+    service. topics, published: statistics by key. stale: keys of missing inputs. faults: exceptions by kind and place. report:
+    the service's own entries, by name.
     """
 
     service: str
@@ -62,7 +62,7 @@ class Report:
     report: dict[str, Any] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """The report as JSON objects; `report` is left out where the service adds nothing."""
+        """The report as JSON objects, without `report` where the service adds nothing."""
         out = dataclasses.asdict(self)
         if not self.report:
             del out["report"]
@@ -73,6 +73,6 @@ _DECODER = msgspec.json.Decoder(Report)
 
 
 def read(answer: bytes) -> Report:
-    """The report in the answer to a health query. Fields that another release sends besides are ignored. Raises ValueError for
-    what is no report."""
+    """Report in the answer to a health query. Additional fields of other releases are ignored. Raises ValueError where the answer
+    is not a report."""
     return _DECODER.decode(answer)

@@ -1,6 +1,7 @@
-"""The one table of senses: what each measures, on which topic, and what is known of its errors.
+"""Table of all senses: the quantity that each measures, its topic, and the model of its errors.
 
-Fusion knows nothing else of its senses. A new sense is a row here, a topic with its message, and the service that publishes it.
+Fusion knows nothing else about its senses. A new sense is a row here, a topic with its message, and the service that publishes
+it.
 """
 
 from __future__ import annotations
@@ -13,28 +14,28 @@ from penumbra.shared.contract.topics import Topic
 
 
 class Measures(Enum):
-    """What a sense measures, by the fields of its message. All have `target` and `frame` too."""
+    """Kinds of measurement, by the fields of their messages. All messages also have `target` and `frame`."""
 
     POSE = ("position", "orientation", "covariance")
     """A pose with its covariance (6, 6)."""
     POSE_INFORMATION = ("position", "orientation", "information")
-    """A pose with its information (6, 6), the inverse covariance: zero along directions that are not observed. It may have a
-    `step`, too: the pose error (6,) that leads to the pose from the one at which its likelihood was linearised."""
+    """A pose with its information (6, 6), the inverse covariance, which is zero along directions that are not observed. It may
+    also have a `step`: the pose error (6,) from the pose at which its likelihood was linearised to this pose."""
     POSITION = ("position", "covariance")
     """The position of the target's origin with its covariance (3, 3)."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """What is known of the errors of one sense beside what its messages say.
+    """Error model of one sense, beyond the content of its messages.
 
-    lasting : share of the variance that is the same from one measurement to the next. 0.75: chosen, not measured.
-    time_constant : time constant [s] with which such an error decays. 1 s: chosen, not measured.
-    floor : standard deviation of what its covariance does not contain, its calibration, in `records.UNITS` of fusion: 0.006 is
-        0.6 mm and 0.34 degrees. All of it lasts. Chosen, not measured.
-    gate : probabilities with which a good measurement passes the gate; the second, while another sense is less surprising; the
-        third, while so and after a row of refusals (`FusionSettings.refusals`): a sense that was wrong is used again when it
-        agrees, not when it is nearly plausible. All are shares in `chi_square.QUANTILES`.
+    lasting : share of the variance that is common to successive measurements. 0.75: chosen, not measured.
+    time_constant : time constant [s] with which this common error decays. 1 s: chosen, not measured.
+    floor : standard deviation of errors that its covariance does not contain (its calibration), in `records.UNITS` of fusion:
+        0.006 is 0.6 mm and 0.34 degrees. These errors do not decay. Chosen, not measured.
+    gate : probabilities with which a good measurement passes the gate. The second applies while another sense is less
+        surprising; the third applies in that case after a row of refusals (`FusionSettings.refusals`): a sense that was wrong is
+        used again when it agrees, not when it is nearly plausible. All are keys of `chi_square.QUANTILES`.
     """
 
     lasting: float = 0.75
@@ -49,12 +50,12 @@ class Sense:
 
     name : as in `FusedPose.sources`, the health report and the log.
     topic : its messages, one stream for each target. `topic.publishers` are the services that may publish it.
-    measures : what its messages contain.
-    errors : what the filter assumes of its errors.
-    usable : value of the message's `state` with which a measurement is used; with any other the sense is only known to be there.
-        None for a message without a state.
-    part : field of the message that names the part of the cell which measured ("camera"). Each part is a stream of its own, with
-        one publisher at a time. None where a target has one stream.
+    measures : kind of measurement in its messages.
+    errors : error model that the filter assumes.
+    usable : value of the message's `state` with which a measurement is used; with any other value the sense only counts as
+        present. None for a message without a state.
+    part : message field that names the part of the cell which measured ("camera"). Each part is a separate stream with one
+        publisher at a time. None where a target has one stream.
 
     Raises TypeError for a topic that is not of a target, and for a message without these fields.
     """
@@ -79,9 +80,9 @@ class Sense:
 
 
 SENSES = (
-    # a mask's bias lasts for as long as the limb rests
+    # the bias of a mask is constant while the limb rests
     Sense("vision", topics.VISION, Measures.POSE, Errors(lasting=0.75, time_constant=1.0), usable="tracking", part="camera"),
-    # windows of the skin share no samples and the noise of its voltages is white: measured on the emulator, a fifth of the
-    # variance is the response model's and lasts
+    # windows of the skin share no samples and the noise of its voltages is white. Measured on the emulator: a fifth of the
+    # variance comes from the response model and is common to successive windows
     Sense("haptic", topics.HAPTIC, Measures.POSE_INFORMATION, Errors(lasting=0.2, time_constant=0.3), usable="in_range"),
 )

@@ -1,4 +1,4 @@
-"""The one table of topics. The bus, `penumbra topics`, the health check and the access rules all read it."""
+"""Table of all topics, used by the bus, `penumbra topics`, the health check and the access rules."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 
 class QoS(Enum):
-    """Why a topic is sent as it is."""
+    """Quality of service of a topic, with its reason."""
 
     LATEST_WINS = "a new sample makes the old one worthless: never wait for a slow reader"
     NEVER_DROP = "every message counts: wait for the reader"
 
 
 class Priority(Enum):
-    """What goes first where several messages wait for a link: Zenoh's priority of that name, which has a queue of its own."""
+    """Zenoh priority of a topic. Each priority has its own queue on a link, and higher ones are sent first."""
 
     POSE = "INTERACTIVE_HIGH"
     SIGNAL = "DATA_HIGH"
@@ -29,11 +29,14 @@ class Priority(Enum):
 
 @dataclass(frozen=True)
 class Topic:
-    """`key` with its {names} to fill in; nominal `rate_hz`; `depth`: samples that a reader keeps while busy;
-    `stale_s`: the age after which a reader calls the topic stale; `publishers`: the processes (`shared.contract.processes`) that
-    may publish it, and `driver` for a user's program with a sensor (`penumbra.client`); `slow_hz`: how often a slow link carries
-    a key's messages, 0 for never (`penumbra router --slow`); `by_camera`: whether all cameras' messages go by one key, each at
-    the rate of its camera; `needs`: the part of a cell without which nobody publishes it, where that is not in its key."""
+    """A topic.
+
+    `key`: with {names} as placeholders; `rate_hz`: nominal rate; `depth`: samples that a busy reader keeps; `stale_s`: age after
+    which a reader calls the topic stale; `publishers`: processes (`shared.contract.processes`) that may publish it, and `driver`
+    for a user's program with a sensor (`penumbra.client`); `slow_hz`: rate per key over a slow link, 0 for never (`penumbra
+    router --slow`); `by_camera`: whether the messages of all cameras share a key, each camera at its own rate; `needs`: part of
+    the cell without which nobody publishes it, where the key does not show this.
+    """
 
     name: str
     key: str
@@ -50,21 +53,21 @@ class Topic:
     needs: Literal["cameras", "pads"] | None = None
 
     def is_expected(self, cell: Cell) -> bool:
-        """Whether a cell has what the publishers of this topic need: without it the topic is not missing."""
+        """Whether a cell has the parts that the publishers of this topic need: without them the topic is not missing."""
         return self.needs is None or bool(getattr(cell, self.needs))
 
     @property
     def oldest_s(self) -> float:
-        """The age after which a message is refused: it is of a backlog, or replayed. Clocks may differ by MAX_FUTURE_S."""
+        """Age [s] after which a message is refused as part of a backlog or a replay. Clocks may differ by MAX_FUTURE_S."""
         return 5.0 * self.stale_s + messages.MAX_FUTURE_S
 
     def at(self, **names: str) -> str:
-        """The key expression; a name that is not given becomes the wildcard `*`."""
+        """Key expression of the topic. A name that is not given becomes the wildcard `*`."""
         wanted = {"cell", "camera", "robot", "pad", "target"}
         return self.key.format(**{name: names.get(name, "*") for name in wanted})
 
     def names(self, key: str) -> dict[str, str]:
-        """The {names} that a key of this topic holds, without the cell's."""
+        """Values of the {names} in a key of this topic, without the cell."""
         pairs = zip(self.key.split("/"), key.split("/"), strict=True)
         return {part[1:-1]: value for part, value in pairs if part.startswith("{") and part != "{cell}"}
 
@@ -91,7 +94,7 @@ TOPICS = (FRAME, JOINTS, VOLTAGES, TRUTH, MASK, VISION, HAPTIC, FUSED)
 
 SMOOTHED = Topic("smoothed", "penumbra/{cell}/target/{target}/pose/smoothed", messages.SmoothedPose, 200, 4, 0.1, (),
                  "the pose afterwards, in files only", Priority.POSE, 0)  # fmt: skip
-"""What `penumbra replay --smooth` writes to files. It is none of TOPICS: nobody may publish it, and no replay plays it."""
+"""Topic that `penumbra replay --smooth` writes to files. It is not in TOPICS: nobody may publish it, and no replay sends it."""
 
 
 QUERYABLES = {
@@ -101,7 +104,7 @@ QUERYABLES = {
     "launcher": "penumbra/{cell}/launcher/control",
     "recorder": "penumbra/{cell}/record/control",
 }
-"""Keys of what processes answer beside their health, by the names that `shared.contract.processes` uses for them."""
+"""Keys of the queryables beside the health query, by their names in `shared.contract.processes`."""
 
 
 def current_pose(cell: str, target: str) -> str:
@@ -110,22 +113,22 @@ def current_pose(cell: str, target: str) -> str:
 
 
 def description(cell: str = "*") -> str:
-    """Queryable: what is in the cell, JSON of `shared.contract.outline.Outline`, for programs that do not have the cell file."""
+    """Queryable: summary of the cell, JSON of `shared.contract.outline.Outline`, for programs that do not have the cell file."""
     return QUERYABLES["description"].format(cell=cell)
 
 
 def control(cell: str) -> str:
-    """Queryable of the emulator: what `penumbra sim` asks, JSON in and out."""
+    """Queryable of the emulator: requests of `penumbra sim`, JSON in and out."""
     return QUERYABLES["control"].format(cell=cell)
 
 
 def launcher(cell: str) -> str:
-    """Queryable of `penumbra up`: what `penumbra restart` and `penumbra scale` ask, JSON in and out."""
+    """Queryable of `penumbra up`: requests of `penumbra restart` and `penumbra scale`, JSON in and out."""
     return QUERYABLES["launcher"].format(cell=cell)
 
 
 def recorder(cell: str) -> str:
-    """Queryable of `penumbra record`: what `penumbra record save` asks, JSON in and out."""
+    """Queryable of `penumbra record`: requests of `penumbra record save`, JSON in and out."""
     return QUERYABLES["recorder"].format(cell=cell)
 
 
@@ -135,7 +138,7 @@ def alive(cell: str, service: str = "*", instance: str = "*") -> str:
 
 
 def beat(cell: str, service: str = "*", instance: str = "*") -> str:
-    """What the replicas of a service say to one another, without content: that this one gets its time."""
+    """Key of the heartbeats between replicas of a service, without content: the sender gets processor time."""
     return f"penumbra/{cell}/beat/{service}/{instance}"
 
 

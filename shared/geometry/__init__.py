@@ -1,1 +1,1 @@
-"""Rigid-body geometry, triangle meshes as pictures, and distances to them."""
+"""Rigid-body geometry, rasterisation of triangle meshes, and distances to them."""

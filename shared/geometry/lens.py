@@ -1,12 +1,12 @@
-"""The lens of a camera: its distortion, and pictures without it.
+"""Lens model of a camera: its distortion, and the undistortion of pictures.
 
-Distortion is that of OpenCV (Brown 1971): radial k1 k2 k3 and tangential p1 p2. With x, y the pinhole's normalised coordinates
-and r^2 = x^2 + y^2, the lens shows a point at
+The distortion model is OpenCV's (Brown 1971): radial k1 k2 k3 and tangential p1 p2. The lens maps the pinhole's normalised
+coordinates x, y, with r^2 = x^2 + y^2, to
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-Everything behind `Undistortion` works on the pinhole picture: the same intrinsics and size, all coefficients zero.
+Everything after `Undistortion` works on the pinhole picture: the same intrinsics and size, all coefficients zero.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from numpy.typing import ArrayLike, NDArray
 from penumbra.shared.geometry.rigid import Array
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
-"""In the order of OpenCV's first five."""
+"""Distortion coefficients, in the order of OpenCV's first five."""
 LARGEST = 20.0
-"""Largest coefficient that is accepted; those of real lenses are below 5."""
+"""Maximum magnitude of a coefficient. Coefficients of real lenses are below 5."""
 VIEW = (0.15, 60.0)
-"""Smallest and largest focal length that is accepted, in widths of the picture: 147 degrees to 1 degree."""
+"""Minimum and maximum focal length, in widths of the picture: fields of view of 147 degrees and 1 degree."""
 SQUARE = 1.25
-"""Largest ratio of the two focal lengths. Pixels of sensors are square to 1 %."""
+"""Maximum ratio of the two focal lengths. Pixels of real sensors are square to 1 %."""
 NEWTON_STEPS = 20
 CONVERGED_PX = 1e-6
-"""The inverse of the distortion takes at most this number of Newton steps, and ends where the error is below this [px]."""
+"""Maximum number of Newton steps of the inverse distortion, and the error [px] below which they end."""
 RADII = 2000
 """Number of radii at which the distortion is tested for a fold."""
 
@@ -45,7 +45,7 @@ FOREIGN = {
         ("D", "d", "dist", "distCoeffs", "dist_coeffs", "distortion", "distortion_coefficients", "coefficients"), _VECTOR
     ),
 }
-"""Keys of other distortion models in a camera's description, each with what to do."""
+"""Keys of other distortion models, each with a remedy."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether it distorts nothing."""
+        """Whether the lens has no distortion."""
         return not any(getattr(self, name) for name in COEFFICIENTS)
 
     def faults(self, room: float = 0.0) -> list[tuple[str, str]]:
-        """The fields that cannot be a camera's, each with what was expected. `room`: how far outside the picture the principal
-        point may lie, as a share of its size, as that of a crop does."""
+        """Implausible fields, each with what was expected. `room`: how far outside the picture the principal point may lie, as a
+        share of the picture's size; above zero for crops."""
         out = []
         for name in ("fx", "fy"):
             low, high = (round(share * self.width) for share in VIEW)
@@ -102,12 +102,12 @@ class Lens:
         return out
 
     def distorted(self, pixels: ArrayLike) -> Array:
-        """Where the lens shows points (..., 2) [px] of the pinhole picture, in the camera's picture (..., 2) [px]."""
+        """Maps points (..., 2) [px] of the pinhole picture to the camera's picture (..., 2) [px]."""
         return np.asarray(self._bent(self._normalised(pixels))[0] * (self.fx, self.fy) + (self.cx, self.cy), np.float64)
 
     def undistorted(self, pixels: ArrayLike) -> Array:
-        """Where points (..., 2) [px] of the camera's picture are in the pinhole picture (..., 2) [px]; NaN for a point that no
-        ray reaches. By Newton's method."""
+        """Maps points (..., 2) [px] of the camera's picture to the pinhole picture (..., 2) [px] by Newton's method; NaN for a
+        point that no ray reaches."""
         wanted = self._normalised(pixels)
         x = wanted.copy()
         error = np.zeros_like(x)
@@ -132,18 +132,18 @@ class Lens:
         return np.asarray(inside & (np.hypot(x[..., 0], x[..., 1]) <= self._fold))
 
     def grid(self) -> Array:
-        """The centres (height, width, 2) of the picture's pixels."""
+        """Pixel centres (height, width, 2) of the picture."""
         return np.stack(np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float)), axis=-1)
 
     def _normalised(self, pixels: ArrayLike) -> Array:
         return np.asarray((np.asarray(pixels, float) - (self.cx, self.cy)) / (self.fx, self.fy), np.float64)
 
     def _bent(self, points: Array) -> tuple[Array, Array]:
-        """The distorted points (..., 2) of normalised ones (..., 2), and their derivatives (..., 2, 2)."""
+        """Distorted points (..., 2) of normalised points (..., 2), and their derivatives (..., 2, 2)."""
         x, y = points[..., 0], points[..., 1]
         r2 = x * x + y * y
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3))  # of the radial factor by x, over x
+        slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3))  # derivative of the radial factor by x, divided by x
         p1, p2 = self.p1, self.p2
         bent = np.stack(
             [x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y],
@@ -158,8 +158,8 @@ class Lens:
 
     @cached_property
     def _folding(self) -> tuple[float, float]:
-        """Radius beyond which the radial distortion runs backwards, infinite where it never does within the picture, and the
-        largest distorted radius up to there. Both normalised."""
+        """Radius at which the radial distortion starts to decrease, infinite where it never does near the picture, and the
+        maximum distorted radius up to there. Both are normalised."""
         corner = np.hypot(max(self.cx, self.width - self.cx) / self.fx, max(self.cy, self.height - self.cy) / self.fy)
         r = np.linspace(0.0, 4.0 * corner, RADII)
         shown = r * (1.0 + r**2 * (self.k1 + r**2 * (self.k2 + r**2 * self.k3)))
@@ -178,15 +178,15 @@ class Lens:
 
 
 class Undistortion:
-    """Makes the pinhole pictures of a lens from the camera's. `unseen` (height, width): pixels of the pinhole picture that the
-    camera does not show, None where it shows all."""
+    """Converts a camera's pictures to pinhole pictures. `unseen` (height, width): pixels of the pinhole picture that the camera
+    does not show, None where it shows all."""
 
     def __init__(self, lens: Lens):
         self._lens = lens
         self._maps: tuple[NDArray[np.int16], NDArray[np.uint16]] | None = None
         self.unseen: NDArray[np.bool_] | None = None
         if not lens.is_pinhole:
-            import cv2  # a pinhole camera needs none of it
+            import cv2  # not needed for a pinhole camera
 
             grid = lens.grid()
             u, v = np.moveaxis(lens.distorted(grid), -1, 0).astype(np.float32)
@@ -195,8 +195,8 @@ class Undistortion:
             self.unseen = unseen if unseen.any() else None
 
     def __call__(self, image: NDArray[np.uint8], region: tuple[int, int, int, int] | None = None) -> NDArray[np.uint8]:
-        """The pinhole picture of a picture (height, width, channels) uint8; black where the camera shows nothing. The picture
-        itself where the lens distorts nothing. region: columns and rows (x0, y0, x1, y1) that are needed; the others may be
+        """Pinhole picture of a picture (height, width, channels) uint8, black where the camera shows nothing. Returns the picture
+        itself where the lens has no distortion. region: columns and rows (x0, y0, x1, y1) that are needed; the others may be
         black. Raises ValueError for a picture of another size."""
         height, width = self._lens.height, self._lens.width
         if image.shape[:2] != (height, width):

@@ -1,7 +1,7 @@
-"""A z-buffer rasteriser for triangle meshes, on one thread.
+"""Z-buffer rasteriser for triangle meshes, on one thread.
 
-A pixel belongs to a triangle when its centre lies inside; centres on an edge that two triangles share belong to exactly one of
-them (top-left rule, on a grid of 1/256 pixel). Triangles are clipped at the near plane. Depth is the camera's z [m].
+A pixel belongs to a triangle if its centre lies inside. Centres on a shared edge belong to exactly one of the two triangles
+(top-left rule, on a grid of 1/256 pixel). Triangles are clipped at the near plane. Depth is the camera's z [m].
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from penumbra.shared.native import inner, kernel
 
 NEAR = 0.02
-"""Nothing closer to the camera than this [m] is drawn."""
+"""Depth [m] of the near plane. Nothing closer to the camera is drawn."""
 SUBPIXEL = 256
 """Coordinates are rounded to this fraction of a pixel, so that the edge functions are exact in integers."""
 EMPTY = 255
-"""The id of a pixel that shows nothing."""
-_FAR_PX = 16384.0  # coordinates beyond are clamped, which keeps the edge functions within 64 bits
+"""The id of pixels without a triangle."""
+_FAR_PX = 16384.0  # coordinates are clamped to this, which keeps the edge functions within 64 bits
 
 
 class Raster:
-    """Depth [m] (h, w) float32 (infinite where empty), `ids` (h, w) uint8 (EMPTY where empty) and `triangles` (h, w) int32, the
-    index of the drawn triangle counted over all draws since `clear` (-1 where empty)."""
+    """Render target: `depth` [m] (h, w) float32 (infinite where empty), `ids` (h, w) uint8 (EMPTY where empty) and `triangles`
+    (h, w) int32, the index of the drawn triangle counted over all draws since `clear` (-1 where empty)."""
 
     def __init__(self, width: int, height: int):
         self.depth = np.empty((height, width), np.float32)
@@ -50,7 +50,8 @@ class Raster:
         cy: float,
         ids: ArrayLike,
     ) -> None:
-        """Draws vertices (n, 3) [m] in the camera's frame, faces (m, 3), with one id for all or one per face (m,)."""
+        """Draws a mesh: vertices (n, 3) [m] in the camera's frame, faces (m, 3). ids: one id for all faces, or one per face
+        (m,)."""
         ids = np.ascontiguousarray(np.broadcast_to(np.asarray(ids, np.uint8), len(faces)))
         vertices = np.ascontiguousarray(vertices, np.float64)
         _draw(vertices, faces, fx, fy, cx, cy, ids, self._drawn, self.depth, self.ids, self.triangles)

@@ -38,8 +38,8 @@ def position_orientation(T: Array) -> tuple[Array, Array]:
 
 
 def rpy(orientation: ArrayLike) -> Array:
-    """Roll, pitch, yaw [rad] (3,) about the fixed x, y, z axes of a quaternion (4,). The pitch is within a quarter turn; there,
-    where only the sum or the difference of roll and yaw is defined, the yaw is zero."""
+    """Roll, pitch, yaw [rad] (3,) about the fixed x, y, z axes of a quaternion (4,). The pitch is within a quarter turn. At its
+    limits only the sum or the difference of roll and yaw is defined; there the yaw is zero."""
     (a, b, _), (d, e, _), (g, h, i) = _from_quaternion(orientation).tolist()
     cosine = math.hypot(a, d)
     pitch = math.atan2(-g, cosine)
@@ -58,12 +58,13 @@ def inverse(T: Array) -> Array:
 
 
 def apply(T: Array, points: ArrayLike) -> Array:
-    """Points (..., 3) of frame b in frame a, for T_a_b."""
+    """Transforms points (..., 3) from frame b to frame a by T = T_a_b."""
     return np.asarray(points) @ T[:3, :3].T + T[:3, 3]
 
 
 def perturb(T: Array, error: ArrayLike) -> Array:
-    """T moved by a pose error (6,): translation [m] added, rotation vector [rad] applied from the left (fixed axes)."""
+    """Applies a pose error (6,) to T: adds the translation [m] and applies the rotation vector [rad] from the left (fixed
+    axes)."""
     error = np.asarray(error, dtype=float)
     out = T.copy()
     out[:3, :3] = rotation(error[3:]) @ T[:3, :3]
@@ -72,7 +73,7 @@ def perturb(T: Array, error: ArrayLike) -> Array:
 
 
 def pose_error(T_true: Array, T: Array) -> Array:
-    """The error (6,) with `perturb(T, error) == T_true`."""
+    """Pose error (6,) for which `perturb(T, error) == T_true`."""
     offset = T_true[:3, 3] - T[:3, 3]
     return np.array([*offset.tolist(), *_rotation_vector(T_true[:3, :3] @ T[:3, :3].T)])
 
@@ -103,7 +104,7 @@ def _rotation_vector(R: Array) -> tuple[float, float, float]:
 
 
 def _from_quaternion(orientation: ArrayLike) -> Array:
-    """The rotation matrix (3, 3) of a quaternion (4,) of any length but zero, for which it raises ValueError."""
+    """Rotation matrix (3, 3) of a quaternion (4,) of any non-zero length. Raises ValueError for zero."""
     x, y, z, w = np.asarray(orientation, float).tolist()
     square = x * x + y * y + z * z + w * w
     if not square > 0.0:
@@ -119,7 +120,7 @@ def _from_quaternion(orientation: ArrayLike) -> Array:
 
 
 def _quaternion(R: Array) -> tuple[float, float, float, float]:
-    """The unit quaternion with w >= 0 of a rotation matrix (3, 3), from its greatest component, by which the others are
+    """Unit quaternion with w >= 0 of a rotation matrix (3, 3). It is computed from its largest component, by which the others are
     divided (Shepperd 1978, doi:10.2514/3.55767b)."""
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     w = a + e + i
@@ -137,7 +138,8 @@ def _quaternion(R: Array) -> tuple[float, float, float, float]:
 
 
 def axis_angle_error(T_true: Array, T: Array, axis: int = 0) -> float:
-    """The angle [rad] between the same body axis (0, 1, 2) of two poses: for a limb along x, its error without the roll."""
+    """Angle [rad] between the same body axis (0, 1, 2) of two poses. For a limb along x this is its orientation error without
+    roll."""
     return float(np.arccos(np.clip(T_true[:3, axis] @ T[:3, axis], -1.0, 1.0)))
 
 

@@ -1,8 +1,8 @@
-"""Rotations and small matrices for inner loops, compiled into them; each may be called from Python too.
+"""Rotations and small matrices for inner loops. They are compiled into kernels and can be called from Python too.
 
-Rotation vectors r (3,) [rad]; `exp(r)` turns about the fixed axes. What is computed is written to the last argument, `out`,
-because allocating costs more than computing it. Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in
-robotics" (2018), arXiv:1812.01537, appendix B.
+Rotation vectors r (3,) are in [rad]; `exp(r)` rotates about the fixed axes. Results are written to the last argument, `out`,
+because an allocation costs more than the computation. Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation
+in robotics" (2018), arXiv:1812.01537, appendix B.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import math
 from penumbra.shared.native import inner
 
 SWEEPS = 16
-"""Largest number of sweeps of Jacobi's method over a matrix. It converges quadratically: six by six takes four to six."""
+"""Maximum number of sweeps of Jacobi's method over a matrix. It converges quadratically: a 6 x 6 matrix takes four to six."""
 NEGLIGIBLE = 1e-32
-"""Share of the sum of all squares below which the squares off the diagonal are rounding."""
+"""Share of the sum of all squares below which the squares off the diagonal count as rounding errors."""
 
 
 @inner

@@ -1,8 +1,8 @@
-"""The nearest point on a triangle mesh, and on which side of the skin a point lies.
+"""Nearest point on a triangle mesh, and signed distance to it.
 
-The skin's response law asks for it from both ends: the emulator for the gap of every electrode, the haptic solve for the
-gap and its derivative. Point to triangle after Ericson, Real-Time Collision Detection (2005), 5.1.5; the sign by
-angle-weighted pseudonormals (Baerentzen & Aanaes 2005, DOI 10.1109/TVCG.2005.49), exact for closed meshes.
+The skin's response law needs it twice: in the emulator for the gap of every electrode, and in the haptic solve for the gap and
+its derivative. Point to triangle after Ericson, Real-Time Collision Detection (2005), 5.1.5; the sign by angle-weighted
+pseudonormals (Baerentzen & Aanaes 2005, DOI 10.1109/TVCG.2005.49), exact for closed meshes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Surface:
             raise ValueError(f"expected a mesh of (n, 3) vertices and (m, 3) faces, got {vertices.shape} and {faces.shape}")
         if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
             raise ValueError(f"expected finite vertices and face indices below {len(vertices)} in the mesh; repair it")
-        # Corners that were stored twice (one per face) are one corner to the pseudonormals.
+        # Duplicate vertices (one per face) are merged for the pseudonormals.
         _, first, inverse = np.unique(np.round(vertices, 9), axis=0, return_index=True, return_inverse=True)
         vertices, faces = vertices[first], inverse.reshape(-1)[faces]
         corners = vertices[faces]
@@ -41,8 +41,8 @@ class Surface:
         self._normals = _pseudonormals(vertices, self.faces)
 
     def nearest(self, points: Array) -> tuple[Array, Array, Array]:
-        """Signed distances (n,) [m] (negative inside), nearest points (n, 3) and unit gradients (n, 3) of the distance,
-        for points (n, 3) in the mesh's frame."""
+        """Signed distances (n,) [m] (negative inside), nearest points (n, 3) and unit gradients (n, 3) of the distance, for
+        points (n, 3) in the mesh's frame."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         distance, nearest, gradient = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3))
         nearest_points(points, *self.arrays, distance, nearest, gradient)
@@ -50,7 +50,7 @@ class Surface:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """Corners (m, 3, 3), centres (3, m), radii (m,) and pseudonormals (m, 7, 3): what compiled code needs."""
+        """Corners (m, 3, 3), centres (3, m), radii (m,) and pseudonormals (m, 7, 3), as arguments of `nearest_points`."""
         return self._corners, self._centers, self._radii, self._normals
 
 
@@ -72,7 +72,7 @@ def _enclosing_circles(corners: Array) -> tuple[Array, Array]:
 
 
 def _pseudonormals(vertices: Array, faces: NDArray[np.int64]) -> Array:
-    """Outward directions (m, 7, 3) at each face's inside, its edges 01, 12, 20 and its corners 0, 1, 2; not normalised."""
+    """Outward directions (m, 7, 3), not normalised, of each face, its edges 01, 12, 20 and its corners 0, 1, 2."""
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Hot loops: functions in plain Python on numpy arrays that run as machine code, without a compiler at run time.
+"""Compiled inner loops: functions in plain Python on numpy arrays that run as machine code, without a compiler at run time.
 
     @inner                                             # called by kernels only: compiled into each of them
     def _square(x): ...
@@ -6,18 +6,17 @@
     @kernel("f8[n, 3], f8[3], out f8[n] -> i8")        # called from Python
     def nearest(points, origin, distances): ...
 
-`python -m penumbra.shared.native.build` compiles every kernel with numba and links them into one library per processor,
-`lib/*.so`, which is part of the repository. A symbol's name holds the `fingerprint` of the sources that it was compiled from,
-so compiled code that no longer belongs to its sources is not found, and is never called. What the library lacks (a kernel was
-edited; there is no library for this machine) is compiled at run time, where numba is installed, and kept in `jit.folder()`
-under that fingerprint.
+`python -m penumbra.shared.native.build` compiles all kernels with numba and links them into one library per processor,
+`lib/*.so`, which is part of the repository. A symbol's name contains the `fingerprint` of its sources, so compiled code that does
+not match its sources is never called. Kernels that the library lacks (edited ones, or all on a machine without a library) are
+compiled at run time, where numba is installed, and cached in `jit.folder()` under that fingerprint.
 
-What runs is chosen by the environment variable PENUMBRA_NATIVE: `library` (default; see above), `jit` (never the libraries) or
+The environment variable PENUMBRA_NATIVE selects what runs: `library` (default; see above), `jit` (never the libraries) or
 `python` (the functions themselves, interpreted: slow, but debuggers and tracebacks work).
 
-Limits on kernels: arrays are C-contiguous; what is written to is marked `out`; a result is one number, everything else goes into
-arrays; nothing is raised (a division by zero gives infinity, as numpy does); no calls of BLAS or LAPACK (`@`, `np.dot`,
-`np.linalg`): matrices are small here, so these are loops. Small arrays may be allocated.
+Limits on kernels: arrays are C-contiguous. Arrays that are written to are marked `out`. The result is one number; everything else
+goes into arrays. Kernels raise nothing; a division by zero gives infinity, as in numpy. BLAS and LAPACK are not available (`@`,
+`np.dot`, `np.linalg`): write loops, since matrices are small here. Small arrays may be allocated.
 """
 
 from __future__ import annotations
@@ -38,21 +37,21 @@ from penumbra.shared.native.signature import Signature
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Progress = Callable[[int, int], None]
-"""Is called with the number of the kernel that is compiled next, from 1, and how many there are to compile."""
+"""Called with the number of the kernel that is compiled next, from 1, and the number of kernels to compile."""
 
 WAYS = ("library", "jit", "python")
 KERNELS: dict[str, Kernel] = {}
 """All kernels of the modules imported so far, by name."""
 KNOWN_SHAPES = 1000
-"""Number of different shapes of its arguments that a kernel remembers as fitting: checking costs ten times as much as looking
-them up, and the number of points of a contour changes in every pass of a search."""
+"""Maximum number of argument shapes that a kernel remembers as valid. A check costs ten times as much as a lookup, and the number
+of points of a contour changes in every pass of a search."""
 _DATA = object.__basicsize__
-"""Where a numpy array holds the address of its data: the first field after an object's header (`PyArrayObject` of numpy's C
-interface). Reading it there costs a tenth of asking for `array.ctypes.data`; `_check_layout` compares the two."""
+"""Offset in a numpy array object of the address of its data: the first field after the object's header (`PyArrayObject` of
+numpy's C interface). Reading it there costs a tenth of `array.ctypes.data`; `_check_layout` compares the two."""
 
 
 def kernel(signature: str, fastmath: bool = False, **records: np.dtype[Any]) -> Callable[[Callable[..., Any]], Kernel]:
-    """Makes a function a kernel.
+    """Decorator that makes a function a kernel.
 
     signature: see `signature.Signature`; records: the structured dtypes that it names; fastmath: sums may be reordered, so the
     last digits differ between processors. Raises ValueError on a signature that does not fit the function.
@@ -61,7 +60,7 @@ def kernel(signature: str, fastmath: bool = False, **records: np.dtype[Any]) -> 
 
 
 def inner(function: Function | None = None, *, fastmath: bool = False) -> Any:
-    """Marks a function that kernels call; it stays a Python function. fastmath: as for `kernel`."""
+    """Decorator for a function that kernels call; it stays a Python function. fastmath: as for `kernel`."""
     if function is None:
         return functools.partial(inner, fastmath=fastmath)
     function.native_options = {"fastmath": fastmath}  # type: ignore[attr-defined]
@@ -69,8 +68,8 @@ def inner(function: Function | None = None, *, fastmath: bool = False) -> Any:
 
 
 class Kernel:
-    """A compiled function. Called with positional arguments; checks the arrays' types, layouts and sizes (TypeError), because
-    compiled code does not. Other threads run meanwhile."""
+    """A compiled function, called with positional arguments. It checks the types, layouts and sizes of arrays (TypeError),
+    because compiled code does not. It releases the GIL."""
 
     def __init__(self, function: Callable[..., Any], signature: Signature, fastmath: bool):
         functools.update_wrapper(self, function)
@@ -138,7 +137,7 @@ class Kernel:
         return result
 
     def _check(self, arguments: tuple[Any, ...]) -> None:
-        """Raises TypeError, in words, where arguments do not fit the signature."""
+        """Raises TypeError that names the argument that does not fit the signature."""
         if len(arguments) != self._count:
             raise TypeError(f"{self.name}: expected {self._count} arguments ({', '.join(self._names)}), got {len(arguments)}")
         sizes: dict[str, tuple[int, str]] = {}
@@ -148,7 +147,7 @@ class Kernel:
                 raise TypeError(f"{self.name}: {name}: expected {parameter}, got {fault}")
 
     def _load(self) -> bool:
-        """Finds the compiled code, or compiles it; false where the Python function is to be called."""
+        """Loads or compiles the machine code; false where the Python function is to be called instead."""
         if _way() == "python":
             return False
         with _LOCK:
@@ -158,7 +157,7 @@ class Kernel:
 
 
 def load() -> list[Kernel]:
-    """Loads the kernels of all modules imported so far from the library, and returns those that it lacks."""
+    """Loads the kernels of all modules imported so far from the library, and returns those that the library lacks."""
     if _way() == "python":
         return []
     with _LOCK:
@@ -168,8 +167,8 @@ def load() -> list[Kernel]:
 
 
 def prepare(progress: Progress | None = None) -> None:
-    """Loads the kernels of all modules imported so far, and compiles those that the library lacks, so that no first call has to.
-    Raises ImportError where that takes numba and it is not installed."""
+    """Loads the kernels of all modules imported so far and compiles those that the library lacks, so that no first call has to.
+    Raises ImportError where this requires numba and it is not installed."""
     with _LOCK:
         missing = load()
         for each, code in zip(missing, _compiled(missing, progress), strict=True):
@@ -177,7 +176,7 @@ def prepare(progress: Progress | None = None) -> None:
 
 
 def _with_attributes(value: Any) -> Any:
-    """Records whose fields can be read as attributes, as compiled code reads them."""
+    """Structured arrays as record arrays, whose fields are attributes, as in compiled code."""
     return value.view(np.recarray) if isinstance(value, np.ndarray) and value.dtype.names else value
 
 
@@ -189,7 +188,7 @@ def _way() -> str:
 
 
 def _in_library(kernel: Kernel) -> Callable[[bytes], int] | None:
-    """The kernel's code in this machine's library, None where it is not there."""
+    """Code of the kernel in this machine's library; None where the library lacks it."""
     library = _library() if _way() == "library" else None
     if library is None:
         return None
@@ -202,7 +201,7 @@ def _in_library(kernel: Kernel) -> Callable[[bytes], int] | None:
 
 
 def _compiled(kernels: list[Kernel], progress: Progress | None = None) -> list[Callable[[bytes], int]]:
-    """The code of kernels that no library has."""
+    """Code of kernels that the library lacks."""
     if not kernels:
         return []
     _check_layout()

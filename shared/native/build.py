@@ -55,7 +55,8 @@ def build(folder: Path) -> dict[str, Any]:
 
 
 def link(code: bytes, architecture: str, library: Path) -> None:
-    """Makes a shared library of an object file. It names no other library: what it needs of libc and libm every Python has."""
+    """Links an object file into a shared library, without other libraries: every Python has the functions of libc and libm it
+    needs."""
     with tempfile.NamedTemporaryFile(suffix=".o") as file:
         file.write(code)
         file.flush()
@@ -63,7 +64,7 @@ def link(code: bytes, architecture: str, library: Path) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Of what the libraries' bytes depend on, beside the sources."""
+    """Versions of the tools that determine the libraries' bytes, beside the sources."""
     from penumbra.shared.native.compiler import VERSIONS
 
     linker = subprocess.run([_linker("x86_64"), "--version"], check=True, capture_output=True, text=True).stdout.splitlines()[0]

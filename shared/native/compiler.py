@@ -1,7 +1,7 @@
-"""From kernels to machine code: numba types and lowers the Python functions, LLVM does the rest, for any processor.
+"""Compiler of kernels: numba types and lowers the Python functions, LLVM generates machine code for any processor.
 
-What numba makes raises exceptions of Python, and counts references to arrays in its own runtime. Neither remains:
-`_without_python` keeps of an exception that there was one, and `RUNTIME` stands in for numba's.
+numba's code raises Python exceptions and counts references to arrays in its own runtime. Neither remains: `_without_python`
+reduces an exception to a failure status, and `RUNTIME` replaces numba's runtime.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ VERSIONS = {"llvmlite": llvmlite.__version__, "numba": numba.__version__}
 
 @dataclass(frozen=True)
 class Target:
-    """A processor, in LLVM's words."""
+    """A processor, in LLVM's terms."""
 
     triple: str
     cpu: str
     features: str = ""
 
     def machine(self) -> llvm.TargetMachine:
-        """What makes code for it."""
+        """LLVM's code generator for it."""
         llvm.initialize_all_targets()
         llvm.initialize_all_asmprinters()
         target = llvm.Target.from_triple(self.triple)
@@ -50,14 +50,14 @@ TARGETS = {
     "x86_64-v3": Target("x86_64-unknown-linux-gnu", "x86-64-v3"),
     "aarch64": Target("aarch64-unknown-linux-gnu", "generic"),
 }
-"""The processors that libraries are made for, by the libraries' names."""
+"""Processors that libraries are built for, by the libraries' names."""
 
 LIBC = {
     "malloc", "free", "memcpy", "memmove", "memset", "acos", "asin", "asinh", "atan", "atan2", "cbrt", "cos", "cosf", "cosh",
     "exp", "exp2", "expf", "expm1", "fmod", "hypot", "log", "log10", "log1p", "log2", "logf", "pow", "powf", "sin", "sinf",
     "sinh", "sincos", "tan", "tanh", "tanhf", "ceil", "floor", "rint", "round", "trunc", "sqrt", "sqrtf",
 }  # fmt: skip
-"""What a library may call: every process with Python has these."""
+"""Functions that a library may call; every Python process provides them."""
 
 RUNTIME = """
 ; The memory of an array: a header (the number of references, ..., the data's address, ...) as numba lays it out, and the data.
@@ -136,11 +136,11 @@ done:
 
 
 def compiled(kernels: Sequence[Kernel], target: Target, lowered: Sequence[str] | None = None) -> bytes:
-    """An object file for a processor with the entries of kernels: `int symbol(const int64_t *block)`.
+    """Object file for a processor with the entry points of kernels: `int symbol(const int64_t *block)`.
 
-    The block holds the offset of the data's address in an array object, then each argument: a number, or an array object's
-    address and its sizes; last the array that takes the result. Returned is zero, or that the kernel failed. lowered: what
-    `lower` gave for each kernel, where that is known already.
+    The block holds the offset of the data's address in an array object, then the arguments: a number, or an array object's
+    address and its sizes; last the array for the result. The return value is zero, or one where the kernel failed. lowered:
+    output of `lower` for each kernel, where it is available already.
     """
     machine = target.machine()
     module = llvm.parse_assembly(RUNTIME)
@@ -161,7 +161,7 @@ def compiled(kernels: Sequence[Kernel], target: Target, lowered: Sequence[str] |
 
 @global_compiler_lock  # type: ignore[untyped-decorator]  # numba has no types for it
 def lower(kernel: Kernel) -> str:
-    """A kernel and its entry in LLVM's language, not optimised, for no processor in particular."""
+    """LLVM assembly of a kernel and its entry point, not optimised and independent of the processor."""
     with _without_optimisation():
         _declare(kernel.function)
         kinds = [_numba_type(each) for each in kernel.signature.parameters]
@@ -190,7 +190,8 @@ def _flags(fastmath: bool) -> Flags:
 
 
 def _declare(function: Any) -> None:
-    """Makes all functions that this one calls known to numba, which asks values of kinds it does not know for `_numba_type_`."""
+    """Registers all functions that this one calls with numba, which reads the attribute `_numba_type_` of values of unknown
+    types."""
     for _, value in used(function):
         if is_native(value) and not hasattr(value, "_numba_type_"):
             fastmath = REORDERED if value.native_options["fastmath"] else False
@@ -202,14 +203,14 @@ def _declare(function: Any) -> None:
 
 
 REORDERED = {"reassoc", "nsz", "contract"}
-"""LLVM's flags for a function with `fastmath`: infinities and NaN remain what they are."""
+"""LLVM's flags for a function with `fastmath`. Infinities and NaN keep their meaning."""
 _CALLED: list[Any] = []
-"""numba's form of the functions that kernels call: their types refer to them, but do not keep them."""
+"""numba's dispatchers of the functions that kernels call. Their types refer to them without keeping them alive."""
 
 
 @contextlib.contextmanager
 def _without_optimisation() -> Iterator[None]:
-    """LLVM optimises once, for the processor that is meant, and not in numba for this one."""
+    """Turns off numba's optimisation; LLVM optimises once, for the target processor."""
     level, config.OPT = config.OPT, config._OptLevel(0)  # type: ignore[attr-defined]
     try:
         yield
@@ -218,14 +219,14 @@ def _without_optimisation() -> Iterator[None]:
 
 
 def _without_python(code: str) -> str:
-    """The code without what makes exceptions: numba's status says that there was one."""
+    """Removes the code that constructs exceptions; numba's status still shows that there was one."""
     code = re.sub(r"^(define [^\n]*raise_with_shape_context[^\n]*\{\n).*?^\}", r"\1  ret i32 1\n}", code, flags=re.M | re.S)
     code = re.sub(r"^  store ptr [^\n]*, ptr %excinfo\b[^\n]*\n", "", code, flags=re.M)
     return re.sub(r"^target [^\n]*\n", "", code, flags=re.M)
 
 
 def _entry(kernel: Kernel, function: str) -> str:
-    """The function that Python calls: reads the block, calls numba's function by numba's convention."""
+    """Entry point that Python calls: reads the block and calls numba's function by numba's calling convention."""
     lines: list[str] = []
     given, slot = ["ptr %result", "ptr %exception"], 0
 
@@ -283,7 +284,7 @@ define i32 @{kernel.symbol}(ptr %block) {{
 
 
 def _internalise(module: llvm.ModuleRef, symbols: set[str]) -> None:
-    """Only symbols can be called from outside: the rest may be inlined and dropped."""
+    """Makes everything but the symbols internal: it may be inlined and dropped."""
     for each in module.functions:
         if not each.is_declaration and each.name not in symbols:
             each.linkage = "internal"
@@ -293,7 +294,7 @@ def _internalise(module: llvm.ModuleRef, symbols: set[str]) -> None:
 
 
 def _optimise(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> None:
-    """As numba does: inline cheaply, drop counts of references that cancel, and then everything."""
+    """Optimises as numba does: inline cheaply, remove reference counts that cancel, then run all passes."""
     cheap, full = (passes.create_pipeline_tuning_options(level) for level in (0, 3))
     cheap.loop_vectorization = cheap.slp_vectorization = full.slp_vectorization = False
     full.loop_vectorization = True

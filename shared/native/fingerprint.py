@@ -1,5 +1,5 @@
-"""What a kernel is compiled from, in sixteen digits: its source lines, those of all functions that it calls, and the values of
-all constants that they read. Two kernels with equal fingerprints are the same machine code."""
+"""Fingerprint of a kernel, sixteen hexadecimal digits: a hash of its source lines, those of all functions that it calls, and the
+values of all constants that they read. Kernels with equal fingerprints have the same machine code."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from penumbra.shared.native import Kernel
 
 FORMAT = "1"
-"""Of the code around a kernel (`compiler.entry`): a change there makes all that was compiled before unknown."""
+"""Version of the code around a kernel (`compiler._entry`). A change invalidates everything that was compiled before."""
 
 
 def fingerprint(kernel: Kernel) -> str:
-    """Sixteen hexadecimal digits. The sources are those on disk at the first call in the process."""
+    """Fingerprint of a kernel. The sources are those on disk at the first call in the process."""
     records = {name: _constant(kind) for name, kind in sorted(kernel.signature.records.items())}
     return _digest(FORMAT, _of(kernel.function), repr(records))
 
@@ -37,7 +37,7 @@ def _of(function: Callable[..., Any]) -> str:
 
 
 def used(function: Callable[..., Any]) -> Iterator[tuple[str, Any]]:
-    """The functions and constants that a function reads from its module, and from modules that this imports, with their names."""
+    """Functions and constants that a function reads from its module and from the modules imported there, with their names."""
     names = sorted({name for code in _codes(function.__code__) for name in code.co_names})
     for name in names:
         value = function.__globals__.get(name)
@@ -51,12 +51,12 @@ def used(function: Callable[..., Any]) -> Iterator[tuple[str, Any]]:
 
 
 def is_native(value: Any) -> bool:
-    """Whether a value is a kernel, or a function for kernels to call."""
+    """Whether a value is a kernel or a function decorated with `inner`."""
     return hasattr(value, "native_options")
 
 
 def plain(value: Any) -> Callable[..., Any]:
-    """The Python function of a kernel or of a function for kernels to call."""
+    """Python function of a kernel or of a function decorated with `inner`."""
     return getattr(value, "function", value)  # type: ignore[no-any-return]
 
 
@@ -68,7 +68,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _source(code: CodeType) -> str:
-    """The lines of a function, decorator and all."""
+    """Source lines of a function, with its decorators."""
     last = max(end or first or 0 for each in _codes(code) for first, end, _, _ in each.co_positions())
     return "".join(linecache.getlines(code.co_filename)[code.co_firstlineno - 1 : last])
 
@@ -82,7 +82,7 @@ def _is_constant(value: Any) -> bool:
 
 
 def _constant(value: Any) -> str:
-    """A value's text, the same for all versions of Python and numpy."""
+    """Text of a value, the same for all versions of Python and numpy."""
     if isinstance(value, type):
         return f"{value.__name__}{value._fields}"  # type: ignore[attr-defined]
     if isinstance(value, tuple):

@@ -1,4 +1,5 @@
-"""Compiles kernels on the machine that runs them, and keeps the result: for sources that the committed libraries do not know."""
+"""Compiles kernels on the machine that runs them, and caches the result: for sources that the committed libraries do not
+match."""
 
 from __future__ import annotations
 
@@ -20,18 +21,17 @@ from penumbra.shared.native.fingerprint import FORMAT
 
 NUMBA = version("numba")
 _ENGINES: list[llvm.ExecutionEngine] = []
-"""What has been loaded stays in memory as long as these."""
+"""Engines of all loaded code, which stays in memory as long as they do."""
 
 
 def folder() -> Path:
-    """Where compiled kernels are kept. Files are named after the sources' fingerprint, the processor and the versions of the
-    compilers, so none is ever out of date."""
+    """Cache of compiled kernels. File names contain the fingerprint of the sources, the processor and the versions of the
+    compilers, so a file is never out of date."""
     return cache() / "native"
 
 
 def load(kernels: Sequence[Kernel], progress: Progress | None = None) -> list[Callable[[bytes], int]]:
-    """The code of kernels, compiled where it is not kept yet. Processes that need the same kernel compile it once: the others
-    wait."""
+    """Code of kernels, compiled where it is not cached. Processes that need the same kernel compile it once: the others wait."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     made_by = f"{llvm.get_host_cpu_name()}-{llvmlite.__version__}-{NUMBA}-{FORMAT}"
@@ -56,7 +56,7 @@ def _kept(kernel: Kernel, file: Path) -> bytes:
         features = llvm.get_host_cpu_features().flatten()
         code = compiled([kernel], Target(llvm.get_process_triple(), llvm.get_host_cpu_name(), features))
         with contextlib.suppress(OSError), tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as new:
-            new.write(code)  # where there is no room, the next start compiles again
+            new.write(code)  # on a full disk, the next start compiles again
             new.flush()
             os.replace(new.name, file)
     return code
@@ -64,7 +64,7 @@ def _kept(kernel: Kernel, file: Path) -> bytes:
 
 @contextlib.contextmanager
 def _alone(file: Path) -> Iterator[None]:
-    """One process at a time, where files can be written at all."""
+    """Lock that admits one process at a time, where the folder is writable."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Which of the committed libraries this machine runs."""
+"""Selects the committed library for this machine."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent / "lib"
 V3 = {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe", "xsave"}
-"""What /proc/cpuinfo calls the instructions of x86-64-v3."""
+"""Instruction sets of x86-64-v3, as named in /proc/cpuinfo."""
 V2 = {"cx16", "lahf_lm", "popcnt", "sse4_1", "sse4_2", "ssse3"}
 
 
 def library() -> Path | None:
-    """The file to load, None where there is none for this machine."""
+    """Path of the library to load; None where there is none for this machine."""
     kind = name()
     return FOLDER / f"{kind}.so" if kind and (FOLDER / f"{kind}.so").exists() else None
 

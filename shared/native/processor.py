@@ -1,4 +1,4 @@
-"""What the processor computes in."""
+"""Number format of networks on this processor."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ CPUINFO = Path("/proc/cpuinfo")
 
 
 def has_bfloat16() -> bool:
-    """Whether networks are run, and trained, in bfloat16: where that is faster than float32, and oneDNN, with which both torch
-    and OpenVINO compute, may make use of it (ONEDNN_MAX_CPU_ISA).
+    """Whether networks are run and trained in bfloat16: where it is faster than float32 and where oneDNN, which torch and
+    OpenVINO use, may use it (ONEDNN_MAX_CPU_ISA).
 
-    It is faster where the processor multiplies matrices of it (AMX: a step of PredNet takes 4.7 ms, in float32 12.3 ms), and on
-    AMD's with vectors of it (Zen 4: 10.6 and 18.3 ms). On Intel's, vectors alone take longer than float32 (18.5 ms).
+    It is faster with matrix instructions for it (AMX: a step of PredNet takes 4.7 ms, in float32 12.3 ms), and with AMD's vector
+    instructions for it (Zen 4: 10.6 and 18.3 ms). Intel's vector instructions alone are slower than float32 (18.5 ms).
     """
     allowed = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
     is_free = allowed in ("DEFAULT", "ALL")

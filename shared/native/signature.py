@@ -1,4 +1,4 @@
-"""What a kernel takes and gives, in one line: `f8[n, 3], i4[m, 3], f8, out f8[n] -> i8`."""
+"""Signature of a kernel in one line: `f8[n, 3], i4[m, 3], f8, out f8[n] -> i8`."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 SCALARS = {"f8": "d", "f4": "d", "i8": "q", "b1": "q"}
-"""The types of numbers, as numpy and as `struct` call them; arrays may have any type of numpy's."""
+"""Types of numbers in numpy's notation, each with its `struct` format. Arrays may have any numpy type."""
 _PARAMETER = re.compile(r"(out )?(\w+)(?:\[([^\]]*)\])?$")
 _CONTIGUOUS, _ALIGNED, _WRITEABLE = 0x1, 0x100, 0x400  # bits of numpy's ndarray.flags.num
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter. dtype: its type; sizes: for each dimension of an array a number, or a name for what is as large in all
-    places of the signature, empty for a number; is_out: whether the kernel writes to it."""
+    """One parameter. dtype: its type; sizes: a number or a name for each dimension of an array, empty for a number; equal names
+    in a signature stand for equal sizes; is_out: whether the kernel writes to it."""
 
     text: str
     dtype: np.dtype[Any]
@@ -34,16 +34,17 @@ class Parameter:
 
     @property
     def flags(self) -> int:
-        """The bits of `ndarray.flags.num` that an array must have."""
+        """Bits of `ndarray.flags.num` that an array must have."""
         return _CONTIGUOUS | _ALIGNED | (_WRITEABLE if self.is_out else 0)
 
     @property
     def format(self) -> str:
-        """How `struct` packs it: an array as the object's address and its sizes."""
+        """Its `struct` format: an array is passed as the object's address and its sizes."""
         return "q" * (1 + len(self.sizes)) if self.sizes else SCALARS[self.dtype.str[1:]]
 
     def fault(self, name: str, value: Any, sizes: dict[str, tuple[int, str]]) -> str | None:
-        """What a value is instead of what is expected, None where it fits. sizes: those named so far, and where; is added to."""
+        """Description of a value that does not fit, else None. sizes: named sizes so far, with their parameters; extended by the
+        call."""
         if not self.sizes:
             kinds: tuple[type, ...] = (int, np.integer, bool, np.bool_) if self.dtype.kind != "f" else (int, float, np.number)
             return None if isinstance(value, kinds) and not isinstance(value, complex) else f"{value!r}"
@@ -67,7 +68,8 @@ class Parameter:
 
 
 def _described(value: np.ndarray[Any, Any]) -> str:
-    """Only written for a fault: shapes are checked in every pass of a search, and numpy spells a dtype slowly."""
+    """Type and shape of an array. For faults only: shapes are checked in every pass of a search, and numpy formats dtypes
+    slowly."""
     return f"an array {value.dtype} {value.shape}"
 
 
@@ -75,7 +77,7 @@ class Signature:
     """The parameters of a kernel, in order, and its result: a number of type `result`, or None.
 
     A parameter is a type (f8, f4, i8, i4, u1, b1, the name of a structured type in `records`, ...), followed by its sizes if it
-    is an array. Raises ValueError on anything else.
+    is an array. Raises ValueError on any other text.
     """
 
     def __init__(self, text: str, records: Mapping[str, np.dtype[Any]] | None = None):

@@ -1,1 +1,1 @@
-"""What the senses share: where to look, what vision reports, and where things were at a stamp."""
+"""Code shared by the senses: image windows, the result of vision, landmarks, and joint angles at a stamp."""

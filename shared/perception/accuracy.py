@@ -1,4 +1,4 @@
-"""How far a pose is from the truth of an emulated cell."""
+"""Error of a pose against the ground truth of an emulated cell."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from penumbra.shared.geometry import rigid
 
 @dataclass(frozen=True)
 class Accuracy:
-    """The fused pose, and where the truth is known its error: position [m] and limb axis [rad]."""
+    """A fused pose with its errors of position [m] and limb axis [rad]; NaN where the truth is unknown."""
 
     pose: FusedPose
     position: float = math.nan
@@ -22,7 +22,7 @@ class Accuracy:
 
 
 def accuracy(pose: FusedPose, truths: Iterable[Truth]) -> Accuracy:
-    """The error of a pose against the truth nearest in time, moved to the pose's stamp by its velocity."""
+    """Error of a pose against the truth nearest in time, extrapolated to the pose's stamp with its velocity."""
     truth = min(truths, key=lambda truth: abs(truth.stamp_ns - pose.stamp_ns), default=None)
     if truth is None:
         return Accuracy(pose)

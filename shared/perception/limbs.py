@@ -1,4 +1,4 @@
-"""Arms in a picture: hands, and the elbows that belong to them, by the landmark models (`landmarks.py`)."""
+"""Arms in a picture: hands and the elbows that belong to them, from the landmark models (`landmarks.py`)."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 from penumbra.shared.perception.landmarks import FOUND, PALM, Hand, Landmarks, Points, Pose, Region
 
 HANDS = 1.0
-"""How far, in sizes of the hand (wrist to knuckles), a wrist of the body's landmarks may be from the hand's own to be it."""
+"""Maximum distance, in sizes of the hand (wrist to knuckles), between a body's wrist landmark and a hand's wrist for the two to
+match."""
 FOREARM = 2.7
-"""Length of a forearm in sizes of the hand, seen from the side (ANSUR II: 0.25 m and 0.09 m)."""
+"""Length of a forearm seen from the side, in sizes of the hand (ANSUR II: 0.25 m and 0.09 m)."""
 KNUCKLES = (5, 9, 13, 17)
-"""Landmarks of a hand that are knuckles, of index to little finger."""
+"""Landmarks of the knuckles, from index to little finger."""
 
 
 @dataclass(frozen=True)
 class Limb:
-    """A hand and where its forearm comes from: points (21, 2) of the hand, elbow and shoulder (2,) where they are known [px]; or
-    where a hand must be that is not seen."""
+    """A hand with its arm: points (21, 2) of the hand, elbow and shoulder (2,) where they are known [px]. is_seen: false for a
+    hand that is not visible but must be there."""
 
     points: Points
     elbow: Points | None = None
@@ -30,12 +31,12 @@ class Limb:
 
     @property
     def size(self) -> float:
-        """From the wrist to the knuckles [px]."""
+        """Size of the hand, as `Hand.size` [px]."""
         return Hand(self.points, 1.0, 0.5).size
 
     @property
     def middle(self) -> Points:
-        """The middle of the palm."""
+        """Middle of the palm (2,) [px]."""
         return np.asarray(self.points[list(PALM)].mean(0))
 
     @property
@@ -45,7 +46,7 @@ class Limb:
         return np.asarray(way / max(float(np.linalg.norm(way)), 1e-6))
 
     def scaled(self, factor: float) -> Limb:
-        """In a picture so many times as large; pixels' middles are at whole numbers."""
+        """The limb in a picture enlarged by a factor. Pixel centres are at integer coordinates."""
         elbow, shoulder = (None if p is None else (p + 0.5) * factor - 0.5 for p in (self.elbow, self.shoulder))
         return replace(self, points=(self.points + 0.5) * factor - 0.5, elbow=elbow, shoulder=shoulder)
 
@@ -53,10 +54,10 @@ class Limb:
 def find(
     models: Landmarks, image: NDArray[np.uint8], before: Iterable[Hand], pose: Pose | None
 ) -> tuple[list[Hand], Pose | None]:
-    """Hands and body in an image (h, w, 3) RGB; they were here before.
+    """Finds hands and body in an image (h, w, 3) RGB, given those of the previous image.
 
-    A body is looked for where its head is seen and, since cells seldom show one, where a person behind a table would be: such a
-    pose is kept only while it agrees with a hand.
+    The body is detected by its head. Cells seldom show a head, so otherwise it is assumed where a person behind a table would be.
+    Such a pose is kept only while it agrees with a hand.
     """
     height, width = image.shape[:2]
     short, long = min(height, width), max(height, width)
@@ -75,8 +76,8 @@ def find(
 
 
 def limb_of(hand: Hand, pose: Pose | None) -> Limb:
-    """A hand with the elbow of the arm whose wrist is at its own; of bodies that are not seen the model invents arms, so the
-    elbow is believed only where it lies opposite the knuckles, at a forearm's distance."""
+    """A hand with the elbow of the arm whose wrist matches the hand's. The model invents arms for bodies that are not visible, so
+    the elbow is accepted only if it lies opposite the knuckles, at a forearm's distance."""
     limb, nearest = Limb(hand.points), HANDS * hand.size
     if pose is None:
         return limb

@@ -1,4 +1,4 @@
-"""Where to look: the window of the image around the predicted targets, around their homes when they are lost."""
+"""Image window for the segmentation: around the predicted targets, or around their homes when they are lost."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.perception.prediction import predict
 
 STEP = 16
-"""Windows begin at multiples of this many of their own pixels, the stride of the coarsest of five layers. Their sides are
-multiples of it, too, unless they end where the picture does."""
+"""Grid [px of the window] of a window's position, the stride of the coarsest of five layers. The sides are multiples of it too,
+unless they end at the picture's edge."""
 SIZE_STEP = 32
-"""Sizes are rounded up to this, so that the size seldom changes while the target turns."""
+"""Step [px of the window] to which sizes are rounded up, so that they seldom change while the target turns."""
 MAX_PIXELS = 224 * 224
-"""Largest window around targets. A larger target is shown at a coarser scale."""
+"""Maximum number of pixels of a window around targets. A larger target is shown at a coarser scale."""
 MAX_PIXELS_WIDE = 320 * 240
-"""Largest window of the whole frame, or around all targets' homes, while one of the targets is lost."""
+"""Maximum number of pixels of a window of the whole frame, or around all targets' homes, while a target is lost."""
 HOME_SIGMAS = 2.0
-"""Distance from its home, in standard deviations, within which a lost target is looked for: further away nothing would be
-taken for it."""
+"""Maximum distance from its home, in standard deviations, of the search for a lost target. A limb further away would not be taken
+for the target."""
 ARM_M = 0.09
-"""Width [m] of a forearm's belly (circumference 0.28 to 0.31 m) and of a hand with its thumb laid on (ANSUR II, Gordon et al.
+"""Width [m] of the belly of a forearm (circumference 0.28 to 0.31 m), and of a hand with adducted thumb (ANSUR II, Gordon et al.
 2014)."""
 WIDEST_ARM_PX = 56
-"""An arm that is wider [px] is shown at a coarser scale, at which the network sees more than smooth skin at once: the widest that
-it is trained with."""
+"""Maximum width [px] of an arm in a window, that of the training. A wider arm is shown at a coarser scale, at which the network
+sees more than smooth skin at once."""
 MARGIN_M = 0.04
-"""Margin around the target [m]: the prediction's error, and the surroundings that show the contour."""
+"""Margin around the target [m], for the error of the prediction and for surroundings that show the contour."""
 NEAR_M = 0.1
-"""A target with a part nearer to the camera than this is not projected."""
+"""Minimum distance [m] from the camera of all parts of a target that is projected."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """A window of a frame: pixel (r, c) of `height` x `width` covers `scale` x `scale` image pixels from
-    (y0 + r * scale, x0 + c * scale) on, as in `messages.Mask`."""
+    """A window of a frame: pixel (r, c) of `height` x `width` covers `scale` x `scale` image pixels, the first of which is (y0 +
+    r * scale, x0 + c * scale), as in `messages.Mask`."""
 
     x0: int
     y0: int
@@ -62,14 +62,14 @@ class Window:
 
 
 def corners_of(vertices: Array) -> Array:
-    """The corners (8, 3) of the box around vertices (n, 3), in their frame."""
+    """Corners (8, 3) of the bounding box of vertices (n, 3), in their frame."""
     low, high = np.min(vertices, axis=0), np.max(vertices, axis=0)
     x, y, z = np.meshgrid(*zip(low, high, strict=True), indexing="ij")
     return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
 
 
 class Sized(Protocol):
-    """Something so many pixels wide and high: a camera, a window."""
+    """Protocol of objects with a width and a height [px]: a camera, a window."""
 
     @property
     def width(self) -> int: ...
@@ -78,7 +78,7 @@ class Sized(Protocol):
 
 
 def whole_frame(camera: Sized) -> Window:
-    """The window of the whole frame, at the scale at which it is looked at."""
+    """Window of the whole frame, at the finest power-of-two scale within MAX_PIXELS_WIDE."""
     scale = 1
     while camera.width * camera.height > MAX_PIXELS_WIDE * scale * scale:
         scale *= 2
@@ -86,14 +86,17 @@ def whole_frame(camera: Sized) -> Window:
 
 
 def reduced(picture: Sized, scale: int) -> Window:
-    """The window of a whole picture at a scale, but for less than `scale` pixels at the right and lower edge."""
+    """Window of a whole picture at a scale, without a remainder of less than `scale` pixels at the right and lower edge."""
     return Window(0, 0, max(picture.width // scale, 1), max(picture.height // scale, 1), scale)
 
 
 class Lookout:
-    """Where to look in the frames of one camera: around the targets of its cell as fusion predicts them, and around the homes of
-    those that are lost. targets: those that it can see, by what its picture shows of the region around their homes; most: pixels
-    of the largest window around those that are not."""
+    """Selects windows in the frames of one camera: around the targets of its cell as predicted from their fused poses, and around
+    the homes of lost targets.
+
+    targets: targets that the camera can see, judged by the region around their homes. most: maximum number of pixels of a window
+    around targets that are not lost.
+    """
 
     def __init__(self, cell: Cell, camera: str, most: int = MAX_PIXELS):
         self._camera, self._most = cell.cameras[camera], most
@@ -113,27 +116,27 @@ class Lookout:
         self._window = self._wide()
 
     def add(self, pose: FusedPose) -> None:
-        """Takes the newest fused pose of a target; of one that it cannot see nothing is kept."""
+        """Stores the newest fused pose of a target. Ignored for a target that the camera cannot see."""
         if pose.target in self._boxes:
             self._poses[pose.target] = pose
 
     @property
     def window(self) -> Window:
-        """The window last looked at, at first that around all homes."""
+        """The latest window; initially the one around all homes."""
         return self._window
 
     @property
     def at_home(self) -> Window:
-        """The window if all targets were found at their homes: one of its size is likely the next after that around all homes."""
+        """Window if all targets were found at their homes. A window of this size likely follows the one around all homes."""
         return window_around(self._camera, self._at_home, None, self._most) or self._wide()
 
     def look(self, stamp_ns: int) -> Window:
-        """The window for a frame exposed at a stamp: kept where it was while it does (`window_around`)."""
+        """Selects the window for a frame exposed at a stamp; the previous one while it fits (`window_around`)."""
         self._window = self.foresee(stamp_ns)
         return self._window
 
     def predicted(self, stamp_ns: int) -> dict[str, tuple[Array, Array]]:
-        """T_world_target and covariance (6, 6) at a stamp, by target, of those that it can see and that are not lost."""
+        """T_world_target and covariance (6, 6) at a stamp, by target, of visible targets that are not lost."""
         found = {}
         for name in self._boxes:
             T, covariance = predict(self._poses.get(name), stamp_ns)
@@ -142,7 +145,7 @@ class Lookout:
         return found
 
     def foresee(self, stamp_ns: int) -> Window:
-        """The window that `look` would give next, for a frame of this stamp."""
+        """The window that `look` would select for a frame of this stamp."""
         known = self.predicted(stamp_ns)
         sure = [(T, self._boxes[name]) for name, (T, _) in known.items()]
         found = window_around(self._camera, sure, self._window, self._most) if len(sure) == len(self._boxes) else None
@@ -154,8 +157,8 @@ class Lookout:
 
 
 def _is_in_picture(camera: Camera, region: Array) -> bool:
-    """Whether a camera may see something of a box, given as its corners (8, 3) in the world: unless all of them lie beyond one
-    side of what it sees."""
+    """Whether a camera may see a part of a box, given its corners (8, 3) in the world: false only if all corners lie beyond one
+    side of the view."""
     x, y, z = rigid.apply(rigid.inverse(camera.T_world_camera), region).T
     u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
     sides = (z - NEAR_M, u, camera.width * z - u, v, camera.height * z - v)
@@ -165,11 +168,11 @@ def _is_in_picture(camera: Camera, region: Array) -> bool:
 def window_around(
     camera: Camera, targets: Iterable[tuple[Array, Array]], previous: Window | None = None, most: int = MAX_PIXELS
 ) -> Window | None:
-    """The window of at most `most` pixels, before its sides are rounded up, that holds targets, given as (T_world_target (4, 4),
-    corners (8, 3) of their box), with a margin of MARGIN_M, arms of ARM_M at most WIDEST_ARM_PX wide.
+    """Window of at most `most` pixels, before its sides are rounded up, around targets, given as (T_world_target (4, 4), corners
+    (8, 3) of their box), with a margin of MARGIN_M. Arms of ARM_M are at most WIDEST_ARM_PX wide.
 
-    The previous window is kept while it holds them and is not much too large: the less it moves, the more the recurrent state
-    is worth. None where no target is in the picture, or one is too near to the camera to say.
+    The previous window is kept while it contains the targets and is not much too large: the recurrent state is worth more the
+    less the window moves. None where no target is in the picture, or one is too near to be projected.
     """
     low, high, arm_px = np.array([np.inf, np.inf]), np.array([-np.inf, -np.inf]), 0.0
     for T_world_target, corners in targets:
@@ -187,9 +190,9 @@ def window_around(
 def window_of(
     picture: Sized, low: Array, high: Array, arm_px: float, previous: Window | None = None, most: int = MAX_PIXELS
 ) -> Window | None:
-    """The window of at most `most` pixels that holds the rectangle from low (2,) to high (2,), x and y [px], as far as it lies in
-    the picture, an arm so wide in the picture at most WIDEST_ARM_PX wide; the previous one is kept as `window_around` says. None
-    where nothing of it lies in the picture."""
+    """Window of at most `most` pixels that contains the visible part of the rectangle from low (2,) to high (2,), x and y [px].
+    arm_px: width of an arm in the picture [px], at most WIDEST_ARM_PX in the window. The previous window is kept as in
+    `window_around`. None where the rectangle lies outside the picture."""
     size = np.array([picture.width, picture.height])
     low, high = np.maximum(low, 0.0), np.minimum(high, size - 1.0)
     if np.any(high - low < 2.0):
@@ -197,7 +200,7 @@ def window_of(
     scale = 1
     while np.prod(np.maximum((high - low) / scale, 2 * STEP)) > most or arm_px > WIDEST_ARM_PX * scale:
         scale *= 2
-    size = size // scale * scale  # less than a pixel of the window is left over
+    size = size // scale * scale  # the remainder is less than a pixel of the window
     if previous is not None and previous.scale == scale and _fits(previous, low, np.minimum(high, size - 1.0)):
         return previous
     unit = STEP * scale

@@ -1,4 +1,4 @@
-"""Where a target should be at the stamp of a measurement, by the last fused pose: what vision and skin know before they look."""
+"""Predicted pose of a target at the stamp of a measurement, from the last fused pose: the prior of vision and skin."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 LONGEST_S = 0.5
-"""A fused pose further away in time than this predicts nothing."""
+"""Maximum time [s] between a fused pose and the stamp of a prediction."""
 UNKNOWN_SPEED = (0.3, 1.5)
-"""Standard deviations of what a constant velocity misses, [m/s] and [rad/s], grown over the time bridged."""
+"""Standard deviations of the error of a constant velocity, [m/s] and [rad/s], multiplied by the time bridged."""
 
 
 def extrapolate(T: Array, velocity: Array, covariance: Array, dt_s: float) -> tuple[Array, Array]:
@@ -21,7 +21,7 @@ def extrapolate(T: Array, velocity: Array, covariance: Array, dt_s: float) -> tu
 
 
 def predict(fused: FusedPose | None, stamp_ns: int) -> tuple[Array, Array] | tuple[None, None]:
-    """T_world_target and covariance at a stamp by the last fused pose; None, None where it is absent, lost or too old."""
+    """T_world_target and covariance at a stamp from the last fused pose; None, None where the pose is absent, lost or too old."""
     if fused is None or fused.state == "lost" or abs(stamp_ns - fused.stamp_ns) * 1e-9 > LONGEST_S:
         return None, None
     T = rigid.transform(fused.position, fused.orientation)

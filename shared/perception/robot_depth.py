@@ -1,4 +1,4 @@
-"""Where robots stand in a camera's view, known exactly from their joints."""
+"""Depth images of robots in a camera's view, from their joint angles."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class RobotDepth:
 
 
 def _outside(centre: Array, radius: float, k: Intrinsics, w: int, h: int) -> bool:
-    """Whether a ball cannot be seen in the window; one that reaches behind the camera is taken for visible."""
+    """Whether a ball lies outside the window. A ball that reaches behind the camera counts as visible."""
     z = centre[2] - radius
     if centre[2] + radius <= 0.0:
         return True

@@ -1,4 +1,4 @@
-"""What every vision process finds of a target in a frame, and the message that fusion receives of it."""
+"""Result of a vision process for a target in a frame, and its message to fusion."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ State = Literal["tracking", "occluded", "lost"]
 
 @dataclass(frozen=True)
 class VisionEstimate:
-    """T_world_target, covariance (6, 6) along the world's axes, overlap and hidden share in [0, 1], state. The pose is the
-    measurement's alone."""
+    """T_world_target, covariance (6, 6) along the world's axes, overlap and hidden share in [0, 1], state. The pose is based on
+    the measurement alone."""
 
     T: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -26,7 +26,7 @@ class VisionEstimate:
     state: State
 
     def message(self, stamp_ns: int, target: str, camera: str, frame: str) -> VisionPose:
-        """The estimate of a frame exposed at a stamp."""
+        """Message of the estimate for a frame exposed at a stamp."""
         position, orientation = rigid.position_orientation(self.T)
         return VisionPose(
             stamp_ns=stamp_ns,

@@ -1,7 +1,6 @@
-"""What the bus carries, in MCAP files (https://mcap.dev): written so that a kill costs at most the last moments, read also where
-the end is missing.
+"""Recordings of the bus in MCAP files (https://mcap.dev). If the recorder is killed, at most the last moments are lost, and files
+without an end can be read.
 
-A file holds the topics twice: as they are on the bus (MessagePack, under their keys), which is what a replay takes, and in the
-schemas of Foxglove (Protobuf), which Foxglove and Rerun show. A camera's frames are kept as JPEG alone, unless all bytes are
-wanted.
+A file contains the topics twice: as on the bus (MessagePack, under their keys), for replay, and in Foxglove's schemas (Protobuf),
+for Foxglove and Rerun. A camera's frames are stored as JPEG only, unless their raw bytes are requested.
 """

@@ -1,4 +1,4 @@
-"""What a file consists of: messages on channels."""
+"""Contents of a file: messages on channels."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from penumbra.shared.runtime.tap import Taken
 
 KEY, PUBLISHER = "key", "publisher"
-"""Metadata of a channel from which a replay takes messages: the key on the bus, and the identity of who published on it."""
+"""Metadata of a channel that is replayed: the key on the bus, and the identity of the publisher."""
 
 
 @dataclass(frozen=True)
 class Channel:
     """A stream of messages in a file.
 
-    topic: its name there. encoding: `msgpack` or `protobuf`. schema: name of the message's type. definition: of a Protobuf
-    schema, a serialised FileDescriptorSet. about: its metadata, as pairs.
+    topic: its name in the file. encoding: `msgpack` or `protobuf`. schema: name of the message's type. definition: serialised
+    FileDescriptorSet of a Protobuf schema. about: metadata, as pairs.
     """
 
     topic: str
@@ -27,7 +27,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Entry:
-    """A message of a file. log_ns: when it was received; stamp_ns: of the measurement; number: its publisher's."""
+    """A message in a file. log_ns: time of reception; stamp_ns: of the measurement; number: in the publisher's sequence."""
 
     channel: Channel
     log_ns: int
@@ -37,7 +37,7 @@ class Entry:
 
 
 def as_on_the_bus(taken: Taken) -> Entry:
-    """The entry that keeps a message to the bit."""
+    """Entry that stores the unchanged bytes of a message."""
     about = ((KEY, taken.key), (PUBLISHER, taken.publisher.hex()))
     channel = Channel(taken.key, "msgpack", f"penumbra.{taken.topic.message.__name__}", about=about)
     return Entry(channel, taken.received_ns, taken.stamp_ns, taken.payload, taken.number)

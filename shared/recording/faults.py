@@ -1,5 +1,5 @@
-"""What can be wrong with a file that was recorded."""
+"""Errors of recorded files."""
 
 
 class RecordingError(ValueError):
-    """A file that cannot be read as asked; the text says what to do."""
+    """A file that cannot be read as requested. The text says what to do."""

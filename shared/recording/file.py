@@ -1,7 +1,7 @@
-"""An MCAP file that is being written.
+"""Writer of an MCAP file.
 
-What is written reaches the kernel with every `flush`, in whole chunks, so that a process that is killed loses what came since.
-Where the disk takes no more, the file ends with its last whole chunk, and is still a file that every reader of MCAP reads.
+Every `flush` hands whole chunks to the kernel, so a killed process loses only what came since. When the disk is full, the file
+ends with its last whole chunk and remains a valid MCAP file.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from penumbra.shared.recording.entries import Channel, Entry
 CHUNK_BYTES = 1 << 20
 MAGIC = b"\x89MCAP0\r\n"
 END = struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MAGIC
-"""The shortest end of a file, without an index: the data end here, the summary has no bytes. (MCAP specification, version 0.)"""
+"""Shortest end of a file, without an index: end of the data, and an empty summary. (MCAP specification, version 0.)"""
 
 
 class File:
-    """A new file. about: its metadata, by name; attachments: by file name; now_ns: the time.
+    """A new file. about: its metadata, by name; attachments: by file name; now_ns: current time.
 
-    Raises FileExistsError where there is one already, and OSError where none can be written.
+    Raises FileExistsError where the file exists already, and OSError where it cannot be written.
     """
 
     def __init__(self, path: Path, about: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes], now_ns: int):
@@ -34,7 +34,7 @@ class File:
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
         self._channels: dict[Channel, int] = {}
         self._schemas: dict[tuple[str, bytes], int] = {}
-        self._wholes = [0]  # where the file may end, the last two places
+        self._wholes = [0]  # the last two offsets at which the file may end
         self.messages = 0
         try:
             self._writer.start("", "penumbra")
@@ -50,11 +50,11 @@ class File:
 
     @property
     def size(self) -> int:
-        """Bytes so far."""
+        """Bytes written so far."""
         return self._stream.tell()
 
     def write(self, entry: Entry) -> None:
-        """Adds a message. Raises OSError where the disk takes no more: only `cut` may follow."""
+        """Adds a message. Raises OSError where the disk is full: only `cut` may follow."""
         channel = self._channels.get(entry.channel)
         if channel is None:
             channel = self._channels[entry.channel] = self._register(entry.channel)
@@ -62,12 +62,12 @@ class File:
         self.messages += 1
 
     def flush(self) -> None:
-        """Hands all to the kernel. Raises OSError as `write`."""
+        """Hands all data to the kernel. Raises OSError as `write`."""
         self._writer.flush()
         self._is_whole()
 
     def sync(self) -> None:
-        """Has the kernel write all to the disk: what survives the loss of power. Any thread may call it."""
+        """Makes the kernel write all data to the disk, so that it survives a loss of power. Any thread may call it."""
         self._stream.sync()
 
     def close(self) -> None:
@@ -77,9 +77,9 @@ class File:
         self._stream.close()
 
     def cut(self) -> None:
-        """Ends the file after its last whole chunk, where the disk has taken no more; without an index, for which there is no
-        room. Where even that is refused, it stays as if its writer were killed."""
-        for at in reversed(self._wholes):  # the end itself takes some bytes, for which a chunk may have to go
+        """Ends the file after its last whole chunk when the disk is full, without an index, for which there is no space. Where
+        even that fails, the file remains as if its writer had been killed."""
+        for at in reversed(self._wholes):  # the end itself needs some bytes, so a chunk may have to be dropped
             try:
                 self._stream.truncate(at)
                 self._stream.write(END)
@@ -103,7 +103,7 @@ class File:
 
 
 class _Stream:
-    """A new file without a buffer: what cannot be written is not kept to be written later."""
+    """A new file without a buffer: data that cannot be written is not kept for a later write."""
 
     def __init__(self, path: Path):
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
@@ -121,7 +121,7 @@ class _Stream:
         return self._at
 
     def flush(self) -> None:
-        """Nothing is kept back."""
+        """Does nothing: there is no buffer."""
 
     def truncate(self, at: int) -> None:
         os.ftruncate(self._descriptor, at)

@@ -1,11 +1,11 @@
-"""The messages of the bus in the schemas of Foxglove (https://docs.foxglove.dev/docs/sdk/schemas), for people to look at.
+"""Conversion of the bus's messages to Foxglove's schemas (https://docs.foxglove.dev/docs/sdk/schemas), for viewers.
 
     /camera/NAME/frame          CompressedImage (JPEG)
     /camera/NAME/calibration    CameraCalibration
     /robot/NAME/joints          JointStates
     /target/NAME/pose/SENSE     PoseInFrame, likewise .../pose/fused and .../truth
     /tf                         FrameTransforms
-    /scene                      SceneUpdate: robots, pads and targets as meshes; points of surfaces that the pads feel, as spheres
+    /scene                      SceneUpdate: robots, pads and targets as meshes; surface points of the pads as spheres
 
 Frames of reference: the cell's own, `camera/NAME`, `ROBOT/LINK`, and a target's name at its fused pose.
 """
@@ -49,19 +49,19 @@ from penumbra.shared.recording.entries import KEY, PUBLISHER, Channel, Entry
 from penumbra.shared.runtime.tap import Taken
 
 QUALITY = 90
-"""Of the pictures, as JPEG counts it: masks and poses from such a picture are those of the picture itself but for noise."""
+"""JPEG quality of the pictures. Masks and poses from such a picture equal those from the original up to noise."""
 LINKS_S = 0.04
-"""Robots' links are placed at most so often [s]: a viewer shows no more."""
+"""Minimum period [s] of the transforms of a robot's links: viewers show no more."""
 ROBOT, TARGET, PAD = Color(r=0.72, g=0.74, b=0.78, a=1.0), Color(r=0.2, g=0.85, b=0.35, a=0.8), Color(r=0.95, g=0.7, b=0.1, a=1.0)
 FELT, TOUCHED = Color(r=0.3, g=0.6, b=1.0, a=0.6), Color(r=0.95, g=0.2, b=0.2, a=0.9)
 LEAST_SPHERE = 0.003
-"""Smallest radius [m] of a point of a surface, as it is drawn."""
+"""Minimum radius [m] of a surface point, as drawn."""
 PAD_SIZE = (0.061, 0.06, 0.002)
-"""Of a pad [m], as it is drawn."""
+"""Size of a pad [m], as drawn."""
 
 
 def channel(topic: str, kind: Any, about: Mapping[str, str] | None = None) -> Channel:
-    """The channel of messages of one Foxglove schema."""
+    """Channel for messages of one Foxglove schema."""
     return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, _definition(kind), tuple((about or {}).items()))
 
 
@@ -72,10 +72,10 @@ def _definition(kind: Any) -> bytes:
 
 
 def unpacked(picture: bytes) -> tuple[int, NDArray[np.uint8]]:
-    """Stamp [ns] and image (h, w, 3) uint8 RGB of a CompressedImage. Raises BadMessage for what is none."""
+    """Stamp [ns] and image (h, w, 3) uint8 RGB of a CompressedImage. Raises BadMessage where the bytes are not one."""
     try:
         found = CompressedImage.FromString(picture)
-    except Exception as error:  # protobuf's DecodeError has no home that all its releases share
+    except Exception as error:  # the module of protobuf's DecodeError depends on the release
         raise BadMessage("picture", f"expected a foxglove.CompressedImage, got {picture[:16]!r}… ({error!s:.100})") from None
     image = cv2.imdecode(np.frombuffer(found.data, np.uint8), cv2.IMREAD_COLOR) if found.data else None
     if image is None:
@@ -85,8 +85,8 @@ def unpacked(picture: bytes) -> tuple[int, NDArray[np.uint8]]:
 
 
 class Viewers:
-    """Makes entries for viewers of what was on the bus of a cell. keeps_frames: whether the frames' own bytes are kept too; else
-    a replay takes them from the pictures."""
+    """Makes entries for viewers from the messages of a cell. keeps_frames: whether the raw frames are stored too; otherwise a
+    replay decodes them from the JPEG pictures."""
 
     def __init__(self, cell: cells.Cell, keeps_frames: bool = False):
         self._cell, self._keeps_frames = cell, keeps_frames
@@ -99,7 +99,7 @@ class Viewers:
         self._felt_ns: dict[str, int] = {}
 
     def stage(self, now_ns: int) -> Iterator[Entry]:
-        """What does not change, for the beginning of a file: calibrations, places of cameras and bases, and all meshes."""
+        """Static entries for the beginning of a file: calibrations, poses of cameras and bases, and all meshes."""
         cell, at = self._cell, _time(now_ns)
         for name, camera in cell.cameras.items():
             yield Entry(channel(f"/camera/{name}/calibration", CameraCalibration), now_ns, now_ns, _calibration(name, camera, at))
@@ -128,7 +128,7 @@ class Viewers:
         yield Entry(self._scene, now_ns, now_ns, SceneUpdate(entities=entities).SerializeToString())
 
     def of(self, taken: Taken) -> Iterator[Entry]:
-        """The entries of one message; none of one that no viewer shows. Raises BadMessage for one that cannot be read."""
+        """Entries of one message; none where viewers do not show it. Raises BadMessage for a message that cannot be decoded."""
         if not _is_shown(taken.topic.message):
             return
         match decode(taken.topic.message, taken.payload):
@@ -167,7 +167,7 @@ class Viewers:
             yield self._transforms(taken.received_ns, joints.stamp_ns, places)
 
     def _target(self, taken: Taken, pose: Any) -> Iterator[Entry]:
-        """Of a message of any sense."""
+        """Entries of a pose message of any sense."""
         name, at = taken.names["target"], _time(pose.stamp_ns)
         placed = _pose(pose.position, pose.orientation)
         found = PoseInFrame(timestamp=at, frame_id=pose.frame, pose=placed)
@@ -209,7 +209,7 @@ class Viewers:
 
 @functools.cache
 def _is_shown(kind: Any) -> bool:
-    """Whether messages of a class are frames, joints, or poses of a sense."""
+    """Whether messages of a class are frames, joints or poses."""
     return kind in (messages.Frame, messages.Joints) or {"frame", "position", "orientation"} <= set(kind.__struct_fields__)
 
 
@@ -229,7 +229,7 @@ def _pose(position: Array, orientation: Array) -> Pose:
 
 
 def _calibration(name: str, camera: cells.Camera, at: Timestamp) -> bytes:
-    """The intrinsics as Foxglove wants them: K (3 x 3), R (3 x 3), P (3 x 4), and distortion as OpenCV orders it."""
+    """Intrinsics in Foxglove's form: K (3 x 3), R (3 x 3), P (3 x 4), and distortion in OpenCV's order."""
     K = camera.K
     calibration = CameraCalibration(
         timestamp=at,
@@ -247,8 +247,8 @@ def _calibration(name: str, camera: cells.Camera, at: Timestamp) -> bytes:
 
 
 def _felt(name: str, pose: messages.HapticPose, at: Timestamp) -> SceneEntity:
-    """The points of surfaces of a target's pads: spheres of one standard deviation of the distance, touched pads' in another
-    colour. Without points, the ones before disappear."""
+    """Surface points of a target's pads: spheres whose radius is the standard deviation of the distance, in another colour for
+    touched pads. An entity without points removes the previous ones."""
     entity = SceneEntity(timestamp=at, frame_id=pose.frame, id=f"surface {name}", frame_locked=True)
     for pad, point in pose.surface.items():
         x, y, z = point.position
@@ -262,7 +262,7 @@ def _felt(name: str, pose: messages.HapticPose, at: Timestamp) -> SceneEntity:
 
 
 def _entity(frame: str, name: str, mesh: Mesh, colour: Color, at: Timestamp) -> SceneEntity:
-    """A mesh that moves with a frame of reference, of that frame's coordinates."""
+    """A mesh in the coordinates of a frame of reference, attached to that frame."""
     triangles = TriangleListPrimitive(
         pose=Pose(orientation=Quaternion(w=1.0)),
         points=[Point3(x=x, y=y, z=z) for x, y, z in mesh.vertices.tolist()],

@@ -1,4 +1,4 @@
-"""What a recording must say of where it comes from, so that it can be understood later and elsewhere."""
+"""Provenance of a recording, for its later use elsewhere."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from penumbra.shared.recording.reading import ABOUT, CELL
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("eclipse-zenoh", "msgspec", "numpy", "openvino", "opencv-python-headless", "scipy", "torch")
-"""Whose version may explain a number."""
+"""Packages whose version may explain a result."""
 WEIGHTS = "weights"
-"""Name of the metadata that hold the SHA-256 of weights, by their paths."""
+"""Name of the metadata that contain the SHA-256 of weights, by their paths."""
 
 
 def about(cell: str | Path) -> dict[str, dict[str, str]]:
-    """The metadata of a recording of a cell, by name. cell: a built-in name or a YAML file."""
+    """Metadata of a recording of a cell, by name. cell: a built-in name or a YAML file."""
     path = cells.source(cell)
     return {
         ABOUT: {
@@ -40,12 +40,12 @@ def about(cell: str | Path) -> dict[str, dict[str, str]]:
 
 
 def attachments(cell: str | Path) -> dict[str, bytes]:
-    """What is attached to a recording: the cell file."""
+    """Attachments of a recording: the cell file."""
     return {CELL: cells.source(cell).read_bytes()}
 
 
 def weights() -> list[Path]:
-    """The committed weights that this installation has: of the services and of the built-in cells' skins."""
+    """Committed weights of this installation: those of the services, and those of the built-in cells' skins."""
     folders = [*ROOT.glob("services/*/weights"), ROOT / "shared" / "cell" / "built_in" / "skin"]
     return sorted(path for folder in folders for path in folder.glob("*") if path.suffix in (".npz", ".pt"))
 

@@ -1,4 +1,4 @@
-"""A file that was recorded, also one whose end is missing."""
+"""Reader of recorded files, also of those whose end is missing."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from penumbra.shared.runtime.bus import topic_of
 ABOUT, CELL = "penumbra", "cell.yaml"
 """Names of the metadata and of the attached cell file."""
 LARGEST = 1 << 30
-"""No record of a good file is larger [bytes]: a greater length is damage."""
+"""Maximum size of a record [bytes]. A larger length indicates damage."""
 BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, OverflowError, EOFError)
-"""What reading a damaged file raises."""
+"""Exceptions that a damaged file can cause."""
 
 
 @dataclass(frozen=True)
 class Played:
-    """A message of a file: when it was received, its key with its names, and who published it."""
+    """A message of a file: the time of its reception, its key with the names in it, and its publisher."""
 
     received_ns: int
     topic: Topic
@@ -50,9 +50,9 @@ class Recording:
     """A file of `penumbra record`.
 
     about: its metadata. attachments: by name. fault: what is wrong with its end, as far as it was read; empty where nothing is.
-    unread: messages of it that no release like this reads, by kind.
+    unread: number of messages that this release cannot decode, by kind.
 
-    Raises RecordingError for a file that is none.
+    Raises RecordingError for any other file.
     """
 
     def __init__(self, path: Path):
@@ -80,7 +80,7 @@ class Recording:
 
     @property
     def is_indexed(self) -> bool:
-        """Whether the file ends with an index of itself, as one that was closed does."""
+        """Whether the file ends with an index, as a file that was closed does."""
         try:
             with self.path.open("rb") as file:
                 return make_reader(file).get_summary() is not None
@@ -88,8 +88,8 @@ class Recording:
             return False
 
     def cell(self) -> cells.Cell:
-        """The cell that was recorded: from its file where that is still there and the same, else from the attached copy. Raises
-        CellError where the copy names files that lay beside its original."""
+        """The recorded cell: from its original file where that exists unchanged, else from the attached copy. Raises CellError
+        where the copy refers to other files beside the original."""
         attached = self.attachments[CELL]
         for path in (cells.BUILT_IN / f"{self.about['cell']}.yaml", Path(self.about["cell_file"])):
             if path.is_file() and path.read_bytes() == attached:
@@ -100,7 +100,7 @@ class Recording:
             return cells.load(path)
 
     def entries(self) -> Iterator[Entry]:
-        """Everything in the file in the order in which it was written, up to where it is damaged."""
+        """All entries in the order in which they were written, up to the first damage."""
         schemas: dict[int, records.Schema] = {}
         channels: dict[int, Channel] = {}
         for record in self._records():
@@ -116,8 +116,8 @@ class Recording:
                     yield Entry(found, record.log_time, record.publish_time, record.data, record.sequence)
 
     def messages(self, wanted: Collection[Topic] = topics.TOPICS) -> Iterator[Played]:
-        """The messages of some topics as they were on the bus, in the order of their arrival. What this release cannot read is
-        counted in `unread`. Raises RecordingError where that is all of them."""
+        """Messages of the wanted topics as they were on the bus, in order of arrival. Messages that this release cannot decode
+        are counted in `unread`. Raises RecordingError where it can decode none of them."""
         count, known = 0, dict[Channel, _Source | None]()
         for entry in self.entries():
             if entry.channel not in known:
@@ -154,7 +154,7 @@ class _Source(NamedTuple):
 
 
 def _source(channel: Channel, wanted: Collection[Topic]) -> _Source | None:
-    """What the messages of a channel were on the bus; None where they are for viewers only, or not wanted."""
+    """Topic, key and publisher on the bus of a channel's messages; None where they are for viewers only, or not wanted."""
     about = dict(channel.about)
     topic = topic_of(about[KEY], wanted) if KEY in about else None
     return _Source(topic, about[KEY], topic.names(about[KEY]), about.get(PUBLISHER, "")) if topic else None
@@ -169,7 +169,7 @@ def _message(topic: Topic, entry: Entry) -> Message:
 
 @dataclass(frozen=True)
 class Mended:
-    """What was saved of a file: messages, seconds from the first to the last, and what was wrong with it."""
+    """Result of `mend`: number of messages, time from the first to the last [s], and the fault of the original file."""
 
     messages: int
     seconds: float
@@ -177,7 +177,8 @@ class Mended:
 
 
 def mend(source: Path, out: Path) -> Mended:
-    """Writes all that can be read of a file to a new one, with an index, and reads that again. Raises RecordingError."""
+    """Copies everything that can be read from a file to a new file with an index, and verifies the copy. Raises
+    RecordingError."""
     recording = Recording(source)
     file = File(out, {ABOUT: recording.about}, recording.attachments, 0)
     first_ns = last_ns = None

@@ -1,1 +1,1 @@
-"""What a service runs on: the node, the bus and its readers, replicas, health, metrics and logs."""
+"""Runtime of the services: the node, the bus and its readers, replicas, health, metrics and logs."""

@@ -1,4 +1,4 @@
-"""Classes of a user's own, which a source names as adapter:MODULE:CLASS."""
+"""Loads a user's own classes, which a source names as adapter:MODULE:CLASS."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ METHODS = ("read", "close")
 
 
 def load(place: str, folder: Path, guide: str) -> type[Any]:
-    """The class of `MODULE:CLASS`, with METHODS; modules are looked for in the folder of the cell file, too. guide: the page that
-    describes it. Raises CellError."""
+    """Class of `MODULE:CLASS`; it must have METHODS. Modules are also imported from the folder of the cell file. guide: the page
+    that describes the class. Raises CellError."""
     module, _, name = place.partition(":")
     if str(folder) not in sys.path:
         sys.path.append(str(folder))

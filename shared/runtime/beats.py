@@ -1,7 +1,7 @@
-"""Which replicas of a service stand still: those whose beats are missed.
+"""Detection of frozen replicas of a service by missed heartbeats.
 
-A liveliness token is there for as long as the connection's lease, also where its process is frozen. Beats tell it sooner; where
-they are wrong, two replicas work on a stream for a moment, and no connection is lost.
+A liveliness token lasts as long as the connection's lease, even if its process is frozen. Heartbeats show this sooner. When they
+are wrong, two replicas work on a stream for a moment, and no connection is lost.
 """
 
 from __future__ import annotations
@@ -9,27 +9,29 @@ from __future__ import annotations
 from collections.abc import Collection
 
 BEAT_S, MISSED = 0.05, 5
-"""Period [s] of a replica's beats, and how many the others miss in a row before they take it for frozen: it stands still for a
-quarter of a second. Chosen: half of the time in which a replica is to have taken over."""
+"""Period [s] of a replica's heartbeats, and the number of successive missed ones after which the others take it for frozen: a
+quarter of a second. Chosen: half of the time within which another replica must have taken over."""
 STEADY = 20
-"""How often it then has to beat before it counts again: one that is stopped again and again does not come and go."""
+"""Number of heartbeats after which such a replica counts again, so that one that is stopped again and again does not come and
+go."""
 
 
 class Beats:
-    """The beats of the replicas, as one of them hears them. own: that one."""
+    """Heartbeats of all replicas, as received by one of them. own: that replica."""
 
     def __init__(self, own: str):
         self._own = own
-        self._missed: dict[str, int] = {}  # in a row, of those that have ever beaten
-        self._unsteady: dict[str, int] = {}  # how often each has to beat until it counts again
+        self._missed: dict[str, int] = {}  # successive misses, by replica that has ever sent a heartbeat
+        self._unsteady: dict[str, int] = {}  # heartbeats that each still has to send until it counts again
         self._last_s: float | None = None
 
     def judge(self, others: Collection[str], heard: Collection[str], now_s: float) -> frozenset[str]:
-        """The replicas that are taken for frozen, at another beat of this one's own: while it stands still itself it misses none,
-        and the others miss its own, so that it is of them afterwards.
+        """Replicas that are taken for frozen. Called at each heartbeat of this replica.
 
-        others: those that hold a token. heard: those that have beaten since the last time; one that never has is not missed, as
-        one of an older release. now_s: of a clock that nobody sets.
+        After it stood still, this replica counts itself as frozen: it cannot have missed others, but they missed its heartbeats.
+
+        others: replicas that hold a token. heard: replicas heard since the last call; one that has never sent a heartbeat (an
+        older release) is not missed. now_s: monotonic time.
         """
         known = [each for each in others if each in heard or each in self._missed]
         self._missed = {each: 0 if each in heard else self._missed[each] + 1 for each in known}

@@ -1,7 +1,7 @@
-"""The bus: one Zenoh session per process, queries, and which topic a key belongs to.
+"""The bus: one Zenoh session per process, queries, and the mapping from keys to topics.
 
-`shared.runtime.connection` has the configuration, `shared.runtime.reader` what reads a subscription,
-`shared.runtime.traffic` what it counts.
+`shared.runtime.connection` has the configuration, `shared.runtime.reader` the readers of subscriptions, `shared.runtime.traffic`
+their counters.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ __all__ = [
 
 RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 RUNTIME = "(rx: (handover: app), app: (worker_threads: 2))"
-"""Zenoh's threads in a client: what waits for the socket also reads the messages. By default it wakes another thread for that,
-and a third one that finds nothing to do. A router keeps the default, by which a reader that waits for room on one link does not
-hold up the others."""
+"""Zenoh's threads in a client. The thread that waits for the socket also reads the messages. By default it wakes another thread
+for that, and a third one that finds nothing to do. A router keeps the default, so that a reader that waits for space on one link
+does not block the others."""
 
 
 class Refused(ValueError):
-    """A query was answered with an error; the text is the answerer's."""
+    """A query was answered with an error; the text is that of the answer."""
 
 
 def taken(endpoint: str) -> BusError:
-    """The error of a router whose port is in use."""
+    """Error of a router whose port is in use."""
     return BusError(
         f"the port of {endpoint} is taken: another router runs there; stop it, or give another port "
         "(penumbra up --port 7448; penumbra router --listen tcp/127.0.0.1:7448)"
@@ -68,11 +68,11 @@ def taken(endpoint: str) -> BusError:
 def open_session(
     connection: Connection, stopping: threading.Event, waiting: Callable[[], None], patience_s: float = math.inf
 ) -> zenoh.Session:
-    """A session, as soon as the router is there; `waiting` is called once if it is not yet. Once open, the session comes back by
-    itself whenever the router does.
+    """Opens a session as soon as the router is available; `waiting` is called once if it is not yet. An open session reconnects
+    by itself whenever the router comes back.
 
-    Raises BusError where the configuration cannot be used, the port is taken, or no router came within `patience_s` or before
-    `stopping` was set.
+    Raises BusError where the configuration cannot be used, the port is taken, or no router was found within `patience_s` or
+    before `stopping` was set.
     """
     config = configuration(connection)
     memory.keep()
@@ -87,7 +87,7 @@ def open_session(
             if "Unable to connect" not in str(error):
                 raise BusError(f"the Zenoh session does not open: {short(error)}") from None
         if stopping.is_set() or time.monotonic() > deadline:
-            from penumbra.shared.runtime import diagnosis  # with Python's TLS, which nothing else here needs
+            from penumbra.shared.runtime import diagnosis  # imports Python's TLS, which nothing else here needs
 
             raise BusError(diagnosis.no_router(connection))
         if not told:
@@ -96,8 +96,8 @@ def open_session(
 
 
 def _open(config: zenoh.Config) -> zenoh.Session:
-    """A session, in a client with the threads of RUNTIME. Zenoh reads them when the first session of a process opens; a process
-    that is started later, which may be a router, inherits nothing."""
+    """Opens a session, in a client with the threads of RUNTIME. Zenoh reads them when the first session of a process opens. Child
+    processes, which may be routers, inherit nothing."""
     if json.loads(config.get_json("mode")) != "client" or RUNTIME_VARIABLE in os.environ:
         return zenoh.open(config)
     os.environ[RUNTIME_VARIABLE] = RUNTIME
@@ -110,7 +110,7 @@ def _open(config: zenoh.Config) -> zenoh.Session:
 def ask(
     session: zenoh.Session, key: str, parameters: str = "", payload: bytes | None = None, timeout_s: float = 1.0
 ) -> list[bytes]:
-    """The payloads of all answers to a query. Raises Refused where the only answers are errors."""
+    """Payloads of all answers to a query. Raises Refused where the only answers are errors."""
     selector = f"{key}?{parameters}" if parameters else key
     answers, errors = [], []
     # every answerer counts, also where several processes answer on the same key
@@ -131,5 +131,5 @@ def ask(
 
 
 def topic_of(key: str, known: Iterable[Topic] = TOPICS) -> Topic | None:
-    """The topic that a key (or a key expression) belongs to, of those that are known."""
+    """The known topic that a key (or a key expression) belongs to; None where there is none."""
     return next((topic for topic in known if zenoh.KeyExpr(topic.at()).includes(key)), None)

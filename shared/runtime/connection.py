@@ -1,4 +1,4 @@
-"""How a process connects to the bus: the Zenoh configuration of a connection, with TLS where it is asked for."""
+"""Zenoh configuration of a process's connection to the bus, with TLS where it is requested."""
 
 from __future__ import annotations
 
@@ -19,28 +19,30 @@ SECURE_ENDPOINT = "tls/127.0.0.1:7447"
 SECURE_PROTOCOLS = ("tls",)
 PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 POOL_BYTES = 8 << 20
-"""Least size of the shared memory: nine frames of a small camera. With half of it, the second of two frames under way at times
-finds no room and goes through a socket, at 0.4 of the rate."""
+"""Minimum size of the shared memory: nine frames of a small camera. With half of it, the second of two frames in transit
+sometimes finds no space and goes through a socket, at 0.4 of the rate."""
 SHARED_BYTES = 100_000
-"""Frames go by shared memory; what is smaller takes no longer through a socket, and leaves its readers nothing behind where its
-publisher dies: they keep its pool for as long as they live."""
+"""Minimum size [bytes] of a message in shared memory, such as a frame. Smaller ones are as fast through a socket, and leave
+nothing behind: readers keep the pool of a publisher that died for as long as they live."""
 ATTEMPT_MS = 500
-"""Longest time [ms] of one attempt to reach the router, inside Zenoh, where no signal is handled."""
+"""Maximum time [ms] of one attempt to reach the router, inside Zenoh, where no signal is handled."""
 
 
 class BusError(RuntimeError):
-    """The bus cannot be used as asked; the text says what to do."""
+    """The bus cannot be used as requested. The text says what to do."""
 
 
 @dataclass(frozen=True)
 class Connection:
-    """How a session meets the others. `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as
-    tcp/127.0.0.1:7447; `config`: a Zenoh JSON5 file, whose settings stand unless `connect` or `listen` say otherwise; `secure`: a
-    folder of `penumbra certs`, with which nothing goes unencrypted and nobody without a certificate takes part; `service`: who
-    this is, and so whose certificate it shows; `slow`: a router's links that carry little; `is_announced`: whether a router
-    answers those that look for one on the network; `pool_bytes`: of shared memory, by which what is large goes to processes of
-    the same host. Readers keep the pool of a publisher that is gone for as long as they live, so it is no larger than it must
-    be."""
+    """Settings of a session.
+
+    `mode`: client (behind a router), peer or router; `connect`, `listen`: endpoints such as tcp/127.0.0.1:7447; `config`: a Zenoh
+    JSON5 file, whose settings apply unless `connect` or `listen` override them; `secure`: a folder of `penumbra certs`: all
+    traffic is encrypted, and every participant needs a certificate; `service`: the service that connects, which selects its
+    certificate; `slow`: a router's links of low bandwidth; `is_announced`: whether a router answers searches on the network;
+    `pool_bytes`: size of the shared memory that carries large messages to processes of the same host. Readers keep the pool of a
+    terminated publisher for as long as they live, so it should be no larger than necessary.
+    """
 
     mode: str | None = None
     connect: tuple[str, ...] = ()
@@ -54,22 +56,22 @@ class Connection:
 
     @property
     def default(self) -> str:
-        """The endpoint where none is given."""
+        """The default endpoint."""
         return SECURE_ENDPOINT if self.secure else DEFAULT_ENDPOINT
 
     @property
     def where(self) -> str:
-        """The endpoints in words."""
+        """The endpoints as text."""
         return ", ".join(self.connect) or (f"the endpoints of {self.config}" if self.config else self.default)
 
     @property
     def whereabouts(self) -> str:
-        """Where a router is looked for, and what it must have."""
+        """Where a router is expected, and the certificate that it needs."""
         return f"at {self.where}" + (f" with a certificate of the same CA as in {self.secure}" if self.secure else "")
 
 
 def connection(options: SimpleNamespace) -> Connection:
-    """The connection that the flags of `services.flags.BUS` and the environment ask for."""
+    """Connection from the flags of `services.flags.BUS` and the environment."""
     connect = tuple(options.connect)
     if not connect and options.config is None and options.mode in (None, "client"):
         connect = connect_by_environment()
@@ -77,23 +79,23 @@ def connection(options: SimpleNamespace) -> Connection:
 
 
 def connect_by_environment() -> tuple[str, ...]:
-    """The endpoints of $PENUMBRA_CONNECT; none where it is not set."""
+    """Endpoints in $PENUMBRA_CONNECT; none where it is not set."""
     return tuple(os.environ.get("PENUMBRA_CONNECT", "").split())
 
 
 def secure_by_environment() -> Path | None:
-    """The folder of $PENUMBRA_SECURE; None where it is not set."""
+    """Folder in $PENUMBRA_SECURE; None where it is not set."""
     folder = os.environ.get("PENUMBRA_SECURE")
     return Path(folder) if folder else None
 
 
 def mode(connection: Connection) -> str:
-    """client, peer or router, as the connection or its file says. Raises BusError like `configuration`."""
+    """Mode of the connection or its file: client, peer or router. Raises BusError like `configuration`."""
     return str(json.loads(configuration(connection).get_json("mode")))
 
 
 def configuration(connection: Connection) -> zenoh.Config:
-    """The Zenoh configuration of a connection. Raises BusError for a file or an endpoint that Zenoh does not take."""
+    """Zenoh configuration of a connection. Raises BusError for a file or an endpoint that Zenoh does not accept."""
     try:
         config = zenoh.Config.from_file(str(connection.config)) if connection.config else zenoh.Config()
     except zenoh.ZError as error:
@@ -117,22 +119,22 @@ def configuration(connection: Connection) -> zenoh.Config:
         "connect/timeout_ms": ATTEMPT_MS,
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 200, "period_increase_factor": 1},
-        # processes meet at the router and nowhere else: what is not configured is not found by chance
+        # processes connect to the router only: no peer is found by chance
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "scouting/delay": 0,  # nor waited for
+        "scouting/delay": 0,  # no wait for scouting
         "transport/shared_memory/transport_optimization/pool_size": connection.pool_bytes,
         "transport/shared_memory/transport_optimization/message_size_threshold": SHARED_BYTES,
     }
     settings |= {key: value for key, value in defaults.items() if not is_set(key)}
     if connection.is_announced:
         nobody: dict[str, list[str]] = {"router": [], "peer": [], "client": []}
-        settings |= {"scouting/multicast/enabled": True, "scouting/multicast/autoconnect": nobody}  # it links to nobody by itself
+        settings |= {"scouting/multicast/enabled": True, "scouting/multicast/autoconnect": nobody}  # it opens no links itself
     if connection.config is None:
-        settings["transport/link/tx/lease"] = 1000  # ms after which a frozen process is no longer alive
+        settings["transport/link/tx/lease"] = 1000  # ms after which a frozen process counts as gone
     for endpoint in (*connection.connect, *connection.listen):
         protocols = SECURE_PROTOCOLS if connection.secure else PROTOCOLS
-        if endpoint.partition("/")[0] not in protocols:  # Zenoh would try it without end
+        if endpoint.partition("/")[0] not in protocols:  # Zenoh would retry it forever
             raise BusError(
                 f"endpoint: expected PROTOCOL/ADDRESS, as in {connection.default}, got {endpoint!r}; "
                 f"protocols{' with --secure' if connection.secure else ''}: {', '.join(protocols)}"
@@ -153,7 +155,7 @@ def configuration(connection: Connection) -> zenoh.Config:
 
 
 def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
-    """Zenoh's settings for mutual TLS, and in a router for who may say what."""
+    """Zenoh's settings for mutual TLS, and a router's access control."""
     if mode == "peer":
         raise BusError("--mode: expected client or router with --secure, got peer; only a router checks who publishes what")
     files = {name: folder / f"{name}.pem" for name in ("ca", holder, f"{holder}-key")}
@@ -181,5 +183,5 @@ def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
 
 
 def short(error: Exception) -> str:
-    """The first line of Zenoh's text, without the place in its sources."""
+    """First line of Zenoh's error text, without the location in its sources."""
     return str(error).partition(" at /")[0].strip().replace("\n", " ")[:300]

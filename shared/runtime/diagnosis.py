@@ -1,4 +1,4 @@
-"""Why a router cannot be reached: each cause has a sentence of its own, and says what to do."""
+"""Diagnosis of an unreachable router: one sentence for each cause, with a remedy."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from penumbra.shared.contract import access
 from penumbra.shared.runtime.connection import Connection
 
 ATTEMPT_S = 0.5
-"""How long one look at an address may take."""
+"""Timeout [s] of one attempt to connect to an address."""
 START = "start `penumbra router` or `penumbra up`, or give --connect"
 BY_TCP = ("tcp", "tls", "ws")
-"""Protocols of which a TCP connection shows whether anybody listens."""
+"""Protocols for which a TCP connection shows whether a process listens."""
 
 
 def no_router(connection: Connection) -> str:
-    """What is wrong with the endpoints of a connection that does not open, one sentence per endpoint."""
+    """Fault of each endpoint of a connection that does not open, one sentence per endpoint."""
     endpoints = connection.connect or (() if connection.config else (connection.default,))
     if not endpoints:
         return f"no router {connection.whereabouts}: {START}"
@@ -49,7 +49,7 @@ def _of(endpoint: str, secure: Path | None) -> str:
 
 
 def _who_listens(endpoint: str, link: socket.socket, host: str, secure: Path | None) -> str:
-    """Somebody does, but no session opened with it."""
+    """Fault where a process listens but no session opens."""
     try:
         context = _context(secure)
     except (OSError, ssl.SSLError) as error:
@@ -72,7 +72,7 @@ def _who_listens(endpoint: str, link: socket.socket, host: str, secure: Path | N
 
 
 def _context(secure: Path | None) -> ssl.SSLContext:
-    """The TLS context of a client; without certificates it accepts every router, only to see whether it uses TLS."""
+    """TLS context of a client. Without certificates it accepts every router, only to find out whether the router uses TLS."""
     context = ssl.create_default_context()
     if secure is None:
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE

@@ -1,8 +1,8 @@
-"""What a reader takes from a publisher: every message once, and no more of them than belong to its topic.
+"""Admission of messages from publishers: every message once, and no more messages than belong to its topic.
 
-A replayed message carries a number that was here before, or a stamp too old for its topic (`Topic.oldest_s`). A publisher is
-forgotten only when whatever it has sent is too old by its stamp. What another publisher repeats, as where two replicas both
-take themselves for the owner, carries a stamp that was here before.
+A replayed message carries a number that was received before, or a stamp too old for its topic (`Topic.oldest_s`). A publisher is
+forgotten only when the stamps of all its messages are too old. A measurement that another publisher repeats, as when two replicas
+both act as the owner, carries a stamp that was received before.
 """
 
 from __future__ import annotations
@@ -16,46 +16,47 @@ from dataclasses import dataclass
 from penumbra.shared.contract.messages import MAX_FUTURE_S, MAX_PAST_S, BadMessage
 
 RATE_TIMES = 5.0
-"""Largest multiple of its topic's rate at which a publisher may send; a second's worth of that may come at once."""
+"""Maximum rate of a publisher as a multiple of its topic's rate. Messages of one second may arrive at once."""
 PUBLISHERS = 16
 """Maximum number of publishers of one key at a time."""
 FORGET_S = MAX_PAST_S + MAX_FUTURE_S
 WINDOW = 64
-"""Number of messages of a publisher that may arrive out of order."""
+"""Number of a publisher's messages that may arrive out of order."""
 MEASUREMENTS = 64
-"""Measurements of a key that are remembered: of the slowest stream more than its oldest that is taken."""
+"""Number of measurements remembered per key. In the slowest stream, the oldest of them is older than any accepted message."""
 SEEN = (1 << WINDOW) - 1
-"""The window of a publisher of which every number was here."""
+"""Window of a publisher from which every number was received."""
 NUMBERS = 1 << 32
-"""Publishers count modulo this: at 200 Hz it comes around after eight months."""
+"""Modulus of publishers' sequence numbers: at 200 Hz they repeat after eight months."""
 IDENTITY_BYTES, NUMBER_BYTES = 12, 4
-"""Sizes of the attachment of a message: its publisher, drawn at random, and its number, little-endian."""
+"""Sizes of the parts of a message's attachment: its publisher's random identity, and its number, little-endian."""
 
 
 class Numbering:
-    """The attachments of one publisher. Zenoh's `source_info` says as much, but takes a reader six calls into Zenoh."""
+    """Attachments of one publisher's messages. Zenoh's `source_info` has the same content, but costs a reader six calls into
+    Zenoh."""
 
     def __init__(self) -> None:
         self._identity = secrets.token_bytes(IDENTITY_BYTES)
         self._numbers = itertools.count()
 
     def attachment(self) -> bytes:
-        """That of the next message. Several threads may ask at once."""
+        """Attachment of the next message. Thread-safe."""
         return self._identity + (next(self._numbers) % NUMBERS).to_bytes(NUMBER_BYTES, "little")
 
 
 class SequenceWindow:
-    """Which of a publisher's numbers were here: the sliding window of RFC 4303, section 3.4.3 (doi:10.17487/RFC4303)."""
+    """Received sequence numbers of a publisher: the sliding window of RFC 4303, section 3.4.3 (doi:10.17487/RFC4303)."""
 
     def __init__(self, number: int):
         self._highest = number
-        self._seen = SEEN  # what was before the first is not waited for
+        self._seen = SEEN  # numbers before the first are not expected
 
     def take(self, number: int) -> int:
-        """How many more numbers are missing than before: those that were left out, or -1 for one that comes late. Raises
-        BadMessage for one that was here, or may have been."""
+        """Change of the count of missing numbers: the numbers skipped, or -1 for one that arrives late. Raises BadMessage for a
+        number that was received, or may have been."""
         ahead = (number - self._highest) % NUMBERS
-        if ahead == 1:  # as almost always
+        if ahead == 1:  # the usual case
             self._seen = (self._seen << 1 | 1) & SEEN
             self._highest = number
             return 0
@@ -71,7 +72,7 @@ class SequenceWindow:
 
 
 class Bucket:
-    """Lets `rate_hz` events a second through, and a second's worth at once (a token bucket). Seconds may start anywhere."""
+    """Token bucket that admits `rate_hz` events per second, and at most those of one second at once."""
 
     def __init__(self, rate_hz: float, now_s: float):
         self._rate_hz = rate_hz
@@ -79,7 +80,7 @@ class Bucket:
         self._last_s = now_s
 
     def take(self, now_s: float) -> bool:
-        """Whether one more fits."""
+        """Whether one more event is admitted."""
         tokens = self._tokens + (now_s - self._last_s) * self._rate_hz
         if tokens > self._full:
             tokens = self._full
@@ -97,17 +98,17 @@ class _Publisher:
 
 
 class Guard:
-    """The publishers of one key. rate_hz: how often one of them is expected to send."""
+    """Publishers of one key. rate_hz: expected rate of each of them."""
 
     def __init__(self, rate_hz: float):
         self._limit_hz = RATE_TIMES * rate_hz
         self._publishers: dict[Hashable, _Publisher] = {}
         self._measurements: deque[tuple[int, str]] = deque(maxlen=MEASUREMENTS)
-        self._newest_ns: int | None = None  # of these: what is newer cannot be one of them
+        self._newest_ns: int | None = None  # the newest of these: a newer stamp cannot be a repetition
 
     def admit(self, publisher: Hashable, number: int | None, now_s: float) -> int | None:
-        """How many more numbers of this publisher are missing than before; None where it does not count. `now_s` must not run
-        backwards. Raises BadMessage: replayed, rate, or publishers where there are too many."""
+        """Change of this publisher's count of missing numbers; None where it does not number its messages. `now_s` must be
+        monotonic. Raises BadMessage: replayed, rate, or publishers where there are too many."""
         found = self._publishers.get(publisher)
         if found is None or now_s - found.received_s > FORGET_S:
             found = self._newcomer(publisher, now_s)
@@ -122,9 +123,12 @@ class Guard:
         return missing
 
     def accept(self, publisher: Hashable, stamp_ns: int, now_s: float, camera: str = "") -> None:
-        """Takes a good message that was admitted; camera: the one that it is measured with, if any. Raises BadMessage for a
-        measurement that was received from another publisher already, and where a publisher that does not number its messages
-        sends one that is not newer; one that does may, as where a pose of one camera is older than the last of another."""
+        """Registers a good message that was admitted. camera: the camera of the measurement, if any.
+
+        Raises BadMessage for a measurement that was received already, from any publisher. A publisher that does not number its
+        messages must also send newer stamps each time; one that does need not, as poses of different cameras may arrive out of
+        order.
+        """
         found = self._publishers[publisher]
         if found.window is None:
             if found.stamp_ns is not None and stamp_ns <= found.stamp_ns:

@@ -1,4 +1,4 @@
-"""How long the handlers of a process take: one that hangs is noticed while other threads still answer as if all were well."""
+"""Detection of hanging handlers: a handler can hang while other threads of the process still answer queries."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ import time
 from types import TracebackType
 
 HANG_S = 1.0
-"""Time [s] beyond the usual after which a handler hangs."""
+"""Time [s] beyond the usual duration after which a handler hangs."""
 FIRST_S = 2.0
-"""Usual duration [s] before any is known: the first calls compile, and fill caches."""
+"""Initial usual duration [s]: the first calls compile kernels and fill caches."""
 SHARE = 0.05
-"""Weight of one call in the usual duration: twenty calls are remembered."""
+"""Weight of one call in the usual duration, a running mean of about twenty calls."""
 
 
 class Turn:
-    """The calls of one handler, one at a time: `with turn: handler(...)`. A call waits for the one under way, which is that of
-    another thread where a subscription was closed and opened again meanwhile.
+    """The calls of one handler, one at a time: `with turn: handler(...)`. A call waits for the one in progress, which is in
+    another thread if a subscription was closed and opened again meanwhile.
 
-    what: the handler in words. patience_s: how much longer than usual a call may take; infinite for one that never returns.
+    what: description of the handler. patience_s: maximum time beyond the usual duration; infinite for a handler that never
+    returns.
     """
 
     def __init__(self, what: str, patience_s: float = HANG_S):
@@ -39,7 +40,7 @@ class Turn:
         self._is_free.release()
 
     def hangs_s(self, now_s: float) -> float:
-        """Duration [s] of the call under way, where that is too long; else 0. `now_s`: of time.monotonic."""
+        """Duration [s] of the call in progress, where it is too long; else 0. `now_s`: time.monotonic()."""
         began_s = self._began_s
         lasts_s = 0.0 if began_s is None else now_s - began_s
         return lasts_s if lasts_s > self._patience_s + self._usual_s else 0.0

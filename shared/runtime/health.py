@@ -1,7 +1,7 @@
-"""The status of a process and its reasons.
+"""Status of a process and its reasons.
 
-ok: no fault. starting: it prepares its work, or waits for a process that does. degraded: it works, but not as it should.
-down: it is cut off from the others.
+ok: no fault. starting: it prepares its work, or waits for a process that does. degraded: it works, but with faults. down: it is
+disconnected from the others.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from penumbra.shared.runtime.traffic import Traffic
 
 STATUSES = ("ok", "starting", "degraded", "down")
 LATELY_S = 30.0
-"""Time [s] for which a fault counts."""
+"""Time [s] for which a fault affects the status."""
 
 
 class Lately:
-    """By how much counters grew in the last LATELY_S. They are looked at once a second or more often."""
+    """Growth of counters within the last LATELY_S. To be called at least once a second."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -27,7 +27,7 @@ class Lately:
         self._grew: deque[tuple[float, tuple[str, str], int]] = deque()
 
     def look(self, counts: Mapping[tuple[str, str], int], now_s: float) -> Counter[tuple[str, str]]:
-        """Takes the counters, each named by where and what, at a time of a steady clock; what grew, and by how much."""
+        """Reads the counters, named by place and kind, at a monotonic time; returns those that grew, and by how much."""
         with self._lock:
             for name, count in counts.items():
                 if by := count - self._last.get(name, 0):
@@ -42,7 +42,7 @@ class Lately:
 
 
 def counts(received: Mapping[str, Traffic], faults: Mapping[str, int]) -> dict[tuple[str, str], int]:
-    """The counters of what should not happen: refused messages by key and kind, and exceptions."""
+    """Counters of faults: refused messages by key and kind, and exceptions."""
     refused = {(key, kind): n for key, traffic in list(received.items()) for kind, n in list(traffic.bad.items())}
     return refused | {("", kind): n for kind, n in list(faults.items())}
 
@@ -56,14 +56,14 @@ def judge(
     progress: str = "",
     waits: Callable[[Traffic], str] = lambda traffic: "",
 ) -> tuple[str, list[str]]:
-    """Status and reasons. away: why the others cannot be reached, empty where they can. received: what is read, by key. grown:
-    which of `counts` grew lately. own: the service's own reasons. progress: what it does before it can work. waits:
-    why an input that was never received is not a fault yet, empty where it is one."""
-    missing: defaultdict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)  # by what is wrong, and pattern of keys
+    """Status and reasons. away: why the others cannot be reached, empty where they can. received: counters of what is read, by
+    key. grown: growth of `counts` lately. own: the service's own reasons. progress: of its preparation. waits: why an input that
+    was never received is not a fault yet, empty where it is one."""
+    missing: defaultdict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)  # by fault and pattern of keys
     known: Counter[str] = Counter()
     for key, traffic in sorted(received.items()):
         pattern = _pattern(key)
-        known[pattern] += math.isfinite(traffic.stale_s)  # others, as the counters of unknown keys, are never missing
+        known[pattern] += math.isfinite(traffic.stale_s)  # others, such as the counters of unknown keys, are never missing
         if traffic.is_stale(now_ns):
             age_s = traffic.age_s(now_ns)
             why = "late" if age_s is not None else waits(traffic)
@@ -89,13 +89,13 @@ def judge(
 
 
 def _pattern(key: str) -> str:
-    """The keys of a topic and kind of part with one pattern: `penumbra/{cell}/skin/*/voltages`."""
+    """Pattern of all keys of a topic and kind of part: `penumbra/{cell}/skin/*/voltages`."""
     chunks = key.split("/")
     return "/".join([*chunks[:3], "*", *chunks[4:]])
 
 
 def _which(keys: list[str], pattern: str, known: int) -> str:
-    """Keys of one pattern in words, of which so many are known in all."""
+    """Keys of one pattern as text. known: number of keys with that pattern."""
     if len(keys) == 1:
         return _short(keys[0])
     return f"{_short(pattern)} ({len(keys)})" if len(keys) == known else f"{_short(pattern)} ({len(keys)} of {known})"

@@ -1,4 +1,4 @@
-"""The Zenoh session of a node: when it opens, what is declared on it, and how it ends."""
+"""Zenoh session of a node: its opening, its declarations, and its end."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.logs import Log
 
 CLOSE_S = 0.8
-"""Closing a session on a bad network may take much longer; a process that ends does not wait for that."""
+"""Maximum wait [s] for a session to close, which may take much longer on a bad network."""
 
 
 class Link:
-    """One session and the threads that work on it. What is declared before the session is open is declared when `declare_all` is
-    called. connection: how to reach the others. stopping: set when the process is to end."""
+    """One session and its threads. Declarations made before the session is open are deferred until `declare_all`. connection: how
+    to reach the others. stopping: set when the process is to end."""
 
     def __init__(self, connection: bus.Connection, stopping: threading.Event, log: Log):
         self.connection = connection
         self.session: zenoh.Session | None = None
-        self._needs_router = bus.mode(connection) == "client"  # refuses a bad configuration before anything else is done
+        self._needs_router = bus.mode(connection) == "client"  # also refuses a bad configuration early
         self._stopping, self._log = stopping, log
         self._opening = threading.Lock()
         self._pending: list[Callable[[zenoh.Session], None]] | None = []
@@ -30,7 +30,7 @@ class Link:
         self._reachable = False
 
     def open(self, patience_s: float) -> zenoh.Session:
-        """The session, opened unless it is open; waits for the router, also for another thread that opens it. Raises
+        """The session, opened if necessary; waits for the router, or for another thread that opens the session. Raises
         bus.BusError."""
         with self._opening:
             if self.session is None:
@@ -46,7 +46,7 @@ class Link:
             declare(session)
 
     def declare_all(self) -> None:
-        """Declares what was asked for so far; from now on everything is declared at once."""
+        """Makes the deferred declarations; later declarations are made at once."""
         assert self.session is not None, "the session must be open"
         pending, self._pending = self._pending or [], None
         for declare in pending:
@@ -59,12 +59,12 @@ class Link:
         thread.start()
 
     def join(self, thread: threading.Thread) -> None:
-        """Counts a thread among those that `close` waits for."""
+        """Adds a thread to those that `close` waits for."""
         self._threads.append(thread)
 
     def close(self, others: Iterable[threading.Thread] = ()) -> None:
-        """Closes the session and waits for the node's threads and others, for about CLOSE_S. `stopping` must be set: a thread
-        that opens the session gives up then."""
+        """Closes the session and waits for the node's threads and others, for about CLOSE_S. `stopping` must be set, so that a
+        thread that opens the session gives up."""
         deadline = time.monotonic() + CLOSE_S
         is_settled = self._opening.acquire(timeout=CLOSE_S)
         session, self.session = self.session, None
@@ -80,7 +80,7 @@ class Link:
                 thread.join(max(0.0, deadline - time.monotonic()))
 
     def look(self) -> None:
-        """Looks whether the router is there, and logs where that has changed."""
+        """Checks whether the router is reachable, and logs changes."""
         if (session := self.session) is None:
             return
         reachable = not self._needs_router or bool(session.info.routers_zid())

@@ -1,4 +1,4 @@
-"""Structured logs: a sentence and its fields, as key=value text or as one JSON object a line, on standard error.
+"""Structured logs on standard error: a sentence and its fields, as key=value text or as one JSON object per line.
 
 A line of JSON is `{time, level, service, instance, message, fields}`, and `trace` where an exception is logged.
 """
@@ -36,16 +36,16 @@ class Log(logging.LoggerAdapter[logging.Logger]):
 
 
 def get(service: str, **fields: Any) -> Log:
-    """The log of a service; `fields` go with every line."""
+    """Log of a service; `fields` are added to every line."""
     return Log(logging.getLogger(f"penumbra.{service}"), fields)
 
 
 def configure(level: str = "info", form: str = "text", service: str = "penumbra", ends_with_thread: bool = False) -> None:
-    """Sends the logs of Penumbra to standard error, from `level` on. As JSON, whatever else the process of `service` says there
-    is a line of JSON too: warnings of libraries, and the exception that ends a thread or the process.
+    """Sends the logs of Penumbra to standard error, from `level` on. As JSON, other output of the process of `service` becomes a
+    line of JSON too: warnings of libraries, and the exception that ends a thread or the process.
 
-    ends_with_thread: the process ends with the first of its threads that fails, with exit code 1. It would look alive and do a
-    part of its work only; its supervisor starts it again. A thread that has no memory to begin with counts as failed.
+    ends_with_thread: the process ends with the first of its threads that fails, with exit code 1. Otherwise it would look alive
+    and do only a part of its work; so its supervisor restarts it. A thread that has no memory to start counts as failed.
     """
     handler = _ToStandardError()
     handler.setFormatter(_Json() if form == "json" else _Text())
@@ -64,20 +64,20 @@ def configure(level: str = "info", form: str = "text", service: str = "penumbra"
 
 
 def _on_thread(log: Log | None, ends_process: bool, failed: threading.ExceptHookArgs) -> None:
-    """The hook for an exception that ends a thread. log: where it is reported, None for Python's own way."""
+    """Hook for an exception that ends a thread. log: where it is reported, None for Python's default output."""
     try:
         if log is None:
             threading.__excepthook__(failed)
         else:
             log.error(f"{failed.exc_type.__name__}: {failed.exc_value}", exc_info=failed.exc_value or True)
-    finally:  # also without memory for words
+    finally:  # even if there is no memory for the report
         if ends_process:
             os._exit(1)
 
 
 def _on_unraisable(failed: sys.UnraisableHookArgs) -> None:
-    """The hook for an exception that cannot be caught, such as that of a thread without the memory to begin: its starter would
-    wait without end."""
+    """Hook for an exception that cannot be caught, such as that of a thread without the memory to start: its starter would wait
+    forever."""
     try:
         sys.__unraisablehook__(failed)
     finally:
@@ -86,12 +86,12 @@ def _on_unraisable(failed: sys.UnraisableHookArgs) -> None:
 
 
 def is_json() -> bool:
-    """Whether `configure` has chosen JSON."""
+    """Whether `configure` has selected JSON."""
     return any(isinstance(handler.formatter, _Json) for handler in logging.getLogger("penumbra").handlers)
 
 
 def sentence(line: str) -> str:
-    """What a line of a log says, without what is around it where it is one of JSON."""
+    """Message of a log line; of a line that is not JSON, the whole line."""
     try:
         return str(json.loads(line)["message"])
     except (ValueError, TypeError, KeyError):
@@ -99,17 +99,17 @@ def sentence(line: str) -> str:
 
 
 def time_of(line: str) -> str | None:
-    """The time of a line of a log as it stands there, which sorts as text; None for a line that goes on, as in a trace."""
+    """Time of a log line as text that can be sorted; None for a continuation line, as in a trace."""
     found = _TIME.match(line)
     return found[1] if found else None
 
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Why a disk takes no more."""
+"""Error numbers of a full disk."""
 
 
 class Lossy:
-    """A text stream that goes on while its disk is full: what cannot be written is lost. Otherwise the stream that it is of."""
+    """Wrapper of a text stream that discards text while the disk is full, rather than raising OSError."""
 
     def __init__(self, stream: TextIO):
         self._stream = stream
@@ -129,7 +129,7 @@ class Lossy:
 
 @contextlib.contextmanager
 def lost_where_full() -> Iterator[None]:
-    """What is written in it is lost where the disk is full."""
+    """Suppresses the OSError of a full disk; the data are lost."""
     try:
         yield
     except OSError as error:
@@ -138,7 +138,7 @@ def lost_where_full() -> Iterator[None]:
 
 
 class _ToStandardError(logging.Handler):
-    """Writes to what sys.stderr is now: a live table puts itself in its place."""
+    """Writes to the current sys.stderr, which a live table replaces."""
 
     def emit(self, record: logging.LogRecord) -> None:
         try:

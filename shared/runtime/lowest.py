@@ -1,4 +1,4 @@
-"""The lowest of recent values: how two clocks differ, of which messages tell, each of them late and none early."""
+"""Minimum of recent values, used for the offset between two clocks: every message is delayed, none is early."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections import deque
 
 
 class Lowest:
-    """The lowest of the values of the last `window_s` seconds."""
+    """Minimum of the values of the last `window_s` seconds."""
 
     def __init__(self, window_s: float):
         self._window_s = window_s
-        self._kept: deque[tuple[float, float]] = deque()  # time and value, each value above the one before
+        self._kept: deque[tuple[float, float]] = deque()  # time and value, in increasing order of both
 
     def add(self, value: float, now_s: float) -> float:
-        """Takes a value at a time of a steady clock [s]; the lowest of those that count, this one among them."""
+        """Adds a value at a monotonic time [s]; returns the minimum of the window, this value included."""
         while self._kept and self._kept[-1][1] >= value:
             self._kept.pop()
         self._kept.append((now_s, value))

@@ -1,6 +1,6 @@
-"""Metrics in Prometheus' format, made of health reports alone: what `Node.health` says, in other words.
+"""Metrics in Prometheus' format, derived from health reports (`Node.health`) alone.
 
-Counters belong to the process that reports them and start anew with it, which is what Prometheus expects.
+Counters belong to the process that reports them and restart with it, as Prometheus expects.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.health import STATUSES
 
 WHO = ("cell", "service", "instance", "host")
-"""The labels of every metric."""
+"""Labels of every metric."""
 
 Reports = Callable[[], Iterable[Report]]
 
 
 def serve(address: str, port: int, reports: Reports) -> WSGIServer:
     """Serves the metrics of `reports()`, called at each request, on http://address:port/metrics in a thread of its own, until
-    `shutdown` and `server_close`. Raises OSError where the port is taken or the address none of this host."""
+    `shutdown` and `server_close`. Raises OSError where the port is taken or the address does not belong to this host."""
     registry = CollectorRegistry()
     registry.register(_Collector(reports))
     server, _ = start_http_server(port, address, registry)
@@ -37,7 +37,7 @@ class _Collector(Collector):
         self._reports = reports
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing in advance: what there is depends on the reports."""
+        """Nothing in advance: the metrics depend on the reports."""
         return ()
 
     def collect(self) -> Iterator[Metric]:
@@ -45,7 +45,7 @@ class _Collector(Collector):
 
 
 def metrics(reports: Iterable[Report]) -> Iterator[Metric]:
-    """The metrics of health reports. Times are in seconds, memory in bytes, CPU in cores."""
+    """Metrics of health reports. Times are in seconds, memory in bytes, CPU in cores."""
     families = _Families()
     for report in reports:
         who = tuple(getattr(report, name) for name in WHO)
@@ -66,7 +66,7 @@ def metrics(reports: Iterable[Report]) -> Iterator[Metric]:
 
 
 def _own(families: _Families, who: tuple[str, ...], report: Report) -> None:
-    """The metrics of a service's own report that its row of the table of processes names."""
+    """Metrics of a service's own report, as listed in its row of the table of processes."""
     process = processes.find(report.service)
     for metric in process.metrics if process else ():
         for entry, row in (report.report.get(metric.within, {}) if metric.within else report.report).items():

@@ -1,16 +1,16 @@
-"""The runtime that every service is built on: a Node wires functions to topics, and keeps count of what they do.
+"""Runtime of every service: a Node connects functions to topics, and counts messages and faults.
 
-def start(node, options):                     # wires; nothing is received before the node runs
+def start(node, options):                     # connects; nothing is received before the node runs
     node.subscribe(FRAME, on_frame, camera="front")
     node.every(0.005, publish_pose)
 
 node.run()                                    # until SIGINT or SIGTERM
 
-Threads. Each subscription calls its handler in a thread of its own, one message after another: two handlers of one service run
-at the same time, and so do timers (`every`), answers (`answer`) and what the health report calls (`add_report`, `add_reasons`).
-What two of them share is owned by one of them and only read by the others as a whole (an attribute or a dictionary's value that
-is replaced, never a container that changes while another thread iterates over it), or has a lock. `latest` may be read from any
-thread.
+Threads. Each subscription calls its handler in a thread of its own, one message after another: two handlers of one service run at
+the same time, and so do timers (`every`), answers (`answer`) and the functions of the health report (`add_report`,
+`add_reasons`). Data that two of them share either have a lock, or one of them owns the data and the others only read them as a
+whole (an attribute or a dictionary's value that is replaced, never a container that changes while another thread iterates over
+it). `latest` may be read from any thread.
 """
 
 from __future__ import annotations
@@ -59,25 +59,25 @@ __all__ = ["CLOSE_S", "LatestMessages", "Node", "ServiceNode"]
 FRAMES_UNDER_WAY = 3
 """Number of frames of each camera in shared memory: one that is written and two that are read."""
 NEWS_S = 0.2
-"""Time [s] within which a session knows the living replicas."""
+"""Maximum time [s] that a session needs to learn of the living replicas."""
 WARM_UP_S = 2.0
-"""Longest time [s] that a replica which joins others only receives, before it takes its share."""
+"""Maximum time [s] for which a replica that joins others only receives, before it takes its share."""
 ASK_S = 0.5
-"""Longest wait [s] for the progress of the publishers of a missing input."""
+"""Maximum wait [s] for the progress of the publishers of a missing input."""
 
 
 class LatestMessages(Protocol):
     """The newest message of each key of a topic."""
 
     def get(self, **names: str) -> Any:
-        """The newest message of the key with these names, None where there was none."""
+        """The newest message of the key with these names; None before the first."""
 
     def drain(self) -> int:
-        """Decodes what was received; the number of good messages so far."""
+        """Processes received messages; returns the number of good messages so far."""
 
 
 class ServiceNode(Protocol):
-    """What the `start` of a service may use: the node on the bus has it, and so has that of a replay."""
+    """Interface for the `start` of a service, provided by the node on the bus and by that of a replay."""
 
     @property
     def cell(self) -> cell.Cell: ...
@@ -102,8 +102,8 @@ class ServiceNode(Protocol):
 class Node:
     """One service instance: a session, its subscriptions, timers and queryables, their counters, and a log.
 
-    What is declared before `open` (which `run` calls) is declared on the bus when it opens; what is published before that is
-    dropped, as it is where there is no subscriber. Use `with` where the node does not `run`.
+    Declarations before `open` (which `run` calls) take effect when it opens. Messages published before that are dropped, as they
+    are without a subscriber. Use `with` where the node does not `run`.
 
     service: name of the service. cell: the cell. connection: how to reach the others.
     """
@@ -148,7 +148,7 @@ class Node:
     # ---- life
 
     def open(self, patience_s: float = float("inf")) -> Node:
-        """Opens the session, waiting for the router, and declares what was asked for. Raises bus.BusError."""
+        """Opens the session, waiting for the router, and makes the deferred declarations. Raises bus.BusError."""
         session = self._link.open(patience_s)
         self._is_open = True
         if not self.is_warm():
@@ -165,7 +165,7 @@ class Node:
         return self
 
     def _announce(self, session: zenoh.Session) -> None:
-        """Answers the health query from now on."""
+        """Starts answering the health query."""
         with self._announcing:
             if self._is_announced:
                 return
@@ -173,7 +173,7 @@ class Node:
             self._queries.serve(session, topics.health(self.cell.name, self.service, self.instance), self._answer_health)
 
     def _announce_early(self) -> None:
-        """Reports the progress of a process that is not open yet."""
+        """Reports the progress of a process whose node is not open yet."""
         try:
             if not self.stopping.is_set():
                 self._announce(self._link.open(float("inf")))
@@ -185,8 +185,8 @@ class Node:
         self._fitness.watch(self.stopping, lambda: list(received.values()), self._come_alive, self._streams.look)
 
     def _come_alive(self) -> None:
-        """The last step of opening: a living replica answers queries, subscribes, and owns streams. Beside other replicas a
-        service warms up first, for at most WARM_UP_S; alone, it starts cold."""
+        """Last step of opening: the replica joins the living ones, which answer queries, subscribe, and own streams. If there are
+        other replicas, it warms up first, for at most WARM_UP_S; alone, it starts cold."""
         session = self.session
         if session is None:
             return
@@ -208,20 +208,21 @@ class Node:
             self.replicas.join(session)
 
     def run(self) -> None:
-        """Opens, and serves until SIGINT or SIGTERM; a second signal ends the process at once. Raises bus.BusError."""
+        """Opens, and serves until SIGINT or SIGTERM. A second signal ends the process at once. Raises bus.BusError."""
         with self.until_signal():
             try:
                 self.open()
             except bus.BusError:
-                if not self.stopping.is_set():  # else: stopped before the router was there
+                if not self.stopping.is_set():  # otherwise it was stopped while it waited for the router
                     raise
             self.stopping.wait()
 
     @contextmanager
     def until_signal(self) -> Iterator[None]:
-        """Within it SIGINT, SIGTERM and SIGHUP (a terminal that is closed) set `stopping`; at its end the node is closed."""
+        """Context in which SIGINT, SIGTERM and SIGHUP (a terminal that is closed) set `stopping`. At its end the node is
+        closed."""
         numbers = [signal.SIGINT, signal.SIGTERM]
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # else: run by nohup
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # otherwise it runs under nohup
             numbers.append(signal.SIGHUP)
         previous = {number: signal.signal(number, self._on_signal) for number in numbers}
         try:
@@ -232,14 +233,14 @@ class Node:
                 signal.signal(number, handler)
 
     def close(self) -> None:
-        """Leaves the bus and ends the node's threads, within about CLOSE_S; then calls what `when_closed` was given."""
+        """Leaves the bus and ends the node's threads, within about CLOSE_S; then calls the functions of `when_closed`."""
         self.stopping.set()
         self._link.close(reader.thread for reader in self.replicas.leave())
         while self._when_closed:
             self._when_closed.pop()()
 
     def when_closed(self, function: Callable[[], None]) -> None:
-        """Calls `function` once the node has left the bus, before the process ends: it completes what must not stay half done."""
+        """Calls `function` after the node has left the bus and before the process ends, for work that must be completed."""
         self._when_closed.append(function)
 
     def __enter__(self) -> Node:
@@ -269,38 +270,38 @@ class Node:
     ) -> None:
         """Calls `handler(message, names)` for every good message, in a thread of this subscription.
 
-        names: fix some of the topic's {names}; the others take every value that the cell has. The handler receives them all, and
-        as `publisher` the sender's identity (empty where it has none), which distinguishes two processes on one key. While the
+        names: fix some of the topic's {names}; the others take every value in the cell. The handler receives all names, and as
+        `publisher` the sender's identity (empty where it has none), which distinguishes two processes on one key. While the
         handler is busy the newest `topic.depth` messages per key are kept. Bad messages are counted and logged once per kind; so
         are exceptions of the handler. Raises CellError for a name that the cell does not have.
 
-        streams: the subscription is there only while this replica owns one of these streams (see `owns`); so the replicas of a
-        service divide the messages, and none receives what another one works on. from_others: leaves out what this node
-        publishes itself.
+        streams: the subscription is active only while this replica owns one of these streams (see `owns`). So the replicas of a
+        service divide the messages, and none receives those that another one processes. from_others: excludes messages that this
+        node publishes.
         """
         self._streams.subscribe(topic, handler, streams, from_others, names)
 
     def latest(self, topic: Topic, from_others: bool = False, **names: str) -> Latest[Any]:
-        """The newest message of each key, for a service that reads less often than messages arrive: only those that are read are
-        decoded, and no thread wakes up when one arrives. They are guarded, counted and missed like those of `subscribe`, except
-        for their delay, which is not known. names, from_others: as in `subscribe`."""
+        """The newest message of each key, for a service that reads less often than messages arrive. Only messages that are read
+        are decoded, and no thread wakes up on arrival. They are guarded, counted and reported as missing like those of
+        `subscribe`, except that their delay is unknown. names, from_others: as in `subscribe`."""
         return self._streams.latest(topic, from_others, names)
 
     def tap(self, wanted: Sequence[Topic], most_bytes: int) -> Tap:
-        """Everything that these topics carry in this cell, as bytes and without a check, until it is taken. most_bytes: that may
-        wait; what comes then is lost, and counted."""
+        """All messages of these topics in this cell, as unchecked bytes, kept until they are taken. most_bytes: maximum size of
+        the waiting messages; further messages are lost, and counted."""
         return self._streams.tap(wanted, most_bytes)
 
     def keys(self, topic: Topic, names: dict[str, str]) -> dict[str, dict[str, str]]:
-        """Every concrete key of a topic in this cell with its names, some of them fixed; none where the cell has no such part.
+        """All concrete keys of a topic in this cell with their names, some of them fixed; empty where the cell has no such part.
         Raises CellError for a name that the cell does not have."""
         return self._streams.keys(topic, names)
 
     # ---- queries
 
     def answer(self, key: str, function: Answer) -> None:
-        """Answers queries on `key` with `function(parameters, payload)`: bytes, or bytes and their encoding. A ValueError becomes
-        an error reply with its text. A replica that warms up, or is unfit, leaves the answers to the others."""
+        """Answers queries on `key` with `function(parameters, payload)`, which returns bytes, or bytes and their encoding. A
+        ValueError becomes an error reply with its text. A replica that warms up or is unfit leaves the answers to the others."""
 
         def answer(parameters: dict[str, str], payload: bytes) -> bytes | tuple[bytes, str]:
             if not self.replicas.has_joined and self.replicas.others:
@@ -310,14 +311,14 @@ class Node:
         self._queries.answer(key, answer)
 
     def query(self, key: str, parameters: str = "", payload: bytes | None = None, timeout_s: float = 1.0) -> list[bytes]:
-        """The payloads of all answers, which may be none. Raises bus.Refused where the only answers are errors."""
+        """Payloads of all answers, possibly none. Raises bus.Refused where the only answers are errors."""
         return self._queries.ask(key, parameters, payload, timeout_s)
 
     # ---- time and replicas
 
     def every(self, period_s: float, function: Callable[[], None], patience_s: float = HANG_S) -> None:
-        """Calls `function` every `period_s` in a thread of its own; turns that are missed are left out. A turn
-        hangs that takes `patience_s` longer than usual: infinite for one that returns when the node stops."""
+        """Calls `function` every `period_s` in a thread of its own; missed calls are skipped. A call hangs if it takes
+        `patience_s` longer than usual. Give infinity for a function that returns only when the node stops."""
         what = f"timer {getattr(getattr(function, 'func', function), '__name__', '')} of {period_s} s"
         turn = self._fitness.turn(what, patience_s)
 
@@ -334,36 +335,38 @@ class Node:
         self._link.declare(lambda _: self._link.spawn(loop, f"every {period_s} s"))
 
     def owns(self, stream: str) -> bool:
-        """Whether this replica is the one of the living replicas of its service that handles `stream`. Shortly after a
-        replica comes or goes two may own a stream, or none."""
+        """Whether this replica, among the living ones of its service, handles `stream`. For a short time after a replica comes or
+        goes, two or none may own a stream."""
         return self.replicas.owns(stream)
 
     def rank(self, stream: str) -> float:
-        """Number of living replicas before this one to handle `stream`; infinity where this one has no part now."""
+        """Number of living replicas that precede this one for `stream`; infinity while this one takes no part."""
         return self.replicas.rank(stream)
 
     # ---- the health report
 
     def progress(self, what: str, done: int, total: int) -> None:
-        """Says how far the service is with what it must do before it can work, as in `progress("compiling", 12, 40)`; the last
-        step ends it. Until then its status is `starting` with the reason `compiling 12 of 40`, on the bus also before the node is
-        open, and so is that of the services that wait for it; the log has a line every 2 s."""
+        """Reports the progress of the preparation of the service, as in `progress("compiling", 12, 40)`; the last step ends it.
+
+        Until then the status is `starting` with the reason `compiling 12 of 40`, on the bus also before the node is open.
+        Services that wait for this one have the status `starting` too. The log has a line every 2 s.
+        """
         self._progress.set(what, done, total)
         if not self._is_early and not self._is_open:
             self._is_early = True
-            atexit.register(self.close)  # where `start` fails, too: Zenoh aborts a process that ends with an open session
+            atexit.register(self.close)  # also where `start` fails: Zenoh aborts a process that ends with an open session
             self._link.spawn(self._announce_early, "announce")
 
     def add_report(self, name: str, function: Callable[[], Any]) -> None:
-        """Adds what `function` returns, as JSON, to the health report under `report` and this name."""
+        """Adds the result of `function`, as JSON, to the health report under `report` and this name."""
         self._reports[name] = function
 
     def add_reasons(self, function: Callable[[], Sequence[str]]) -> None:
-        """Adds the reasons that `function` returns, in words: while there are any, the status is `degraded`."""
+        """Adds reasons, as texts from `function`: while there are any, the status is `degraded`."""
         self._reasons.append(function)
 
     def warm_when(self, function: Callable[[], bool]) -> None:
-        """Lets a replica join the others only when `function` returns that it could continue another one's work."""
+        """Lets a replica join the others only when `function` returns true: that it could continue another one's work."""
         self._warm.append(function)
 
     def is_warm(self) -> bool:
@@ -371,11 +374,11 @@ class Node:
         return all(function() for function in self._warm)
 
     def thin_out(self, slow: SlowLinks) -> None:
-        """Has a router send little over some of its links; before it is open."""
+        """Limits the traffic of a router over some of its links. Call before the node is open."""
         self._link.connection = replace(self.connection, slow=slow)
 
     def announce(self) -> None:
-        """Has a router answer those that look for one on the network; before it is open."""
+        """Makes a router answer searches on the network. Call before the node is open."""
         self._link.connection = replace(self.connection, is_announced=True)
 
     def report(self) -> Report:
@@ -412,8 +415,8 @@ class Node:
         return self.report().as_json()
 
     def fault(self, where: str, error: Exception) -> None:
-        """Counts an exception; the first of its kind and place is logged with its trace. Raises a MemoryError again: a
-        process out of memory ends and is started again (`services.run.serve`)."""
+        """Counts an exception; the first of its kind and place is logged with its trace. Raises a MemoryError again: a process
+        that is out of memory ends and is restarted (`services.run.serve`)."""
         if isinstance(error, MemoryError):
             raise error
         frames = traceback.extract_tb(error.__traceback__)
@@ -424,7 +427,7 @@ class Node:
             self.log.error(f"{type(error).__name__}: {error}", where=where, at=place, exc_info=error)
 
     def _ask_health(self, service: str) -> list[bytes]:
-        """The health reports of another service; none of its own, for which it would wait itself."""
+        """Health reports of another service; empty for this service, because it would wait for itself."""
         return [] if service == self.service else self.query(topics.health(self.cell.name, service), timeout_s=ASK_S)
 
     def _answer_health(self, parameters: dict[str, str], payload: bytes) -> bytes:
@@ -432,7 +435,7 @@ class Node:
 
     def _judge(self, grown: Counter[tuple[str, str]], now_ns: int) -> tuple[str, list[str]]:
         """Status and reasons; grown: counters that grew lately."""
-        if not self._is_open and self.session is not None:  # early on the bus: nothing is read yet
+        if not self._is_open and self.session is not None:  # on the bus before `open`: nothing is read yet
             return health.judge("", {}, grown, [], now_ns, str(self._progress) or "not ready yet")
         own = [*self._fitness.faults(), *(reason for reasons in self._reasons for reason in reasons())]
         progress = str(self._progress)
@@ -442,8 +445,8 @@ class Node:
         return self._lately.look(health.counts(self._streams.received, self._faults), time.monotonic())
 
     def _update(self) -> None:
-        """Once a second: CPU, the counters of faults, the state of the link, and the heartbeat file that a container's health
-        check reads: the status and its reasons, in words."""
+        """Updates CPU, the counters of faults and the state of the link once a second. It also writes the heartbeat file for a
+        container's health check: the status and its reasons as text."""
         self._cpu = self._process.cpu_percent() / 100
         grown = self._look()
         if self.session is None:
@@ -456,7 +459,7 @@ class Node:
             status, reasons = self._judge(grown, self.now_ns())
             fresh = Path(f"{heartbeat}.new")
             fresh.write_text(": ".join([status, "; ".join(reasons)]).removesuffix(": ") + "\n")
-            fresh.replace(heartbeat)  # at once: it is never read half written
+            fresh.replace(heartbeat)  # atomically: it is never read half written
 
 
 def _safe(text: str) -> str:

@@ -1,6 +1,6 @@
-"""The web page's address, and the keys of those who open it on a secured bus.
+"""Address of the web page, and access keys for it on a secured bus.
 
-A key is derived from the private key of a certificate: whoever has the certificate can make it, and it is the same after a
+A key is derived from the private key of a certificate. Whoever has the certificate can derive it, and it is the same after a
 restart and on every host.
 """
 
@@ -15,15 +15,15 @@ from pathlib import Path
 from penumbra.shared.contract.report import Report
 
 PORT = 8470
-"""Where the page is served, where nothing else is asked for."""
+"""Default port of the page."""
 REPORT = "page"
-"""Name of the address in the health report of the dashboard."""
+"""Entry of the address in the dashboard's health report."""
 KEY_BYTES = 18
 
 
 def key(folder: Path, holder: str) -> str | None:
-    """The key of the holder of a certificate of `penumbra certs`; None where the folder has no private key of that name that can
-    be read."""
+    """Access key of the holder of a certificate of `penumbra certs`; None where the folder has no readable private key of that
+    name."""
     try:
         secret = (folder / f"{holder}-key.pem").read_bytes()
     except OSError:
@@ -33,11 +33,11 @@ def key(folder: Path, holder: str) -> str | None:
 
 
 def link(address: str, key: str | None) -> str:
-    """The link that opens the page. A browser does not send what follows the `#`: the key stays out of logs and proxies."""
+    """Link that opens the page. A browser does not send what follows the `#`, so the key stays out of logs and proxies."""
     return f"{address}#key={key}" if key else address
 
 
 def address_in(reports: Iterable[Report]) -> str:
-    """The address of the page that the reports of a cell name, empty where they name none."""
+    """Address of the page from the health reports of a cell; empty where none contains it."""
     found = (report.report.get(REPORT) for report in reports)
     return next((str(page["address"]) for page in found if isinstance(page, dict) and page.get("address")), "")

@@ -1,4 +1,4 @@
-"""The progress of a process that is starting, and of those whose messages it waits for."""
+"""Progress of a process that is starting, and of the publishers that it waits for."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from penumbra.shared.runtime.logs import Log
 from penumbra.shared.runtime.traffic import Traffic
 
 LOG_S = 2.0
-"""Time [s] between two lines of the log about one task."""
+"""Period [s] of the log lines about one task."""
 ABSENT_S = 10.0
-"""Time [s] after the start of this process in which a publisher that does not answer may still be starting."""
+"""Time [s] after the start of this process for which a publisher without an answer may still be starting."""
 SETTLE_S = 2.0
-"""Time [s] that a publisher which has become ready may take for its first message."""
+"""Maximum time [s] between a publisher's readiness and its first message."""
 STARTING_S = 120.0
 """Time [s] after which an input that was never received is a fault, whatever its publishers report."""
 
 
 class Progress:
-    """The tasks of a start under way, each with its steps done and in all. May be used from several threads."""
+    """Tasks in progress during a start, each with its completed and total steps. Thread-safe."""
 
     def __init__(self, log: Log):
         self._log = log
@@ -48,26 +48,26 @@ class Progress:
             self._log.info(text)
 
     def __str__(self) -> str:
-        """The tasks in words; empty where there are none."""
+        """The tasks as text; empty where there are none."""
         with self._lock:
             return ", ".join(self._tasks.values())
 
 
 class Waiting:
-    """Why an input that was never received is not a fault yet: its publishers are starting, or were a moment ago.
+    """Reasons why an input that was never received is not a fault yet: its publishers are starting, or were a moment ago.
 
-    ask: the answers to the health query of a service; raises bus.Refused where it is there and too busy to answer. `look` asks,
-    and may block for as long as that takes; `why` does not.
+    ask: returns the answers of a service to the health query; raises bus.Refused where it is too busy to answer. `look` calls it,
+    and may block for that time; `why` does not.
     """
 
     def __init__(self, ask: Callable[[str], Iterable[bytes]]):
         self._ask = ask
         self._began_s = time.monotonic()
-        self._doing: dict[str, str] = {}  # by service that is starting
-        self._settled_s: dict[str, float] = {}  # since when a service answers that it is not
+        self._doing: dict[str, str] = {}  # progress by service that is starting
+        self._settled_s: dict[str, float] = {}  # time since which a service answers that it is not starting
 
     def look(self, received: Iterable[Traffic], now_ns: int) -> None:
-        """Asks the publishers of inputs that were never received for their progress."""
+        """Queries the progress of the publishers of inputs that were never received."""
         missing = [traffic for traffic in received if traffic.stamp_ns is None and traffic.is_stale(now_ns)]
         now_s = time.monotonic()
         if now_s - self._began_s > STARTING_S:
@@ -76,12 +76,12 @@ class Waiting:
             reports = []
             try:
                 answers = self._ask(service)
-            except bus.Refused:  # it compiles, say
+            except bus.Refused:  # for example because it compiles
                 self._doing.setdefault(service, "")
                 self._settled_s.pop(service, None)
                 continue
             for answer in answers:
-                with contextlib.suppress(ValueError):  # of another release
+                with contextlib.suppress(ValueError):  # a report of another release
                     reports.append(report.read(answer))
             starting = [found for found in reports if found.status == "starting"]
             if starting:
@@ -95,7 +95,7 @@ class Waiting:
                 self._settled_s.pop(service, None)
 
     def why(self, traffic: Traffic) -> str:
-        """What its publishers do, in words; empty where it should have been received by now."""
+        """State of an input's publishers as text; empty where the input should have been received by now."""
         now_s = time.monotonic()
         if now_s - self._began_s > STARTING_S:
             return ""

@@ -11,19 +11,19 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.link import Link
 
 QUERY_DEPTH = 32
-"""Queries on a key that may wait to be answered."""
+"""Maximum number of queries on a key that wait for an answer."""
 
 Answer = Callable[[dict[str, str], bytes], "bytes | tuple[bytes, str]"]
 
 
 class Queries:
-    """Answers queries on a link and asks others. failed: called with the place and the exception of a function that fails."""
+    """Answers and sends queries on a link. failed: called with the place and the exception of a function that fails."""
 
     def __init__(self, service: str, link: Link, failed: Callable[[str, Exception], None]):
         self._service, self._link, self._failed = service, link, failed
 
     def answer(self, key: str, function: Answer) -> None:
-        """Answers on `key` from the time that the link declares things."""
+        """Answers on `key` from the time when the link makes its declarations."""
         self._link.declare(lambda session: self.serve(session, key, function))
 
     def serve(self, session: zenoh.Session, key: str, function: Answer) -> None:
@@ -42,7 +42,7 @@ class Queries:
         self._link.spawn(run, f"answer {key}")
 
     def ask(self, key: str, parameters: str, payload: bytes | None, timeout_s: float) -> list[bytes]:
-        """The payloads of all answers; none where nobody answers, or the link is not open. Raises bus.Refused."""
+        """Payloads of all answers; empty where nobody answers or the link is not open. Raises bus.Refused."""
         session = self._link.session
         return bus.ask(session, key, parameters, payload, timeout_s) if session else []
 

@@ -1,4 +1,4 @@
-"""The traffic of a cell by topic, from the health reports of its processes."""
+"""Traffic of a cell by topic, from the health reports of its processes."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from penumbra.shared.runtime import bus
 
 @dataclass
 class TopicRow:
-    """All keys of one topic: rates by key, of all replicas that publish it together; delays to readers; sums of what was dropped
-    and refused."""
+    """Traffic on all keys of one topic: rates by key, summed over the replicas that publish it; delays to readers; numbers of
+    dropped and refused messages."""
 
     name: str
     rates: dict[str, float] = field(default_factory=dict)
@@ -22,12 +22,12 @@ class TopicRow:
 
     @property
     def rate_hz(self) -> float:
-        """Mean rate of a key."""
+        """Mean rate per key."""
         return sum(self.rates.values()) / len(self.rates) if self.rates else 0.0
 
 
 def topic_rows(reports: Iterable[Report], names: Iterable[str]) -> list[TopicRow]:
-    """A row for each of the topics of these names: rates as published, delays and losses as received."""
+    """One row for each topic of these names: rates as published, delays and losses as received."""
     rows = {name: TopicRow(name) for name in names}
     for found in reports:
         for key, traffic in found.published.items():

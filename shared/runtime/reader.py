@@ -1,8 +1,8 @@
-"""What reads a subscription: `Reader` hands every message to a handler, `Latest` keeps the newest until it is read.
+"""Readers of a subscription: `Reader` passes every message to a handler, `Latest` keeps the newest until it is read.
 
-Both judge a sample alike: its key, its size, the publisher's number and rate (`shared.runtime.guard`), its version and its stamp.
-What is done for each message is done at most 200 times a second and finds no cache warm: each function of another library that
-is called, and each call into Zenoh, costs some ten microseconds.
+Both check a sample alike: its key, its size, the publisher's number and rate (`shared.runtime.guard`), its version and its stamp.
+These checks run at most 200 times a second and find no cache warm: each call of another library, and each call into Zenoh, costs
+some ten microseconds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ M = TypeVar("M", bound=Message)
 
 @dataclass
 class Stream:
-    """One key that is read: the names in it, its counters, and who may send on it."""
+    """One key that is read: the names in it, its counters, and its publishers."""
 
     names: dict[str, str]
     traffic: Traffic
@@ -44,12 +44,12 @@ class Stream:
 
 @dataclass(frozen=True)
 class Inbox:
-    """What a reader is declared with.
+    """Settings of a reader.
 
-    expression: the key expression that is subscribed to. depth: samples that are kept while none is taken. streams: every
-    concrete key that the cell knows; a sample on any other key is refused and counted in `unknown`, so that no publisher can make
-    the table grow. now_ns: the clock that stamps are compared with. refused: called with the first bad message of each kind on a
-    key. failed: called with every exception of a handler. from_others: leaves out what this session publishes itself.
+    expression: the key expression of the subscription. depth: maximum number of samples that wait. streams: all concrete keys of
+    the cell. A sample on any other key is refused and counted in `unknown`, so that no publisher can make the table grow. now_ns:
+    the clock to which stamps are compared. refused: called with the first bad message of each kind on a key. failed: called with
+    every exception of a handler. from_others: excludes messages that this session publishes.
     """
 
     topic: Topic
@@ -63,13 +63,13 @@ class Inbox:
     unknown: Traffic = field(default_factory=lambda: Traffic(math.inf))
 
     def subscribe(self, session: zenoh.Session) -> zenoh.Subscriber[Any]:
-        """A subscription with a ring: a Python callback or the default channel would let one slow reader hold up every other
-        subscriber of the session."""
+        """Subscribes with a ring buffer: with a Python callback or the default channel, one slow reader would block all other
+        subscribers of the session."""
         origin = zenoh.Locality.REMOTE if self.from_others else zenoh.Locality.ANY
         return session.declare_subscriber(self.expression, zenoh.handlers.RingChannel(self.depth), allowed_origin=origin)
 
     def admit(self, sample: zenoh.Sample, now_s: float) -> tuple[Stream, bytes, bytes]:
-        """The stream, the publisher and the payload of a sample, before anything that takes long. Raises BadMessage."""
+        """Stream, publisher and payload of a sample, after the fast checks. Raises BadMessage."""
         key = self.key_of(sample)
         stream = self.streams.get(key)
         if stream is None:
@@ -85,7 +85,7 @@ class Inbox:
         return stream, publisher, payload.to_bytes()
 
     def key_of(self, sample: zenoh.Sample) -> str:
-        """The key of a sample; where a single key is subscribed to, whatever is received is meant for it."""
+        """Key of a sample. Where the subscription has a single key, every sample belongs to it."""
         return self.expression if len(self.streams) == 1 else str(sample.key_expr)
 
     def refuse(self, key: str, error: BadMessage) -> None:
@@ -98,7 +98,7 @@ class Inbox:
 
 
 class Reader:
-    """A thread that decodes samples as they come and calls `handler(message, names)` with each. turn: is told when the handler
+    """Thread that decodes samples as they arrive and calls `handler(message, names)` with each. turn: notified when the handler
     begins and returns."""
 
     def __init__(self, session: zenoh.Session, inbox: Inbox, handler: Callable[[Any, dict[str, str]], None], turn: Turn):
@@ -110,7 +110,7 @@ class Reader:
         self.thread.start()
 
     def close(self) -> None:
-        """Ends the subscription; the message that is under way is still handed on."""
+        """Ends the subscription. The message in progress is still handled."""
         self._subscriber.undeclare()
 
     def _run(self) -> None:
@@ -148,11 +148,11 @@ class _Newest(Generic[M]):
 
 
 class Latest(Generic[M]):
-    """The newest message of each key of a topic, for a caller that reads less often than messages arrive: no thread wakes up when
-    a message arrives, and only a message that is read is decoded. The others are taken from the ring by `drain`, which looks at
-    their number, version and stamp, and counts them. Several threads may look at once.
+    """The newest message of each key of a topic, for a caller that reads less often than messages arrive. No thread wakes up when
+    a message arrives, and only a message that is read is decoded. `drain` takes the others from the ring, checks their number,
+    version and stamp, and counts them. Thread-safe.
 
-    `drain` must be called every LOOK_S at least, or the ring overflows; the node does so.
+    `drain` must be called at least every LOOK_S (`fitness`), or the ring overflows; the node does so.
     """
 
     def __init__(self, inbox: Inbox):
@@ -169,7 +169,7 @@ class Latest(Generic[M]):
         self._subscriber = self._inbox.subscribe(session)
 
     def get(self, **names: str) -> M | None:
-        """The newest good message of the key with these names, None where there was none. Raises KeyError for a key that is not
+        """The newest good message of the key with these names, None before the first. Raises KeyError for a key that is not
         read."""
         key = self._keys[tuple(sorted(names.items()))]
         with self._lock:
@@ -184,7 +184,7 @@ class Latest(Generic[M]):
             return newest.message
 
     def drain(self) -> int:
-        """Takes what has come since the last time, and returns `count`."""
+        """Processes the messages since the last call, and returns `count`."""
         with self._lock:
             self._drain()
             return self.count
@@ -215,7 +215,7 @@ class Latest(Generic[M]):
 
 
 def sender_of(sample: zenoh.Sample) -> tuple[bytes, int | None]:
-    """Who sent a message, and its number (`guard.Numbering`); nobody and None where it does not say."""
+    """Publisher of a message, and its number (`guard.Numbering`); empty and None without a valid attachment."""
     attachment = sample.attachment
     if attachment is None or len(attachment) != IDENTITY_BYTES + NUMBER_BYTES:
         return b"", None

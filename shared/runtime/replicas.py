@@ -1,7 +1,7 @@
-"""The replicas of a service: which of them live, which of them owns a stream, and which are not fit to own any.
+"""Replicas of a service: which are alive, which of them owns a stream, and which are unfit to own any.
 
-Each replica that can work holds a liveliness token; all that see the same tokens find the same owner for a stream. One that
-stands still is left out before its token goes (`beats.py`).
+Each replica that can work holds a liveliness token. All replicas that see the same tokens find the same owner for a stream. One
+that stands still is excluded before its token expires (`beats.py`).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from penumbra.shared.runtime.beats import BEAT_S, Beats
 from penumbra.shared.runtime.traffic import Traffic
 
 CLOCK_S = 1.0
-"""Period [s] over which messages are counted to find whether a process's clock differs from all others."""
+"""Period [s] over which messages are counted to detect a process's clock that differs from all others."""
 CLOCK_MESSAGES = 10
-"""Least number of messages refused for their stamps in it. Chosen, not measured."""
+"""Minimum number of messages refused for their stamps in it. Chosen, not measured."""
 PACE_SHARE = 0.5
-"""Weight of the newest look in the smoothed lateness of a process: three late looks in a row suffice."""
+"""Weight of the newest check in the smoothed lateness of a process: three late checks in a row suffice."""
 PACE_LOST = 0.5
-"""Share of its time whose loss makes a process withdraw: the next replica is faster. Chosen, not measured."""
+"""Share of lost processor time above which a process withdraws: the next replica is faster. Chosen, not measured."""
 
 
 class ReaderThread(Protocol):
-    """What reads a subscription."""
+    """Reader of a subscription."""
 
     thread: threading.Thread
 
@@ -39,7 +39,8 @@ class ReaderThread(Protocol):
 
 @dataclass
 class Share:
-    """A subscription that is there only while one of `streams` is this replica's. traffic: of its keys; read: opens it."""
+    """A subscription that is open only while this replica owns one of `streams`. traffic: counters of its keys; read: opens
+    it."""
 
     streams: tuple[str, ...]
     traffic: list[Traffic]
@@ -47,7 +48,7 @@ class Share:
     reader: ReaderThread | None = None
 
     def follow(self, is_own: bool) -> None:
-        """Opens or closes the subscription where that has changed."""
+        """Opens or closes the subscription according to the ownership."""
         for traffic in self.traffic:
             traffic.is_read = is_own
         if is_own and self.reader is None:
@@ -58,9 +59,10 @@ class Share:
 
 
 class Replicas:
-    """This replica among the living ones. key, beat_key: of its liveliness token and its beats, with the instance as last chunk.
+    """This replica among the living ones. key, beat_key: keys of its liveliness token and its heartbeats, with the instance as
+    the last chunk.
 
-    Before it is open it is alone and owns everything. `others`: the instances that hold a token beside this one.
+    Before it is open it is alone and owns everything. `others`: the other instances that hold a token.
     """
 
     def __init__(self, key: str, beat_key: str):
@@ -81,14 +83,14 @@ class Replicas:
 
     @property
     def is_last_to_withdraw(self) -> bool:
-        """Whether this one withdraws last, of those that live, where none of them is fit."""
+        """Whether this replica withdraws last among the living ones, where all are unfit."""
         return self._instance == min(self._living, default="")
 
     def __len__(self) -> int:
         return len(self._living)
 
     def wait(self) -> None:
-        """Owns nothing until the other replicas are known."""
+        """Gives up ownership until the other replicas are known."""
         with self._lock:
             self._living, self._ranks = frozenset(), {}
 
@@ -109,7 +111,7 @@ class Replicas:
                 return
 
     def beat(self, session: zenoh.Session, stopping: threading.Event) -> None:
-        """Tells the other replicas that this one gets its time, and leaves out those that do not, until `stopping` is set."""
+        """Sends heartbeats to the other replicas, and excludes those whose heartbeats are missing, until `stopping` is set."""
         beats, own, expression = Beats(self._instance), self._beat_key, f"{self._beat_key.rpartition('/')[0]}/*"
         try:
             ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(64)
@@ -126,11 +128,11 @@ class Replicas:
         with self._lock:
             if frozen != self._frozen:
                 self._frozen = frozen
-                if self._living:  # else it waits for the others' tokens
+                if self._living:  # otherwise it still waits for the others' tokens
                     self._count()
 
     def join(self, session: zenoh.Session) -> None:
-        """Declares the liveliness token: from now on this replica owns streams."""
+        """Declares the liveliness token: from now on this replica can own streams."""
         with self._lock:
             if self._token is None:
                 self._token = session.liveliness().declare_token(self._key)
@@ -145,13 +147,13 @@ class Replicas:
             self._count()
 
     def share(self, share: Share) -> None:
-        """Follows the ownership of a share's streams from now on."""
+        """Opens and closes a share's subscription from now on."""
         with self._lock:
             self._shares.append(share)
             share.follow(any(map(self.owns, share.streams)))
 
     def leave(self) -> list[ReaderThread]:
-        """Takes over no more streams; returns the readers of those that it owns."""
+        """Stops taking over streams; returns the readers of the streams that it owns."""
         with self._lock:
             shares, self._shares = self._shares, []
             return [share.reader for share in shares if share.reader is not None]
@@ -161,9 +163,9 @@ class Replicas:
         return self.rank(stream) == 0
 
     def rank(self, stream: str) -> float:
-        """Number of living replicas of this service before this one to handle `stream`: 0 for its owner, 1 for the one that
-        will own it when the owner goes away; infinity where this one has no part yet. Rendezvous hashing (Thaler and
-        Ravishankar 1998, doi:10.1109/90.663936): a replica that comes or goes moves only its own streams."""
+        """Number of living replicas of this service that precede this one for `stream`: 0 for its owner, 1 for its next owner;
+        infinity while this one takes no part. Rendezvous hashing (Thaler and Ravishankar 1998, doi:10.1109/90.663936): a replica
+        that comes or goes moves only its own streams."""
         rank = self._ranks.get(stream)
         if rank is None:
             ranks, living = self._ranks, self._living
@@ -173,18 +175,18 @@ class Replicas:
         return rank
 
     def _count(self) -> None:
-        """This replica counts as soon as the others know of it, or where there are none. Where all stand still, as on an
-        overloaded machine, all count."""
+        """Updates who is living. This replica counts as soon as the others know of it, or where there are none. Where all stand
+        still, as on an overloaded machine, all count."""
         self._ranks = {}
         here = self.others if self._token is None and self.others else self.others | {self._instance}
         self._living = here - self._frozen or here
-        self._ranks = {}  # again: another thread may have put a rank among the old ones into the first
+        self._ranks = {}  # again: meanwhile another thread may have stored a rank computed from the old replicas
         for share in self._shares:
             share.follow(any(map(self.owns, share.streams)))
 
 
 class Clock:
-    """Detects, by the messages that are refused, a clock that differs from those of all publishers. fault: in words, empty where
+    """Detects, from refused messages, that this host's clock differs from those of all publishers. fault: as text, empty where
     there is none."""
 
     def __init__(self) -> None:
@@ -193,7 +195,7 @@ class Clock:
         self.fault = ""
 
     def judge(self, traffic: Iterable[Traffic], now_s: float) -> str:
-        """The fault now. traffic: of all that is read; now_s: of a clock that nobody sets."""
+        """The current fault. traffic: counters of everything that is read; now_s: monotonic time."""
         if now_s - self._since_s >= CLOCK_S:
             traffic = list(traffic)
             good = sum(each.count for each in traffic)
@@ -205,14 +207,14 @@ class Clock:
 
 
 class Pace:
-    """Detects, by how late a periodic look of this process is, that it does not get its time: it is stopped again and again, or
-    the machine is overloaded, where fewer replicas do more. One long stop does not count: it is over."""
+    """Detects a lack of processor time, from the lateness of a periodic check: the process is stopped again and again, or the
+    machine is overloaded, where fewer replicas do more. A single long stop does not count, because it is over."""
 
     def __init__(self) -> None:
         self._lost = 0.0
 
     def judge(self, late_s: float, period_s: float) -> str:
-        """The fault now, empty where there is none. late_s: how much later than after period_s it looks again."""
+        """The current fault, empty where there is none. late_s: delay of the check beyond period_s."""
         self._lost += PACE_SHARE * (late_s / (late_s + period_s) - self._lost)
         return f"this process is stalled for {self._lost:.0%} of the time" if self._lost > PACE_LOST else ""
 

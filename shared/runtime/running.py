@@ -1,4 +1,4 @@
-"""How the processes of a cell fare, asked from outside: by `penumbra doctor`, `penumbra topics --hz` and the Python client."""
+"""State of a cell's processes, queried from outside: for `penumbra doctor`, `penumbra topics --hz` and the Python client."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from penumbra.shared.contract import report, topics
 from penumbra.shared.runtime import bus
 
 ANSWER_S = 1.0
-"""Longest wait [s] for the answer of an instance."""
+"""Maximum wait [s] for the answer of an instance."""
 
 
 @dataclass(frozen=True)
@@ -19,9 +19,9 @@ class Instance:
 
     Attributes:
         service: Its name, such as `fusion`.
-        instance: Tells replicas of a service apart.
+        instance: Distinguishes replicas of a service.
         status: `ok`, `starting`, `degraded` or `down`.
-        reasons: Why, where it is not `ok`.
+        reasons: For a status other than `ok`.
     """
 
     service: str
@@ -34,7 +34,7 @@ class Instance:
 
 
 def ask(session: zenoh.Session, cell: str) -> list[Instance]:
-    """Every instance of a cell, by service; one that is on the bus but does not answer within ANSWER_S is down."""
+    """All instances of a cell, by service. An instance that is on the bus but does not answer within ANSWER_S is down."""
     found = {}
     for reply in session.liveliness().get(topics.alive(cell), timeout=ANSWER_S):
         if reply.ok is not None:
@@ -46,13 +46,13 @@ def ask(session: zenoh.Session, cell: str) -> list[Instance]:
 
 
 def cells_there(session: zenoh.Session) -> list[str]:
-    """The names of the cells of which a process is on the bus."""
+    """Names of the cells that have a process on the bus."""
     replies = session.liveliness().get(topics.alive("*"), timeout=ANSWER_S)
     return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None})
 
 
 def whats_there(session: zenoh.Session, cell: str, service: str) -> str:
-    """What to do where a service does not answer: which processes, or which other cells, are on this router."""
+    """Remedy where a service does not answer, depending on which processes, or which other cells, are on this router."""
     running = sorted({instance.service for instance in ask(session, cell)})
     if service in running:
         return f"{service} runs, and has nothing to answer yet: see `penumbra topics --hz`"

@@ -1,4 +1,4 @@
-"""Publishes on one key."""
+"""Publisher of messages on one key."""
 
 from __future__ import annotations
 
@@ -23,6 +23,6 @@ class Sender:
         self._numbering = Numbering()
 
     def send(self, message: Message) -> None:
-        """Encodes and sends a message of the topic. Raises BadMessage where an array has not the declared dtype and shape, and
-        zenoh.ZError where the session is closed."""
+        """Encodes and sends a message of the topic. Raises BadMessage where an array does not have the declared dtype and shape,
+        and zenoh.ZError where the session is closed."""
         self._publisher.put(self._encode(message), attachment=self._numbering.attachment())

@@ -1,9 +1,9 @@
-"""Slow links between hosts: what crosses them, and how little may wait before them.
+"""Slow links between hosts: which messages cross them, and how few may wait.
 
-A frame takes 14 s over a link of 64 kB/s, and whatever waits behind it comes as late. So what cannot cross in time is left out
-before it enters the link, whole messages of it: each topic crosses as often as its `slow_hz` says. What does cross waits in no
-long queue: TCP's send buffer and Zenoh's batches would hold seconds of such a link, so both are made small, and a message that
-finds them full is dropped. Priorities (`topics.Priority`) let poses pass what waits.
+A frame takes 14 s over a link of 64 kB/s, and delays all messages behind it. So messages that cannot cross in time are dropped
+before they enter the link: each topic crosses at the rate `slow_hz`. The others must not wait in long queues. TCP's send buffer
+and Zenoh's batches would hold seconds of such a link, so both are made small, and a message that finds them full is dropped.
+Priorities (`topics.Priority`) let poses overtake waiting messages.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from typing import Any
 
 BATCH = 4096
-"""Bytes that are sent in one piece, which nothing overtakes: a sixteenth of a second at 64 kB/s."""
+"""Bytes that are sent at once, which nothing overtakes: a sixteenth of a second at 64 kB/s."""
 SEND_BUFFER = 8192
-"""Bytes that TCP may hold; the kernel takes twice as many, for its own bookkeeping."""
+"""Size [bytes] of TCP's send buffer. The kernel doubles it, for its own bookkeeping."""
 
 
 @dataclass(frozen=True)
 class SlowLinks:
-    """interfaces: network interfaces of this host, such as wlan0. rates_hz: how often each key may leave by them, 0 for never;
-    a key that is not named leaves as often as it comes."""
+    """Slow links of a router. interfaces: network interfaces of this host, such as wlan0. rates_hz: maximum rate per key over
+    them, 0 for never; other keys are not limited."""
 
     interfaces: tuple[str, ...]
     rates_hz: Mapping[str, float]
@@ -39,8 +39,8 @@ class SlowLinks:
         return {"downsampling": [rule], "transport/link/tx/batch_size": BATCH}
 
     def bounded(self, endpoints: Iterable[str], is_listening: bool) -> tuple[str, ...]:
-        """Endpoints, to listen on or to connect to, with a small send buffer where they lie on these interfaces."""
-        import psutil  # slow to import, and few have a slow link
+        """Endpoints to listen on or to connect to, with a small send buffer for those on these interfaces."""
+        import psutil  # slow to import, and slow links are rare
 
         known = psutil.net_if_addrs()
         own = {address.address for name in self.interfaces for address in known.get(name, ())}
@@ -53,7 +53,7 @@ class SlowLinks:
 
 
 def _local(endpoint: str, is_listening: bool) -> str | None:
-    """The address of this host that an endpoint uses; None where it may be any."""
+    """Address of this host that an endpoint uses; None where it may be any."""
     host, _, port = endpoint.partition("#")[0].partition("/")[2].rpartition(":")
     host = host.strip("[]")
     if is_listening:
@@ -61,7 +61,7 @@ def _local(endpoint: str, is_listening: bool) -> str | None:
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, kind, protocol) as probe:
-            probe.connect(address)  # sends nothing: only finds the way
+            probe.connect(address)  # sends nothing: only selects the route
             return str(probe.getsockname()[0])
-    except OSError:  # no way yet
+    except OSError:  # no route yet
         return None

@@ -1,4 +1,4 @@
-"""The messages of a node: the keys of a topic in its cell, their publishers and readers, and their counters."""
+"""Messages of a node: the keys of a topic in its cell, their publishers and readers, and their counters."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Handler = Callable[[Any, dict[str, str]], None]
 
 
 class _Publisher(NamedTuple):
-    """What publishing on one key needs, looked up once."""
+    """Cached objects for publishing on one key."""
 
     sender: Sender
     traffic: Traffic
@@ -38,8 +38,8 @@ class _Publisher(NamedTuple):
 class Streams:
     """The topics that a node reads and publishes.
 
-    link: the session. replicas: who owns what. now_ns: the clock of stamps. turn: makes the watch of a new handler. failed:
-    called with the place and the exception of a handler that fails. received, published: the counters by key.
+    link: the session. replicas: ownership of streams. now_ns: the clock of stamps. turn: makes the monitor of a new handler.
+    failed: called with the place and the exception of a handler that fails. received, published: counters by key.
     """
 
     def __init__(
@@ -72,13 +72,13 @@ class Streams:
         try:
             found.sender.send(message)
         except zenoh.ZError:
-            if self._link.session is not None:  # else: closed meanwhile
+            if self._link.session is not None:  # otherwise it was closed meanwhile
                 raise
             return
         found.traffic.record(message.stamp_ns, self._now_ns())
 
     def subscribe(self, topic: Topic, handler: Handler, owned: Sequence[str], from_others: bool, names: dict[str, str]) -> None:
-        """As `Node.subscribe`; owned: the streams that this replica must own one of."""
+        """As `Node.subscribe`; owned: its `streams`."""
         inbox = self._inbox(topic, from_others, names, lambda keys: topic.depth * keys)
         if inbox is None:
             return
@@ -116,26 +116,26 @@ class Streams:
         return tap
 
     def drain(self) -> None:
-        """Takes in what `latest` keeps: counters and ages are of now then."""
+        """Processes the messages for `latest`, so that counters and ages are current."""
         for latest in self._latest:
             latest.drain()
 
     def look(self) -> None:
-        """Takes in what `latest` keeps, and how often messages come and go. One thread looks, every LOOK_S."""
+        """Processes the messages for `latest`, and updates the rates. One thread calls it, every LOOK_S."""
         self.drain()
         now_s = time.monotonic()
         for traffic in (*self.received.values(), *self.published.values()):
             traffic.rate.look(traffic.count, now_s)
 
     def _inbox(self, topic: Topic, from_others: bool, names: dict[str, str], depth: Callable[[int], int]) -> Inbox | None:
-        """What a reader of a topic needs, with counters of its own; None where the cell has no such part. depth: of the ring, by
-        the number of keys."""
+        """Settings of a reader of a topic, with counters of its own; None where the cell has no such part. depth: of the ring, as
+        a function of the number of keys."""
         keys = self.keys(topic, names)
         if not keys:
             self._log.info("nothing to read: the cell has no such part", topic=topic.name)
             return None
         expression = next(iter(keys)) if len(keys) == 1 else topic.at(cell=self._cell.name, **names)
-        is_expected = topic.is_expected(self._cell) and not from_others  # there need not be others
+        is_expected = topic.is_expected(self._cell) and not from_others  # other publishers are optional
         stale_s = topic.stale_s if is_expected else math.inf
         streams = {
             key: Stream(found, self._count(key, Traffic(stale_s, topic.publishers)), Guard(self.rate_hz(topic, found)))
@@ -154,7 +154,7 @@ class Streams:
         return _Publisher(Sender(session, topic, key), self.published.setdefault(key, Traffic(topic.stale_s)))
 
     def rate_hz(self, topic: Topic, names: dict[str, str]) -> float:
-        """How often a key's publisher sends: as the table says, but for what follows the cameras' own rates."""
+        """Rate of a key's publisher: that of the table, or higher where it follows the cameras' rates."""
         rates = {name: camera.rate_hz for name, camera in self._cell.cameras.items()}
         if topic.by_camera:
             return max(topic.rate_hz, sum(rates.values()))
@@ -173,18 +173,19 @@ class Streams:
         return {topic.at(cell=self._cell.name, **found): found for found in combinations}
 
     def _count(self, key: str, traffic: Traffic) -> Traffic:
-        """Keeps the counters of one more reader of a key."""
+        """Registers the counters of one more reader of a key."""
         readers = sum(1 for known in self.received if known.partition(" #")[0] == key)
         self.received[key if not readers else f"{key} #{readers + 1}"] = traffic
         return traffic
 
     def _refused(self, key: str, error: BadMessage) -> None:
-        """Logs the first bad message of each kind on a key. Another release publishes on many keys at once: it is logged once."""
+        """Logs the first bad message of each kind on a key. A wrong version is logged once for all keys: another release
+        publishes on many."""
         if error.kind == "version" and next(self._other_versions):
             return
         self._log.warning("message refused; more of this kind are only counted", key=key, kind=error.kind, why=str(error))
 
 
 def _names(topic: Topic) -> tuple[str, ...]:
-    """The {names} of a topic's key, without the cell's."""
+    """The {names} of a topic's key, without the cell."""
     return tuple(name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell")

@@ -1,7 +1,7 @@
-"""Everything that topics carry, as bytes and without a check, for whoever keeps it: no message is left out because nobody looks.
+"""Access to all messages of topics, as unchecked bytes, for a recorder: no message is left out for lack of a reader.
 
-Zenoh's thread puts a message aside as soon as it arrives, so that a camera's shared memory is free again at once; the owner takes
-them together, a few times a second.
+Zenoh's thread copies a message as soon as it arrives, so that a camera's shared memory is free again at once. The owner takes the
+messages together, a few times a second.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from penumbra.shared.runtime.traffic import Traffic
 
 @dataclass(frozen=True)
 class Taken:
-    """A message as it was on the bus. received_ns: its arrival. stamp_ns: as it says, else its arrival. publisher: its identity,
-    empty where it has none; number: the publisher's."""
+    """A message as it was on the bus. received_ns: its arrival. stamp_ns: its stamp, else its arrival. publisher: its identity,
+    empty where it has none; number: in the publisher's sequence."""
 
     received_ns: int
     stamp_ns: int
@@ -37,10 +37,10 @@ class Taken:
 
 
 class Tap:
-    """What came since it was last taken.
+    """Messages since the last `take`.
 
-    keys: the concrete keys of each topic, with the names in them and their counters. most_bytes: that may wait to be taken; what
-    comes then is lost. lost: how many messages were. now_ns: the clock.
+    keys: the concrete keys of each topic, with the names in them and their counters. most_bytes: maximum size of waiting
+    messages; further ones are lost. lost: number of lost messages. now_ns: the clock.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class Tap:
     def open(self, session: zenoh.Session) -> None:
         """Subscribes."""
         for key in self._keys:
-            # Zenoh's own thread: another one would be woken for each message
+            # runs in Zenoh's own thread: another thread would be woken for each message
             handler = zenoh.handlers.Callback(functools.partial(self._put, key), indirect=False)
             session.declare_subscriber(key, handler)
 
     def take(self) -> list[Taken]:
-        """All messages that wait, in the order of their arrival."""
+        """All waiting messages, in the order of their arrival."""
         with self._lock:
             waiting, self._waiting, self._bytes = self._waiting, deque(), 0
         for taken in waiting:

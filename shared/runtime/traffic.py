@@ -1,4 +1,4 @@
-"""Counters of what is received and published on a key: how many messages, how often, how old."""
+"""Counters of the messages received and published on a key: number, rate and age."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from penumbra.shared.contract.report import TopicReport
 
 RATE_WINDOW_S = 3.0
-"""Time over which a rate is averaged."""
+"""Time constant [s] of the mean rate."""
 
 
 class Rate:
-    """Events per second over about the last RATE_WINDOW_S, from a count that is looked at now and then, so that an event costs
-    nothing: the exponentially weighted mean of what each time between two looks had, divided by the weight that the time since
-    the first event can have. `hz` is that of the last look."""
+    """Event rate over about the last RATE_WINDOW_S. It is derived from a count that is read now and then, so that an event costs
+    nothing: the exponentially weighted mean of the rates between two reads, divided by the total weight of the time since the
+    first event. `hz`: the rate at the last read."""
 
     def __init__(self) -> None:
         self._first_s = self._last_s = math.nan
@@ -23,8 +23,8 @@ class Rate:
         self.hz = 0.0
 
     def look(self, count: int, now_s: float) -> None:
-        """Takes the count of events so far. `now_s` must not run backwards."""
-        if count and math.isnan(self._first_s):  # what came before this look came within an unknown time
+        """Reads the count of events so far. `now_s` must be monotonic."""
+        if count and math.isnan(self._first_s):  # the time of the events before this read is unknown
             self._first_s = self._last_s = now_s
             self._count = count
         elif now_s > self._last_s:
@@ -37,10 +37,10 @@ class Rate:
 
 @dataclass
 class Traffic:
-    """What came (or went) on one key. `stale_s`: the age after which it is missing; `publishers`: the services that may publish
-    it, where it is read; `bad`: refused messages by kind; `dropped`: gaps in the publishers' own count, None for what cannot be
-    known; `delay_s`: from the measurement to here, of the last message; `is_read`: whether anybody here reads it
-    now: what another replica reads is never stale."""
+    """Counters of one key that is received or published. `stale_s`: age after which it is missing; `publishers`: the services
+    that may publish it, where it is read; `bad`: refused messages by kind; `dropped`: gaps in the publishers' numbers, None where
+    unknown; `delay_s`: from the last message's measurement to its arrival; `is_read`: whether this process reads it now; what
+    another replica reads is never stale."""
 
     stale_s: float
     publishers: tuple[str, ...] = ()
@@ -53,19 +53,19 @@ class Traffic:
     rate: Rate = field(default_factory=Rate)
 
     def record(self, stamp_ns: int, now_ns: int | None) -> None:
-        """Counts a good message. now_ns: when it came by the clock of stamps, None where that is not known."""
+        """Counts a good message. now_ns: time of its arrival by the clock of stamps, None where it is unknown."""
         self.count += 1
         self.stamp_ns = stamp_ns
         if now_ns is not None:
             self.delay_s = (now_ns - stamp_ns) * 1e-9
 
     def missed(self, count: int | None) -> None:
-        """Counts messages that did not come; None where the publisher does not number them."""
+        """Counts messages that did not arrive; None where the publisher does not number them."""
         if count is not None:
             self.dropped = (self.dropped or 0) + count
 
     def age_s(self, now_ns: int) -> float | None:
-        """Seconds since the newest measurement; None where none ever came."""
+        """Time since the newest measurement [s]; None before the first."""
         return None if self.stamp_ns is None else (now_ns - self.stamp_ns) * 1e-9
 
     def is_stale(self, now_ns: int) -> bool:

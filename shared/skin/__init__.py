@@ -1,1 +1,1 @@
-"""The capacitive skin: where its electrodes are, what they read near a limb, its boards and its faults."""
+"""The capacitive skin: its electrodes, their response to a limb, its boards and its faults."""

@@ -1,10 +1,9 @@
-"""The sensing board's protocol on its serial line: commands of 16 bytes, replies of sums, and what the sums say.
+"""Protocol of the sensing board on its serial line: commands of 16 bytes, replies with sums, and amplitudes from the sums.
 
 A board excites its pad's ring with a sine of `electrode_hz`, takes `samples_per_cycle` samples of each of its six channels in
-every cycle, and adds up each of these samples over many cycles. The amplitude of a channel is the first Fourier component of
-the mean cycle. There is no header, no checksum and no sequence number: a reply's size and what is possible in it are all there
-is to find whether it is whole. Only bytes and arrays here: `services/skin` has the serial port, `sim.skin.board` the emulated
-board.
+every cycle, and sums each of these samples over many cycles. The amplitude of a channel is the first Fourier component of the
+mean cycle. There is no header, no checksum and no sequence number: only a reply's size and the plausibility of its values show
+whether it is complete. Only bytes and arrays here: `services/skin` has the serial port, `sim.skin.board` the emulated board.
 """
 
 from __future__ import annotations
@@ -23,43 +22,43 @@ from penumbra.shared.geometry.rigid import Array
 BAUD = 500_000
 """Rate of the serial line [bit/s]."""
 BYTE_S = 10 / BAUD
-"""A byte on the line: eight bits, a start and a stop."""
+"""Duration [s] of a byte on the line: eight bits, a start and a stop."""
 CLOCK_HZ = 120e6
-"""Every period is a whole number of ticks of this clock."""
+"""Clock frequency [Hz]. Every period is a whole number of its ticks."""
 SAMPLE_HZ = 400e3
-"""Samples a second of a channel after power-on."""
+"""Sampling rate [Hz] of a channel after power-on."""
 ELECTRODE_HZ = 100e3
 """Frequency [Hz] of the excitation after power-on."""
 CHANNELS = 6
-"""Channels of the converter."""
+"""Number of channels of the converter."""
 COMMAND_BYTES, HEAD_BYTES = 16, 16
-"""Length of a command, and of a reply before its sums."""
+"""Length [bytes] of a command, and of a reply before its sums."""
 SAMPLES_PER_CYCLE = range(2, 10)
-"""Samples per cycle that a board can do: beyond them the firmware stops."""
+"""Samples per cycle that a board supports; with more, its firmware stops."""
 BLOCK = 128
-"""Samples that a board takes in one go: the number of cycles grows in steps of about BLOCK / samples_per_cycle."""
+"""Number of samples that a board takes at once. The number of cycles grows in steps of about BLOCK / samples_per_cycle."""
 MOST_MEASURES = 65_504
-"""Largest number of cycles in a command that a board answers."""
+"""Maximum number of cycles in a command that a board answers."""
 FULL_SCALE = 4095
-"""The largest value of one sample, 12 bits."""
+"""Maximum value of one sample, 12 bits."""
 UNUSED = 0xFFFF_FFFF
-"""Value of `measures` in a command that sets none."""
+"""Value of `measures` in a command that does not use it."""
 KEEP = struct.unpack("<f", b"\xff\xff\xff\xfe")[0]
-"""Frequency in a command that leaves it as it is: any negative one does. With UNUSED and KEEP no 16 bytes across two commands
-look like another command, so a board that lost a byte stays silent and does nothing that was not asked for."""
+"""Frequency in a command that leaves the setting unchanged, as any negative one does. With UNUSED and KEEP no 16 bytes across two
+commands look like another command, so a board that lost a byte stays silent and executes nothing unintended."""
 OVERRUN = b"Error\r\n"
-"""What the firmware prints, on the same line and at any place, when its converter was not read in time."""
+"""Text that the firmware prints, on the same line and at any place, when its converter was not read in time."""
 
 _COMMAND = struct.Struct("<iIff")
 _HEAD = struct.Struct("<Bx6H2x")
 
 
 class PacketError(ValueError):
-    """Bytes that are no command or reply of a board; the text says what was expected and what came."""
+    """Bytes that are not a command or reply of a board. The text says what was expected and what was received."""
 
 
 class Kind(IntEnum):
-    """The content of a command."""
+    """Type of a command."""
 
     SEND_MEASURES = 0
     SET_FREQ = 1
@@ -68,8 +67,8 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Command:
-    """kind: a `Kind`, or any other 32-bit integer, which no board answers. measures: cycles to measure. electrode_hz: of the
-    excitation. sample_hz: of the converter, and for SET_FREQ_2 the samples per cycle."""
+    """A command. kind: a `Kind`, or any other 32-bit integer, which no board answers. measures: cycles to measure. electrode_hz:
+    of the excitation. sample_hz: of the converter, and for SET_FREQ_2 the samples per cycle."""
 
     kind: int
     measures: int = UNUSED
@@ -77,7 +76,7 @@ class Command:
     sample_hz: float = KEEP
 
     def pack(self) -> bytes:
-        """The 16 bytes. Raises PacketError for numbers that do not fit into them."""
+        """The command as 16 bytes. Raises PacketError for numbers out of range."""
         try:
             return _COMMAND.pack(self.kind, self.measures, self.electrode_hz, self.sample_hz)
         except (struct.error, OverflowError):
@@ -85,27 +84,28 @@ class Command:
 
     @staticmethod
     def unpack(data: bytes) -> Command:
-        """Raises PacketError for another size than 16 bytes."""
+        """Decodes a command. Raises PacketError for any size but 16 bytes."""
         if len(data) != COMMAND_BYTES:
             raise PacketError(f"expected a command or its echo of {COMMAND_BYTES} bytes, got {len(data)}")
         return Command(*_COMMAND.unpack(data))
 
     def is_answered(self, samples_per_cycle: int) -> bool:
-        """Whether a board answers it, rather than keeping silent."""
+        """Whether a board answers the command or stays silent."""
         if self.kind == Kind.SEND_MEASURES:
             return 0 < self.measures <= MOST_MEASURES and samples_per_cycle in SAMPLES_PER_CYCLE
         return self.kind in (Kind.SET_FREQ, Kind.SET_FREQ_2)
 
 
 def send_measures(measures: int) -> bytes:
-    """Asks for the sums over so many cycles, as `cycles` rounds them. Raises PacketError for a number never answered."""
+    """Requests the sums over a number of cycles, rounded as in `cycles`. Raises PacketError for a number that is never
+    answered."""
     if not 0 < measures <= MOST_MEASURES:
         raise PacketError(f"measures: expected 1 to {MOST_MEASURES} cycles, got {measures}, which a board never answers")
     return Command(Kind.SEND_MEASURES, measures).pack()
 
 
 def set_frequency(electrode_hz: float, samples_per_cycle: int) -> bytes:
-    """SET_FREQ_2. Raises PacketError for what would stop the firmware."""
+    """The command SET_FREQ_2. Raises PacketError for values that stop the firmware."""
     if samples_per_cycle not in SAMPLES_PER_CYCLE:
         raise PacketError(f"samples_per_cycle: expected 2 to 9, got {samples_per_cycle}; above 9 the firmware stops")
     if not 0.0 < electrode_hz * samples_per_cycle < CLOCK_HZ:
@@ -114,39 +114,39 @@ def set_frequency(electrode_hz: float, samples_per_cycle: int) -> bytes:
 
 
 def period(hz: float, multiple: int = 1) -> int:
-    """Ticks of the clock [1 / 120 MHz] in the period that a board takes for a frequency: a multiple of so many, at least one."""
+    """Period, in ticks of the clock [1 / 120 MHz], that a board uses for a frequency: a multiple of `multiple`, at least one."""
     return max(1, round(CLOCK_HZ / hz / multiple)) * multiple
 
 
 def actual_hz(hz: float, multiple: int = 1) -> float:
-    """The frequency that a board takes for one that is asked for; multiple: samples per cycle, where the two are set together."""
+    """Frequency that a board uses for a requested one. multiple: samples per cycle, where the two are set together."""
     return CLOCK_HZ / period(hz, multiple)
 
 
 def step(samples_per_cycle: int) -> int:
-    """The cycles of one block: `measures` are reached in steps of it."""
+    """Number of cycles in one block, by which `measures` grow."""
     return round(BLOCK / samples_per_cycle)
 
 
 def cycles(measures: int, samples_per_cycle: int) -> int:
-    """The cycles that a board measures when asked for `measures`: 100 at 4 samples a cycle gives 128."""
+    """Number of cycles that a board measures when `measures` are requested: 100 at 4 samples per cycle gives 128."""
     size = step(samples_per_cycle)
     return -(-measures // size) * size
 
 
 def reply_bytes(samples_per_cycle: int) -> int:
-    """Size of a reply to SEND_MEASURES."""
+    """Size [bytes] of a reply to SEND_MEASURES."""
     return HEAD_BYTES + 4 * CHANNELS * samples_per_cycle
 
 
 def reply_s(count: int, electrode_hz: float, samples_per_cycle: int) -> float:
-    """The least time [s] from a command's first byte to its reply's last: two packets on the line and the cycles."""
+    """Minimum time [s] from a command's first byte to its reply's last: two packets on the line and the cycles."""
     return (COMMAND_BYTES + reply_bytes(samples_per_cycle)) * BYTE_S + count / electrode_hz
 
 
 @dataclass(frozen=True)
 class Reply:
-    """counts (6,): cycles of each channel; sums (6, samples_per_cycle): of the raw samples over these cycles."""
+    """A reply. counts (6,): cycles of each channel; sums (6, samples_per_cycle): sums of the raw samples over these cycles."""
 
     counts: NDArray[np.int64]
     sums: NDArray[np.int64]
@@ -156,8 +156,8 @@ class Reply:
         return int(self.sums.shape[1])
 
     def fourier(self) -> tuple[Array, NDArray[np.complex128]]:
-        """Mean level (6,) and first Fourier component (6,) of the mean cycle, in steps of the converter: |X| is the amplitude,
-        arg X the phase of a cosine. At two samples a cycle only the component along the samples can be seen.
+        """Mean level (6,) and first Fourier component X (6,) of the mean cycle, in steps of the converter: |X| is the amplitude,
+        arg X the phase of a cosine. With two samples per cycle only the component along the samples is observable.
 
         Raises PacketError where a channel has no cycles.
         """
@@ -170,21 +170,22 @@ class Reply:
         return mean.mean(axis=1), mean @ _waves(self.samples_per_cycle)
 
     def is_possible(self, count: int) -> bool:
-        """Whether a board that was asked for `count` cycles can have sent it: every channel has so many, and no sum is more than
-        full scale in each."""
+        """Whether the reply to a request of `count` cycles is plausible: every channel has this count, and no sum exceeds full
+        scale in all cycles."""
         return bool((self.counts == count).all() and self.sums.max() <= FULL_SCALE * count)
 
 
 @cache
 def _waves(samples_per_cycle: int) -> NDArray[np.complex128]:
-    """(samples_per_cycle,): 2 / n exp(-2 pi i k / n); at two samples the wave is its own conjugate and counts once."""
+    """Fourier weights (samples_per_cycle,): 2 / n exp(-2 pi i k / n). With two samples the wave is its own conjugate and counts
+    once."""
     n = samples_per_cycle
     waves: NDArray[np.complex128] = (1.0 if n == 2 else 2.0) / n * np.exp(-2j * np.pi * np.arange(n) / n)
     return waves.round(15)
 
 
 def encode(counts: ArrayLike, sums: ArrayLike) -> bytes:
-    """The reply of counts (6,) and sums (6, samples_per_cycle). Raises PacketError for what does not fit into one."""
+    """Bytes of a reply with counts (6,) and sums (6, samples_per_cycle). Raises PacketError for values out of range."""
     n, s = np.asarray(counts), np.asarray(sums)
     if n.shape != (CHANNELS,) or s.ndim != 2 or len(s) != CHANNELS or s.shape[1] not in SAMPLES_PER_CYCLE:
         raise PacketError(f"expected counts (6,) and sums (6, 2 to 9), got {n.shape} and {s.shape}")
@@ -194,7 +195,7 @@ def encode(counts: ArrayLike, sums: ArrayLike) -> bytes:
 
 
 def decode(data: bytes) -> Reply:
-    """Counts and sums of a whole reply. Raises PacketError with the sizes that fit where it is not one."""
+    """Counts and sums of a complete reply. Raises PacketError that names the valid sizes."""
     spc = data[0] if data else 0
     if spc in SAMPLES_PER_CYCLE and len(data) == reply_bytes(spc):
         counts = np.array(_HEAD.unpack_from(data)[1:], dtype=np.int64)
@@ -210,8 +211,8 @@ def decode(data: bytes) -> Reply:
 
 
 def readers(pad: Pad, pad_type: PadType) -> tuple[SensingBoard, ...]:
-    """The boards of a pad as the cell file has them, or where it has none: two electrodes a board in the order of the pad type,
-    the first on channels 0 to 2, the second on 3 to 5. Five electrodes c, r, l, t, b take three boards."""
+    """Boards of a pad from the cell file. Default: two electrodes per board in the order of the pad type, the first on channels 0
+    to 2, the second on 3 to 5. Five electrodes c, r, l, t, b need three boards."""
     if pad.boards:
         return pad.boards
     names = list(pad_type.electrodes)
@@ -220,20 +221,20 @@ def readers(pad: Pad, pad_type: PadType) -> tuple[SensingBoard, ...]:
 
 
 FILLER = b"\xff"
-"""A byte that is the start of no command. 16 of them end any command that a board is reading."""
+"""A byte with which no command starts. 16 of them end any command that a board is reading."""
 
 
 def realign_probes(attempt: int = 0) -> list[bytes]:
-    """16 pieces of a stream in which a board finds exactly one command, wherever in a command it is: each is one byte
-    longer than a command. Each asks to keep the frequencies, and carries its number and that of the attempt (modulo 8) in
-    `measures`, which the board's answer repeats. All else in the stream is unknown to a board. Between the pieces a board needs
-    time to answer."""
+    """Stream of 16 pieces in which a board finds exactly one command, wherever in a command it is: each piece is one byte longer
+    than a command. Each asks to keep the frequencies, and carries its number and that of the attempt (modulo 8) in `measures`,
+    which the board's answer repeats. A board recognises nothing else in the stream. Between the pieces it needs time to
+    answer."""
     return [_probe(attempt, number).pack() + FILLER for number in range(COMMAND_BYTES)]
 
 
 def realign_answer(data: bytes, attempt: int = 0) -> tuple[int, Command] | None:
-    """The first answer to `realign_probes` of this attempt in received bytes: the number of the piece that the board understood,
-    and the answer; None without. When `sent` pieces were sent, (number - sent) % 16 fillers set the board right."""
+    """First answer to `realign_probes` of this attempt in received bytes: the number of the piece that the board understood, and
+    the answer; None where there is none. After `sent` pieces, (number - sent) % 16 fillers realign the board."""
     answers = {_probe(attempt, number).pack()[:8]: number for number in range(COMMAND_BYTES)}
     for at in range(len(data) - COMMAND_BYTES + 1):
         if (number := answers.get(data[at : at + 8])) is not None:

@@ -1,7 +1,7 @@
-"""Whether a pad's electrodes work, by their voltages; and the likely reason where a pad's voltages do not fit.
+"""Detection of faulty electrodes from a pad's voltages, and the likely reason where a pad's voltages do not fit.
 
-`Watch` sees one pad alone. What it cannot see there (a pad turned on its mount, a calibration from another pad) `likely` finds by
-comparing what the pad reads with what the field model says for a pose that the other pads and cameras know.
+`Watch` examines one pad alone. `likely` finds faults that this cannot show (a pad rotated on its mount, a calibration from
+another pad): it compares the pad's signals with the field model at a pose known from the other pads and cameras.
 """
 
 from __future__ import annotations
@@ -19,38 +19,38 @@ from penumbra.shared.skin.layout import Skin
 Kind = Literal["saturated", "dead", "noisy", "hum", "drift"]
 
 BLOCK = 20
-"""Samples in which a limb's motion is a cubic: what is left of them is noise."""
+"""Number of samples over which a limb's motion is a cubic; the residual is noise."""
 LOOK_S = 1.0
-"""Samples of one look: 50 and 60 Hz are apart in it, and a mean is known to 0.08 mV."""
+"""Duration [s] of one look: it resolves 50 and 60 Hz, and a mean is known to 0.08 mV."""
 LEAST_SAMPLES = 100
-"""Least number of samples of a look, whatever their rate."""
+"""Minimum number of samples in a look, at any sampling rate."""
 MAINS_HZ = (50.0, 60.0)
 """Frequencies of the mains."""
 BESIDE_HZ = (-6.0, -3.5, 3.5, 6.0)
-"""Where nothing may be beside a line of the mains: a moving limb leaves something at all of them."""
+"""Offsets [Hz] from a mains line of the frequencies that it is compared with. A moving limb contributes at all of them."""
 QUIET = 0.25
-"""Share of the calibrated noise below which an electrode is dead: 6 standard deviations of an estimate from 800 degrees of
-freedom lie at 0.7, the rest is for a calibration that was noisy."""
+"""Share of the calibrated noise (variance) below which an electrode is dead. 6 standard deviations of an estimate with 800
+degrees of freedom lie at 0.7; the rest is a margin for a calibration that was noisy."""
 NOISY = 4.0
 """Multiple of the calibrated noise (variance) above which an electrode is noisy. Chosen, not measured."""
 RIPPLE = 0.01
 """Noise as a share of the signal that is no fault: a hand is never quite still."""
 LINE = 25.0
-"""Power of a line over what white noise gives on average: false once in exp(25) looks."""
+"""Minimum power of a mains line, relative to its mean under white noise: one false alarm in exp(25) looks."""
 STANDS_OUT = 4.0
-"""A line's amplitude over those beside it."""
+"""Minimum ratio of a line's amplitude to those beside it."""
 HUM_V = 5e-4
-"""Mains below this [V] harms nothing."""
+"""Amplitude [V] below which hum is harmless."""
 BELOW_V = 1.5e-3
-"""A signal so far below zero [V] is no limb: a body takes field lines away, it adds none."""
+"""Magnitude [V] of a negative signal that is a fault: a body takes field lines away, it adds none."""
 ALONE = (4.0, 10.0)
 ALONE_V = 3e-3
 FAR_V = 0.03
-"""An electrode whose signal is this many times that of all others of its pad, and by ALONE_V [V] larger, is faulty: the first
-factor for signals up to FAR_V [V], as from a limb 5 cm away, which gives all nearly the same; the second above it. Chosen, not
-measured."""
+"""An electrode is faulty if its signal exceeds the largest of its pad's others by such a factor plus ALONE_V [V]. The first
+factor is for signals up to FAR_V [V], as from a limb 5 cm away, whose signals are nearly equal; the second is for larger ones.
+Chosen, not measured."""
 LASTS = 3
-"""Looks in a row that find a drift before it is reported."""
+"""Number of successive looks with a drift before it is reported."""
 
 MENDS: dict[Kind, str] = {
     "saturated": "turn the amplifier's potentiometer down, or take away what touches the pad",
@@ -63,7 +63,7 @@ MENDS: dict[Kind, str] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """Why an electrode is not used; `text` says what was expected and what came."""
+    """Reason why an electrode is not used; `text` says what was expected and what was measured."""
 
     kind: Kind
     text: str
@@ -71,8 +71,8 @@ class Fault:
 
 @dataclass(frozen=True)
 class Look:
-    """What one look saw of e electrodes. level (e,) [V]: mean; signal (e,) [V]: of it what the skin adds, without its sign; noise
-    (e,) [V^2]: variance of a sample, motion apart; hum (e,) [V], hum_hz (e,): amplitude of the mains and its frequency."""
+    """Measurements of one look at e electrodes. level (e,) [V]: mean; signal (e,) [V]: the skin's part of it, without polarity;
+    noise (e,) [V^2]: variance of a sample without motion; hum (e,) [V], hum_hz (e,): amplitude of the mains and its frequency."""
 
     level: Array
     signal: Array
@@ -82,16 +82,16 @@ class Look:
 
 
 class Watch:
-    """Finds faults of one pad's electrodes as its samples come; `pad` is its place in `skin`. False alarms with white noise: see
-    the thresholds. Saturated and dead ones are reported within BLOCK samples, the others after a look, a drift after LASTS
-    looks."""
+    """Detects faults of one pad's electrodes as samples arrive; `pad` is its index in `skin`. For the false alarms under white
+    noise, see the thresholds. Saturated and dead electrodes are reported within BLOCK samples, other faults after a look, a drift
+    after LASTS looks."""
 
     def __init__(self, skin: Skin, pad: int):
         own = skin.of(pad)
         self.names = tuple(name.partition("/")[2] for name in skin.names[own])
         self._a3, self._polarity, self._noise = skin.a3[own], skin.polarity[own], skin.noise[own]
         self._end, self._top = skin.full_scale[own], skin.full_scale[own] - 0.5 * skin.lsb[own]
-        # a range that is no noise; an electrode whose own noise is below a step of the converter may have none
+        # range below which there is no noise; an electrode with noise below a step of the converter may show none
         self._still = np.where(self._noise > skin.lsb[own] ** 2, 1.01 * skin.lsb[own], -np.inf)
         reach = skin.peak[own] / skin.a2[own]
         self._even: Array = reach.mean() / reach
@@ -104,7 +104,7 @@ class Watch:
         self._odd = np.zeros(len(self.names), np.int64)
 
     def add(self, stamp_ns: int, period_ns: int, volts: Array) -> dict[str, Fault]:
-        """Take a batch (s, e) [V] whose last row has stamp_ns; the faults in force by electrode."""
+        """Adds a batch (s, e) [V] whose last row has stamp_ns; returns the current faults by electrode."""
         if self._rows and abs(stamp_ns - (len(volts) - 1) * period_ns - self._due_ns) > 3 * period_ns + 5_000_000:
             self._forget()
         self._due_ns = stamp_ns + period_ns
@@ -122,7 +122,7 @@ class Watch:
 
     @property
     def faults(self) -> dict[str, Fault]:
-        """The faults in force by electrode, the gravest of each."""
+        """Current faults by electrode, the gravest of each."""
         found = {**self._slow, **self._quick}
         return {self.names[k]: found[k] for k in sorted(found)}
 
@@ -178,8 +178,8 @@ class Watch:
         return out
 
     def _drifts(self, signal: Array) -> NDArray[np.bool_]:
-        """Signals (e,) [V] that no body gives: below zero, or of one electrode alone."""
-        even = signal * self._even  # as large as each other's where a body is far
+        """Signals (e,) [V] that no body causes: negative ones, or that of one electrode alone."""
+        even = signal * self._even  # equal for all electrodes where a body is far
         below: NDArray[np.bool_] = signal < -BELOW_V
         if len(signal) < 3:
             return below
@@ -198,8 +198,8 @@ def _cubics() -> Array:
 
 @lru_cache(maxsize=4)
 def _lines(samples: int, period_s: float) -> NDArray[np.complex128]:
-    """Rows that give the amplitude of each line of the mains and of the frequencies beside it; Hann's window, so that a limb's
-    motion stays below them."""
+    """Rows that give the amplitudes of each mains line and of the frequencies beside it. Hann's window keeps a limb's motion
+    below them."""
     time = np.arange(samples) * period_s
     window = np.hanning(samples)
     window *= 2.0 / window.sum()
@@ -207,13 +207,13 @@ def _lines(samples: int, period_s: float) -> NDArray[np.complex128]:
     return np.asarray(window * np.exp(-2j * np.pi * hz[:, None] * time), np.complex128)
 
 
-# ---- what a whole pad is likely to be
+# ---- faults of a whole pad
 
 
 def arrangements(centroids: Array) -> dict[str, NDArray[np.intp]]:
-    """Ways in which a pad may sit wrongly on its mount: for each, which electrode (e,) then is where another should be.
+    """Wrong ways to mount a pad: for each, the index (e,) of the electrode at whose place each electrode then is.
 
-    centroids (e, 2 or 3) [m] in the pad's frame. Ways that bring no electrode to another's place are left out.
+    centroids (e, 2 or 3) [m] in the pad's frame. Ways that move no electrode to another's place are left out.
     """
     xy = centroids[:, :2]
     turns = {
@@ -233,8 +233,8 @@ def arrangements(centroids: Array) -> dict[str, NDArray[np.intp]]:
 
 @dataclass(frozen=True)
 class Suspicion:
-    """`text`: what a pad is likely to be, None where it fits; misfit: mean squared residual of the pad as the cell file has it,
-    in variances; left: of it, what stays if `text` is right; gain: the pad's signals over the predicted ones."""
+    """Diagnosis of a pad. `text`: likely fault, None where the pad fits; misfit: mean squared residual with the pad as in the
+    cell file, in variances; left: the rest of it if `text` is right; gain: ratio of the pad's signals to the predicted ones."""
 
     text: str | None
     misfit: float
@@ -243,28 +243,28 @@ class Suspicion:
 
 
 MISFIT = 4.0
-"""Mean squared residual, in variances, from which a pad does not fit, whatever the reason."""
+"""Mean squared residual, in variances, above which a pad does not fit, for any reason."""
 SUSPECT = 0.5
-"""Mean squared residual, in variances, from which a pad does not fit where a reason is found that explains it."""
+"""Mean squared residual, in variances, above which a pad does not fit where an arrangement explains it."""
 EXPLAINED = 0.4
-"""Largest share of the misfit that an explanation may leave."""
+"""Maximum share of the misfit that may remain after an explanation."""
 MODEL_ERROR = 0.05
-"""Relative error of the predicted signals: that of the field model."""
+"""Relative error of the predicted signals, from the field model."""
 CONTRAST = 0.3
-"""Share of the pose's error that reaches the electrodes of a pad each in its own way."""
+"""Share of the pose's error that affects each electrode of a pad differently."""
 LASTING = 0.5
-"""Share of the pose's error that stays over the moments, and looks like a gain."""
+"""Share of the pose's error that is constant over the moments, and looks like a gain."""
 SURE = 3.0
-"""Standard deviations at which a gain is another pad's."""
+"""Standard deviations from one at which a gain is another pad's."""
 
 
 def likely(predicted: Array, measured: Array, noise: Array, pose_error: Array, centroids: Array) -> Suspicion:
-    """Which fault of a whole pad explains what it reads.
+    """Finds the fault of a whole pad that explains its signals.
 
-    predicted, measured (k, e) [V]: signals at k moments with a body in reach, by the field model and by the electrodes; noise
-    (k, e) or (e,) [V^2]: variance of a measured one; pose_error (k,): standard deviation of the predicted ones as a share, for
-    the error of the pose, which makes all electrodes of a pad read more or less alike; centroids (e, 2 or 3).
-    Raises ValueError for other shapes or none.
+    predicted, measured (k, e) [V]: signals at k moments with a body in reach, from the field model and from the electrodes; noise
+    (k, e) or (e,) [V^2]: variance of a measured signal; pose_error (k,): relative standard deviation of the predicted signals due
+    to the pose's error, which affects all electrodes of a pad nearly alike; centroids (e, 2 or 3). Raises ValueError for other
+    shapes or none.
     """
     if predicted.shape != measured.shape or predicted.ndim != 2 or not len(predicted):
         raise ValueError(f"expected signals (k, e) of the same shape, got {predicted.shape} and {measured.shape}")
@@ -272,7 +272,8 @@ def likely(predicted: Array, measured: Array, noise: Array, pose_error: Array, c
     spread = noise + own**2
 
     def misfit(model: Array) -> float:
-        """With a covariance of diag(spread) and (pose_error model)(pose_error model)^T (Sherman and Morrison 1950)."""
+        """Mean squared residual with a covariance of diag(spread) + (pose_error model)(pose_error model)^T (Sherman and Morrison
+        1950)."""
         left = measured - model
         alike = pose_error[:, None] * model / spread
         removed = np.sum(alike * left, axis=1) ** 2 / (1.0 + np.sum(alike * pose_error[:, None] * model, axis=1))

@@ -1,9 +1,9 @@
-"""The capacitive skin as the cell describes it: where its electrodes are and how their amplitudes [V] come about.
+"""Geometry and amplitudes [V] of the capacitive skin, as the cell file describes it.
 
-What comes near takes field lines away: the capacitance between ring and electrode falls by a `change` [fF], and the amplitude
-is v = a3 + polarity * gain * sensitivity * change. `gain` is what a calibration finds beside the design, about one. What a limb
-at a pose changes is the field model's part (`shared.skin.response`); the paper's response law (eq. sensor_approx) stands for it
-where only the gap d to the skin is known: v = a3 + polarity * a1 / (1 + a2 d^2).
+An object near takes field lines away: the capacitance between ring and electrode falls by a `change` [fF], and the amplitude is v
+= a3 + polarity * gain * sensitivity * change. `gain` is the calibrated signal relative to the design, about one. The field model
+(`shared.skin.response`) gives the change for a limb at a pose. The paper's response law (eq. sensor_approx) replaces it where
+only the gap d to the skin is known: v = a3 + polarity * a1 / (1 + a2 d^2).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from penumbra.shared.geometry.rigid import Array
 GAIN_GAPS = (0.02, 0.05, 0.10)
 """Gaps [m] at which a calibrated law is compared with the designed one."""
 HOME_SIGMAS = 3.0
-"""Distance from its home, in standard deviations, within which a target is taken to stay."""
+"""Maximum distance of a target from its home, in standard deviations."""
 RANGES = 2.0
-"""Largest distance of a target, in ranges of a pad, at which the pad belongs to those that may feel it."""
+"""Maximum distance of a target, in ranges of a pad, at which the pad may sense it."""
 
 
 def electrode_positions(pad_type: PadType) -> Array:
@@ -33,12 +33,13 @@ def electrode_positions(pad_type: PadType) -> Array:
 
 
 class Skin:
-    """All electrodes of a cell's pads in one row, n in all, in the order of the cell file.
+    """All n electrodes of a cell's p pads, in the order of the cell file.
 
-    pads: names (p,); first (p + 1,): pad k holds electrodes first[k] to first[k + 1]; names (n,) as PAD/ELECTRODE; centroids
-    (n, 3) in the frame of each one's pad; peak (n,) = a1 [V], a2, a3, polarity (n,): the calibrated law, or where there is none
-    the designed one; gain (n,): its signal as a share of the designed one's; sensitivity (n,) [V/fF]; noise (n,) [V^2]: variance
-    of one sample of a millisecond; lsb (n,) [V]: a step of the converter; full_scale (n,) [V]: where amplitudes end.
+    pads: names (p,); first (p + 1,): pad k has electrodes first[k] to first[k + 1]; names (n,) as PAD/ELECTRODE; centroids (n, 3)
+    [m] in the frame of the electrode's pad; peak (n,) = a1 [V], a2, a3, polarity (n,): the calibrated law, or the designed one
+    where there is none; gain (n,): signal relative to the designed one; sensitivity (n,) [V/fF]; noise (n,) [V^2]: variance of
+    one sample of a millisecond; lsb (n,) [V]: a step of the converter; full_scale (n,) [V]: maximum amplitude.
+
     Raises ValueError where the cell has no pads.
     """
 
@@ -67,7 +68,7 @@ class Skin:
         designed = [e.law for kind in types for e in kind.electrodes.values()]
         a1, a2, gaps = np.array([e.a1 for e in designed]), np.array([e.a2 for e in designed]), np.array(GAIN_GAPS)[:, None]
         ratio = self.peak / (1.0 + self.a2 * gaps**2) / (a1 / (1.0 + a2 * gaps**2))
-        self.gain: Array = np.exp(np.log(ratio).mean(axis=0))  # a1 alone trades off with a2
+        self.gain: Array = np.exp(np.log(ratio).mean(axis=0))  # a1 alone is correlated with a2
         self.sensitivity: Array = np.repeat([kind.chain.sensitivity for kind in types], counts)
         self.full_scale = np.repeat([kind.chain.adc_reference / 2.0 for kind in types], counts)
         self.lsb = np.repeat([kind.chain.adc_reference / (2.0**kind.chain.adc_bits - 1.0) for kind in types], counts)
@@ -77,11 +78,11 @@ class Skin:
         return len(self.centroids)
 
     def of(self, pad: int) -> slice:
-        """Which electrodes belong to a pad."""
+        """Slice of a pad's electrodes."""
         return slice(int(self.first[pad]), int(self.first[pad + 1]))
 
     def T_world_pads(self, links: Mapping[str, Array] | None = None) -> Array:
-        """Pad poses (p, 4, 4) for the poses of the links that carry them, by `ROBOT/LINK`; `world` needs none."""
+        """Pad poses (p, 4, 4), given the poses of the links that carry them, by `ROBOT/LINK`; `world` is not needed."""
         links = {"world": np.eye(4), **(links or {})}
         missing = sorted(set(self.links) - set(links))
         if missing:
@@ -95,7 +96,7 @@ class Skin:
         return turned + T[:, :3, 3]
 
     def signal(self, amplitude: ArrayLike) -> Array:
-        """What the skin adds to an electrode's amplitude (..., n): polarity * (v - a3) [V], positive near a person."""
+        """Contribution of the skin to electrodes' amplitudes (..., n): polarity * (v - a3) [V], positive near a person."""
         return self.polarity * (np.asarray(amplitude, float) - self.a3)
 
     def amplitude(self, change: ArrayLike) -> Array:
@@ -104,15 +105,15 @@ class Skin:
         return np.clip(analog, 0.0, self.full_scale)
 
     def volts(self, gaps: ArrayLike) -> Array:
-        """Noise-free amplitudes (..., n) [V] that the response law has at gaps (..., n) [m]; a negative gap counts as contact."""
+        """Noise-free amplitudes (..., n) [V] of the response law at gaps (..., n) [m]. A negative gap counts as contact."""
         d = np.maximum(gaps, 0.0)
         return self.a3 + self.polarity * self.peak / (1.0 + self.a2 * d * d)
 
 
 @dataclass(frozen=True)
 class Near:
-    """The pads of a cell that one of its targets may come near: those on robots, and of the others those around its home. `cell`:
-    with these pads alone; pads (k,) and electrodes (m,): which ones they are in the whole cell's `Skin`."""
+    """Pads of a cell that may sense one of its targets: all pads on robots, and other pads near the target's home. `cell`: the
+    cell with these pads only; pads (k,) and electrodes (m,): their indices in the whole cell's `Skin`."""
 
     cell: cells.Cell
     pads: NDArray[np.int64]
@@ -136,11 +137,11 @@ class Near:
 
 
 def link_names(robots: Mapping[str, Mapping[str, Array]]) -> dict[str, Array]:
-    """Link poses of all robots under the names that pads use: {"panda": {"link7": T}} gives {"panda/link7": T}."""
+    """Link poses of all robots with names as in pads: {"panda": {"link7": T}} gives {"panda/link7": T}."""
     return {f"{robot}/{link}": T for robot, links in robots.items() for link, T in links.items()}
 
 
 def pad_poses(cell: cells.Cell, links: Mapping[str, Array]) -> dict[str, Array]:
-    """T_world_pad (4, 4) of the pads on the world and on the links, as in `link_names`, whose poses are known."""
+    """T_world_pad (4, 4) of the pads on the world and on the links with a known pose, named as in `link_names`."""
     known = {"world": np.eye(4), **links}
     return {name: known[pad.link] @ pad.T_link_pad for name, pad in cell.pads.items() if pad.link in known}

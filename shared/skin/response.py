@@ -1,12 +1,12 @@
-"""What a limb at a pose changes at the electrodes: small networks, fitted to the boundary-element field of a cell's pads.
+"""Response of the electrodes to a limb at a pose: small networks, fitted to the boundary-element field of a cell's pads.
 
-One network serves one mounting: a pad type, with or without the robot's link behind it, and one limb. It sees how the limb's skin
-lies before the pad (sums over pieces of it, weighted by powers of their nearness, with their first and second moments) and which
-part of the limb that is, and gives the logarithm of the change of capacitance [fF] of every electrode, whose sign is the same for
-every limb: what is grounded takes field lines away.
-`penumbra skin model` fits the networks; a mounting is known by its fingerprint wherever the files come from.
+One network serves one mounting: a pad type, with or without the robot's link behind it, and one limb. Its input is the position
+of the limb's skin in front of the pad (sums over pieces of it, weighted by powers of their nearness, with their first and second
+moments), and which part of the limb that is. Its output is the logarithm of the change of capacitance [fF] of every electrode.
+The sign of the change is the same for every limb: what is grounded takes field lines away. `penumbra skin model` fits the
+networks. A mounting is identified by its fingerprint alone.
 
-The limb's size is two logarithms, of the factors by which it is longer and thicker than the cell file's target in its size.
+The limb's size is two logarithms, of its length and girth relative to the cell file's target in its size.
 """
 
 from __future__ import annotations
@@ -29,37 +29,37 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
 
 FOLDER = "skin"
-"""Beside a cell file: where its fitted networks are."""
+"""Folder beside a cell file with its fitted networks."""
 FEATURES = 36
 RIM = 0.024
-"""The limb's nearness is also seen from four points so far [m] from the pad's middle, where outer electrodes are."""
+"""Distance [m] from the pad's middle of four more points that see the limb's nearness, where outer electrodes are."""
 CORE = 0.01
-"""Added to distances from the pad's middle [m]: in contact nothing becomes infinite."""
+"""Offset [m] of distances from the middle of the pad, which keeps them finite in contact."""
 LANES = 16
-"""Sums over the limb's skin are as many partial sums: two or more vectors on every processor."""
+"""Number of partial sums over the limb's skin: two or more vectors on every processor."""
 ROUND = 0.02
-"""The side from which the limb is seen fades out this near [m] to its axis, where it has no meaning."""
+"""Distance [m] from the limb's axis below which the direction around the limb fades out; it is undefined on the axis."""
 SUMS = 20
-"""Sums over the limb's skin that the features are made of: see `_sums`."""
+"""Number of sums over the limb's skin from which the features are computed: see `_sums`."""
 SLOPES = 8
-"""What a response is differentiated by: the pose error along the pad's axes, and the two sizes."""
+"""Number of derivatives of a response: by the pose error along the pad's axes, and by the two sizes."""
 _X, _Y, _Z, _FACING, _AREA, _SEEN, _NEAR, _ROOT, _RIGHT, _LEFT, _TOP, _BOTTOM = (LANES * row for row in range(12))
 _MOVED, _ROWS = 12 * LANES, 12 + 4 * SLOPES
-"""Where `_sums` keeps what it knows of LANES pieces: from _MOVED on the derivatives of x, y, z and facing."""
+"""Layout of the working memory of `_sums` for LANES pieces: the derivatives of x, y, z and facing begin at _MOVED."""
 
 
 @dataclass(frozen=True)
 class Rest:
-    """What the other links of the robot change at a mounting's electrodes: coefficients (e, terms) of a second-degree polynomial
-    for the logarithm [fF], in joint angles that run from -1 to 1 within middle -+ half (j,) [rad]; of several mountings with one
-    dimension more in front."""
+    """Changes at a mounting's electrodes due to the robot's other links: coefficients (e, terms) of a second-degree polynomial
+    for the logarithm [fF], in joint angles scaled from middle -+ half (j,) [rad] to -1 to 1. With several mountings, the arrays
+    have one more dimension in front."""
 
     coefficients: Array
     middle: Array
     half: Array
 
     def change(self, joints: ArrayLike) -> Array:
-        """Changes (..., e) [fF] at joint angles (..., j); beyond the range as at its end."""
+        """Changes (..., e) [fF] at joint angles (..., j), clipped to the range of the fit."""
         exponents: Array = np.einsum("...t,...et->...e", self.terms(np.asarray(joints)), self.coefficients)
         return np.exp(exponents)
 
@@ -82,9 +82,9 @@ def _pairs(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 @dataclass(frozen=True)
 class Network:
-    """The response of one mounting. points (7, k): the limb's skin in pieces, in its own frame: centre [m], normal, area [m^2];
-    mean and scale (FEATURES,) of the input; three weight matrices (rows are outputs) with biases; a linear skip (e, FEATURES);
-    rest: the robot's own share, where the pad sits on one; error: standard deviation of the relative error on held-out poses."""
+    """Response of one mounting. points (7, k): pieces of the limb's skin, in its own frame: centre [m], normal, area [m^2]; mean
+    and scale (FEATURES,) of the input; three weight matrices (rows are outputs) with biases; a linear skip (e, FEATURES); rest:
+    contribution of the robot, where the pad sits on one; error: standard deviation of the relative error on held-out poses."""
 
     points: NDArray[np.float32]
     mean: Array
@@ -97,11 +97,11 @@ class Network:
 
     @property
     def ends(self) -> Array:
-        """Where the limb begins and ends along its axis (2,) [m]."""
+        """Coordinates (2,) [m] of the limb's ends along its axis."""
         return np.array([self.points[0].min(), self.points[0].max()], dtype=float)
 
     def arrays(self) -> dict[str, Array]:
-        """Everything under names, to be stored."""
+        """All arrays by name, for storage."""
         out: dict[str, Any] = {"points": self.points, "mean": self.mean, "scale": self.scale, "error": self.error}
         out |= {f"weight{i}": w for i, w in enumerate(self.weights)} | {f"bias{i}": b for i, b in enumerate(self.biases)}
         if self.rest is not None:
@@ -121,12 +121,12 @@ class Network:
 
 
 class Response:
-    """The networks of all pads of a cell for one of its targets; every pad has e electrodes, in the order of
-    `shared.skin.layout.Skin`. size (2,): logs of the target's own length and girth, beside the mesh's. error (n,): standard
-    deviation of what the networks get wrong, as a share of the change.
+    """Networks of all pads of a cell for one of its targets. Every pad has e electrodes, in the order of
+    `shared.skin.layout.Skin`. size (2,): logs of the target's length and girth relative to the mesh. error (n,): standard
+    deviation of the networks' error, as a share of the change.
 
-    known: networks by fingerprint, those of `networks` unless given. Raises CellError where a pad's mounting has no network, or
-    pads differ in their number of electrodes.
+    known: networks by fingerprint; default: those of `networks`. Raises CellError where a pad's mounting has no network, or pads
+    differ in their number of electrodes.
     """
 
     def __init__(self, cell: cells.Cell, target: str, known: Mapping[str, Network] | None = None):
@@ -147,7 +147,7 @@ class Response:
         size = cell.targets[target].size or cells.Size()
         self.size = np.log([size.length, size.girth])
         rests = {pad: rest for pad, each in enumerate(prints) if (rest := known[each].rest) is not None}
-        self._moved = np.array(list(rests), np.int64)  # the pads before links
+        self._moved = np.array(list(rests), np.int64)  # the pads in front of links
         self._rest = Rest(*(np.stack([getattr(rest, name) for rest in rests.values()]) for name in REST)) if rests else None
         self.error = np.repeat([known[each].error for each in prints], self.electrodes)
         self.index = np.array([different.index(each) for each in prints])
@@ -160,21 +160,21 @@ class Response:
                        biases[2], np.stack([each.skip for each in own]).astype(np.float32))  # fmt: skip
 
     def change(self, T_pads_target: Array, size: ArrayLike = (0.0, 0.0)) -> Array:
-        """Changes (n,) [fF] by the limb at T_pads_target (p, 4, 4), with its size (2,): log length, log girth."""
+        """Changes (n,) [fF] due to the limb at T_pads_target (p, 4, 4) with its size (2,): log length, log girth."""
         out = np.empty(len(self.index) * self.electrodes)
         values(*self.arrays, np.ascontiguousarray(T_pads_target), self.size + size, out)
         return np.exp(out)
 
     def rest(self, joints: ArrayLike) -> Array:
-        """Changes (n,) [fF] by the robot's other links at all joint angles (j,) of the cell: there also without a limb."""
+        """Changes (n,) [fF] due to the robot's other links, also without a limb, at all joint angles (j,) of the cell."""
         out = np.zeros((len(self.index), self.electrodes))
         if self._rest is not None:
             out[self._moved] = self._rest.change(joints)
         return out.reshape(-1)
 
     def logs(self, T_pads_target: Array, size: ArrayLike = (0.0, 0.0)) -> tuple[Array, Array]:
-        """Log changes (n,) and their derivatives (n, 8) by the target's pose, as `geometry.perturb` moves it but along the axes
-        of each electrode's own pad, and by the two sizes."""
+        """Log changes (n,) and their derivatives (n, 8) by the target's pose, as in `rigid.perturb` but along the axes of each
+        electrode's own pad, and by the two sizes."""
         out = np.empty(len(self.index) * self.electrodes)
         jacobian = np.empty((len(out), 8))
         derivatives(*self.arrays, np.ascontiguousarray(T_pads_target), self.size + size, out, jacobian)
@@ -182,7 +182,8 @@ class Response:
 
 
 def fingerprint(cell: cells.Cell, pad: str, target: str, bare: bool = False) -> str:
-    """What the response of a pad to a target depends on: copper and board, the limb, and unless `bare` the link behind."""
+    """Hash of what the response of a pad to a target depends on: copper and board, the limb, and unless `bare` the link
+    behind."""
     own, aim = cell.pads[pad], cell.targets[target]
     kind = cell.pad_types[own.type]
     parts = {
@@ -214,14 +215,14 @@ def networks(cell: cells.Cell) -> dict[str, Network]:
 
 
 def save(path: Path, network: Network, own: str) -> None:
-    """Store a network for the mounting with this fingerprint, in half the memory."""
+    """Stores a network in single precision, for the mounting with this fingerprint."""
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = {name: np.asarray(a, np.float32) for name, a in network.arrays().items()}
     np.savez_compressed(path, fingerprint=np.array(own), **arrays)  # type: ignore[arg-type]
 
 
 def features(points: NDArray[np.float32], T_pad_limb: Array, size: Array) -> Array:
-    """Input (n, FEATURES) of a network for limbs of these points at T_pad_limb (n, 4, 4), of sizes (n, 2)."""
+    """Input (n, FEATURES) of a network for limbs with these points at T_pad_limb (n, 4, 4), of sizes (n, 2)."""
     out = np.empty((len(T_pad_limb), FEATURES))
     ends = np.array([points[0].min(), points[0].max()], dtype=float)
     points = _whole(points)
@@ -231,14 +232,14 @@ def features(points: NDArray[np.float32], T_pad_limb: Array, size: Array) -> Arr
 
 
 def _whole(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Pieces of skin (7, k), with some without area at the end, so that there are a multiple of LANES."""
+    """Pieces of skin (7, k), padded with pieces of zero area to a multiple of LANES."""
     more = np.repeat(points[:, -1:], -points.shape[1] % LANES, axis=1)
     more[6] = 0.0
     return np.ascontiguousarray(np.concatenate([points, more], axis=1))
 
 
 def _stack(arrays: list[Array]) -> NDArray[np.float32]:
-    """Arrays in one, smaller ones filled up with zeros: a unit without weights changes nothing."""
+    """Stacks arrays, padding smaller ones with zeros: a unit without weights changes nothing."""
     shape = np.max([each.shape for each in arrays], axis=0)
     padded = [np.pad(each, [(0, n - k) for n, k in zip(shape, each.shape, strict=True)]) for each in arrays]
     return np.stack(padded).astype(np.float32)
@@ -513,7 +514,7 @@ def _outputs(last, bias, skip, second, x, out):  # type: ignore[no-untyped-def]
 
 ARRAYS = """i8[p], f4[m, 7, k], f8[m, 2], f8[m, 36], f8[m, 36],
     f4[m, 36, a], f4[m, a], f4[m, a, b], f4[m, b], f4[m, e, b], f4[m, e], f4[m, e, 36]"""
-"""`Response.arrays`, for the kernels' signatures: m networks of p pads, with a and b units in their layers and e electrodes."""
+"""Signature of `Response.arrays` for kernels: m networks for p pads, with a and b units in their layers and e electrodes."""
 
 
 @kernel(f"{ARRAYS}, f8[p, 4, 4], f8[2], out f8[n]")
