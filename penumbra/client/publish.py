@@ -128,7 +128,7 @@ class Robot:
         """Sends joint angles.
 
         Args:
-            q: Angles [rad] in the order of `joints`.
+            q: Angles [rad], or displacements [m] of prismatic joints, in the order of `joints`.
             stamp_ns: Time of the measurement [ns since the epoch]. None: now.
 
         Raises:

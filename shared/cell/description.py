@@ -221,7 +221,7 @@ class Motion(Model):
     high: Vector3 = Field(description="upper bounds of x, y, z [m]")
     rpy_low: Angles3 = Field(description="lower bounds of roll, pitch, yaw [rad]")
     rpy_high: Angles3 = Field(description="upper bounds of roll, pitch, yaw [rad]")
-    speed: Annotated[Number, Field(ge=0.01, le=10)] = Field(default=0.25, description="mean speed of a reach [m/s]")
+    speed: Annotated[Number, Field(ge=0.01, le=10)] = Field(default=0.25, description="maximum speed of a reach [m/s]")
 
     @model_validator(mode="after")
     def _ordered(self) -> Motion:

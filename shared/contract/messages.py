@@ -242,7 +242,7 @@ class HapticPose(Message, frozen=True, kw_only=True):
 
     `state`: in_range (a limb), unidentified (a limb or another object: the pose is that of a limb that would give these
     voltages), object (not a limb: the same pose, with zero information) or out_of_range (nothing near). Use only in_range as the
-    target's pose.
+    target's pose. `gap`: smallest distance from an electrode to the limb's surface at this pose [m].
 
     `surface`: the nearest surface point by pad, for each pad that senses something: the `link` that carries the pad, the point's
     `position` in `frame`, its `distance` from the middle of the pad with the standard deviations `along` and `across` the line

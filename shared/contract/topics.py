@@ -76,7 +76,7 @@ FRAME = Topic("frame", "penumbra/{cell}/camera/{camera}/frame", messages.Frame, 
               ("emulator", "camera", "ros2", "driver"), "one RGB image", Priority.IMAGE, 0)  # fmt: skip
 JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints, 50, 16, 0.1,
                ("emulator", "robot", "ros2", "driver"),
-               "joint angles [rad]", Priority.SIGNAL, 20)  # fmt: skip
+               "joint angles [rad], or displacements [m]", Priority.SIGNAL, 20)  # fmt: skip
 VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1,
                  ("emulator", "skin", "driver"), "electrode amplitudes [V], 1 kHz in batches", Priority.SIGNAL, 0)  # fmt: skip
 TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 50, 16, 0.2, ("emulator",),
