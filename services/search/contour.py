@@ -1,4 +1,4 @@
-"""The mesh's occluding contour, its distance to the boundary of a mask, and how that changes with the pose."""
+"""Occluding contour of a mesh, its offsets from the boundary of a mask, and their normal equations in the pose."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from penumbra.shared.native import inner, kernel
 from penumbra.shared.perception.intrinsics import Intrinsics
 
 NEAR = 0.05
-"""Edges nearer to the camera than this are left out [m]."""
+"""Minimum depth [m]: nearer edges are left out."""
 BESIDE = 1.5
 """Distance [px] below which the contours of two parts cannot be distinguished in a mask."""
 FINE = 2
-"""Pixels, per pixel of the mask and direction, of the silhouette that separates the outer contour from the inner: distant fingers
-are as wide as one pixel of the mask."""
+"""Resolution of the silhouette that separates the outer contour from the inner one, in pixels per pixel of the mask along each
+axis: distant fingers are as wide as one pixel of the mask."""
 ACROSS = 0.35
-"""Distance [px] on both sides of the contour at which the silhouette is looked up."""
+"""Distance [px] from the contour, to both sides, at which the silhouette is sampled."""
 COLUMN = 8
-"""Width of the columns [px] in which neighbouring points are looked for, at least BESIDE."""
+"""Width [px] of the columns in which neighbouring points are searched for, at least BESIDE."""
 APART = 0.01
-"""Two points of the contour whose depths differ by more than this [m] belong to two parts."""
+"""Difference in depth [m] from which two points of the contour belong to two parts."""
 SHAPE = 0.006
-"""Error of the mesh's cross-section [m]: levers shorter than this say nothing about the roll."""
+"""Error of the mesh's cross-section [m]: shorter levers give no information about the roll."""
 MOST = 4096
 """Maximum number of points of a contour: more than fit in an image."""
 CREASE = 0.8
-"""Facets that meet at a larger angle [rad] are a crease of the body, and not a sample of a round surface."""
+"""Angle [rad] between two facets above which their edge is a crease of the body, and not a sample of a round surface."""
 
 
 POINT = np.dtype(
@@ -44,7 +44,7 @@ POINT = np.dtype(
         ("position", "f8", 3),  # X, Y, Z in the camera's frame [m]
         ("pixel", "f8", 2),  # u, v [px]
         ("normal", "f8", 2),  # the contour's outward unit normal in the image
-        ("length", "f8"),  # of the contour that the point stands for [px]
+        ("length", "f8"),  # of contour that the point represents [px]
     ]
 )
 """A point of a contour."""
@@ -54,8 +54,8 @@ Points = NDArray[np.void]
 
 @dataclass(frozen=True)
 class Matched:
-    """A contour beside a mask: its `points` (n,), their offsets r (n,) [px] along the outward normal to the mask's boundary and
-    their `kind` (n,) (`_match`); `both`, `free`: see `evidence.compare`."""
+    """A contour compared with a mask: its `points` (n,), their offsets r (n,) [px] along the outward normal to the mask's
+    boundary, and their `kind` (n,) (`_match`); `both`, `free`: see `evidence.compare`."""
 
     points: Points
     r: Array
@@ -65,8 +65,8 @@ class Matched:
 
 
 class Model:
-    """A triangle mesh prepared for contours. `edges` (n, 4): two vertices and two faces (-1: none) each; `wrist`: where its hand
-    begins along x [m], infinite where it has none."""
+    """A triangle mesh prepared for contours. `edges` (n, 4): two vertices and two faces (-1: none) per edge; `wrist`: x at which
+    its hand begins [m], infinite without a hand."""
 
     def __init__(self, mesh: Mesh):
         self.vertices = np.ascontiguousarray(mesh.vertices, np.float64)
@@ -75,11 +75,11 @@ class Model:
         in_hand = mesh.vertices[mesh.faces[mesh.labels == Label.HAND], 0]
         self.wrist = float(in_hand.min(initial=math.inf))
         self.closed = bool((self.edges[:, 3] >= 0).all())
-        # the output of a pass: as large for every pose, so that its kernel's arguments are checked once
+        # the output of a pass: of the same size for every pose, so that its kernel's arguments are checked once
         self._memory = np.empty(MOST, POINT), np.empty(MOST), np.empty(MOST, np.uint8), np.empty(2, np.int64)
 
     def beyond_wrist(self, T: Array, k: Intrinsics, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-        """The pixels (h, w) beyond the wrist at a pose T_camera_target; none where the limb points at the camera."""
+        """The pixels (h, w) beyond the wrist at a pose T_camera_target; none if the limb points at the camera."""
         ends = T[:3, 3] + np.outer([0.0, self.wrist], T[:3, 0]) if math.isfinite(self.wrist) else np.zeros((2, 3))
         if ends[:, 2].min() < NEAR:
             return np.zeros(shape, np.bool_)
@@ -108,7 +108,7 @@ class Model:
 
     def matched(self, T: Array, evidence: Evidence, spacing: float, reach: float, hand: float = 1.0) -> Matched:
         """The outer contour at a pose T_camera_target, compared with a mask's boundary within `reach` [px]. Beyond the wrist,
-        where offsets are `hand` times as uncertain, a point stands for `hand`^-2 of its length."""
+        where offsets are `hand` times as uncertain, the length of a point is multiplied by `hand`^-2."""
         V, k = self.in_camera(T), evidence.intrinsics
         found, intrinsics = self._memory, np.array([k.fx, k.fy, k.cx, k.cy])
         mask = evidence.state, evidence.field, evidence.guarded, evidence.known
@@ -334,9 +334,9 @@ def _nearest(image, u, v):
 
 
 LEVELS = (0.2, 0.7)
-"""Bounds of the value of a field that counts as a boundary."""
+"""Minimum and maximum value of a field that counts as its boundary."""
 DROPPED, MEASURED, BOUNDED = 0, 1, 2
-"""What became of a contour point. BOUNDED: on the way to the boundary something covers the view, which only says that the contour
+"""Kind of a contour point. BOUNDED: something covers the view before the boundary, or no boundary is within reach, so the contour
 has to move at least that far."""
 
 
@@ -406,22 +406,22 @@ def _match(points, field, guarded, shown, state, known, reach, r, kind):
 
 
 def slow_waves(points: Points, T: Array) -> list[Array]:
-    """Shapes (n,) that an error of the contour of a limb at T_camera_target (4, 4) may have: on either side, straight and bent
-    along it."""
+    """Slowly varying error shapes (n,) of the contour of a limb at T_camera_target (4, 4): per side, linear and quadratic along
+    the limb."""
     along = (points["position"] - T[:3, 3]) @ T[:3, 0]
     s = 2.0 * (along - along.min(initial=0.0)) / max(float(np.ptp(along)) if len(along) else 0.0, 1e-6) - 1.0
     return [np.where(side, shape, 0.0) for side in sides(points, T) for shape in (s, 1.5 * s**2 - 0.5)]
 
 
 def sides(points: Points, T: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which points of a contour (n,) are on the one and on the other side of a limb at T_camera_target (4, 4) in the image."""
+    """Which points of a contour (n,) are on one side and on the other side of a limb at T_camera_target (4, 4) in the image."""
     across = points["normal"][:, 0] * T[1, 0] - points["normal"][:, 1] * T[0, 0] > 0.0
     return ~across, across
 
 
 def stretched(points: Points, T: Array, k: Intrinsics) -> tuple[Array, Array]:
-    """Offsets (n,) [px] of the contour of a limb at T_camera_target (4, 4) along its normals, per unit of its log length and of
-    its log girth."""
+    """Displacements (n,) [px] of the contour of a limb at T_camera_target (4, 4) along its normals, per unit of log length and of
+    log girth."""
     axis, from_middle = T[:3, 0], points["position"] - T[:3, 3]
     along = np.outer(from_middle @ axis, axis)
     x, y, z = points["position"].T
@@ -431,11 +431,11 @@ def stretched(points: Points, T: Array, k: Intrinsics) -> tuple[Array, Array]:
 
 
 class Equations(NamedTuple):
-    """The normal equations of a contour's offsets, of the pose error along the camera's axes and the dilation.
+    """Normal equations for the pose error along the camera's axes and the mask's dilation, from a contour's offsets.
 
-    H (7, 7) : information. g (7,) : its right side. length : of the contour that was measured [px]. square : sum of length times
-    Huber-limited squared offset [px^3]. counted : length that costs [px]. cost : Huber's (chi^2 where all is within `huber`).
-    rolls : share of the information about the roll that comes from levers longer than SHAPE.
+    H (7, 7) : information. g (7,) : its right side. length : of the measured contour [px]. square : sum of length times squared
+    offset, limited by `huber` [px^3]. counted : length that enters the cost [px]. cost : Huber's cost (chi^2 if all offsets are
+    within `huber`). rolls : share of the information about the roll that comes from levers longer than SHAPE.
     """
 
     H: Array
@@ -459,10 +459,10 @@ def normal_equations(
     huber: float,
     bounded: bool,
 ) -> Equations:
-    """The normal equations of the offsets r (n,) [px] of contour points (n,), of a `kind` (n,) each (`_match`).
+    """Normal equations from the offsets r (n,) [px] of contour points (n,) and their kinds (n,) (`_match`).
 
     `weights` (n,) [1/px^2] of the points; `origin` (3,) [m] and `axis` (3,) of the target; `bounded`: whether BOUNDED points
-    inform, beside that they cost.
+    enter the normal equations, and not only the cost.
     """
     H, g, sums = np.zeros((7, 7)), np.zeros(7), np.empty(5)
     origin, axis = np.ascontiguousarray(origin), np.ascontiguousarray(axis)

@@ -18,26 +18,26 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 SMALLEST_PX = 150
-"""Least number of pixels of a region whose shape can be used."""
+"""Minimum number of pixels of a region whose shape can be used."""
 MOST_PARTS = 3
-"""Maximum number of regions tried, from the largest: a piece of furniture that a network takes for the target may be larger."""
+"""Maximum number of regions that are tried, largest first: furniture that a network labels as the target may be larger."""
 TILTS = (-0.6, -0.3, 0.0, 0.3, 0.6)
-"""Samples of the axis's angle out of the image plane [rad]."""
+"""Samples of the angle [rad] between the limb's axis and the image plane."""
 ROLLS = (0.0, np.pi)
-"""Samples of the roll about the axis, from that at home [rad]: around it, and the limb turned over."""
+"""Samples of the roll [rad] about the axis, relative to that at home: the same, and the limb turned over."""
 SLIDES = (-0.3, -0.15, 0.0, 0.15, 0.3)
-"""Samples of where the visible part's middle is on the limb, in lengths of the limb: one end may be hidden."""
+"""Samples of the limb's middle along its axis, from the visible part's, in lengths of the limb: one end may be hidden."""
 
 
 def is_shown(mask: Mask, target_labels: Collection[int]) -> bool:
-    """Whether a mask shows as much of a target as a region needs."""
+    """Whether a mask shows at least SMALLEST_PX pixels of a target."""
     return bool(np.count_nonzero(np.isin(mask.labels, list(target_labels))) >= SMALLEST_PX)
 
 
 def regions(mask: Mask, target_labels: Collection[int], reach_px: float) -> Iterator[tuple[Mask, list[Mask]]]:
-    """Windows of a mask, each `reach_px` around one of its target-coloured regions, the largest first, and the same with less of
-    the region to start from: all of it, then either half, for where the upper arm is bare a network may colour it too, and the
-    region has a bend. The rest, and the regions of earlier windows, are marked as unknown.
+    """Windows of a mask, `reach_px` around each region with the target's labels, largest first, each with the masks to start
+    from: the whole region, then either half. A network may label a bare upper arm as the target, too, so that the region has a
+    bend. The other half, and the regions of earlier windows, are marked as unknown.
     """
     labels = mask.labels.copy()
     _, numbers, stats, centroids = cv2.connectedComponentsWithStats(np.isin(labels, list(target_labels)).astype(np.uint8))
@@ -60,7 +60,7 @@ def regions(mask: Mask, target_labels: Collection[int], reach_px: float) -> Iter
 
 
 def _halves(inside: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """A region (h, w) cut across its longest direction through its middle."""
+    """The two halves of a region (h, w), cut through its middle across its longest direction."""
     pixels = np.argwhere(inside)
     from_middle = pixels - pixels.mean(axis=0)
     longest = np.linalg.eigh(from_middle.T @ from_middle)[1][:, 1]
@@ -71,10 +71,10 @@ def _halves(inside: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bo
 
 
 def hypotheses(model: Model, evidence: Evidence, T_home: Array) -> list[Array]:
-    """Poses T_camera_target (4 x 4 each) that could have made the mask's largest region; empty where it is too small.
+    """Poses T_camera_target (4 x 4 each) that may have produced the mask's largest region; empty if it is too small.
 
-    The region's second moments give the axis in the image, its hand which end is which, its width the depth; rolls are counted
-    from that of `T_home` (T_camera_target where the target is expected).
+    The region's second moments give the axis in the image, its hand pixels the direction, its width a depth, beside that of
+    `T_home` (T_camera_target where the target is expected). Rolls are relative to `T_home`.
     """
     count, regions, stats, centroids = cv2.connectedComponentsWithStats((evidence.state == TARGET).astype(np.uint8))
     largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])) if count > 1 else 0
@@ -105,8 +105,8 @@ def hypotheses(model: Model, evidence: Evidence, T_home: Array) -> list[Array]:
 
 
 def mirrored(T: Array) -> list[Array]:
-    """Poses (4 x 4 each) with nearly the silhouette of T_camera_target: the axis tilted the other way out of the image plane,
-    or a roll beside it. A fit that stopped at one of them is started again from the others."""
+    """Poses (4 x 4 each) with nearly the same silhouette as T_camera_target: the axis tilted the other way out of the image
+    plane, or another roll. A fit that stopped at one of them is restarted from the others."""
     sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
     x = T[:3, 0]
     reflected = x - 2.0 * (x @ sight) * sight
@@ -119,7 +119,7 @@ def mirrored(T: Array) -> list[Array]:
 
 
 def _directions(evidence: Evidence, rows: NDArray[np.intp], columns: NDArray[np.intp], axis: Array) -> list[Array]:
-    """The axis (2,) in the image, pointing to the hand; both ways where the hand is not recognised."""
+    """The axis (2,) in the image, pointing to the hand; both directions if the hand is not recognised."""
     is_hand = evidence.hand[rows, columns] != 0
     if not 0.02 < is_hand.mean() < 0.75:  # where nearly all is labelled as hand, the labels say nothing
         return [axis, -axis]
@@ -129,7 +129,7 @@ def _directions(evidence: Evidence, rows: NDArray[np.intp], columns: NDArray[np.
 
 
 def _shortest_rotation(a: Array, b: Array) -> Array:
-    """The rotation matrix of the shortest arc from unit vector a (3,) to b (3,); about any perpendicular where they oppose."""
+    """The rotation matrix of the shortest arc from unit vector a (3,) to b (3,); about any perpendicular if they are opposite."""
     axis = np.cross(a, b)
     if np.linalg.norm(axis) < 1e-9:
         if a @ b > 0.0:

@@ -1,4 +1,4 @@
-"""The evidence of a mask: whether each pixel shows the target, shows that it is not there, or is hidden by something."""
+"""Evidence of a mask: whether each pixel shows the target, is free of it, or is covered by something."""
 
 from __future__ import annotations
 
@@ -15,37 +15,38 @@ from penumbra.shared.native import kernel
 from penumbra.shared.perception.intrinsics import Intrinsics
 
 FREE, TARGET, COVERED = 0, 1, 2
-"""State of a pixel. COVERED: something stands in front, or nothing is known there. The limb's other parts cover too: the
-upper arm's rounded end hides a few centimetres of the elbow, so that their border is not the target's contour."""
+"""State of a pixel. COVERED: something is in front of the target, or the pixel is unknown. Other parts of the limb count as
+covering, too: the upper arm's rounded end hides a few centimetres of the elbow, so their border is not the target's contour."""
 
 SMOOTHING_PX = 1.0
-"""Standard deviation of the blur that makes the boundary of a hard mask sub-pixel: about the stairs' own period."""
+"""Standard deviation [px] of the blur that makes the boundary of a hard mask sub-pixel: about the period of its stairs."""
 TAPS = (0.000133831, 0.004431862, 0.053991128, 0.241971445, 0.398943469, 0.241971445, 0.053991128, 0.004431862, 0.000133831)
-"""Weights of that blur along a row and along a column, as OpenCV's."""
+"""Weights of that blur along rows and along columns, equal to OpenCV's."""
 LEAST_KNOWN = 1e-3
 """Smoothed share of known pixels below which a pixel counts as unknown."""
 NOTHING_COVERED = np.empty((0, 0), np.float32)
-"""`Evidence.known` where everything is known."""
+"""`Evidence.known` if no pixel is covered."""
 INNER = 0.84
-"""Smoothed share of the target below which a pixel of it is on a boundary. At a straight boundary this is one pixel per pixel of
-its length."""
+"""Smoothed share of the target below which a target pixel is on a boundary. A straight boundary then has one such pixel per pixel
+of its length."""
 GUARD_PX = 2
-"""Within this distance of a covered pixel a boundary may be the occluder's and not the target's."""
+"""Distance [px] from a covered pixel within which a boundary may be the occluder's and not the target's."""
 DEPTH_MARGIN = 0.05
-"""What lies further than this behind the target's furthest point [m] is behind it for certain: half a limb's thickness."""
+"""Distance [m] behind the target's farthest point beyond which something is certainly behind it: half a limb's thickness."""
 
 UNEXPLAINED_PX, PREDICTED_PX = 5, 10
-"""Within the first distance [px] of a mask its boundary may be the target's own; within the second the prediction may be off."""
+"""Distances [px]: within the first of a mask's target, its boundary may be the target's own; by the second, the prediction may be
+off."""
 FORESHORTENED = 0.4
-"""A limb whose image is shorter than this share of its length has no side beyond its end in the picture."""
+"""Minimum length of a limb's image relative to that of a limb parallel to it: a shorter one has no side beyond its end."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """`state` (h, w) uint8; `field` (h, w) float32, the smoothed share of the target in what is known, 0.5 on its boundary;
-    `guarded` (h, w) uint8, 1 where COVERED is near; `hand` (h, w) uint8, 1 on the part of the target that lies towards +x;
-    `known` (h, w) float32, the smoothed share of what is known, (0, 0) where all is; `seen_px`: pixels that show the target,
-    and `boundary_px`: those on a boundary that is its own; `x0`, `y0`, `scale`: its window as in `messages.Mask`."""
+    """`state` (h, w) uint8; `field` (h, w) float32: smoothed share of the target among known pixels, 0.5 on its boundary;
+    `guarded` (h, w) uint8: 1 near COVERED pixels; `hand` (h, w) uint8: 1 on the target's hand, which lies towards +x; `known` (h,
+    w) float32: smoothed share of known pixels, (0, 0) if all are known; `seen_px`: number of pixels that show the target;
+    `boundary_px`: number of those on the target's own boundary; `x0`, `y0`, `scale`: window as in `messages.Mask`."""
 
     state: NDArray[np.uint8]
     field: NDArray[np.float32]
@@ -60,7 +61,7 @@ class Evidence:
     scale: int = 1
 
     def measurements(self, correlation: float) -> float:
-        """The number of independent measurements, with those that the six unknowns of a pose need."""
+        """Number of independent measurements of the boundary, plus six for the unknowns of a pose."""
         return self.boundary_px / correlation + 6.0
 
 
@@ -72,8 +73,8 @@ def classify(
 ) -> NDArray[np.uint8]:
     """The state (h, w) of every pixel of a mask of class indices (h, w).
 
-    `robot_depth` (h, w) [m], infinite where the robot is not, decides over the mask where given: `reach` being the target's
-    smallest and largest depth [m], the robot covers what it stands in front of, and is background where it stands behind.
+    `robot_depth` (h, w) [m], infinite outside the robot, overrides the mask if given. `reach`: the target's smallest and largest
+    depth [m]. A robot in front of the target covers it, and a robot behind the target is background.
     """
     table = np.full(256, COVERED, np.uint8)
     table[[Label.BACKGROUND, Label.TORSO]] = FREE
@@ -89,7 +90,7 @@ def classify(
 
 
 def cover_outside(state: NDArray[np.uint8], x0: int, y0: int, scale: int, camera: Camera) -> None:
-    """Marks in place what a window (first pixel x0, y0) shows beyond the image's border: nothing is known there."""
+    """Marks in place as COVERED the pixels of a window (first pixel x0, y0) outside the image: nothing is known there."""
     h, w = state.shape
     left, top = max(0, -(x0 // scale)), max(0, -(y0 // scale))
     right, bottom = (camera.width - x0) // scale, (camera.height - y0) // scale
@@ -98,9 +99,9 @@ def cover_outside(state: NDArray[np.uint8], x0: int, y0: int, scale: int, camera
 
 
 def cover_beyond(state: NDArray[np.uint8], T: NDArray[np.float64], start: float, k: Intrinsics) -> None:
-    """Marks in place what lies beyond the near end of a limb: the body goes on there, and where bare skin meets bare skin a mask
-    does not know the joint. T_camera_target (4 x 4) has the limb along x, which begins at `start` [m]. A limb that points at the
-    camera has no such side in the image, and is left as it is.
+    """Marks in place as COVERED the target's pixels beyond the near end of a limb: the body continues there, and where bare skin
+    meets bare skin a mask does not show the joint. T_camera_target (4 x 4) has the limb along x, which begins at `start` [m]. A
+    limb that points at the camera has no such side in the image, and is left as it is.
     """
     ends = T[:3, 3] + np.outer([start, 0.0], T[:3, 0])
     if ends[:, 2].min() <= 0.0:
@@ -116,8 +117,8 @@ def cover_beyond(state: NDArray[np.uint8], T: NDArray[np.float64], start: float,
 
 
 def cover_unexplained(state: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> None:
-    """Marks in place what lies in the predicted silhouette (h, w) and far from all of the target's pixels: if the prediction is
-    right something hides it there, though the mask says background."""
+    """Marks in place as COVERED the free pixels in or near the predicted silhouette (h, w) and far from all target pixels: if the
+    prediction is right, something hides it there, though the mask says background."""
     far = cv2.distanceTransform((state != TARGET).astype(np.uint8), cv2.DIST_L2, 3) > UNEXPLAINED_PX
     around = cv2.dilate(predicted.astype(np.uint8), np.ones((2 * PREDICTED_PX + 1, 2 * PREDICTED_PX + 1), np.uint8))
     state[(state == FREE) & far & (around != 0)] = COVERED
@@ -159,7 +160,7 @@ def _blur(image: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def compare(state: NDArray[np.uint8], silhouette: NDArray[np.bool_]) -> tuple[int, int]:
-    """Pixels of a silhouette (h, w) that show the target, and that are free, by a mask's states (h, w)."""
+    """Numbers of pixels of a silhouette (h, w) that show the target, and that are free, by a mask's states (h, w)."""
     counts = np.empty(2, np.int64)
     count_compared(state, silhouette, counts)
     both, free = counts.tolist()

@@ -1,12 +1,12 @@
-"""The pose once more, on the image itself: a mask is as sharp as a network draws it, the picture is sharper.
+"""Refines the pose on the image itself, which is sharper than a network's mask.
 
 One pass, from a pose near the right one (contracting curve density: Hanek, Beetz 2004, doi:10.1023/B:VISI.0000036836.66311.97):
   1. project the mesh's contour (`contour.Model.matched`) and read the picture's colours on a short line across it at each point;
-  2. learn the colours on both sides: mean and covariance of what lies just beyond the edge's blur, pooled along the contour;
+  2. learn the colours on both sides: mean and covariance just beyond the edge's blur, pooled along the contour;
   3. for every offset of the edge on the line, compare the colours with those of a blurred step between the two sides, and add
-     what the mask says; this is the likelihood of the contour's offset, taken for a Gaussian;
+     the mask's term; this is the likelihood of the contour's offset, approximated by a Gaussian;
   4. solve for the pose error as `fit` does.
-What covers the target ends the lines, as it guards the mask's boundary.
+The lines end where something covers the target (`Evidence.guarded`).
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ from penumbra.shared.native import inner, kernel
 from penumbra.shared.perception.intrinsics import Intrinsics
 
 LINE = 5
-"""Reach of the line on both sides of the contour [px], read at every pixel's distance."""
+"""Reach of a line on both sides of the contour [px]; it is sampled once per pixel."""
 OFFSETS = 8
-"""Largest offset of the edge on the line, to both sides [half pixels]."""
+"""Maximum offset of the edge on the line, to both sides [half pixels]."""
 BLUR = 0.7
-"""Width of the edge [px]: a step through this camera is 0.5 - 0.5 tanh(x / BLUR)."""
+"""Width of the edge [px]: the image of a step is 0.5 - 0.5 tanh(x / BLUR)."""
 NEAREST = 1
-"""The pixel on the contour shows both sides; from this distance on [px] the colours of its sides are learned."""
+"""Minimum distance [px] from the contour at which a side's colours are learned: the pixel on it shows both sides."""
 NEAR, SPREADS = 1.5, (1.0, 1.5)
-"""Distance [px] at which a pixel's colour counts most for its side, and standard deviations [px] of that weight inside and
-outside: nearer the sides are mixed, and farther inside a limb is in another light. With equal weights the edge of a side in the
-shade was found up to 0.9 px too far inside, since its last pixels look more like what is behind it than like the limb's others.
-Chosen on seven replays and 1120 single pictures."""
+"""Distance [px] from the contour at which a pixel's colour counts most for its side, and standard deviations [px] of that weight
+inside and outside. Nearer, the sides are mixed, and farther inside a limb is lit differently. With equal weights the edge of a
+side in the shade was found up to 0.9 px too far inside, since its last pixels look more like the background than like the rest of
+the limb. Chosen on seven replays and 1120 single pictures."""
 
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """Noise of a picture's colours. `passes`: at most; `spacing` of contour points [px]; `pooling`: standard deviation of
-    the pooling along the contour [px]; `floor`: least standard deviation of a colour [of 255]; `clipped`: largest squared
+    """Noise of a picture's colours. `passes`: maximum number; `spacing` of contour points [px]; `pooling`: standard deviation of
+    the pooling along the contour [px]; `floor`: minimum standard deviation of a colour [of 255]; `clipped`: maximum squared
     Mahalanobis distance of a pixel; `temperature`: number of a line's pixels that count as one; `mask`: standard deviation of the
-    mask's boundary on a line [px]; `huber` [px]; `edge`: standard deviation that an offset has at least [px]; `correlation`:
-    length of contour over which offsets err together [px]; `dilation`: of the whole contour [px]; `wave`: of errors that change
-    slowly along each side of the limb, as its shading does [px]: with one side hidden they look like another distance. Where both
-    sides of an edge are so alike that its offset is uncertain by more than that, these are as large, and by what that is above
-    `edge` the whole side of the limb errs together. Where the offsets are larger than TYPICAL, so are all of these."""
+    mask's boundary on a line [px]; `huber`: Huber's threshold [px]; `edge`: minimum standard deviation of an offset [px];
+    `correlation`: length of contour over which offsets share their error [px]; `dilation`: standard deviation of the whole
+    contour's [px]; `wave`: standard deviation of errors that change slowly along each side of the limb, as its shading does [px].
+    With one side hidden, they look like another distance. If both sides of an edge are so alike that its offset is more uncertain
+    than `wave`, they are as large as that, and what exceeds `edge` is an error of the whole side of the limb. If offsets are
+    larger than TYPICAL, all these errors grow."""
 
     passes: int = 5
     spacing: float = 3.0
@@ -69,13 +70,13 @@ class ImageSettings:
 
 
 def native(image: NDArray[np.uint8], evidence: Evidence) -> tuple[NDArray[np.uint8], Evidence]:
-    """The part of an image (h, w, 3) that the evidence's window shows, and the evidence in the image's own pixels."""
+    """The part of an image (h, w, 3) in the evidence's window, and the evidence at the image's resolution."""
     (h, w), scale = evidence.state.shape, evidence.scale
     x0, y0, width, height = evidence.x0, evidence.y0, w * scale, h * scale
     inside = np.ascontiguousarray(image[max(y0, 0) : max(y0 + height, 0), max(x0, 0) : max(x0 + width, 0)])
     left, top = min(max(-x0, 0), width), min(max(-y0, 0), height)
     right, bottom = width - left - inside.shape[1], height - top - inside.shape[0]
-    if left or top or right or bottom:  # what lies beyond the image is COVERED, so its colours do not matter
+    if left or top or right or bottom:  # pixels outside the image are COVERED, so their colours do not matter
         inside = np.pad(inside, ((top, bottom), (left, right), (0, 0)))
     if scale == 1:
         return inside, evidence
@@ -108,9 +109,9 @@ def fit_image(
     settings: ImageSettings | None = None,
     limits: Limits | None = None,
 ) -> Fit:
-    """The pose near `first` whose contour lies on an edge of colours in the image (h, w, 3) uint8 RGB that the mask is of.
+    """The pose near `first` whose contour lies on a colour edge in the mask's image (h, w, 3) uint8 RGB.
 
-    `prior` (6, 6): information about T_prior (4 x 4) along the camera's axes, taken out of the result again as by `fit`.
+    `prior` (6, 6): information about T_prior (4 x 4) along the camera's axes, removed from the result as by `fit`.
     """
     settings, limits = settings or ImageSettings(), limits or Limits()
     regular = np.zeros((7, 7))
@@ -148,22 +149,22 @@ def fit_image(
 
 
 def straightest(straight: Fit, bent: Fit) -> Fit:
-    """Of fits with the hand believed and not, the first where the mesh's stiff hand fits about as well as the forearm."""
+    """The fit that trusts the mesh's stiff hand if it is about as good as the one that trusts it less; else the latter."""
     return straight if straight.rms < STRAIGHT * bent.rms else bent
 
 
 def unfitted(rms: float, points: float) -> float:
-    """Root mean square [px] that offsets have about the truth, where a fit of a pose to so many independent points left `rms`: it
-    takes as much of the error away as it has unknowns."""
+    """RMS [px] of the offsets about the true pose, if a fit to `points` independent points left `rms`: the fit absorbs as many
+    degrees of freedom as a pose has unknowns."""
     return rms * math.sqrt(points / max(points - UNKNOWNS, 1.0))
 
 
 @dataclass(frozen=True)
 class _Pass:
-    """The normal equations (7, 7), (7,) at a pose T, `moved` (7,) from the prior; length of contour measured [px], root mean
-    square of the offsets left [px] and the share of the roll that is used. points (n,) of the contour, sigma (n,) [px]: standard
-    deviations of their offsets, and equations: what gives the normal equations of offsets (n,). misfit: mean square [px^2] of the
-    offsets left and of what they leave open, so that a contour along which nothing is seen is no good one."""
+    """Normal equations (7, 7), (7,) at a pose T, which is `moved` (7,) from the prior; length of the measured contour [px], RMS
+    of the remaining offsets [px] and the share of the roll that is used. points (n,) of the contour; sigma (n,) [px]: standard
+    deviations of their offsets; equations: function from offsets (n,) to normal equations. misfit: mean square [px^2] of the
+    remaining offsets and of their uncertainty, so that a contour along which nothing is seen is not a good one."""
 
     T: Array
     moved: Array
@@ -178,18 +179,18 @@ class _Pass:
     equations: Callable[[Array], Equations]
 
     def waves(self, settings: ImageSettings, larger: float) -> Array:
-        """The right sides (7, k) of `ImageSettings.wave`, so many times larger."""
+        """The right sides (7, k) of the errors of `ImageSettings.wave`, times `larger`."""
         shared, whole = np.maximum(self.sigma, settings.wave), np.maximum(self.sigma - settings.edge, 0.0)
         errors = [shared * wave for wave in slow_waves(self.points, self.T)]
         errors += [whole * side for side in sides(self.points, self.T)]
         return np.stack([self.equations(larger * error).g for error in errors], axis=1)
 
     def bends(self, covariance: Array, intrinsics: Intrinsics) -> Array:
-        """The right sides (7, BENDS) of what the equations leave out: a pose that is off by one standard deviation moves the
-        contour by more than its derivative, along the directions that a covariance (6, 6) knows least."""
+        """The right sides (7, BENDS) of the second-order motion of the contour, which the equations leave out, for pose errors of
+        one standard deviation along the most uncertain directions of a covariance (6, 6)."""
         axis = self.T[:3, 0]
         lever = np.diag([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])
-        lever[3:, 3:] -= LEVER_M * np.outer(axis, axis)  # a roll hardly moves the contour, and has a doubt of its own
+        lever[3:, 3:] -= LEVER_M * np.outer(axis, axis)  # a roll hardly moves the contour; `marginal` adds its uncertainty
         variances, directions = np.linalg.eigh(lever @ covariance @ lever)
         off = directions[:, -BENDS:] * np.sqrt(np.maximum(variances[-BENDS:], 0.0))
         off[3:] /= LEVER_M
@@ -198,8 +199,7 @@ class _Pass:
 
 @dataclass(frozen=True)
 class _Picture:
-    """An image (h, w, 3) uint8 with the evidence of its pixels, in which the pose is looked for; hand: as of
-    `mask_fit.Fit`."""
+    """An image (h, w, 3) uint8 in which the pose is searched for, with the evidence of its pixels; hand: as of `mask_fit.Fit`."""
 
     model: Model
     image: NDArray[np.uint8]
@@ -210,7 +210,7 @@ class _Picture:
     hand: float
 
     def halved(self) -> _Picture:
-        """The same at half the resolution: twice the reach."""
+        """The same at half the resolution, which doubles the reach."""
         h, w = self.evidence.state.shape[0] // 2, self.evidence.state.shape[1] // 2
         k, evidence = self.evidence.intrinsics, self.evidence
 
@@ -228,7 +228,7 @@ class _Picture:
         return replace(self, image=half(self.image).astype(np.uint8, copy=False), evidence=smaller)
 
     def descend(self, T: Array, passes: int) -> _Pass:
-        """The pose of the best of Gauss-Newton's steps from T: where little shows, they do not always end there."""
+        """The best of the Gauss-Newton steps from T: if little is visible, the last one is not always the best."""
         moved = np.zeros(7)
         moved[:6] = rigid.pose_error(T, self.T_prior)
         best: _Pass | None = None
@@ -237,7 +237,7 @@ class _Picture:
             step = np.linalg.solve(here.H + self.regular, here.g - self.regular @ moved)
             step /= max(1.0, float(np.max(np.abs(step[:6]) / MAX_STEP)))
             T, moved = rigid.perturb(T, step[:6]), moved + step
-            if best is None or here.rms < best.rms:  # the derivatives are those before the step, which hardly moves them
+            if best is None or here.rms < best.rms:  # derivatives at the pose before the step, which hardly changes them
                 best = replace(here, T=T, moved=moved, g=here.g - here.H @ step)
             if np.abs(step[:3]).max() < CONVERGED and np.abs(step[3:6]).max() < 4.0 * CONVERGED:
                 break
@@ -265,8 +265,8 @@ class _Picture:
 
 
 def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:
-    """The picture at the mask's own resolution, which is `scale` times coarser, at twice that, and so on up to its own: a mask is
-    as wrong in its own pixels, however many of the image's they are."""
+    """The pictures from the mask's resolution, `scale` times coarser, to the image's own, in steps of two. A mask's error is
+    constant in its own pixels, and so larger in those of finer pictures."""
     pictures = [replace(picture, settings=replace(picture.settings, mask=scale * picture.settings.mask))]
     while scale > 1:
         scale //= 2
@@ -276,9 +276,9 @@ def _pyramid(picture: _Picture, scale: int) -> list[_Picture]:
 
 
 def _further(pictures: list[_Picture], T: Array, T_prior: Array | None) -> Iterator[tuple[float, Array, list[_Picture]]]:
-    """Starts and ways where the mask's pose T may have led astray, in the order in which they are tried, each unless the offsets
-    left are small enough already: from the prediction, if there is one; where the right pose was out of the lines' reach, from
-    coarse to fine; both, with twice the reach at first."""
+    """Further starts and pictures in case the mask's pose T was misleading, in the order in which they are tried, with the RMS
+    [px] of the offsets below which a try is not needed: from the prediction, if there is one; from coarse to fine, if the right
+    pose was out of the lines' reach; both, with twice the reach at first."""
     if T_prior is not None:
         yield TYPICAL, T_prior, pictures[-1:]
     if len(pictures) > 1:
@@ -288,7 +288,7 @@ def _further(pictures: list[_Picture], T: Array, T_prior: Array | None) -> Itera
 
 
 def _through(pictures: list[_Picture], T: Array) -> _Pass:
-    """The pose reached from T in one picture after the other, as the last one sees it."""
+    """The last pass of a descent from T through the pictures in turn."""
     for picture in pictures:
         found = picture.descend(T, picture.settings.passes)
         T = found.T
@@ -296,7 +296,7 @@ def _through(pictures: list[_Picture], T: Array) -> _Pass:
 
 
 def _bend(points: Points, T: Array, error: Array, intrinsics: Intrinsics) -> Array:
-    """Second-order part (n,) [px] of the way of contour points along their normals as a pose moves by an error (6,)."""
+    """Second-order part (n,) [px] of the motion of contour points along their normals under a pose error (6,)."""
     from_middle = points["position"] - T[:3, 3]
 
     def pixels(moved: Array) -> Array:
@@ -308,28 +308,28 @@ def _bend(points: Points, T: Array, error: Array, intrinsics: Intrinsics) -> Arr
 
 
 BENDS = 2
-"""Number of directions of a pose along which its contour is followed to the second order: distance and tilt."""
+"""Number of directions of a pose along which the contour's motion is computed to second order: distance and tilt."""
 UNKNOWNS = 6
 """Number of unknowns of a pose."""
 LEVER_M = 0.15
-"""Length [m] at which a rotation counts as a way: half of a forearm's."""
+"""Length [m] that converts a rotation to a displacement: half of a forearm's."""
 TYPICAL = 0.2
-"""Root mean square [px] of the offsets (`unfitted`) up to which the covariance is that of the settings; above, it grows with its
-fourth power, and what the contour's points share grows with it."""
+"""RMS [px] of the offsets (`unfitted`) up to which the covariance is that of the settings. Above it, the covariance grows with
+the fourth power of the RMS, including the errors that the contour's points share."""
 SHARP = 0.3
-"""Root mean square [px] of the offsets left, each limited to `ImageSettings.huber`, below which a pose is accepted."""
+"""RMS [px] of the remaining offsets, each limited to `ImageSettings.huber`, below which a pose is accepted."""
 STRAIGHT = 1.15
-"""Largest ratio of the offsets left with a straight hand to those with a bent one, for which the hand is straight. Measured on
-four runs of `arm`: so are 70 % of the poses whose roll is right, and 10 % of those that are more than 15 degrees off, for which a
-hand only seems bent."""
+"""Maximum ratio of the remaining offsets with a straight hand to those with a bent one at which the hand counts as straight.
+Measured on four runs of `arm`: it is for 70 % of the poses whose roll is right, and for 10 % of those more than 15 degrees off,
+for which a hand only seems bent."""
 MAX_STEP = np.array([0.02, 0.02, 0.05, 0.1, 0.1, 0.1])
-"""Largest step of a pass [m, rad]."""
+"""Maximum step of a pass [m, rad]."""
 CONVERGED = 2e-4
-"""A pass that moves less than this [m], and four times it [rad], is the last."""
+"""A pass that moves less than this [m], and four times this [rad], is the last."""
 _SAMPLES = 2 * LINE + 1
 _GRID = 2 * OFFSETS + 1
 _MIXED = 3
-"""Half pixels from the edge up to which a pixel shows a mixture of both sides."""
+"""Distance from the edge [half pixels] up to which a pixel shows a mixture of both sides."""
 
 
 def offsets(
@@ -344,7 +344,7 @@ def offsets(
     temperature: float,
     mask_sigma: float,
 ) -> tuple[Array, Array, NDArray[np.uint8]]:
-    """Offset [px] of the edge along the outward normal of each contour point, its standard deviation and whether it was measured
+    """Offset [px] of the edge along the outward normal of each contour point, its standard deviation, and whether it was measured
     (DROPPED, MEASURED). The arguments after `mask_kind` are those of `ImageSettings`."""
     n = len(points)
     r, sigma, kind = np.zeros(n), np.ones(n), np.zeros(n, np.uint8)

@@ -1,19 +1,19 @@
 """The default search: least squares between the mesh's occluding contour and the boundary of the mask.
 
 One pass, from a pose T_camera_target:
-  1. project the mesh; its occluding contour are the edges between a face seen from the front and one seen from behind (`trace`);
+  1. project the mesh; its occluding contour consists of the edges between a front face and a back face (`contour._trace`);
   2. keep the points on the outside of the silhouette and outside everything that covers the target;
-  3. from each, walk along the contour's normal to the mask's boundary: the offset r [px] (`match`);
-  4. solve the damped normal equations for the pose error and for the mask's dilation b, r = J e + b + noise.
-The passes are Levenberg-Marquardt with Huber's weights; where they end badly, they start again after coarse passes with a longer
-walk. What is hidden is dropped and not scored.
+  3. from each, walk along the contour's normal to the mask's boundary: the offset r [px] (`contour._match`);
+  4. solve the damped normal equations for the pose error e and the mask's dilation b, r = J e + b + noise.
+The passes are Levenberg-Marquardt with Huber's weights. If the start fits badly, coarse passes with a longer walk come
+first. Hidden parts are dropped and not scored.
 
-The mesh's hand is stiff, and people bend theirs: where the hand's contour fits much worse than the forearm's, its offsets count
-as so much more uncertain, and the last passes are repeated.
+The mesh's hand is stiff, and people bend theirs. If the hand's contour fits much worse than the forearm's, its offsets count as
+more uncertain by that factor, and the last passes are repeated.
 
-The covariance is that of the measurement alone. Neighbouring points of a mask's boundary err together, so the contour counts as
-one independent point per correlation length; the dilation b is a nuisance with a prior of its own and is marginalised, because
-half a pixel around the limb looks like centimetres of depth.
+The covariance is that of the measurement alone. Neighbouring points of a mask's boundary share their errors, so the contour
+counts as one independent point per correlation length. The dilation b is a nuisance parameter with its own prior and is
+marginalised, because half a pixel around the limb looks like centimetres of depth.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 SPACING_PX = 3.0
-"""Distance [px] of the sampled contour points: closer ones bring no new information."""
+"""Spacing [px] of the sampled contour points: closer ones add no information."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """How a mask's boundary errs, in pixels of the mask.
+    """Errors of a mask's boundary, in pixels of the mask.
 
-    `edge`: standard deviation along the normal; `correlation`: length along the contour over which errors are one error;
-    `dilation`: standard deviation of the whole mask's being too large or small. Defaults: a trained network's
-    masks, chosen and not measured.
+    `edge`: standard deviation along the normal; `correlation`: length along the contour over which points share their error;
+    `dilation`: standard deviation of the dilation of the whole mask. Defaults: for a trained network's masks, chosen and not
+    measured.
     """
 
     edge: float = 0.5
@@ -49,8 +49,8 @@ class Noise:
 
 @dataclass(frozen=True)
 class Limits:
-    """Standard deviations of position [m] and rotation [rad] of a direction that the contour does not show: the weak prior
-    that keeps the solve regular, and the largest deviations published."""
+    """Standard deviations of position [m] and rotation [rad] along directions that the contour does not show: the weak prior that
+    keeps the solve regular, and the maximum that is published."""
 
     position: float = 1.0
     rotation: float = 1.5
@@ -65,43 +65,45 @@ class Limits:
 
 
 COARSE = (24.0, 5.0, 4)
-"""Reach of the walk [px], Huber's threshold [px] and largest number of passes, where the fit starts again from far."""
+"""Reach of the walk [px], Huber's threshold [px] and maximum number of passes, for a start that may be far off."""
 FINE = (8.0, 2.0, 8)
-"""The same of the passes that end a fit."""
+"""The same for the passes that end a fit."""
 CONVERGED = 1e-3
-"""Step [m] below which a fit ends where no refinement on the image follows."""
+"""Step [m] below which a fit ends if no refinement on the image follows."""
 ROUGH = 4e-3
-"""Step [m] below which a fit ends where the image refines it: a pixel or two."""
+"""Step [m] below which a fit ends if the image refines it: a pixel or two."""
 MAX_STEP = np.array([0.06, 0.06, 0.10, 0.25, 0.25, 0.25])
-"""Largest step of a pass [m, rad]: beyond it the points matched belong to other parts of the contour."""
+"""Maximum step of a pass [m, rad]: beyond it, the matched points belong to other parts of the contour."""
 DAMPING = (1e-3, 10.0, 1e2)
-"""Marquardt's factor at the start, its change after a pass that gained or lost, and the factor at which the passes end."""
+"""Marquardt's factor at the start, its change after a pass that lowered the cost or did not, and the factor above which passes
+end."""
 BENT, MOST_BENT = 2.0, 8.0
-"""Offsets of the hand's contour, as multiples of the forearm's, from which it is taken for bent, as the mesh's stiff hand is not,
-and up to which its standard deviation grows with them."""
+"""Ratio of the offsets of the hand's contour to the forearm's from which the hand counts as bent, unlike the mesh's stiff one,
+and the maximum of this ratio as a factor on the hand's standard deviation."""
 LEAST_ARM_PX = 30.0
-"""Length [px] of the forearm's contour without which its hand is believed."""
+"""Minimum length [px] of the forearm's contour: with less, the hand counts as straight."""
 BENDS = 3
-"""Largest number of times that the fit is repeated for a bent hand."""
+"""Maximum number of times that the fit is repeated for a bent hand."""
 KEPT = 0.05
 """Share of the prior's information that stays in the measurement: without any, directions that the contour hardly shows would be
-extrapolated far beyond where the problem is linear."""
+extrapolated far beyond the linear range."""
 GOOD = 2.0
-"""`Fit.misfit` below which nearly every right fit is."""
+"""Maximum `Fit.misfit` of nearly all right fits."""
 MISFIT = 3.0
-"""`Fit.misfit` above which one of a hundred right fits is, and most wrong ones are."""
+"""`Fit.misfit` that one in a hundred right fits, and most wrong ones, exceed."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: where contour and mask were compared;
-    `points`: number of independent points of contour that were measured; `rms`: their offset left [px]; `dilation`: the mask's
-    estimated dilation [px]; `cost`: chi^2 of contour, dilation and prior together, or of the contour alone, in the mask's pixels,
-    where the image shows it, or of the forearm's contour, whose errors are what the pose leaves, where there is a `shape`;
-    `misfit`: that of the mask per measurement, 1 to 3 where the pose is right; `both`, `free`: see `evidence.compare`; `overlap`:
-    see `overlap_of`; `hand`: how many times as uncertain as the forearm's the hand's contour was taken for (`Problem.bent`);
-    `sharp`: whether the image has edges along the contour (`image_fit.fit_image`); `shape`: standard deviation of the limb's
-    surface from the mesh's [m], where the contour was fitted with one (`shape_fit.fit_shape`)."""
+    """T_camera_target with its 6 x 6 covariance along the camera's axes; `T_searched`: pose at which contour and mask were
+    compared; `points`: number of independent contour points that were measured; `rms`: of their remaining offsets [px];
+    `dilation`: the mask's estimated dilation [px]; `misfit`: the mask's cost per measurement, 1 to 3 for right poses; `both`,
+    `free`: see `evidence.compare`; `overlap`: see `overlap_of`; `hand`: ratio of the uncertainty of the hand's contour to that of
+    the forearm's (`Problem.bent`); `sharp`: whether the image has edges along the contour (`image_fit.fit_image`); `shape`:
+    standard deviation of the limb's surface from the mesh's [m], if the contour was fitted with one (`shape_fit.fit_shape`).
+
+    `cost`: chi^2 of contour, dilation and prior; after `fit_image`, of the contour alone, in the mask's pixels; with a `shape`,
+    of the forearm's contour, with errors estimated from its remaining offsets."""
 
     T: Array
     covariance: Array
@@ -120,9 +122,9 @@ class Fit:
 
 
 def overlap_of(model: Model, T: Array, evidence: Evidence, hand: float) -> tuple[int, int, float]:
-    """Pixels that show the target, and that are free, in the silhouette at T_camera_target (`evidence.compare`), and the
-    intersection over union of silhouette and mask's target, of the pixels that are scored, in [0, 1]; a pixel beyond the
-    wrist counts 1 / hand."""
+    """Numbers of pixels of the silhouette at T_camera_target that show the target, and that are free (`evidence.compare`), and
+    the intersection over union of the silhouette and the mask's target among scored pixels, in [0, 1]; a pixel beyond the wrist
+    counts 1 / hand."""
     state = evidence.state
     shown = model.silhouette(T, evidence.intrinsics, (0, 0, *state.shape[::-1]))
     both, free = compare(state, shown)
@@ -159,7 +161,7 @@ class Problem:
         found = self.model.matched(T, evidence, SPACING_PX, reach, self.hand)
         r, both = found.r - moved[6], found.both
         equations = self.normal_equations(T, found.points, r, found.kind, huber, True)
-        # parts of the mask without a contour near by exert no force, but must not lower the cost; nor may points that drop out
+        # parts of the mask without a contour nearby do not pull, but must not lower the cost; nor must points that drop out
         unexplained = (evidence.seen_px - both) / (self.noise.correlation * self.noise.edge)
         cost = equations.cost * evidence.boundary_px / max(equations.counted, 1.0) + unexplained
         cost += float(np.dot(moved, self.regular @ moved))
@@ -173,8 +175,8 @@ class Problem:
         return normal_equations(points, r, kind, weights, T[:3, 3], T[:3, 0], k.fx, k.fy, huber, bounded)
 
     def bent(self, here: Pass) -> tuple[float, float]:
-        """How many times the offsets of the hand's contour are those of the forearm's, from 1 to MOST_BENT, and how long it is
-        [px]; 1 where too little of the forearm shows to say, or too little is amiss."""
+        """Ratio of the offsets of the hand's contour to the forearm's, from 1 to MOST_BENT, and the length of the hand's contour
+        [px]; the ratio is 1 if too little of the forearm is visible, or if it is below BENT."""
         points = here.points
         beyond = (points["position"] - here.T[:3, 3]) @ here.T[:3, 0] > self.model.wrist
         length = np.where(here.kind == DROPPED, 0.0, points["length"]) * np.where(beyond, self.hand**2, 1.0)
@@ -187,8 +189,8 @@ class Problem:
         return (1.0 if ratio < BENT else min(ratio, MOST_BENT)), hand_px
 
     def loosened(self, here: Pass) -> tuple[Pass, float]:
-        """The pass that ends a fit once the hand is trusted as far as it fits, and what that costs: the logarithm of a Gaussian's
-        width, so that a pose that explains the hand wins over one that does not."""
+        """The last pass of a fit after adapting the hand's uncertainty to its offsets, and the cost of this: the logarithm of a
+        Gaussian's width, so that a pose that explains the hand wins over one that does not."""
         hand_px = 0.0
         for _ in range(BENDS):
             hand, hand_px = self.bent(here)
@@ -199,7 +201,8 @@ class Problem:
         return here, 2.0 * math.log(self.hand) * hand_px / self.noise.correlation
 
     def coarse(self, T: Array, moved: Array) -> tuple[Array, Array]:
-        """The pose and what it is moved by after steps that are all taken, as the contour points matched change with each."""
+        """The pose and its distance from the prior after coarse steps, which are all taken, as each changes the matched
+        points."""
         reach, huber, passes = COARSE
         for _ in range(passes):
             step = self.step(self.at(T, moved, reach, huber), 0.0)
@@ -209,7 +212,7 @@ class Problem:
         return T, moved
 
     def fine(self, here: Pass, stage: tuple[float, float, int] = FINE) -> Pass:
-        """The best pose near by, by Levenberg and Marquardt."""
+        """The best pose nearby, by Levenberg-Marquardt."""
         (reach, huber, passes), damping = stage, DAMPING[0]
         for _ in range(passes):
             step = self.step(here, damping)
@@ -244,9 +247,9 @@ def fit(
 ) -> Fit:
     """The pose T_camera_target whose contour lies on the mask's boundary, searched from T_start (4 x 4).
 
-    `prior` (6, 6) is the information about T_prior (T_start where None) along the camera's axes. It keeps the solve near where
-    the contour says little, and is taken out of the result again: `Fit.T` and `Fit.covariance` are the measurement's alone.
-    `converged`: a pass that moves less than this [m], and four times it [rad], is the last of its stage.
+    `prior` (6, 6): information about T_prior (T_start if None) along the camera's axes. It keeps the solve near the prior where
+    the contour gives little information, and is removed from the result: `Fit.T` and `Fit.covariance` are the measurement's
+    alone. `converged`: a pass that moves less than this [m], and four times this [rad], is the last of its stage.
     """
     noise, limits = noise or Noise(), limits or Limits()
     weak = limits.information
@@ -266,13 +269,13 @@ def fit(
     here, loose = problem.loosened(problem.fine(here))
     cost = here.cost + loose
 
-    # the pose is final: only what was measured informs
+    # the pose is final: only measured points give information
     moved = here.moved
     measured = problem.normal_equations(here.T, here.points, here.r, here.kind, FINE[1], False)
     length = measured.length
     rms = math.sqrt(measured.square / length) if length > 0 else math.inf
     misfit = cost / independent
-    # a mask or a fit worse than expected: the residuals give the noise
+    # if the mask or the fit is worse than expected, the residuals set the noise
     trust = 1.0 / max(1.0, (rms / noise.edge) ** 2 if length > 0 else 1.0, misfit / MISFIT)
     both, free, overlap = overlap_of(model, here.T, evidence, problem.hand)
     rolls = measured.rolls if problem.hand == 1.0 else None
@@ -285,13 +288,12 @@ def fit(
 def marginal(
     T: Array, moved: Array, H: Array, g: Array, regular: Array, rolls: float | None, limits: Limits, waves: Array | None = None
 ) -> tuple[Array, Array]:
-    """The pose and covariance (6, 6) of the measurement alone, from the normal equations of pose error and dilation at T,
-    which is `moved` (7,) from the prior: the prior in `regular` (7, 7) is left out but for KEPT, the dilation marginalised (Schur
-    complement).
+    """The pose and covariance (6, 6) of the measurement alone, from the normal equations of pose error and dilation at T, which
+    is `moved` (7,) from the prior. The prior in `regular` (7, 7) is removed except for the share KEPT, and the dilation is
+    marginalised (Schur complement).
 
-    `rolls`: share of the information about the roll that is used, see `normal_equations`; None where the hand is bent, which may
-    be a straight one at another roll; `waves` (7, k): right sides of errors that all of the contour shares, of one standard
-    deviation each.
+    `rolls`: share of the information about the roll that is used, see `normal_equations`; None for a bent hand, which may be a
+    straight one at another roll; `waves` (7, k): right sides of errors of one standard deviation that the whole contour shares.
     """
     gain = H[:6, 6] / (H[6, 6] + regular[6, 6])
     weak = (1.0 - KEPT) * limits.information + KEPT * regular[:6, :6]
@@ -301,9 +303,9 @@ def marginal(
         bent = covariance @ (waves[:6] - np.outer(gain, waves[6]))
         covariance = covariance + bent @ bent.T
     covariance = (covariance + covariance.T) / 2.0
-    if rolls is None:  # however the hand is bent, the forearm is where it is
+    if rolls is None:  # a bent hand makes only the forearm's roll uncertain
         covariance[3:, 3:] += limits.rotation**2 * np.outer(T[:3, 0], T[:3, 0])
-    else:  # the roll that a nearly round section shows is uncertain, and so is all that is correlated with it
+    else:  # the roll of a nearly round section is uncertain, and so is all that is correlated with it
         c = covariance[:, 3:] @ T[:3, 0]
         roll = float(T[:3, 0] @ c[3:])
         covariance += min(1.0 / max(rolls, 1e-9) - 1.0, limits.rotation**2 / roll) * np.outer(c, c) / roll

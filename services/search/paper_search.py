@@ -1,6 +1,6 @@
-"""The paper's search: gradient ascent on the overlap f_m of the mask and the mask that the mesh would make.
+"""The paper's search: gradient ascent on the overlap f_m of the mask and the mesh's candidate mask.
 
-Nothing is added: pixels that something covers are scored as if the target were not there, as in the paper.
+It adds nothing to the paper: covered pixels are scored as if the target were not there.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from penumbra.shared.perception.intrinsics import Intrinsics
 
 @dataclass(frozen=True)
 class Ascent:
-    """`sample` [m, rad]: distance of the samples that the Jacobian of f_m is estimated from; `step` and `smallest`: first and
-    last step as a multiple of them; `iterations` at most. The paper leaves them open; these find the top from 2 cm and 4 deg."""
+    """`sample` [m, rad]: step of the central differences that estimate the Jacobian of f_m; `step`, `smallest`: first and minimum
+    step as multiples of it; `iterations`: maximum number. The paper leaves them open; these find the maximum from 2 cm and 4
+    deg."""
 
     sample: tuple[float, ...] = (0.004, 0.004, 0.02, 0.03, 0.03, 0.03)
     step: float = 2.0
@@ -30,7 +31,7 @@ class Ascent:
 def f_m(m: NDArray[np.bool_], m_hat: NDArray[np.bool_]) -> float:
     """The overlap in [-1, 1] of two masks (h, w): sum over i, j of 4 (m - 1/2) (m_hat - 1/2) / (w h), the paper's f_m.
 
-    A pixel in which they agree counts 1, one in which they differ -1, so it is 1 - 2 * (share that differs).
+    A pixel in which they agree counts 1, one in which they differ -1, so f_m is 1 - 2 * (share that differs).
     """
     return 1.0 - 2.0 * np.count_nonzero(m != m_hat) / m.size
 
@@ -38,10 +39,10 @@ def f_m(m: NDArray[np.bool_], m_hat: NDArray[np.bool_]) -> float:
 def ascend(
     model: Model, T_previous: Array, m: NDArray[np.bool_], k: Intrinsics, ascent: Ascent | None = None
 ) -> tuple[Array, float]:
-    """The pose T_camera_target with the most overlap near the previous frame's, argmax of f_m(m, f_g(x, Omega)), and its f_m.
+    """The pose T_camera_target of maximum overlap near the previous frame's, argmax of f_m(m, f_g(x, Omega)), and its f_m.
 
-    The Jacobian of f_m is estimated from samples on both sides of the pose along all six directions, and followed; a step that
-    gains nothing is halved.
+    The ascent follows the Jacobian of f_m, estimated by central differences along all six directions; a step that gains nothing
+    is halved.
     """
     ascent = ascent or Ascent()
     h, w = m.shape

@@ -1,5 +1,5 @@
-"""Looks for lost arms in the picture by landmarks, where their models are installed: in a thread of its own, so that no tracked
-stream waits, only while an arm is lost, and at most once every EVERY_NS for each camera."""
+"""Looks for lost arms in the picture by landmarks, if their models are installed. It has its own thread, so that no tracked
+stream waits, and looks only while an arm is lost, at most once every EVERY_NS per camera."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from penumbra.shared.perception.limbs import find, limb_of
 Image = NDArray[np.uint8]
 
 LOST_NS = 300_000_000
-"""Time [ns] for which a target is lost before landmarks are looked for. Chosen: the search alone has tried twice by then."""
+"""Time [ns] for which a target must be lost before landmarks are looked for. Chosen: the search alone has tried twice by then."""
 EVERY_NS = 250_000_000
-"""Least time [ns] between two looks at a camera's picture: one costs 20 to 60 ms of processor time."""
+"""Minimum time [ns] between two looks at a camera's picture: one costs 20 to 60 ms of processor time."""
 FRESH_NS = 500_000_000
-"""Age [ns] up to which a first pose is used: an arm moves 10 cm meanwhile."""
+"""Maximum age [ns] of a first pose that is used: an arm moves 10 cm meanwhile."""
 MOST = 6
-"""Maximum number of first poses for a target, those of all hands in the picture together."""
+"""Maximum number of first poses per target, from all hands in the picture together."""
 
 
 @dataclass(frozen=True)
 class _Wanted:
-    """Targets that are lost in a picture."""
+    """A picture, and the targets that are lost in it."""
 
     stamp_ns: int
     undistorted: Callable[[], Image]
@@ -40,14 +40,14 @@ class _Wanted:
 
 
 class Refinder:
-    """First poses for the lost targets of a cell.
+    """Finds first poses for the lost targets of a cell.
 
-    Threads: `ask` and `starts` are called by the threads of masks, each of which has its cameras for itself; `look` by a timer.
-    What they share are dictionaries whose entries are replaced as a whole, or taken out.
+    Threads: the mask threads, each with its own cameras, call `ask` and `starts`; a timer calls `look`. They share dictionaries
+    whose entries are replaced or removed as a whole.
     """
 
     def __init__(self, cell: Cell, folder: Path):
-        """folder: of the models. Without a good one, or without what runs them, nothing is found; `missing` says why."""
+        """folder: of the landmark models. Without valid models, or without openvino, nothing is found, and `missing` says why."""
         bodies = {name: starter.body_of(target, cell.body) for name, target in cell.targets.items()}
         self._bodies = {name: body for name, body in bodies.items() if body is not None}
         self._cameras, self._folder = cell.cameras, folder
@@ -64,11 +64,11 @@ class Refinder:
             self.missing = f"no landmark models in {folder}; do penumbra segmentation models"
 
     def describe(self) -> dict[str, object]:
-        """For the health report: whether lost arms are looked for by landmarks, what is missing, and how often it was done."""
+        """Fields of the health report: whether landmarks are in use, what is missing for them, and the number of looks."""
         return {"is_installed": not self.missing, "missing": self.missing, "looks": self._looks}
 
     def ask(self, camera: str, lost: Collection[str], stamp_ns: int, undistorted: Callable[[], Image]) -> None:
-        """Says which targets are lost in a picture of a camera, whose pinhole picture `undistorted` makes."""
+        """Requests a look for targets that are lost in a camera's picture; `undistorted` makes its pinhole picture."""
         since = self._since[camera] = {target: self._since[camera].get(target, stamp_ns) for target in lost}
         due = tuple(name for name in since if name in self._bodies and stamp_ns - since[name] >= LOST_NS)
         if self.missing or not due or 0 <= stamp_ns - self._asked_ns[camera] < EVERY_NS:
@@ -77,12 +77,12 @@ class Refinder:
         self._wanted[camera] = _Wanted(stamp_ns, undistorted, due)
 
     def starts(self, camera: str, target: str, stamp_ns: int) -> Sequence[Array]:
-        """Poses T_camera_target (4, 4) of a target that may be in a picture of this stamp, each set of them once."""
+        """First poses T_camera_target (4, 4) of a target for a picture of this stamp; each set is returned once."""
         found_ns, poses = self._found.pop((camera, target), (0, []))
         return poses if abs(stamp_ns - found_ns) <= FRESH_NS else ()
 
     def look(self) -> None:
-        """Looks at the pictures that were asked for since the last call."""
+        """Looks at the pictures that were requested since the last call."""
         for camera in list(self._wanted):
             wanted = self._wanted.pop(camera)
             if self._models is None:

@@ -1,22 +1,22 @@
-"""Other poses of a tracked limb that explain the picture as well: its roll where the hand is hidden, its tilt where it lies
-in the image plane.
+"""Rivals of a tracked limb's pose, which explain the picture as well: another roll if the hand is hidden, another tilt if the
+limb lies in the image plane.
 
-A forearm is nearly round: without its hand, a limb that is turned over has almost the same contour, and every fit stays with
-the turn that it began with, surely or not. So its rivals are fitted to the picture: turns about the limb's axis, and the mirror
-image of its tilt. What the pictures say of a rival adds up. One that they and the prediction prefer takes the pose's place, and
-the others are its rivals then. Until all have been compared it keeps that place in the next pictures, where a fit from the
-prediction, which has the turn before, would end there again. A rival that they cannot refute makes the pose as uncertain as the
-two are apart, until it is compared again; so does one that was not compared yet. What the prediction says it knows from the
-pictures before: a limb does not turn over because something hides its hand.
+A forearm is nearly round. Without its hand, a limb that is turned over has almost the same contour, and every fit keeps the roll
+that it started from, right or wrong. So rivals are fitted to the picture: turns about the limb's axis, and the mirror image of
+its tilt. The evidence of the pictures about a rival is summed. A rival that the pictures and the prediction prefer replaces the
+pose, and all rivals are compared anew. Until that is done, it keeps its place in the next pictures, in which a fit from the
+prediction, which has the turn before, would end at the previous pose again. A rival that is not refuted makes the pose as
+uncertain as the two are apart, until it is compared again; so does one that was not compared yet. The prediction counts because
+it knows the pictures before: a limb does not turn over because something hides its hand.
 
-A bent hand makes one of them look right, as the mesh's stiff one then points where the bent one is; so where the hand is bent the
-forearms are compared alone.
+With a bent hand, a wrong rival may look right, as the mesh's stiff hand then points to where the bent one is. So if the hand is
+bent, only the forearms are compared.
 
-One is compared in a picture: eight times as many in the first ones would have a limb that was just found wait, and it would be
-elsewhere by then. The mirror image comes first, as it is the farthest away: a limb found again with the wrong tilt is 10 cm off.
-Once all were compared, the one that is refuted least comes every second time, and the refuted ones wait while others are left, so
-that a rival that is right wins within a few pictures. Where all are refuted, pictures go by without: a comparison costs as much
-as the pose itself. A limb that is not quite the mesh has its mirror image as a rival in each picture (`against_mirror`).
+One rival is compared per picture: all eight at once would delay the first pictures of a limb that was just found, and it would
+have moved by then. The mirror image comes first, as it is the farthest away: a limb found again with the wrong tilt is 10 cm off.
+Once all were compared, every second comparison is of the least refuted rival, and refuted ones wait while others are left, so
+that a right rival wins within a few pictures. If all are refuted, pictures are skipped: a comparison costs as much as the pose
+itself. A limb that is not quite the mesh has its mirror image as a rival in each picture (`against_mirror`).
 """
 
 from __future__ import annotations
@@ -34,40 +34,40 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 Shown = Callable[[Array, int, float], Fit]
-"""The pose near T (4 x 4) after at most so many steps, with the hand's contour so many times as uncertain as the forearm's
-(`mask_fit.Fit.hand`)."""
+"""Function of T (4 x 4), passes and hand: the pose near T after at most `passes` steps, with the hand's contour `hand` times as
+uncertain as the forearm's (`mask_fit.Fit.hand`)."""
 TURNS = tuple(math.radians(degrees) for degrees in (180.0, 30.0, -30.0, 60.0, -60.0, 120.0, -120.0))
-"""Turns of the rivals about the limb's axis [rad]: as far apart as `PASSES` steps of a fit reach, and half of that beside the
-pose. Measured: a fit that starts 60 degrees from a pose that is off by 35 ends elsewhere."""
+"""Turns of the rivals about the limb's axis [rad], spaced by the reach of `PASSES` steps of a fit, and by half of that next to
+the pose. Measured: a fit that starts 60 degrees from a pose that is off by 35 ends elsewhere."""
 RIVALS = len(TURNS) + 1
 """Number of rivals: the turns, and the mirror image."""
 PASSES = 8
-"""Steps of a rival's fit, at most."""
+"""Maximum number of steps of a rival's fit."""
 REFUTED = 9.0
-"""Difference of two poses' `Fit.cost`, and of what the prediction says of them, from which the worse one is refuted: three
-standard deviations. Where even the better one fits worse than noise explains, the cost's difference counts less."""
+"""Difference of two poses' costs, `Fit.cost` plus the squared distance from the prediction, from which the worse pose is refuted:
+three standard deviations. If even the better pose fits worse than noise explains, the difference of `Fit.cost` counts less."""
 PREFERRED = 18.0
-"""The same from which a rival takes the pose's place, and up to which one that did keeps it until all are compared. Chosen: half
-as much let poses that are wrong as well take it."""
+"""The difference from which a rival replaces the pose, and up to which a rival that did keeps its place until all are compared.
+Chosen: half as much also let wrong poses replace it."""
 SURPRISING = 9.0
-"""Largest squared Mahalanobis distance from the prediction that counts: a prediction may be wrong, so it says no more than a
-picture that refutes. With twice as much, 1.7 % of the fused poses of the paper's experiment were beyond three sigma in place of
+"""Maximum squared Mahalanobis distance from the prediction that counts: a prediction may be wrong, so it counts no more than a
+picture that refutes. With twice as much, 1.7 % of the fused poses of the paper's experiment were beyond three sigma instead of
 0.7 %, and a limb that was predicted the wrong way round stayed so."""
 LASTS, LASTS_FOREARM = 10.0, 30.0
-"""Number of pictures in a row of which the same one of two poses may be the wrong one, and where only the forearm tells, as the
-hand is bent or the limb is not quite the mesh. An observer takes the pictures' errors for independent: ten that prefer the wrong
-turn a little would convince it. Of bent hands, with ten 8 % of the fused poses were farther off in place and axis than 99.7 % are
-to be, in place of 5 % (30 streams of 2 s, seeds 76 to 78)."""
+"""Number of pictures in a row in which the same one of two poses may be wrong; the second if only the forearm decides, as the
+hand is bent or the limb is not quite the mesh. An observer treats the pictures' errors as independent: ten pictures that slightly
+prefer the wrong turn would convince it. With ten for bent hands, 8 % of the fused poses were outside the 99.7 % bound of place
+and axis, instead of 5 % (30 streams of 2 s, seeds 76 to 78)."""
 REST_NS = 140_000_000
-"""Time [ns] between two comparisons while all rivals are refuted: each is compared every 1.1 s, or in each eighth picture where
+"""Time [ns] between two comparisons while all rivals are refuted: each is compared every 1.1 s, or in every eighth picture if
 pictures are rarer."""
 KEPT, MOST = 0.7, 6.0
-"""Share of the evidence about a rival that is kept until it is compared again, and the most that one picture says against it: two
-have to refute it, and several that prefer one of the two a little decide together. Chosen."""
+"""Share of the evidence about a rival that is kept until it is compared again, and maximum evidence of one picture against it:
+two pictures are needed to refute it, and several with a slight preference decide together. Chosen."""
 APART_RAD = 0.2
-"""Poses that differ by less are one."""
+"""Angle [rad] below which two poses count as one."""
 JUMPED_RAD = 0.4
-"""A pose that differs by more from that in the picture before has jumped: then that one is its rival."""
+"""Angle [rad] from the pose in the picture before above which a pose has jumped; the pose before is then its rival."""
 
 
 class Rivals:
@@ -78,23 +78,22 @@ class Rivals:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew, as with another limb."""
+        """Start over, as with another limb."""
         self._next = 0
         self._is_least_due = False
         self._begin()
 
     def _begin(self) -> None:
-        """Compare all again with another pose of the same limb."""
+        """Compare all rivals again, with another pose of the same limb."""
         self._evidence: list[float | None] = [None] * RIVALS
         self._doubts: list[Array | None] = [None] * RIVALS
         self._before: Array | None = None
         self._compared_ns = 0
 
     def contested(self, best: Fit, stamp_ns: int, shown: Shown, surprise: Callable[[Fit], float]) -> Fit:
-        """`best`, or a rival where the picture of this stamp and the prediction prefer that, as uncertain as rivals make it.
+        """`best`, or a rival if the picture of this stamp and the prediction prefer it, with the uncertainty that its rivals add.
 
-        shown: of the image, without regard to a prediction; surprise(fit): the squared Mahalanobis distance of a pose from the
-        prediction.
+        shown: fits to the image, without a prediction; surprise(fit): squared Mahalanobis distance of a pose from the prediction.
         """
 
         def unlikelier(other: Fit) -> float:
@@ -121,7 +120,7 @@ class Rivals:
         self._before = best.T
         axes, covariance = _axes(best), best.covariance
         for which, left in enumerate(self._doubts):
-            if self._evidence[which] is None:  # not compared yet: as sure of its place as the pose itself
+            if self._evidence[which] is None:  # not compared yet: assumed to fit as well as the pose
                 T = _start(best, which)
                 left = self._doubt(best, T, np.zeros((6, 6)), unlikelier(replace(best, T=T)))
             if left is not None:
@@ -137,8 +136,7 @@ class Rivals:
         return True
 
     def _chosen(self) -> int:
-        """The rival to compare: the next one that is not refuted, but once all were compared every second time the one that is
-        refuted least."""
+        """The rival to compare: the next one not refuted; once all were compared, every second time the least refuted one."""
         evidence = [-math.inf if known is None else known for known in self._evidence]
         self._is_least_due = not self._is_least_due
         if self._is_least_due and -math.inf < min(evidence) < REFUTED:
@@ -149,7 +147,7 @@ class Rivals:
         return which
 
     def _doubt(self, best: Fit, T: Array, covariance: Array, excess: float) -> Array:
-        """What a rival adds (`_added`), along the limb's axes."""
+        """The covariance that a rival adds (`_added`), along the limb's axes."""
         axes = _axes(best)
         return np.asarray(axes.T @ _added(best, T, covariance, excess, self._limits) @ axes, np.float64)
 
@@ -157,11 +155,11 @@ class Rivals:
 def against_mirror(
     best: Fit, near: Callable[[Array], Fit], surprise: Callable[[Fit], float], overlap: float, limits: Limits
 ) -> Fit:
-    """The pose of a limb that is not quite the mesh, or its mirror image where that and the prediction are likelier together, as
-    uncertain as the two are apart.
+    """The pose of a limb that is not quite the mesh, or its mirror image if fit and prediction together prefer it, as uncertain
+    as the two are apart.
 
-    near(T): such a pose near T (4 x 4), without regard to a prediction; surprise(fit): as of `Rivals.contested`; overlap: that a
-    rival has at least (`Fit.overlap`).
+    near(T): such a pose near T (4 x 4), without a prediction; surprise(fit): as of `Rivals.contested`; overlap: minimum
+    `Fit.overlap` of a rival.
     """
     T = detect.mirrored(best.T_searched)[0]
     if _angle(T, best.T_searched) < JUMPED_RAD:
@@ -176,8 +174,8 @@ def against_mirror(
 
 
 def _added(best: Fit, T: Array, covariance: Array, excess: float, limits: Limits) -> Array:
-    """What a rival T (4 x 4) adds to the covariance (6, 6) of the best pose: as much of its own covariance, and of the square of
-    what they are apart, `LASTS` times, as it has of the probability of both. excess: by how much its cost is above the pose's."""
+    """The covariance (6, 6) that a rival T (4 x 4) adds to that of the best pose: the rival's share of the probability of both,
+    times its own covariance plus `LASTS` times the square of their difference. excess: of its cost over the pose's."""
     apart = rigid.pose_error(T, best.T)
     apart[3:] /= max(1.0, float(np.linalg.norm(apart[3:])) / limits.rotation)
     share = 1.0 / (1.0 + math.exp(0.5 * min(excess, 100.0)))
@@ -186,7 +184,7 @@ def _added(best: Fit, T: Array, covariance: Array, excess: float, limits: Limits
 
 
 def _start(best: Fit, which: int) -> Array:
-    """The pose from which to fit a rival."""
+    """The pose from which a rival is fitted."""
     T = best.T_searched.copy()
     if which == 0:
         return detect.mirrored(T)[0]
@@ -195,8 +193,8 @@ def _start(best: Fit, which: int) -> Array:
 
 
 def _fitted(T: Array, best: Fit, shown: Shown) -> Fit:
-    """The rival near T (4 x 4). Where the best pose's hand is bent, the rival's may be, too, and the forearm decides, unless the
-    mesh's stiff hand fits there as well as the forearm: a bent one hardly ever looks like it."""
+    """The rival near T (4 x 4). If the best pose's hand is bent, the rival's may be bent, too, and the forearm decides, unless
+    the mesh's stiff hand fits there as well as the forearm: a bent hand hardly ever looks like it."""
     straight = shown(T, PASSES, 1.0)
     if best.hand == 1.0:
         return straight
@@ -204,9 +202,9 @@ def _fitted(T: Array, best: Fit, shown: Shown) -> Fit:
 
 
 def _excess(other: Fit, best: Fit, shown: Shown) -> float:
-    """By how much a rival's cost is above that of the best pose; infinite where it is the same pose, or none. Costs are taken for
-    the longer of the two contours: a hand that is seen edge on has less of it than one that shows its fingers, and must not be
-    the cheaper for what it leaves unexplained."""
+    """By how much a rival's cost exceeds that of the best pose; infinite if the two are the same pose, or the image does not
+    confirm the rival. Costs are scaled to the longer of the two contours: a hand seen edge on has less contour than one that
+    shows its fingers, and must not gain by that."""
     if not other.sharp or _angle(other.T, best.T) < APART_RAD:
         return math.inf
     here = best if best.hand == other.hand else shown(best.T_searched, 1, other.hand)
@@ -220,5 +218,5 @@ def _angle(a: Array, b: Array) -> float:
 
 
 def _axes(fit: Fit) -> Array:
-    """From the limb's axes to the camera's, of a pose error (6, 6)."""
+    """Matrix (6, 6) that takes a pose error from the limb's axes to the camera's."""
     return np.asarray(np.kron(np.eye(2), fit.T[:3, :3]), np.float64)

@@ -1,4 +1,4 @@
-"""Wires the search to the bus: masks, frames, joints and the fused pose in, the camera's pose out."""
+"""Connects the search to the bus: masks, frames, joints and the fused pose in, the camera's pose out."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from penumbra.shared.runtime.node import ServiceNode
 
 NAME = "search"
 FRAMES_KEPT = 4
-"""Number of frames of a camera that are kept until their masks come."""
+"""Maximum number of frames per camera that are kept until their masks come."""
 JOINTS_NEAR_NS = 200_000_000
-"""Largest distance [ns] of a frame from the joint angles with which robots are drawn into it. Chosen: a mask of which nothing is
-known of the robot is worse than one with a robot that has moved a little."""
+"""Maximum time [ns] between a frame and the joint angles with which robots are drawn into it. Chosen: a mask without any
+knowledge of the robot is worse than one with a robot that has moved a little."""
 LOOK_S = 0.05
-"""Period [s] of the thread that looks for lost arms: how long a picture waits for it."""
+"""Period [s] of the thread that looks for lost arms: a picture waits up to this long."""
 LOAD_S = 30.0
-"""Longest time [s] of a look, in which the landmark models may be loaded."""
+"""Maximum time [s] of a look, in which the landmark models may be loaded."""
 
 FLAGS = (
     flags.Option("--method", choices=METHODS, default="default", help="default: contour least squares; paper: ascent on f_m"),
@@ -43,11 +43,11 @@ EXAMPLE = "penumbra search --cell table --method paper"
 
 
 def start(node: ServiceNode, options: flags.Options) -> None:
-    """Subscribes; every mask is searched for every target that its camera can see and this replica owns.
+    """Subscribes. Each mask is searched for every target that its camera can see and this replica owns.
 
-    Threads: the joints of a robot are written by their reader, `frames[camera]` to the reader of that camera's
-    frames. The reader of its masks takes what is there at that moment; the searches of a camera are that reader's alone. Lost
-    arms are looked for by landmarks in a timer's thread (`Refinder`).
+    Threads: the reader of a robot's joints writes these, and the reader of a camera's frames writes `frames[camera]`. The reader
+    of the camera's masks uses what is there at that moment, and only it uses the searches of that camera. A timer's thread looks
+    for lost arms by landmarks (`Refinder`).
     """
     cell = node.cell
     cameras = [cell.one("cameras", options.camera)] if options.camera else list(cell.cameras)
@@ -77,7 +77,7 @@ def start(node: ServiceNode, options: flags.Options) -> None:
 
     def on_frame(message: Frame, names: dict[str, str]) -> None:
         known = frames[names["camera"]]
-        frames[names["camera"]] = (*known, message)[-FRAMES_KEPT:]  # a new one each time: `on_mask` may be in the old one
+        frames[names["camera"]] = (*known, message)[-FRAMES_KEPT:]  # a new tuple: `on_mask` may be reading the old one
 
     def on_joints(message: Joints, names: dict[str, str]) -> None:
         joints.add(names["robot"], message.stamp_ns, message.position)

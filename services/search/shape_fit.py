@@ -1,11 +1,11 @@
-"""The fit of a limb that is not quite the mesh.
+"""Fits a limb that is not quite the mesh.
 
-A person's forearm has muscles, sleeves and measures of its own. Its contour lies millimetres beside the mesh's, which from nearby
-are several pixels: more than a mask errs, and more than an edge in the image may be off. So where no pose of the mesh explains
-the mask, the difference is taken for the shape's. The surface is off the mesh's by `Fit.shape`, a standard deviation that follows
-from the offsets left, and errs together over BULGE along the limb, on either side in slow waves, by a size that is not this
-person's, and by a hand that is bent as a whole. All of this is in the covariance: without a girth there is no sure distance, but
-the limb's direction and its place in the picture are known as well as ever.
+A person's forearm has its own muscles, sleeves and dimensions. Its contour lies millimetres beside the mesh's, which at close
+range are several pixels: more than the error of a mask, and more than an edge in the image may be off. So if no pose of the mesh
+explains the mask, the difference is attributed to the shape. The surface deviates from the mesh's by `Fit.shape`, a standard
+deviation that follows from the remaining offsets. Its errors are shared over the length BULGE along the limb, on either side in
+slow waves, by a size that is not this person's, and by a hand that is bent as a whole. All of this is in the covariance: without
+a girth the distance is not certain, but the limb's direction and its place in the picture are known as well as before.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ from penumbra.shared.geometry.rigid import Array
 REACH, HUBER = 3.0, 2.0
 """Reach of the walk and Huber's threshold, in standard deviations of the contour."""
 FARTHEST = 24.0
-"""The longest walk [px]: beyond it lie other things."""
+"""Maximum length of the walk [px]: other things lie beyond it."""
 BULGE = 0.04
-"""Length along a limb over which its surface errs together [m]: of a muscle's belly, of a fold of a sleeve."""
+"""Length [m] along a limb over which its surface shares its error: that of a muscle's belly, or of a fold of a sleeve."""
 UNLIKE = 2.0
-"""Factor on the standard deviations that follow from all this: people differ from the mesh in more ways. Without it, of 57 people
-with exact masks and bent hands (0.8 m, found without a prediction) distance, place across the line of sight and tilt have an RMS
-of 2.2, 2.0 and 2.6 standard deviations."""
+"""Factor on the resulting standard deviations: people differ from the mesh in more ways. Without it, the errors of distance,
+place across the line of sight and tilt of 57 people with exact masks and bent hands (0.8 m, found without a prediction) have an
+RMS of 2.2, 2.0 and 2.6 standard deviations."""
 ROUNDS = 4
-"""Number of times that shape and pose are estimated in turn."""
+"""Number of rounds, each of which estimates the pose and then the shape."""
 
 
 def fit_shape(
@@ -59,9 +59,9 @@ def fit_shape(
     noise: Noise | None = None,
     limits: Limits | None = None,
 ) -> Fit:
-    """The pose near `first` of a limb whose surface is not the mesh's, with the size of the difference.
+    """The pose near `first` of a limb whose surface differs from the mesh's, with the size of the difference.
 
-    `prior` (6, 6): information about T_prior (4 x 4) along the camera's axes, taken out of the result again as by `mask_fit.fit`;
+    `prior` (6, 6): information about T_prior (4 x 4) along the camera's axes, removed from the result as by `mask_fit.fit`;
     size_spread (2,): standard deviations of log length and log girth about the mesh's.
     """
     noise, limits = noise or Noise(), limits or Limits()
@@ -108,20 +108,20 @@ def fit_shape(
 
 
 def _measured_px(here: Pass, wrist: float, hand: float) -> float:
-    """The length of the contour that was measured [px], a bent hand's as well: it says little of the pose, but shows a limb."""
+    """The length of the measured contour [px], a bent hand included: that says little about the pose, but shows a limb."""
     return float(np.sum(_lengths(here, wrist, hand)[0] * (here.kind == MEASURED)))
 
 
 def _lengths(here: Pass, wrist: float, hand: float) -> tuple[Array, NDArray[np.bool_]]:
-    """The length of contour that each point stands for [px], and whether it lies beyond the wrist."""
+    """The length of contour [px] that each point represents, and whether it lies beyond the wrist."""
     beyond = (here.points["position"] - here.T[:3, 3]) @ here.T[:3, 0] > wrist
     return here.points["length"] * np.where(beyond, hand**2, 1.0), beyond
 
 
 def _spreads(here: Pass, wrist: float, hand: float, least: float, huber: float) -> tuple[float, float]:
-    """The standard deviation [px] of the offsets of the forearm's contour, at least `least`, and how many times that of the
-    hand's is; where hardly any of the forearm shows, that of both and 1. An offset beyond Huber's threshold counts by its
-    distance."""
+    """The standard deviation [px] of the offsets of the forearm's contour, at least `least`, and the ratio of the hand's to it;
+    if hardly any of the forearm is visible, the standard deviation of both, and 1. An offset beyond Huber's threshold counts
+    linearly."""
     length, beyond = _lengths(here, wrist, hand)
     length = np.where(here.kind == DROPPED, 0.0, length)
     r = np.abs(here.r)

@@ -1,8 +1,8 @@
 """First poses of a forearm from landmarks in the picture: elbow, wrist and knuckles.
 
-For a target that is lost, beside the hypotheses of `detect.py`, which know its mask alone. The hand hangs on the forearm by a
-wrist with two angles, as a bent one would pull the forearm aside. A forearm that points to the camera and one that points away
-look the same but for perspective: both are returned.
+They are used for a lost target, beside the hypotheses of `detect.py`, which know only its mask. The hand is attached by a
+wrist with two angles, as a bent hand would otherwise pull the forearm aside. A forearm that points to the camera and one that
+points away look the same except for perspective: both are returned.
 """
 
 from __future__ import annotations
@@ -20,36 +20,36 @@ from penumbra.shared.perception.limbs import KNUCKLES, Limb
 TO_KNUCKLES = 0.47
 """Distance of the knuckles from the wrist as a share of the hand's length."""
 ACROSS = (0.36, 0.12, -0.12, -0.36)
-"""Where the knuckles of index to little finger lie across the hand, in breadths, towards the thumb."""
+"""Positions of the knuckles from index to little finger across the hand, in breadths of the hand, towards the thumb."""
 ELBOW, WRIST, KNUCKLE = 0.35, 0.12, 0.1
-"""Standard deviations of the landmarks, in distances from the wrist to the knuckles: measured on photographs, the elbow's by the
-body's model, the others by the hand's; the rest is what bodies differ by."""
+"""Standard deviations of the landmarks, in distances from the wrist to the knuckles: measured on photographs, the elbow's with
+the body's model, the others with the hand's; the rest is the variation of bodies."""
 BENT = np.array([0.35, 0.2])
-"""Standard deviations of the wrist's angles [rad]: up and down, and to the sides."""
+"""Standard deviations of the wrist's angles [rad]: up and down, and sideways."""
 ABOUT_Y, ABOUT_Z = np.array([[[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], float)
-"""Cross products with the axes of the wrist: derivatives of a rotation about them."""
+"""Cross-product matrices of the wrist's axes, for the derivatives of rotations about them."""
 TURNS = 4
-"""Rolls from which the fit begins."""
+"""Number of rolls from which the fit begins."""
 PASSES, CONVERGED = 12, 5e-3
-"""Largest number of passes of a fit, and the step [m, rad] below which one is the last."""
+"""Maximum number of passes of a fit, and the step [m, rad] below which a pass is the last."""
 DAMPING = (1e-2, 10.0)
-"""Marquardt's factor at the start, and its change after a pass that gained or lost."""
+"""Marquardt's factor at the start, and its change after a pass that lowered the cost or did not."""
 NEAR_M = 0.05
-"""Points nearer to the camera than this are projected as if they were so far away."""
+"""Minimum depth [m] in projections: nearer points are projected as if they were at this depth."""
 FAR_RAD, FAR = 0.3, 0.05
-"""Poses are two where they differ by so much in direction, or so much of their distance from the camera."""
+"""Differences of distinct poses: in rotation [rad], or in position as a share of the distance from the camera."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """A pose of the forearm T_camera_target (4, 4) and how badly it fits the landmarks, in standard deviations (RMS)."""
+    """A pose of the forearm T_camera_target (4, 4) and its misfit to the landmarks, in standard deviations (RMS)."""
 
     T: Array
     misfit: float
 
 
 def body_of(target: Target, body: Body) -> Body | None:
-    """The measures of the limb that a target's mesh is; None where that is a user's own mesh, whose elbow and wrist are not
+    """The dimensions of the limb that a target's mesh represents; None for a user's own mesh, whose elbow and wrist are not
     known."""
     if target.mesh != "body:forearm":
         return None
@@ -66,8 +66,8 @@ def body_of(target: Target, body: Body) -> Body | None:
 
 
 def starts(limb: Limb, camera: Camera, body: Body) -> list[Start]:
-    """Poses of a body's forearm that would look like this limb in the undistorted picture, best first; none where its landmarks
-    are no hand. Of a left arm its mirror image is found, the thumb where it is: the mesh is a right one."""
+    """Poses of a body's forearm that would look like this limb in the undistorted picture, best first; none if its landmarks are
+    no hand. For a left arm, its mirror image is found, with the thumb in its place: the mesh is a right arm."""
     problem = _Problem.of(limb, camera, body)
     if problem is None:
         return []
@@ -79,7 +79,7 @@ def starts(limb: Limb, camera: Camera, body: Body) -> list[Start]:
 
 
 def _first(limb: Limb, camera: Camera, body: Body, size: float) -> list[Array]:
-    """Rough poses from which to fit: the limb's direction in the picture, tilted to the camera and away, turned about itself."""
+    """Rough poses from which to fit: the limb's direction in the picture, tilted to the camera and away, at TURNS rolls."""
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     wrist = limb.points[0]
     depth = float(focal.mean()) * TO_KNUCKLES * body.hand_length / size
@@ -104,8 +104,8 @@ def _first(limb: Limb, camera: Camera, body: Body, size: float) -> list[Array]:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Landmarks (n, 2) [px] with their standard deviations (n, 1) [px]: wrist, knuckles and the elbow where it is known. size: of
-    the hand [px], from wrist to knuckles; half: of the forearm's length [m]; knuckles (4, 3) in the hand's frame [m]."""
+    """Landmarks (n, 2) [px] with their standard deviations (n, 1) [px]: wrist, knuckles and, if known, the elbow. size: of the
+    hand [px], from wrist to knuckles; half: half the forearm's length [m]; knuckles (4, 3) in the hand's frame [m]."""
 
     points: Array
     sigma: Array
@@ -130,8 +130,8 @@ class _Problem:
         return cls(np.vstack(points), size * np.array(sigma)[:, None], size, body.forearm_length / 2.0, there, focal, centre)
 
     def fitted(self, T: Array) -> Start:
-        """The pose near T that fits the landmarks best, by Levenberg and Marquardt; an outlier counts by its distance, not by
-        its square (weights of the smooth L1 loss)."""
+        """The pose near T that fits the landmarks best, by Levenberg-Marquardt; an outlier counts linearly and not by its square
+        (weights of the smooth L1 loss)."""
         angles, damping = np.zeros(2), DAMPING[0]
         r, J = self._residuals(T, angles)
         for _ in range(PASSES):
@@ -149,7 +149,7 @@ class _Problem:
         return Start(T, float(np.sqrt(_cost(r) / self.points.size)))
 
     def _residuals(self, T: Array, angles: Array) -> tuple[Array, Array]:
-        """Offsets of the projected landmarks and of the wrist's angles (2,) from rest, in standard deviations (m,), and their
+        """Offsets of the projected landmarks, and of the wrist's angles (2,) from rest, in standard deviations (m,), and their
         derivatives (m, 8) by pose error and angles."""
         about_y, about_z = rigid.rotation((0.0, angles[0], 0.0)), rigid.rotation((0.0, 0.0, angles[1]))
         bent = self.knuckles @ (about_z @ about_y).T

@@ -1,4 +1,4 @@
-"""The search of one target in the masks of one camera: evidence, fit, judgement, and the way back after a loss."""
+"""The search for one target in the masks of one camera: evidence, fit, verdict, and recovery after a loss."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ METHODS = ("default", "paper")
 
 @dataclass(frozen=True)
 class Searched(VisionEstimate):
-    """`T_searched`: the most probable pose together with the prediction."""
+    """`T_searched`: the most probable pose, given the measurement and the prediction."""
 
     T_searched: Array
 
@@ -62,7 +62,7 @@ class Search:
         self._detected_ns: int | None = None
         self._last: tuple[int, Array] | None = None  # stamp and T_camera_target of the last picture in which it was tracked
         self._rivals = Rivals(self._limits)
-        self._has_other_shape = False  # than the mesh: as the last pose that was tracked says
+        self._has_other_shape = False  # than the mesh, in the last picture in which it was tracked
         self._sharp = 0  # pictures that showed the mesh, less those in which the target was lost since
 
     def prepare(self) -> None:
@@ -86,11 +86,11 @@ class Search:
         image: NDArray[np.uint8] | None = None,
         starts: Sequence[Array] = (),
     ) -> Searched:
-        """What a mask, and the image it is of, say about the target's pose.
+        """The estimate of the target's pose from a mask and its image.
 
-        T_prior (4 x 4): the predicted T_world_target, None where nothing is known; `prior_covariance` (6, 6) along the world's
-        axes; `joints` (n,) [rad] by robot, to know exactly what the robots hide; `image` (h, w, 3) uint8 RGB: without it the mask
-        alone is used; starts (4 x 4 each): first poses T_camera_target for a target that is lost, from elsewhere than the mask.
+        T_prior (4 x 4): the predicted T_world_target, None if unknown; `prior_covariance` (6, 6) along the world's axes; `joints`
+        (n,) [rad] by robot, for the exact occlusion by robots; `image` (h, w, 3) uint8 RGB: without it only the mask is used;
+        starts (4 x 4 each): first poses T_camera_target for a lost target, from another source than the mask.
 
         Raises ValueError for a mask or an image that cannot be this camera's.
         """
@@ -134,8 +134,8 @@ class Search:
         image: NDArray[np.uint8] | None,
         starts: Sequence[Array],
     ) -> tuple[Evidence, Fit] | None:
-        """The pose found elsewhere than at the prediction where that is better than the one `tracked` from there, if any: where
-        the last pictures showed the target, at one of the starts, or anywhere in the mask."""
+        """The pose found elsewhere than at the prediction, if it is better than `tracked`, the pose found there: near the last
+        tracked pose, at one of the starts, or anywhere in the mask."""
         other = None
         if self._last is not None and 0 < mask.stamp_ns - self._last[0] < self.settings.recent_ns:
             seen, found = self._near(mask, self._last[1], T_start, joints)
@@ -159,9 +159,9 @@ class Search:
         joints: Mapping[str, Array] | None,
         image: NDArray[np.uint8] | None,
     ) -> tuple[Evidence, Fit, bool]:
-        """The pose near the prediction, and whether no other need be looked for. The fit to the mask is rough where an image
-        comes after it; what the image does not confirm is tried again from mirror images, and behind an unknown occluder. A limb
-        that was of another shape than the mesh still is."""
+        """The pose near the prediction, and whether no other needs to be searched for. The fit to the mask is rough if an image
+        follows. A pose that the image does not confirm is fitted again from mirror images, and behind an unknown occluder. A limb
+        that had another shape than the mesh is assumed to keep it."""
         seen = self._gather(mask, T_start, joints, limb=T_start)
         prior = self._regularising(prior_covariance)
         first = self._fit(seen, T_start, T_start, prior, CONVERGED if image is None else ROUGH)
@@ -182,7 +182,7 @@ class Search:
     def _among_rivals(
         self, seen: Evidence, best: Fit, stamp_ns: int, image: NDArray[np.uint8] | None, T_prior: Array, prior: Array
     ) -> Fit:
-        """The pose that image and prediction show, or its rival's. prior: information (6, 6) about T_prior."""
+        """The pose that image and prediction prefer: `best` or a rival. prior: information (6, 6) about T_prior."""
         if image is None or not best.sharp:
             self._rivals.forget()
             return best
@@ -196,7 +196,7 @@ class Search:
     def _behind_unknown(
         self, seen: Evidence, labels: NDArray[np.uint8], T_start: Array, prior: Array, image: NDArray[np.uint8]
     ) -> tuple[Evidence, Fit] | None:
-        """The pose if what hides the target is no occluder to the mask, where the image confirms it."""
+        """The pose behind something that the mask does not label as an occluder; None if the image does not confirm it."""
         state = seen.state.copy()
         predicted = self._model.silhouette(T_start, seen.intrinsics, (0, 0, *state.shape[::-1]))
         evidence.cover_unexplained(state, predicted)
@@ -205,7 +205,7 @@ class Search:
         return (less, closer) if closer.sharp else None
 
     def _closer(self, seen: Evidence, found: Fit, T_prior: Array, prior: Array, image: NDArray[np.uint8] | None) -> Fit:
-        """A fit, or where the image shows edges at a pose near it, that pose."""
+        """The fit refined on the image if that shows edges along the contour; else the fit itself."""
         if image is None or seen.seen_px < detect.SMALLEST_PX:
             return found
         closer = fit_image(self._model, found, image, seen, T_prior, prior)
@@ -216,7 +216,7 @@ class Search:
         return closer if closer.sharp and closer.overlap >= least_overlap(is_expected, self.settings) else found
 
     def _gather(self, mask: Mask, T: Array, joints: Mapping[str, Array] | None, limb: Array | None = None) -> Evidence:
-        """`limb`: T_camera_target of the limb, where it is known; beyond its near end the mask is not used."""
+        """The evidence of a mask. `limb`: T_camera_target of the limb, if known; beyond its near end the mask is not used."""
         k = Intrinsics.of_window(self._camera, mask.x0, mask.y0, mask.scale)
         depth = self._robots.render(joints, k, mask.labels.shape) if joints else None
         z = self._model.in_camera(T)[:, 2]
@@ -243,14 +243,14 @@ class Search:
         return np.asarray(np.linalg.inv(self.settings.prior_inflation**2 * covariance + floor), np.float64)
 
     def _settled(self, seen: Evidence, first: Fit, T_prior: Array, prior: Array) -> Fit:
-        """A fit, or where it is bad a better one beside it: the error is mostly in the roll, or in the tilt's sign."""
+        """The fit, or, if it is bad, the best of fits beside it: the error is mostly in the roll, or in the sign of the tilt."""
         if seen.seen_px < detect.SMALLEST_PX or first.misfit <= MISFIT:
             return first
         beside = [self._fit(seen, T, T_prior, prior) for T in detect.mirrored(first.T_searched)]
         return min((first, *beside), key=lambda found: found.cost)
 
     def _is_better(self, other: Fit, first: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
-        """Whether another pose explains the mask better, and the prediction allows it or itself fails."""
+        """Whether another pose explains the mask better, and either the prediction allows it or the first one fails."""
         if other.overlap <= max(first.overlap, self.settings.fits):
             return False
         covariance, floor = self._predicted(prior_covariance)
@@ -259,7 +259,7 @@ class Search:
         return bool(first.overlap < self.settings.fits or distance < self.settings.gate)
 
     def _is_expected(self, found: Fit, T_start: Array, prior_covariance: Array | None) -> bool:
-        """Whether the prediction is sure, and the pose found is where it says."""
+        """Whether the prediction is sure and agrees with the pose found."""
         covariance, floor = self._predicted(prior_covariance)
         distance = float(np.linalg.norm(T_start[:3, 3]))
         sight = T_start[:3, 3] / distance
@@ -272,8 +272,8 @@ class Search:
         return bool(error @ np.linalg.solve(uncertain, error) < self.settings.expected)
 
     def _with_mirror(self, seen: Evidence, first: Fit, T_start: Array, prior: Array) -> Fit:
-        """The first fit, from the prediction, and that from its mirror image where both may be right: an axis nearly parallel
-        to the image looks the same tilted either way. Merged by their likelihoods, so that the covariance covers both."""
+        """The fit from the prediction, merged with the fit from its mirror image if both may be right: an axis nearly parallel to
+        the image looks the same tilted either way. They are merged by likelihood, so that the covariance covers both."""
         T_mirror = detect.mirrored(first.T_searched)[0]
         away = rigid.pose_error(T_mirror, T_start)
         if first.overlap < self.settings.fits or (first.misfit < GOOD and away @ prior @ away > self.settings.gate):
@@ -289,7 +289,7 @@ class Search:
         return replace(first, T=rigid.perturb(first.T, share * apart), covariance=covariance)
 
     def _is_detection_due(self, stamp_ns: int, case: str, is_news: bool) -> bool:
-        """is_news: there is something that the last one did not know."""
+        """Whether to detect now. is_news: there are new starts."""
         early = self._detected_ns is not None and 0 < stamp_ns - self._detected_ns < self.settings.detect_every_ns[case]
         if early and not is_news:
             return False
@@ -299,8 +299,8 @@ class Search:
     def _detect(
         self, mask: Mask, T_home: Array, joints: Mapping[str, Array] | None, starts: Sequence[Array]
     ) -> tuple[Evidence, Fit] | None:
-        """The target anywhere in the mask, not too far from home: the pose that explains most of the first region it fits, found
-        from one of the starts or from the mask's shape."""
+        """Finds the target anywhere in the mask, not too far from home: the pose that explains most of the first region that it
+        fits, found from one of the starts or from the mask's shape."""
         information, best, most = self._home_information, None, (False, 0.0)
         reach_px = self._reach * self._camera.fx / mask.scale / max(T_home[2, 3], contour.NEAR)
         for window, pieces in detect.regions(mask, self._target.label_values, reach_px):
@@ -326,7 +326,7 @@ class Search:
     def _first_poses(
         self, whole: Evidence, pieces: Sequence[Mask], T_home: Array, joints: Mapping[str, Array] | None, starts: Sequence[Array]
     ) -> Iterator[Array]:
-        """Poses from which to fit a region: of the starts those that overlap best, and the best of each of its pieces."""
+        """Poses from which a region is fitted: the starts with the largest overlap, and the best one of each of its pieces."""
         overlaps = [(self._overlap(whole, T), T) for T in starts]
         near = sorted((pair for pair in overlaps if pair[0] > self.settings.start_overlap), key=lambda pair: -pair[0])
         yield from (T for _, T in near[: self.settings.detect_fits])
@@ -368,8 +368,8 @@ class Search:
     def _judge(
         self, seen: Evidence, best: Fit, with_image: bool, T_prior: Array | None, prior_covariance: Array | None
     ) -> Searched:
-        """The estimate of a fit; `with_image`: an image was there to confirm it; T_prior: T_camera_target as predicted, None
-        where nothing is known."""
+        """The estimate from a fit; `with_image`: whether there was an image to confirm it; T_prior: predicted T_camera_target,
+        None if unknown."""
         may_differ = self._sharp < self.settings.shape_known[0] and seen.seen_px >= detect.SMALLEST_PX
         if may_differ and best.shape is None and not best.sharp and best.misfit > MISFIT:
             if T_prior is None:
@@ -397,7 +397,7 @@ class Search:
         return self._estimate(best.T_searched, self._limits.covariance, best.overlap, found.hidden, state, best.T_searched)
 
     def _shaped(self, seen: Evidence, found: Fit, T_prior: Array, prior: Array) -> Fit:
-        """The fit of a limb whose shape is not quite the mesh's."""
+        """Fits a limb whose shape is not quite the mesh's."""
         spread = anatomy.SIZE_SPREAD if self._target.size is None else anatomy.SIZE_MEASURED
 
         def near(T: Array, T_prior: Array, prior: Array) -> Fit:
@@ -423,7 +423,7 @@ class Search:
         )
 
     def _amodal_px(self, T: Array, k: Intrinsics) -> int:
-        """Pixels of the whole silhouette, whatever covers it and wherever the window ends."""
+        """Number of pixels of the whole silhouette, also where it is covered or outside the window."""
         V = self._model.in_camera(T)
         if V[:, 2].min() < contour.NEAR:
             return 0
@@ -433,9 +433,9 @@ class Search:
         return int(np.count_nonzero(self._model.silhouette(T, k, window)))
 
     def _paper(self, seen: Evidence, T_start: Array) -> Searched:
-        """The paper's ascent from the prediction. The paper does not say what follows a loss, but its errors imply that the limb
-        is found again: an ascent that ends elsewhere than the mask is repeated from poses that could have made the mask."""
-        if seen.seen_px < detect.SMALLEST_PX:  # f_m is then greatest where the silhouette leaves the picture
+        """The paper's ascent from the prediction. The paper does not describe what follows a loss, but its errors imply that the
+        limb is found again: an ascent that ends away from the mask is repeated from poses that may have produced the mask."""
+        if seen.seen_px < detect.SMALLEST_PX:  # f_m would then be largest where the silhouette leaves the picture
             return self._lost(T_start)
         mask, k, fails = seen.state == TARGET, seen.intrinsics, self.settings.paper_fails
         T, value = paper_search.ascend(self._model, T_start, mask, k)
@@ -462,7 +462,7 @@ class Search:
 
 
 def _surprise(T_prior: Array, prior: Array) -> Callable[[Fit], float]:
-    """What gives a pose's squared Mahalanobis distance from a prediction T_prior (4 x 4) with its information (6, 6)."""
+    """Function that gives a pose's squared Mahalanobis distance from a prediction T_prior (4 x 4) with its information (6, 6)."""
 
     def distance(found: Fit) -> float:
         away = rigid.pose_error(found.T, T_prior)

@@ -10,7 +10,7 @@ from penumbra.shared.perception.vision import State
 
 
 class Verdict(Enum):
-    """The cases. `state`: what is published; `reason`: in words."""
+    """The cases. `state`: the published state; `reason`: the explanation."""
 
     RIGHT = "tracking", "mask, and image where the limb is the mesh and there is one, confirm the pose"
     COVERED = "occluded", "too little is visible, and most of the target is covered or outside the picture"
@@ -25,10 +25,10 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Findings:
-    """What is known of a fitted pose before it is judged. overlap, misfit, is_sharp, shape, points: as of `mask_fit.Fit`; hidden:
-    share of the silhouette in [0, 1] that the mask does not show; covered: share that something covers, or that lies outside the
-    window; has_image: whether an image was there to confirm the pose; is_expected: whether a sure prediction says that the target
-    is there, and it is not just now that it is of another shape than the mesh."""
+    """Properties by which a fitted pose is judged. overlap, misfit, is_sharp, shape, points: as of `mask_fit.Fit`; hidden: share
+    of the silhouette in [0, 1] that the mask does not show; covered: share that is covered or outside the window; has_image:
+    whether there was an image to confirm the pose; is_expected: whether a sure prediction agrees with the pose, and its shape, if
+    not the mesh's, is not new."""
 
     overlap: float
     misfit: float
@@ -42,7 +42,7 @@ class Findings:
 
 
 def verdict(found: Findings, settings: SearchSettings) -> Verdict:
-    """Judges a fitted pose. A small piece of a target is accepted only where a sure prediction expects it."""
+    """Judges a fitted pose. A small piece of a target is accepted only if a sure prediction expects it."""
     largest_hidden = settings.hidden if found.is_expected else settings.recognised
     least_points = settings.least_points if found.is_expected else settings.recognised_points
     if found.hidden > largest_hidden or found.points < least_points:
@@ -61,7 +61,7 @@ def verdict(found: Findings, settings: SearchSettings) -> Verdict:
 
 
 def least_overlap(is_confirmed: bool, settings: SearchSettings) -> float:
-    """The least overlap of a right pose. is_confirmed: the image confirms the pose where a sure prediction expects it."""
+    """The minimum overlap of a right pose. is_confirmed: whether the image confirms the pose and a sure prediction expects it."""
     return settings.fits_expected if is_confirmed else settings.fits
 
 
