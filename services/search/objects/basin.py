@@ -1,12 +1,12 @@
-"""The way from a far start to the pose that a mask shows, for masks that are wrong in places.
+"""Finds the pose that a mask shows from a far start, for masks that are wrong in places.
 
-  1. Turn the start about the object's middle to all sides (`starts`), and shift each so that silhouette and mask have the same
-     middle and the same area (`align`).
-  2. A few steps of least squares of contour against boundary each, on a small picture; the best go on (`descend`).
-  3. More steps on the full picture, with ever less said by points that are far off.
-  4. The hypotheses are compared by how many pixels silhouette and mask differ in, and how far those are from the mask's boundary.
+  1. Turn the start about the object's middle in all directions (`starts`), and shift each so that silhouette and mask have the
+     same middle and the same area (`align`).
+  2. Take a few least-squares steps of contour against boundary on a small picture, and go on with the best poses (`descend`).
+  3. Take more steps on the full picture, with less and less weight for points that are far off.
+  4. Compare the hypotheses by the number of pixels in which silhouette and mask differ, and by their distances from the boundary.
 
-The start itself counts as a weak measurement: of poses that explain the mask alike, the nearest to the start is right.
+The start itself counts as a weak measurement: of poses that explain the mask equally well, the nearest to the start is right.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ AXES = 16
 SURVIVORS = (14, 5)
 """Number of hypotheses kept after the alignment, and for the full picture."""
 SAME = (0.01, 0.06)
-"""Hypotheses nearer than this [m, rad] are one."""
+"""Hypotheses nearer than this [m, rad] count as one."""
 NOISE = Noise(edge=2.0, correlation=40.0, dilation=0.7)
 """Errors of a network's mask of any object [px of the image]."""
 FARTHEST_PX = 8.0
-"""Largest distance from the mask's boundary [px of the image] that a pixel counts with: a missing part is one mistake."""
+"""Maximum distance from the mask's boundary [px of the image] with which a pixel counts: a missing part is one mistake."""
 PIECE = 0.2
-"""Least share of the mask that a piece of it has, to be taken for the whole object."""
+"""Share of the mask above which a piece of it is also tried as the whole object."""
 AROUND = 0.5
 """Margin around the mask that is searched, in diagonals of the mask."""
 DAMPING = 0.02
@@ -54,13 +54,13 @@ DAMPING = 0.02
 STILL = (3e-4, 1.5e-3)
 """A step smaller than this [m, rad] is the last."""
 MAX_STEP = np.array([0.08, 0.08, 0.15, 0.3, 0.3, 0.3])
-"""Largest step of a pass [m, rad] for an object a metre away."""
+"""Maximum step of a pass [m, rad] for an object a metre away."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """An object about its own middle: with few triangles for the small picture, and with all; its creases; and its colours for
-    both, None where it has none."""
+    """An object about its own middle: a model with few triangles for the small picture, and one with all; its creases; and its
+    colours for both, None if it has none."""
 
     coarse: Model
     fine: Model
@@ -75,7 +75,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Level:
-    """A mask in a picture whose pixels are `scale` image pixels wide; `distance` (h, w) float32: of each pixel's centre from the
+    """A mask in a picture whose pixels are `scale` image pixels wide; `distance` (h, w) float32: from each pixel's centre to the
     mask's boundary [px of this picture]."""
 
     evidence: Evidence
@@ -88,7 +88,7 @@ class Level:
 
 
 def level(state: NDArray[np.uint8], k: Intrinsics, x0: int, y0: int, scale: int) -> Level:
-    """The state (h, w) of the pixels from (x0, y0) on of an image with intrinsics k, made smaller."""
+    """The state (h, w) of the pixels from (x0, y0) on of an image with intrinsics k, scaled down."""
     if scale > 1:
         h, w = state.shape[0] // scale, state.shape[1] // scale
         cut = state[: h * scale, : w * scale]
@@ -130,7 +130,7 @@ def _difference(state, distance, silhouette, farthest, counts):
 
 @dataclass(frozen=True)
 class Score:
-    """How a pose explains a mask; `cost`: chi^2 of the pixels that differ and of the way from the start."""
+    """How well a pose explains a mask; `cost`: chi^2 of the pixels that differ and of the distance from the start."""
 
     cost: float
     both: int
@@ -144,7 +144,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known beforehand: T_camera_object and the information (6, 6) about it along the camera's axes."""
+    """Prior of a pose: T_camera_object and the information (6, 6) about it along the camera's axes."""
 
     T: Array
     information: Array
@@ -161,13 +161,13 @@ def score(model: Model, at: Level, T: Array, prior: Prior, noise: Noise = NOISE)
     counts = np.empty(3, np.int64)
     total = _difference(at.evidence.state, at.distance, silhouette, FARTHEST_PX / at.scale, counts)
     both, free, covered = counts.tolist()
-    # a contour that is off by r along a length l makes pixels differ whose distances sum up to l r^2 / 2
+    # the distances of the pixels that differ sum up to l r^2 / 2 for a contour that is off by r along a length l
     cost = 2.0 * total * at.scale**3 / (noise.edge**2 * noise.correlation)
     return Score(cost + prior.cost(T), both, at.evidence.seen_px + free, covered)
 
 
 def starts(T: Array, angles: tuple[float, ...] = TURNS, count: int = AXES) -> list[Array]:
-    """The pose T (4 x 4) turned about its origin to all sides, by angles [deg] about so many axes."""
+    """The pose T (4 x 4), and T turned about its origin by angles [deg] about `count` axes in all directions."""
     i = np.arange(count) + 0.5
     z = 1.0 - 2.0 * i / count  # a Fibonacci lattice on the sphere
     angle = np.pi * (1.0 + 5.0**0.5) * i
@@ -181,7 +181,7 @@ Moments = tuple[float, float, float]
 
 
 def regions(at: Level) -> list[Moments]:
-    """The mask, and where it is of several pieces each of the large ones: the others may be another object's."""
+    """The whole mask, and, if it has several pieces, each of the large ones: the others may belong to another object."""
     target = at.evidence.state == TARGET
     count, _, sizes, middles = cv2.connectedComponentsWithStats(target.astype(np.uint8))
     areas = sizes[1:, cv2.CC_STAT_AREA]
@@ -191,7 +191,7 @@ def regions(at: Level) -> list[Moments]:
 
 
 def align(model: Model, at: Level, T: Array, wanted: Moments) -> Array:
-    """The pose shifted so that the silhouette's area and middle are those of a region; what is covered does not count."""
+    """The pose shifted so that the silhouette's area and middle are those of a region; covered pixels do not count."""
     state, k = at.evidence.state, at.evidence.intrinsics
     h, w = at.shape
     for _ in range(2):  # the second time in the right place and of nearly the right size
@@ -224,7 +224,7 @@ class Contour:
     kind: NDArray[np.uint8]
 
     def jacobian(self, T: Array, k: Intrinsics) -> Array:
-        """How the contour moves along its normal (n, 7) [px] by a pose error at T [m, rad] and by the mask's dilation [px]."""
+        """Jacobian (n, 7) of the contour's motion along its normal [px] by a pose error at T [m, rad] and the dilation [px]."""
         position, normal = self.points["position"], self.points["normal"]
         (X, Y, Z), (nx, ny) = position.T, normal.T
         J = np.empty((len(X), 7))
@@ -242,13 +242,13 @@ def contour(model: Model, at: Level, T: Array, reach: float, spacing: float = 2.
 
 
 def robust(r: Array, width: float) -> Array:
-    """Weights (n,) of offsets: those of Cauchy's distribution, for which one far away says nearly nothing."""
+    """Weights (n,) of offsets: those of Cauchy's distribution, by which a distant one counts almost nothing."""
     return 1.0 / (1.0 + np.square(r / width))
 
 
 def information(found: Contour, at: Level, T: Array, width: float, noise: Noise) -> tuple[Array, Array]:
-    """The information (6, 6) about the pose error at T and its right side (6,), of points that count less and less beyond `width`
-    [px of the image]. The mask's dilation is marginalised (Schur complement)."""
+    """The information (6, 6) about the pose error at T and its right side (6,), from points whose weights decrease beyond an
+    offset of `width` [px of the image]. The mask's dilation is marginalised (Schur complement)."""
     weights = found.points["length"] * robust(found.r, width / at.scale) * (found.kind != DROPPED)
     weights *= at.scale**3 / (noise.edge**2 * noise.correlation)
     J = found.jacobian(T, at.evidence.intrinsics)
@@ -259,7 +259,7 @@ def information(found: Contour, at: Level, T: Array, width: float, noise: Noise)
 
 
 def descend(model: Model, at: Level, T: Array, prior: Prior, widths: tuple[float, ...], noise: Noise = NOISE) -> Array:
-    """Steps of least squares, one for each of `widths` [px of the image], beyond which points count less and less."""
+    """Least-squares steps, one for each of `widths` [px of the image], the offset beyond which the points' weights decrease."""
     for width in widths:
         found = contour(model, at, T, max(3.0 * width / at.scale, 4.0))
         H, g = information(found, at, T, width, noise)
@@ -279,14 +279,14 @@ _DIAGONAL = np.diag_indices(6)
 
 @dataclass(frozen=True)
 class Pyramid:
-    """A mask on a small and on the full picture."""
+    """A mask in a small and in the full picture."""
 
     coarse: Level
     fine: Level
 
 
 def pyramid(state: NDArray[np.uint8], k: Intrinsics) -> Pyramid:
-    """`state` (h, w): FREE, TARGET or COVERED for every pixel of an image with intrinsics k. Far from the mask it is left out."""
+    """A mask cropped and scaled. `state` (h, w): FREE, TARGET or COVERED for every pixel of an image with intrinsics k."""
     target = state == TARGET
     rows, columns = np.flatnonzero(target.any(axis=1)), np.flatnonzero(target.any(axis=0))
     size = math.sqrt(np.count_nonzero(target))
@@ -301,8 +301,8 @@ def pyramid(state: NDArray[np.uint8], k: Intrinsics) -> Pyramid:
 COARSE_WIDTHS = (16.0, 12.0, 10.0, 8.0, 8.0)
 MORE_WIDTHS = (8.0, 6.0, 6.0, 5.0, 5.0)
 FINE_WIDTHS = (5.0, 4.0, 4.0, 3.0, 3.0, 3.0)
-"""Widths [px of the image] of the successive steps, see `descend`: on the small picture for all hypotheses, there for the best,
-and on the full picture."""
+"""Widths [px of the image] of the successive steps, see `descend`: for all hypotheses on the small picture, for the best ones
+there, and for those on the full picture."""
 
 
 def search(shape: Shape, masks: Pyramid, prior: Prior, noise: Noise = NOISE) -> list[tuple[Score, Array]]:
@@ -323,7 +323,7 @@ def ranked(model: Model, at: Level, poses: list[Array], prior: Prior, noise: Noi
 
 
 def distinct(ranked: list[tuple[Score, Array]]) -> list[tuple[Score, Array]]:
-    """Those of which none better is near by."""
+    """The poses that have no better one nearby (SAME)."""
     kept: list[tuple[Score, Array]] = []
     for one in ranked:
         errors = [rigid.pose_error(one[1], T) for _, T in kept]

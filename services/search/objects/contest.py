@@ -1,7 +1,7 @@
-"""The hypotheses about an object's pose compete by how well they explain the picture.
+"""Compares hypotheses about an object's pose by how well they explain the picture.
 
-`search` follows those of `region.hypotheses` from small to large pictures and keeps the best of each stage, which
-`settled` brings to their optimum; `follow` has one, a prediction.
+`search` follows those of `region.hypotheses` from small to large pictures, keeps the best of each stage, and brings them to their
+optimum (`settled`); `follow` has one, a prediction.
 """
 
 from __future__ import annotations
@@ -20,42 +20,43 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 
 FIRST, KEPT = 12, (6, 4, 3)
-"""Number of hypotheses that are followed at first, and after each stage."""
+"""Number of hypotheses that are followed at first, and kept after each stage."""
 COLOURED = (60, 8)
-"""Number of hypotheses whose colours are compared with the mesh's where it has some, and of those the number that is followed
-besides."""
+"""Number of hypotheses whose colours are compared with the mesh's, if it has some, and number of those that are followed in
+addition."""
 BY_PAINT = 5.0
-"""Weight of the log-likelihood of the mesh's colours beside what speaks for a contour that is shifted: from 3 to 10, one in
-eleven to one in five of the first hypotheses of simulated things that are then near the truth were not without it."""
+"""Weight of the log-likelihood of the mesh's colours relative to the score of a shifted contour. With 3 to 10, one in eleven to
+one in five of the first hypotheses of simulated objects that are near the truth were not near it without the colours."""
 CONVINCING = 3.0
-"""Log-likelihood of the mesh's colours, 20 to 1, from which they prove a pose."""
+"""Log-likelihood of the mesh's colours from which they prove a pose: 20 to 1."""
 AGAIN = (9.0, 21.0, 33.0), 20
-"""Angles [deg] by which, and number of axes about which the starts are turned to look once more where the best pose is refuted,
-and for a mesh with colours where neither colours nor contour are convincing."""
+"""Angles [deg], and number of axes, by which the starts are turned for a second search: if the best pose is refuted, and, for a
+mesh with colours, if neither colours nor contour are convincing."""
 REFUTED = 0.0
-"""Log-likelihood below which a pose explains the picture less than a contour anywhere else does: it is not the right one, however
-much of its contour happens to lie on edges."""
+"""Log-likelihood below which a pose explains the picture less well than a contour anywhere else: it is wrong, however much of its
+contour happens to lie on edges."""
 SUPPORTED = (0.35, 0.65)
-"""Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful: on photographs right poses
-have 0.7 to 1 where nothing hides the object, and of those far off few have more than 0.6."""
+"""Share of the contour that lies on edges, below which a pose is lost, and below which it is doubtful. On photographs, right
+poses have 0.7 to 1 if nothing hides the object, and few that are far off have more than 0.6."""
 SAME_START = (0.012, 0.2)
-"""Shifted hypotheses nearer than this [m, rad] are one."""
+"""Shifted hypotheses nearer than this [m, rad] count as one."""
 SCORED_PX = 30.0
-"""Length of contour whose offsets count as one in the likelihood of a pose [px]."""
+"""Length of contour [px] whose offsets count as one in the likelihood of a pose."""
 SETTLING = (4,) * 8
-"""Reaches of the last steps [px]. Distance and tilt together hardly change the contour, so each step covers only a small part of
-the way to their optimum."""
+"""Reaches of the lines in the last steps [px]. Distance and tilt together hardly change the contour, so each step covers only a
+small part of the way to their optimum."""
 LEAST_SUPPORT = 0.05
-"""Least likelihood of an offset near none, against that of any: what hides the object makes a few lines wrong, not the pose."""
+"""Minimum likelihood of an offset near zero, relative to that of any offset: an occluder makes a few lines wrong, not the
+pose."""
 SCORING = 7
 """Reach of the lines by which poses are compared [px]."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A pose T_camera_object; `score`: log-likelihood of its contour and colours against any others, with the start; `colours`:
-    that of the colours alone, 0 where the mesh has none; `support`: share of the contour's length that lies on an edge;
-    `length` of contour that is seen [px of the image]; `level`: where it was compared."""
+    """A pose T_camera_object; `score`: log-likelihood of its contour and colours relative to any others, and of the start;
+    `colours`: that of the colours alone, 0 if the mesh has none; `support`: share of the contour's length that lies on an edge;
+    `length`: of the visible contour [px of the image]; `level`: picture in which it was compared."""
 
     T: Array
     score: float
@@ -100,8 +101,8 @@ def search(shape: Shape, window: Window, prior: Prior, reach: float) -> list[Fou
 
 
 def followed(shape: Shape, window: Window, prior: Prior, of_mask: Floats | None, poses: list[Array]) -> list[Found]:
-    """Where hypotheses lead from small to large pictures, best first, with the log-odds of the mask's colours, or, None, with
-    those inside and around each pose's silhouette."""
+    """The poses to which hypotheses lead from small to large pictures, best first, with the log-odds of the mask's colours, or,
+    if None, of those inside and around each pose's silhouette."""
     factors = window.factors
     stages = [(factors[0], shape.coarse, (7, 7, 6, 6), 0.06), (factors[0], shape.coarse, (6, 5), 0.03)]
     stages += [(factor, shape.fine, (7, 6, 5), 0.02) for factor in factors[1:]]
@@ -120,8 +121,8 @@ def followed(shape: Shape, window: Window, prior: Prior, of_mask: Floats | None,
 
 
 def first(shape: Shape, at: Level, found: list[tuple[float, Array]]) -> list[Array]:
-    """The hypotheses that are followed, of all with what speaks for their contours, best first: those of the best contours, and
-    where the mesh has colours those of the best contours and colours together."""
+    """Selects the hypotheses to follow from all with their scores, best first: those with the best contours, and, if the mesh has
+    colours, those with the best contours and colours together."""
     poses = distinct([T for _, T in found], SAME_START, FIRST)
     if at.painted is None:
         return poses
@@ -140,7 +141,7 @@ def settled(shape: Shape, found: list[Found], prior: Prior) -> list[Found]:
 
 
 def distinct(poses: list[Array], same: tuple[float, float], most: int) -> list[Array]:
-    """Those of which none before is nearer than `same` [m, rad], at most so many."""
+    """The poses that have no earlier one nearer than `same` [m, rad], at most `most` of them."""
     kept: list[Array] = []
     for T in poses:
         errors = [rigid.pose_error(T, other) for other in kept]
@@ -152,7 +153,7 @@ def distinct(poses: list[Array], same: tuple[float, float], most: int) -> list[A
 
 
 def follow(shape: Shape, window: Window, table: Floats, prior: Prior) -> Found:
-    """The pose near a prediction, by the log-odds (BINS^3,) of colours that are known."""
+    """The pose near a prediction, by known log-odds (BINS^3,) of the colours."""
     small, large = window.factors[max(len(window.factors) - 2, 0)], window.factors[-1]
     T = descend(shape, shape.coarse, window.level(small, table), prior.T, prior, (7, 6), small == large, near=True)
     at = window.level(large, table)

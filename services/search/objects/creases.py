@@ -1,4 +1,4 @@
-"""The creases of a mesh that are seen inside its silhouette: edges between two faces that are both turned to the camera."""
+"""Visible creases of a mesh inside its silhouette: edges between two faces that both face the camera."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.perception.intrinsics import Intrinsics
 
 SHARP = 0.5
-"""Angle between the faces of a crease [rad] from which it is seen: below it, it may be a facet of a round surface."""
+"""Minimum angle between the faces of a crease [rad]: an edge with a smaller one may belong to a round surface."""
 BEHIND = 0.004
-"""How far behind the surface that the camera sees [m] a point counts as hidden."""
+"""Distance [m] behind the visible surface beyond which a point counts as hidden."""
 BORDER = 2
-"""Points nearer to the picture's border [px] are left out."""
+"""Margin at the picture's border [px] in which points are left out."""
 
 
 class Creases:
@@ -29,8 +29,8 @@ class Creases:
         self._model, self._edges = model, E[turn > SHARP]
 
     def points(self, T: Array, k: Intrinsics, shape: tuple[int, int], spacing: float) -> Points:
-        """Points (n,) of the creases seen at a pose T_camera_object in a picture (h, w), `spacing` [px] apart; their normals are
-        the creases' in the image, to either side."""
+        """Points (n,) of the visible creases at a pose T_camera_object in a picture (h, w), `spacing` [px] apart. Their normals
+        are those of the creases in the image, of either sign."""
         V, F, E = self._model.in_camera(T), self._model.faces, self._edges
         corners = V[F[E[:, 2:]]]  # (n, two faces, three corners, 3)
         away = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])

@@ -1,4 +1,4 @@
-"""Meshes of users: read, checked, repaired and simplified, so that contours can be drawn from them."""
+"""Reads, checks, repairs and simplifies users' meshes, so that contours can be drawn from them."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from penumbra.shared.native import kernel
 Faces = NDArray[np.int32]
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
-"""Metres in a unit."""
+"""Metres per unit."""
 EXTENT = (0.005, 20.0)
-"""Bounds of the largest side [m] of an object: others have a wrong unit."""
+"""Bounds of the largest side [m] of an object: outside them its unit is wrong."""
 MERGE = 1e-6
-"""Vertices nearer than this share of the largest side are one."""
+"""Distance, as a share of the largest side, below which vertices are merged."""
 
 DENSE = 5
-"""Multiple of the wanted number of triangles above which a grid simplifies the mesh first."""
+"""Multiple of the wanted number of triangles above which the mesh is simplified on a grid first."""
 CELL = 0.008
 """Side of the grid's cells, as a share of the largest side: less than a pixel of most pictures."""
 
 
 class ObjectFileError(ValueError):
-    """What a user gave cannot be used; the text says what was expected, what was received and what to do."""
+    """Input of a user that cannot be used; the text says what was expected, what was received and what to do."""
 
 
 def load(path: Path, unit: str) -> tuple[Mesh, Cloud | None]:
-    """The triangle mesh of a file (PLY, STL, OBJ, GLB, OFF) in metres, as it is, and its colours, None where it has none; `unit`
+    """The triangle mesh of a file (PLY, STL, OBJ, GLB, OFF) in metres, not repaired, and its colours, None if it has none; `unit`
     is one of UNITS. Raises ObjectFileError."""
     import trimesh
 
@@ -63,8 +63,8 @@ def load(path: Path, unit: str) -> tuple[Mesh, Cloud | None]:
 
 
 def repaired(mesh: Mesh, most: int) -> Mesh:
-    """The same surface with at most about `most` triangles: coinciding vertices are one, triangles without area and twins are
-    gone, and neighbours turn the same side outwards. Holes stay. Raises ObjectFileError where nothing is left."""
+    """The same surface with at most about `most` triangles. Coinciding vertices are merged, triangles without area and duplicates
+    are removed, and the triangles are oriented outwards. Holes stay. Raises ObjectFileError if nothing is left."""
     vertices, faces = _merged(mesh.vertices, mesh.faces)
     if not len(faces):
         raise ObjectFileError("mesh: expected triangles with an area, got none")
@@ -91,7 +91,7 @@ def _merged(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
 
 
 def _clustered(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
-    """One vertex a cell of a grid, where the planes of its triangles meet best (Lindstrom 2000, doi:10.1145/344779.344912)."""
+    """One vertex per grid cell, where the planes of its triangles meet best (Lindstrom 2000, doi:10.1145/344779.344912)."""
     cell = CELL * float(np.ptp(vertices, axis=0).max())
     key = np.floor((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
     _, index, count = np.unique(key @ np.array([1, 1 << 20, 1 << 40]), return_inverse=True, return_counts=True)
@@ -113,14 +113,14 @@ def _clustered(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
 
 
 def _oriented(vertices: Array, faces: Faces) -> Faces:
-    """The faces, those of each connected part turned alike, and outwards."""
+    """The faces, consistently oriented within each connected part, and outwards."""
     a = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     owner = np.tile(np.arange(len(faces)), 3)
     ends = np.sort(a, axis=1)
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     same = (ends[order[1:]] == ends[order[:-1]]).all(axis=1)
     i, j = order[:-1][same], order[1:][same]
-    # neighbours that are turned alike run along their common edge in opposite directions
+    # consistently oriented neighbours run along their common edge in opposite directions
     differ = (a[i, 0] == a[j, 0]).astype(np.int8)
     part, flip = np.empty(len(faces), np.int64), np.empty(len(faces), np.int8)
     _spread(owner[i], owner[j], differ, part, flip)

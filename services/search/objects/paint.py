@@ -1,13 +1,13 @@
-"""The colours of a mesh against those of the picture inside its silhouette, where the mesh has a texture or coloured vertices.
+"""Compares the colours of a mesh, of its texture or its vertices, with those of the picture inside its silhouette.
 
-Points spread evenly over the surface carry the mesh's colours, smoothed as far as their neighbours (`painted`). At a pose,
-those that the camera sees are compared with the picture, which is smoothed as much. Both are logarithms, so that light is an
+Points spread evenly over the surface have the mesh's colours, smoothed as far as their neighbours (`painted`). At a pose, the
+visible points are compared with the picture, which is smoothed by the same amount. Both are logarithms, so that light is an
 offset: each channel of the picture is fitted by a multiple of the mesh's colour, the direction of the surface (shading) and an
 offset (`compared`).
 
-That says two things. How the offsets between the colours change with the pose gives least squares (`information`), as photometric
-tracking does (Lucas, Kanade 1981). How much better the mesh's colours explain the picture than shading alone is the likelihood
-of the texture's being there against that of any other (`score`); what hides a part makes it wrong only there.
+The comparison has two uses. The derivative of the colour differences by the pose gives least squares (`information`), as in
+photometric tracking (Lucas, Kanade 1981). How much better the mesh's colours explain the picture than shading alone is the
+likelihood that the texture is there, relative to any other (`score`); an occluder makes it wrong only where it hides the object.
 """
 
 from __future__ import annotations
@@ -32,37 +32,37 @@ from penumbra.shared.perception.intrinsics import Intrinsics
 Floats = NDArray[np.float32]
 
 CLOUD = 24_000
-"""Number of points of the surface whose colours are read from a mesh's file."""
+"""Number of points of the surface at which colours are read from a mesh's file."""
 POINTS = (1200, 4000)
-"""Number of points that are compared, in the smallest picture and in larger ones: half of them are seen, 2 to 4 px apart."""
+"""Number of points that are compared, in the smallest picture and in larger ones: half of them are visible, 2 to 4 px apart."""
 SPREAD = 0.6
-"""Standard deviation of the smoothing of colours, in distances of the points."""
+"""Standard deviation of the smoothing of colours, in distances between points."""
 LEAST_CONTRAST = 0.05
-"""Standard deviation of a mesh's colours (logarithm) below which it is of one colour, and says nothing."""
+"""Standard deviation of a mesh's colours (logarithm) below which it counts as of one colour and gives no information."""
 DARK = 16.0
-"""Added to a colour of 0 to 255 before the logarithm: darker ones are noise and reflections."""
+"""Added to a colour of 0 to 255 before the logarithm: darker colours are noise and reflections."""
 SIGMA = 0.15
-"""Least standard deviation of the picture's colours (logarithm) from those that the mesh's explain: highlights, shadows, prints
+"""Minimum standard deviation of the picture's colours (logarithm) from those that the mesh explains: highlights, shadows, prints
 that differ."""
 GAIN = 1.6
-"""Largest contrast of the picture against the mesh's, the least being none: textures are scanned in other light, and fade."""
+"""Maximum contrast of the picture relative to the mesh's; the minimum is zero: textures are scanned in other light, and fade."""
 GRAZING = 0.2
-"""Least cosine between a surface's direction and the line of sight: flatter ones show nothing."""
+"""Minimum cosine of the angle between a surface's normal and the line of sight: flatter surfaces show nothing."""
 EDGE = 2.0
 """Distance from the silhouette's edge within which nothing is compared, in standard deviations of the smoothing."""
 LEAST_SEEN = 1e-3
-"""Share of the points' weight that is added to the normal equations of the light: of directions that no seen surface has."""
+"""Share of the points' weight that is added to the normal equations of the light, for directions that no visible surface has."""
 FEWEST = 40
-"""Least number of points that are compared."""
+"""Minimum number of points that are compared."""
 ROBUST = 0.4
-"""Difference of colours (logarithm) beyond which a point counts less and less: something hides it."""
+"""Difference of colours (logarithm) beyond which a point's weight decreases: something hides it."""
 FITS = 2
-"""Number of fits of the light, each with the weights of the one before."""
+"""Number of fits of the light, each with weights from the one before."""
 HIDDEN = 0.05
-"""Least likelihood of a point's colour, against that of any: it may be hidden."""
+"""Minimum likelihood of a point's colour, relative to that of any: it may be hidden."""
 PATCH = 20.0
-"""Number of points whose colours' differences err together: smoothing joins 4 or 5 of them (4 pi SPREAD^2), and highlights,
-shadows and errors of the texture's place more."""
+"""Number of points whose colour differences share their error: smoothing joins 4 or 5 of them (4 pi SPREAD^2); highlights,
+shadows and errors of the texture's place join more."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Paint:
-    """Points (n, 3) [m] of a surface, their outward normals (n, 3) and colours (n, 3), logarithms smoothed by `spread` [m]."""
+    """Points (n, 3) [m] of a surface, their outward normals (n, 3) and colours (n, 3): logarithms smoothed by `spread` [m]."""
 
     points: Array
     normals: Array
@@ -84,7 +84,7 @@ class Paint:
 
 
 def cloud(mesh: Any) -> Cloud | None:
-    """The coloured points of a trimesh.Trimesh; None where it has no colours."""
+    """The coloured points of a trimesh.Trimesh; None if it has no colours."""
     visual, faces = mesh.visual, np.asarray(mesh.faces)
     vertices = np.asarray(mesh.vertices, np.float64)
     points, face, weights = spread_over(vertices, faces, CLOUD)
@@ -108,7 +108,7 @@ def _image(material: Any) -> NDArray[np.uint8] | None:
 
 
 def spread_over(vertices: Array, faces: NDArray[np.integer[Any]], count: int) -> tuple[Array, NDArray[np.int64], Array]:
-    """Points (count, 3) spread evenly over a mesh, the face (count,) and the weights (count, 3) of its corners for each."""
+    """Points (count, 3) spread evenly over a mesh, with the face (count,) and the weights (count, 3) of its corners per point."""
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     ends = np.cumsum(area)
@@ -122,7 +122,7 @@ def spread_over(vertices: Array, faces: NDArray[np.integer[Any]], count: int) ->
 
 
 def painted(mesh: Mesh, found: Cloud) -> tuple[Paint, Paint] | None:
-    """The points of a mesh whose faces are turned outwards, for POINTS; None where it is of one colour."""
+    """The points of a mesh whose faces are turned outwards, for each of POINTS; None if it is of one colour."""
     tree = cKDTree(found.points)
     corners = mesh.vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -150,8 +150,8 @@ def smoothed(image: NDArray[np.uint8], sigma: float) -> Floats:
 
 @dataclass(frozen=True)
 class Painted:
-    """The paint of a mesh, the smoothed picture (h, w, 3) with intrinsics k that it is compared with, and where something
-    covers that (h, w)."""
+    """The paint of a mesh; the smoothed picture (h, w, 3) with intrinsics k with which it is compared; and `guarded` (h, w),
+    where something covers the picture."""
 
     paint: Paint
     picture: Floats
@@ -161,10 +161,10 @@ class Painted:
 
 @dataclass(frozen=True)
 class Compared:
-    """The points (n,) that are seen at a pose T: `position` and `normal` (n, 3) in the camera's frame, `colours` (n, 3) of the
-    mesh, the picture's `gradient` (n, 3, 2) by the direction of the line of sight, what the mesh's colours leave of the
-    picture's (n, 3), what shading alone leaves of them (n, 3), and the `share` (n,) of an independent patch that each point
-    is."""
+    """The points (n,) that are visible at a pose T: `position` and `normal` (n, 3) in the camera's frame, `colours` (n, 3) of the
+    mesh, `gradient` (n, 3, 2) of the picture by the direction of the line of sight, the residuals of the picture's colours `left`
+    (n, 3) by the mesh's colours and `plain` (n, 3) by shading alone, and the `share` (n,) of an independent patch that each point
+    represents."""
 
     T: Array
     position: Array
@@ -177,7 +177,7 @@ class Compared:
 
     @property
     def score(self) -> float:
-        """Log-likelihood of the mesh's colours against that of any others, over all patches."""
+        """Log-likelihood of the mesh's colours relative to any others, over all patches."""
         return float(_score(self.left, self.plain, self.share, SIGMA, ROBUST, HIDDEN))
 
     @property
@@ -190,7 +190,7 @@ class Compared:
 
 
 def compared(at: Painted, model: Model, T: Array) -> Compared | None:
-    """The colours of mesh and picture at a pose T_camera_object, the model saying what is seen; None where too little is."""
+    """Compares the colours of mesh and picture at a pose T_camera_object; the model gives the visible points. None if too few."""
     paint, k = at.paint, at.k
     P, N = paint.points @ T[:3, :3].T + T[:3, 3], paint.normals @ T[:3, :3].T
     h, w = at.guarded.shape

@@ -1,8 +1,8 @@
-"""One pose of any rigid mesh on any mask or picture (`find_pose`), and a sequence of them (`Tracker`).
+"""Finds the pose of any rigid mesh in a mask or picture (`find_pose`), or in a sequence of them (`Tracker`).
 
 The start counts as a weak measurement beside the mask: a mask that is a few per cent too large says less about the depth than a
-start that is a few centimetres off. The covariance is that of both together. Of a mask alone its noise is measured on the mask
-itself, by how far the contour stays away from its boundary; where there is a picture, the picture decides (`region`).
+start that is a few centimetres off. The covariance is that of both together. For a mask alone, its noise is measured on the mask
+itself, by the distance of the contour from its boundary; if there is a picture, the picture decides (`region`).
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ Bool = NDArray[np.bool_]
 State = Literal["tracking", "occluded", "doubtful", "lost"]
 
 FACES = (800, 4000)
-"""Number of triangles that a mesh is simplified to, for small and for full pictures: finer ones are smaller than a pixel."""
+"""Number of triangles to which a mesh is simplified, for small and for full pictures: finer ones are smaller than a pixel."""
 START = (0.035, 0.4)
-"""Standard deviations [m, rad] of a start, along and about each axis: 6 cm and 40 degrees in all."""
+"""Standard deviations [m, rad] of a start, along and about each axis: 6 cm and 40 degrees in total."""
 SMALLEST_PX = 60
-"""Least number of pixels of a mask that shows a pose."""
+"""Minimum number of pixels of a mask that shows a pose."""
 FITS = 0.75
-"""Overlap below which the object is not where the pose says. At the right pose, masks with an IoU of 0.83 have 0.8."""
+"""Minimum overlap of a right pose. At the right pose, masks with an IoU of 0.83 have 0.8."""
 COVERS = 0.6
-"""Share of the silhouette that is covered, from which a pose that fits is called occluded."""
+"""Share of the silhouette that is covered, above which a pose that fits is called occluded."""
 EDGE_PX = (0.4, 6.0)
 """Bounds of the estimated standard deviation [px] of a mask's boundary."""
 CORRELATION, DILATION = 30.0, 0.35
-"""Length over which a mask's boundary errs together [px], and how much too large or small the mask is [px], for each pixel that
-the boundary errs: fitted to the masks of `penumbra bench objects`."""
+"""Length over which a mask's boundary shares its error [px], and standard deviation of the mask's dilation [px], both per pixel
+of the boundary's standard deviation: fitted to the masks of `penumbra bench objects`."""
 
 
 class RigidObject:
-    """A mesh prepared for contours, about its own middle, and for pictures of its colours where there are some. Raises
+    """A mesh about its own middle, prepared for contours, and for comparisons of its colours if it has some. Raises
     ObjectFileError for a mesh without a surface."""
 
     def __init__(self, mesh: Mesh, colours: Cloud | None = None):
@@ -63,14 +63,14 @@ class RigidObject:
         self._moments = mesh.vertices.T @ mesh.vertices / len(mesh.vertices)
 
     def error(self, covariance: Array, T: Array) -> float:
-        """Root mean square error [m] of the mesh's points by a covariance (6, 6) of T_camera_middle."""
+        """RMS error [m] of the mesh's points by a covariance (6, 6) of T_camera_middle."""
         S = T[:3, :3] @ self._moments @ T[:3, :3].T
         # a rotation vector w moves a point x by w x x: E |w x x|^2 = tr(W (tr(S) 1 - S)), and the middle is at no mean of x
         turned = float(np.trace(covariance[3:, 3:] @ (np.trace(S) * np.eye(3) - S)))
         return math.sqrt(float(np.trace(covariance[:3, :3])) + turned)
 
     def published(self, found: ObjectEstimate) -> ObjectEstimate:
-        """An estimate of the middle's pose, T_camera_middle, as one of the object's own frame."""
+        """Converts an estimate of the middle's pose, T_camera_middle, to one of the object's own frame."""
         x, y, z = found.T[:3, :3] @ self.T_middle_object[:3, 3]
         A = np.eye(6)
         A[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # a rotation vector w moves the origin by w x (x, y, z)
@@ -82,8 +82,8 @@ class RigidObject:
 class ObjectEstimate:
     """T_camera_object, covariance (6, 6) along the camera's axes, overlap in [0, 1] and state.
 
-    The overlap is that of mask and silhouette, without a mask the share of the visible contour that lies on an edge. Doubtful:
-    the most probable pose, that may be off by more than a tenth of the object, as the covariance says.
+    The overlap is that of mask and silhouette; without a mask, it is the share of the visible contour that lies on an edge.
+    Doubtful: the most probable pose, which may be off by more than a tenth of the object, as the covariance says.
     """
 
     T: Array
@@ -93,7 +93,7 @@ class ObjectEstimate:
 
 
 def observed(mask: Bool, occluder: Bool | None = None) -> NDArray[np.uint8]:
-    """The state (h, w) of every pixel, of a mask (h, w) and of what stands in front of the object."""
+    """The state (h, w) of every pixel, from a mask (h, w) and the pixels of occluders."""
     state = np.where(mask, TARGET, FREE).astype(np.uint8)
     if occluder is not None:
         state[occluder] = COVERED
@@ -101,7 +101,7 @@ def observed(mask: Bool, occluder: Bool | None = None) -> NDArray[np.uint8]:
 
 
 def started(rigid: RigidObject, T_start: Array, spread: tuple[float, float] = START) -> Prior:
-    """What a start T_camera_object says, known to `spread` [m, rad] along and about each axis."""
+    """The prior of a start T_camera_object with standard deviations `spread` [m, rad] along and about each axis."""
     return Prior(T_start @ rigid.T_object_middle, np.diag(np.repeat(np.square(spread) ** -1.0, 3)))
 
 
@@ -115,7 +115,7 @@ def find_pose(
     spread: tuple[float, float] = START,
 ) -> ObjectEstimate:
     """The pose of an object in a mask (h, w), in a picture (h, w, 3) uint8 RGB or in both, from a start T_camera_object (4 x 4)
-    that may be 30 degrees and 5 cm off. Raises ValueError where neither is given.
+    that may be 30 degrees and 5 cm off. Raises ValueError if neither is given.
 
     `occluder` (h, w): pixels that show something in front of the object; `spread`: standard deviations [m, rad] of the start
     along and about each axis.
@@ -132,7 +132,7 @@ def find_pose(
 
 
 def judged(shape: Shape, masks: Pyramid, found: list[tuple[Score, Array]], prior: Prior) -> ObjectEstimate:
-    """The estimate of the middle's pose, T_camera_middle, from those that `basin` found, best first."""
+    """The estimate of the middle's pose, T_camera_middle, from the poses that `basin` found, best first."""
     model, at = shape.fine, masks.fine
     noise = measured_noise(model, at, found[0][1])
     widths = (2.0 * noise.edge,) * 4
@@ -147,7 +147,7 @@ def judged(shape: Shape, masks: Pyramid, found: list[tuple[Score, Array]], prior
     errors = [pose_error(other, T) for _, other in found]
     apart = sum((w * np.outer(e, e) for w, e in zip(weights, errors, strict=True)), np.zeros((6, 6)))
     covariance = covariance + apart / weights.sum()
-    if prior.cost(T) > ONE_IN_10_000:  # nothing that the start allows explains the mask
+    if prior.cost(T) > ONE_IN_10_000:  # no pose that the start allows explains the mask
         return _lost(T, best.overlap)
     state = _state(best, contour.points["length"][contour.kind == MEASURED].sum() * at.scale)
     if state == "lost":
@@ -156,7 +156,7 @@ def judged(shape: Shape, masks: Pyramid, found: list[tuple[Score, Array]], prior
 
 
 def measured_noise(model: Model, at: Level, T: Array) -> Noise:
-    """How the mask errs, by what the contour at the right pose leaves."""
+    """The mask's noise, from the contour's remaining offsets at the right pose."""
     found = basin.contour(model, at, T, 3.0 * EDGE_PX[1] / at.scale)
     r = np.abs(found.r[found.kind == MEASURED]) * at.scale
     if not len(r):
@@ -178,17 +178,17 @@ def _lost(T: Array, overlap: float = 0.0) -> ObjectEstimate:
 GAP = 0.015
 """Distance from a good pose's contour within which no colours are learned, as a share of the object's size."""
 MARGIN = 2.0
-"""How far from the start an object is looked for in a picture, in standard deviations of its position."""
+"""Distance from the start within which an object is searched for, in standard deviations of its position."""
 TYPICAL = 0.85
-"""Share of the contour that lies on edges from which the covariance is that of the settings; below, it grows with its fourth
-power."""
+"""Share of the contour on edges from which the covariance is that of the settings; below, it grows with the share's inverse
+fourth power."""
 CERTAIN = 0.06
-"""Root mean square error of the mesh's points by the covariance, as a share of the diameter, above which a pose is doubtful: one
-in ten is then off by more than a tenth, if the error is mostly of one direction, as that of the depth."""
+"""RMS error of the mesh's points by the covariance, as a share of the diameter, above which a pose is doubtful: one in ten is
+then off by more than a tenth, if the error is mostly along one direction, such as the depth."""
 
 
 class _Colours:
-    """Judges poses of an object by pictures of a camera with intrinsics k."""
+    """Judges poses of an object from pictures of a camera with intrinsics k."""
 
     def __init__(self, rigid: RigidObject, k: Intrinsics):
         self._rigid, self._shape, self._k = rigid, rigid.shape, k
@@ -196,7 +196,8 @@ class _Colours:
     def search(
         self, picture: NDArray[np.uint8], mask: Bool | None, occluder: Bool | None, prior: Prior
     ) -> tuple[ObjectEstimate, NDArray[np.float32] | None]:
-        """The estimate of T_camera_middle from far, and the log-odds of the colours there, None where edges hardly support it."""
+        """The estimate of T_camera_middle from a far start, and the log-odds of the colours there; None if edges hardly support
+        it."""
         reach = MARGIN * float(np.sqrt(1.0 / prior.information[0, 0]))
         window = region.Window(
             picture, mask, occluder, self._k, self._shape, prior.T, reach * self._k.fx / max(prior.T[2, 3], NEAR)
@@ -230,9 +231,10 @@ class _Colours:
         return ObjectEstimate(T, covariance, overlap, "occluded" if covered > COVERS else "tracking")
 
     def _posterior(self, found: list[contest.Found], prior: Prior) -> tuple[Array, Array]:
-        """The best pose with the prior, by how exact contours are, and its covariance, with the other poses by likelihood."""
+        """The best pose with the prior, weighted by the accuracy of the contours, and its covariance with the other poses by
+        likelihood."""
         best = found[0]
-        trust = min(1.0, max(best.support, 0.1) / TYPICAL) ** 4  # what hides a part may have pulled the rest along
+        trust = min(1.0, max(best.support, 0.1) / TYPICAL) ** 4  # an occluder may have pulled the rest of the contour along
         colours = best.level.compared(self._shape, best.T) if best.colours > contest.CONVINCING else None
         measured = region.covariance(self._shape, best.level, best.T, trust, colours)
         gain = measured @ np.linalg.inv(measured + np.linalg.inv(prior.information))
@@ -247,21 +249,22 @@ class _Colours:
 FRAME_WIDTHS = (8.0, 6.0, 5.0, 5.0, 5.0)
 """Widths [px] of the steps from the prediction, see `basin.descend`."""
 DROP = 0.12
-"""Decrease of the overlap, against its usual value, from which the surroundings are searched too."""
+"""Decrease of the overlap from its usual value above which the surroundings are searched, too."""
 SMOOTHING = 0.3
 """Weight of the newest frame in the smoothed velocity."""
 LEARNING = 0.1
 """Weight of the newest frame in the colours."""
 UNKNOWN = (0.6, 3.0)
-"""Standard deviations of the change of velocity, [m/s] and [rad/s]; the pose's grow by them with the time bridged."""
+"""Standard deviations of the change of velocity, [m/s] and [rad/s]; those of the pose grow by them with the bridged time."""
 LONGEST_S = 0.3
-"""Time without a sight of the object [s] after which it is looked for no further away than before."""
+"""Time [s] without a sight of the object after which the uncertainty of its pose stops growing."""
 
 
 class Tracker:
-    """A rigid object in a sequence of masks or pictures: each pose starts from the last one, moved on at constant velocity.
+    """Tracks a rigid object in a sequence of masks or pictures: each pose starts from the last one at constant velocity.
 
-    T_start (4 x 4): T_camera_object before the first frame, known to `spread` [m, rad]; `dt_s`: time between frames.
+    T_start (4 x 4): T_camera_object before the first frame, with standard deviations `spread` [m, rad]; `dt_s`: time between
+    frames.
     """
 
     def __init__(
@@ -276,11 +279,11 @@ class Tracker:
         self._colours = _Colours(rigid, k)
         self._table: NDArray[np.float32] | None = None  # log-odds of the colours
         self._usual_support = 0.0
-        self._convinced = False  # whether the mesh's colours have been seen: then they are expected
+        self._convinced = False  # whether the mesh's colours have been seen: from then on they are expected
         self._missed = -1  # frames since the last pose; there was none before the start
 
     def update(self, mask: Bool | None, occluder: Bool | None = None, picture: NDArray[np.uint8] | None = None) -> ObjectEstimate:
-        """The pose in the next frame; arguments as of `find_pose`. Lost, the pose is the last one and the covariance wide."""
+        """The pose in the next frame; arguments as of `find_pose`. If lost, the pose is the last one and the covariance wide."""
         if mask is None and picture is None:
             raise ValueError("Tracker.update: expected a mask, a picture or both, got neither")
         T = perturb(self._T, self._velocity * self._dt)
@@ -338,7 +341,7 @@ class Tracker:
         return found
 
     def _miss(self, found: ObjectEstimate | None, occluder: Bool | None) -> ObjectEstimate:
-        """The object is where it was, as far as is known: covered where something stands there."""
+        """The estimate of an object that is not seen: its last pose, occluded if something covers it, else lost."""
         self._missed = max(self._missed, 0) + 1
         self._velocity = np.zeros(6)
         covered = False

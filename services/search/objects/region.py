@@ -1,16 +1,17 @@
-"""The pose of an object by the colours and edges of a picture around the start, with or without a mask.
+"""Finds the pose of an object from the colours and edges of a picture around the start, with or without a mask.
 
-  1. Learn the colours inside and outside as histograms: from the mask without what is near its boundary, or from where the start
-     lets expect the object. Their log-odds say of each pixel how probably it is the object's (`Window.table`).
-  2. On a small picture, turn the start to all sides, and shift each turned contour to where it lies on edges and between the
+  1. Learn the colours inside and outside as histograms: from the mask without the pixels near its boundary, or from where the
+     start predicts the object. Their log-odds say how probably a pixel is the object's (`Window.table`).
+  2. On a small picture, turn the start in all directions, and shift each turned contour to where it lies on edges and between the
      colours (`hypotheses`).
   3. Least squares over lines across the contour, from small to large pictures (correspondence lines: Stoiber et al. 2022,
      doi:10.1007/s11263-022-01579-8): on each line the log-odds and the strength of the edges give a distribution of the contour's
      offset. Without a mask every hypothesis learns the colours from its own silhouette. Creases count as edges, too.
-  4. The hypotheses compete by the likelihood of the offsets (`contest.py`).
+  4. Compare the hypotheses by the likelihood of the offsets (`contest.py`).
 
-How much larger the contour is than the object in the picture, and how it errs in waves along its direction, by the errors of
-mesh, shadows and picture, is unknown and marginalised (`information`). A mask's boundary itself says nothing within BAND_PX.
+Two errors of the contour are unknown and marginalised (`information`): its dilation relative to the object in the picture, and
+waves along its direction, from errors of mesh, shadows and picture. A mask gives no information within
+BAND_PX of its boundary.
 """
 
 from __future__ import annotations
@@ -38,61 +39,61 @@ Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
 SIZES = (45.0, 90.0, 200.0)
-"""Square root of the silhouette's area [px] in the pictures, which are scaled down by powers of two to about it."""
+"""Square root of the silhouette's area [px] in the pictures, which are scaled down by powers of two to about these sizes."""
 BINS = 16
-"""Bins of a histogram in each of the three colours."""
+"""Number of bins of a histogram per colour channel."""
 LARGEST_ODDS = 3.0
-"""Largest log-odds of a colour: no colour is certain."""
+"""Maximum log-odds of a colour: no colour is certain."""
 MIXED = 0.1
 """Share of both sides' colours that is expected on either side."""
 BAND_PX, MASK_ODDS = 4.0, 1.5
-"""How far a mask's boundary may be off [px of the image], and the log-odds of what lies further inside or outside."""
+"""Maximum error of a mask's boundary [px of the image], and the log-odds of pixels further inside or outside."""
 RING = 0.35
 """Width of the ring around the silhouette in which the outer colours are learned, as a share of its size."""
 ROBUST = (0.7, 0.25)
-"""Offset beyond which a line counts less and less, as a share of its reach: in a search, and near a prediction, where larger ones
-are those of things that hide the object."""
+"""Offset beyond which a line's weight decreases, as a share of its reach: in a search, and near a prediction, where larger
+offsets belong to occluders."""
 SPACING = 2.0
-"""Distance of the lines along the contour [px]."""
+"""Spacing of the lines along the contour [px]."""
 TEMPERATURE = 3.0
 """Number of a line's pixels that count as one: neighbours have the same colour."""
 FLAT, FLAT_INSIDE = 0.15, 0.3
-"""Likelihood of the contour's being where the picture shows no edge, beside that of a strong edge, which is 1; and of creases',
-which are often not seen."""
+"""Likelihood of the contour where the picture shows no edge, relative to that at a strong edge, which is 1; and the same of
+creases, which are often not visible."""
 EDGE, CORRELATION = 0.4, 6.0
-"""Standard deviation that an offset has at least, and length of contour over which offsets err together [px]."""
+"""Minimum standard deviation of an offset, and length of contour over which offsets share their error [px]."""
 DILATION = 1.0
-"""Standard deviation of the contour's being too large or small [px of the image]: meshes and poses of real objects differ from
-their pictures by this much."""
+"""Standard deviation of the contour's dilation [px of the image]: meshes and poses of real objects differ from their pictures by
+this much."""
 HARMONICS, WAVES = 4, 0.3
-"""Number of harmonics of the normal's direction by which the contour, and the creases, err as a whole (waves), and what their
-standard deviation usually is [px of the image]: at poses fitted to 13 photographs, their amplitudes are 0.1 to 0.7 px."""
+"""Number of harmonics of the normal's direction in the common errors (waves) of the contour, and of the creases, and the usual
+standard deviation of the waves [px of the image]: at poses fitted to 13 photographs, their amplitudes are 0.1 to 0.7 px."""
 _DILATION, _WAVES = 6, np.arange(7, 7 + 4 * HARMONICS)
-"""Places of the contour's own errors behind the six of the pose: its dilation, and cosines and sines of the harmonics, for the
+"""Indices of the contour's own errors after the six of the pose: its dilation, and cosines and sines of the harmonics, for the
 contour and for the creases."""
 STIFF = 0.1
 """Usual standard deviation of waves near a prediction [px of the image]: the contour has hardly changed since it was fitted."""
 ASSUMED, ESTIMATES = 1.0, 3
-"""Number of waves that the usual standard deviation counts as where that of a picture is estimated, and passes of that."""
+"""Number of waves as which the usual standard deviation counts in the estimate of a picture's, and iterations of that."""
 DEPTHS = (0.95, 1.0, 1.05)
-"""Distances of the hypotheses, as shares of the start's."""
+"""Distances of the hypotheses, relative to the start's."""
 ANGLES = 8
-"""Number of directions of edges that are kept apart."""
+"""Number of edge directions that are distinguished."""
 STEP = 2
-"""Distance of the shifts that are tried [px of the small picture]."""
+"""Spacing of the shifts that are tried [px of the small picture]."""
 BESIDE = 2.5
 """Distance from the contour at which the colours on both sides are compared [px of the small picture]."""
 BY_EDGE, BY_COLOUR = 0.15, 0.04
-"""Weights of the log-likelihood of edges and of the log-odds of colours for each pixel of a contour that is shifted."""
+"""Weights, per pixel of a shifted contour, of the log-likelihood of edges and of the log-odds of colours."""
 ONTO = 1.0
 """Distance from the contour [px] within which an edge is the contour's."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """A window of the picture whose pixels are `scale` image pixels wide: log-odds (h, w) of being the object's, gradient (h, w,
-    2) of the strongest colour against its typical size, and `guarded` (h, w) uint8 where something covers; what the mesh's
-    colours are compared with, None where it has none."""
+    """A window of the picture whose pixels are `scale` image pixels wide: log-odds (h, w) of being the object's; gradient (h, w,
+    2) of the strongest colour channel, relative to its typical size; `guarded` (h, w) uint8, where something covers; `painted`:
+    picture for the comparison with the mesh's colours, None if it has none."""
 
     odds: Floats
     gradient: Floats
@@ -102,7 +103,7 @@ class Level:
     painted: Painted | None
 
     def compared(self, shape: Shape, T: Array) -> Compared | None:
-        """The colours of mesh and picture at a pose; None where there are none to compare."""
+        """Compares the colours of mesh and picture at a pose; None if there are none to compare."""
         return None if self.painted is None else compared(self.painted, shape.coarse, T)
 
     @property
@@ -112,8 +113,8 @@ class Level:
 
 @dataclass(frozen=True)
 class _Plain:
-    """What a window shows in one size, before colours are learned: `bins` (h, w) of the colours, `prior` (h, w) log-odds and
-    `inside` (h, w), the distance from the mask's boundary in bands, None without one."""
+    """A window at one size, before colours are learned: `bins` (h, w) of the colours, `prior` (h, w): log-odds by the mask, and
+    `inside` (h, w): distance from the mask's boundary in bands; both are None without a mask."""
 
     bins: NDArray[np.int64]
     gradient: Floats
@@ -130,9 +131,9 @@ class _Plain:
 
 
 class Window:
-    """The part of a picture (H, W, 3) in which an object is looked for.
+    """The part of a picture (H, W, 3) in which an object is searched for.
 
-    `mask`, `occluder` (H, W): pixels that show the object, and something in front of it; `margin` [px] around the contour at T.
+    `mask`, `occluder` (H, W): pixels that show the object, and something in front of it; `margin` [px]: around the contour at T.
     """
 
     def __init__(
@@ -155,7 +156,7 @@ class Window:
 
         def cut(image: Bytes) -> Bytes:
             part = np.ascontiguousarray(image[y0 : y0 + h * s, x0 : x0 + w * s])
-            if part.shape[:2] != (h * s, w * s):  # the picture ends before the least window does
+            if part.shape[:2] != (h * s, w * s):  # the picture is smaller than the minimum window
                 return np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
             return part if s == 1 else np.asarray(cv2.resize(part, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
 
@@ -171,7 +172,7 @@ class Window:
         self._plain: dict[int, _Plain] = {}
 
     def plain(self, factor: int) -> _Plain:
-        """The window made smaller by a factor."""
+        """The window scaled down by a factor."""
         if factor not in self._plain:
             self._plain[factor] = self._made(factor)
         return self._plain[factor]
@@ -206,20 +207,20 @@ class Window:
         return _Plain((c[..., 0] * BINS + c[..., 1]) * BINS + c[..., 2], gradient, covered, guarded, k, prior, inside, painted)
 
     def level(self, factor: int, table: Floats) -> Level:
-        """The window made smaller by a factor, with the log-odds (BINS^3,) of the colours."""
+        """The window scaled down by a factor, with the log-odds (BINS^3,) of the colours."""
         at = self.plain(factor)
         n, (h, w) = max(factor // self._learning, 1), at.shape
-        # mixed colours of smaller pictures were not learned: their log-odds are the pixels' mean
+        # smaller pictures mix colours that were not learned together: their log-odds are the mean of the pixels'
         odds = table[self.plain(factor // n).bins[: h * n, : w * n]]
         if n > 1:
             odds = np.asarray(cv2.resize(odds, (w, h), interpolation=cv2.INTER_AREA), np.float32)
         odds = odds if at.prior is None else odds + at.prior
-        # the points are as far apart as a few pixels of the second size: larger pictures show no more of them
+        # the points are a few pixels of the second size apart: larger pictures show no more of them
         painted = self.plain(factor if factor in self.factors[:2] else self.factors[1]).painted
         return Level(odds, at.gradient, at.guarded, at.k, factor * self.scale, painted)
 
     def table(self, inside: Floats, outside: Floats) -> Floats:
-        """Log-odds (BINS^3,) of the colours that pixels of these weights (h, w) show, in the size for learning."""
+        """Log-odds (BINS^3,) of the colours by the weights (h, w) of pixels inside and outside, at the size for learning."""
         at = self.plain(self._learning)
         both = []
         for weight in (inside, outside):
@@ -239,7 +240,7 @@ class Window:
         return None if inside is None else self.table((inside > 1.0).astype(np.float32), (inside < -1.0).astype(np.float32))
 
     def of_pose(self, model: Model, T: Array, gap: float) -> Floats:
-        """The table of the colours inside and around a silhouette, without what is nearer to its contour than `gap`, a share of
+        """The table of the colours inside and around a silhouette, without pixels nearer to its contour than `gap`, a share of
         its size."""
         at, size = self.plain(self._learning), self._extent / self._learning
         h, w = at.shape
@@ -251,7 +252,7 @@ class Window:
         return self.table(inner.astype(np.float32), outer.astype(np.float32))
 
     def of_poses(self, model: Model, poses: list[Array]) -> Floats:
-        """The table of the colours that are the object's where many poses say so."""
+        """The table of colours, weighted by the share of many poses that cover a pixel."""
         small = self.plain(self.factors[0])
         h, w = small.shape
         share = sum((model.silhouette(T, small.k, (0, 0, w, h)).astype(np.float32) for T in poses), np.zeros((h, w), np.float32))
@@ -261,13 +262,13 @@ class Window:
 
 
 def _span(first: float, last: float, size: int) -> tuple[int, int]:
-    """The pixels [first, last) of a picture's side."""
+    """The pixels [first, last), limited to a picture's side."""
     begin = int(min(max(first, 0.0), size - 9.0))
     return begin, int(max(min(last, size), begin + 8.0))
 
 
 def _extent(model: Model, T: Array, k: Intrinsics, size: float) -> float:
-    """Square root of the silhouette's area [px], measured in a small picture; `size` [px] of its bounding box's diagonal."""
+    """Square root of the silhouette's area [px], measured in a small picture; `size` [px]: diagonal of its bounding box."""
     f = max(size / 64.0, 1e-3)
     x, y, z = T[:3, 3]
     n = 160
@@ -281,7 +282,7 @@ def _square(radius: float) -> Bytes:
 
 
 def _smoothed(histogram: Array, axis: int) -> Array:
-    """Weights of 1/4, 1/2, 1/4 along an axis."""
+    """A histogram smoothed by 1/4, 1/2, 1/4 along an axis."""
     a = np.moveaxis(histogram, axis, 0)
     out = 0.5 * a
     out[1:] += 0.25 * a[:-1]
@@ -315,8 +316,8 @@ def _gradient(image, out):
 
 @dataclass(frozen=True)
 class Lines:
-    """What the lines across a contour say: its points with offsets r (n,) [px], their variance (n,) [px^2], and the likelihood
-    (n,) of an offset near none against that of any."""
+    """Measurements of the lines across a contour: its points with offsets r (n,) [px], their variance (n,) [px^2], and the
+    likelihood (n,) of an offset near zero, relative to that of any offset."""
 
     contour: Contour
     variance: Array
@@ -324,12 +325,12 @@ class Lines:
 
     @property
     def length(self) -> Array:
-        """Of contour (n,) [px] that each measured point stands for."""
+        """Length of contour (n,) [px] that each measured point represents."""
         return np.asarray(self.contour.points["length"] * (self.contour.kind == MEASURED), np.float64)
 
 
 def lines(shape: Shape, model: Model, at: Level, T: Array, reach: int, inside: bool = False) -> Lines:
-    """The lines of the contour of a model at a pose, `reach` [px] to both sides, or those of the creases."""
+    """The lines across the contour of a model at a pose, `reach` [px] to both sides, or, if `inside`, across its creases."""
     h, w = at.shape
     if inside:
         points, shown = shape.creases.points(T, at.k, at.shape, SPACING), np.zeros((h, w), np.bool_)
@@ -408,8 +409,8 @@ def _lines(points, odds, gradient, guarded, shown, inside, reach, temperature, f
 
 
 def _equations(one: Lines, inside: bool, at: Level, T: Array, width: float) -> tuple[Array, Array]:
-    """How the offsets change with the pose error and the contour's own errors (n, m), and the same with the offsets' weights:
-    those count less and less beyond `width` [px]."""
+    """Jacobian (n, m) of the offsets by the pose error and the contour's own errors, and the same with the offsets' weights,
+    which decrease beyond an offset of `width` [px]."""
     normal = one.contour.points["normal"]
     turns = np.arange(1, HARMONICS + 1) * np.arctan2(normal[:, 1], normal[:, 0])[:, None]
     J = np.zeros((len(normal), 7 + len(_WAVES)))
@@ -424,11 +425,12 @@ def _equations(one: Lines, inside: bool, at: Level, T: Array, width: float) -> t
 def information(
     found: list[tuple[Lines, bool]], at: Level, T: Array, width: float, usual_px: float = WAVES
 ) -> tuple[Array, Array]:
-    """The information (6, 6) about the pose error at T and its right side (6,), of the lines of contour and creases (True), with
-    the contour's own errors marginalised (Schur complement); `usual_px`: the waves' usual standard deviation [px of the image].
+    """The information (6, 6) about the pose error at T and its right side (6,), from the lines of contour and creases (True),
+    with the contour's own errors marginalised (Schur complement); `usual_px`: the waves' usual standard deviation [px of the
+    image].
 
-    How large the waves are is estimated with them (the evidence procedure: MacKay 1992, doi:10.1162/neco.1992.4.3.415): an exact
-    mesh shows the pose by small differences of its shape, another one by its size and place alone.
+    The size of the waves is estimated together with them (the evidence procedure: MacKay 1992, doi:10.1162/neco.1992.4.3.415): an
+    exact mesh shows the pose by small differences of its shape, an inexact one only by its size and place.
     """
     n = 7 + len(_WAVES)
     H, g = np.zeros((n, n)), np.zeros(n)
@@ -461,8 +463,8 @@ def descend(
     creases: bool,
     near: bool = False,
 ) -> Array:
-    """Steps of least squares, one for each length of the lines in `reaches` [px], with or without creases. `near` a prediction,
-    what hides the object shall not take the pose along: offsets count less beyond a smaller width, and waves are smaller."""
+    """Least-squares steps, one for each length of the lines in `reaches` [px], with or without creases. `near` a prediction, an
+    occluder must not pull the pose along: weights decrease beyond a smaller offset, and waves are smaller."""
     robust, waves = (ROBUST[1], STIFF) if near else (ROBUST[0], WAVES)
     for reach in reaches:
         found = [(lines(shape, model, at, T, reach, inside), inside) for inside in ((False, True) if creases else (False,))]
@@ -483,15 +485,15 @@ _DIAGONAL = np.diag_indices(6)
 
 
 def covariance(shape: Shape, at: Level, T: Array, trust: float, colours: Compared | None) -> Array:
-    """The covariance (6, 6) of a pose by contour and creases, whose errors are trusted by a share `trust`, and by the mesh's
-    colours where they convince, with the errors of the mesh's scale (SCALE) and of what rotations it shows (LEVER)."""
+    """The covariance (6, 6) of a pose from contour and creases, whose information is multiplied by `trust`, and from the mesh's
+    colours if they are convincing, with the errors of the mesh's scale (SCALE) and of its levers (LEVER)."""
     both = [(lines(shape, shape.fine, at, T, ENDING, inside), inside) for inside in (False, True)]
     H, _ = information(both, at, T, 0.7 * ENDING)
     lever2 = 0.0
     for one, inside in both:
         J, weighted = _equations(one, inside, at, T, 0.7 * ENDING)
         lever2 += float(np.sum(np.hypot(weighted[:, 0], weighted[:, 1]) * np.hypot(J[:, 0], J[:, 1]))) * (LEVER * shape.size) ** 2
-    # a body of revolution shows nothing of its turn, but its facets and a scan's roughness seem to
+    # a body of revolution gives no information about its turn, but its facets and a scan's roughness seem to
     scale = np.repeat([1.0, 1.0 / shape.size], 3)
     values, vectors = np.linalg.eigh(np.outer(scale, scale) * (H - np.diag(np.repeat([0.0, lever2], 3))))
     believed = (vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scale, scale)
@@ -504,11 +506,11 @@ def covariance(shape: Shape, at: Level, T: Array, trust: float, colours: Compare
 
 
 SCALE = 0.01
-"""Standard deviation of a mesh's scale: of scans, and of objects of one kind."""
+"""Relative standard deviation of a mesh's scale: of scans, and of objects of one kind."""
 LEVER = 0.02
 """Standard deviation of the levers by which the contour shows a rotation, as a share of the object's size."""
 ENDING = 4
-"""Reach of the lines of the last steps [px]."""
+"""Reach of the lines in the last steps [px]."""
 
 
 @kernel("POINT[n], f4[a, h, w], f4[h, w], i8, f8, f8, f8, out f8[m, m]", POINT=POINT)
@@ -539,7 +541,7 @@ def _vote(points, edges, odds, step, beside, by_edge, by_colour, value):
 
 def hypotheses(model: Model, at: Level, starts: list[Array], prior: Prior, reach: float) -> list[tuple[float, Array]]:
     """The poses that result from shifting each start, up to `reach` [m], to the two places where its contour lies best on edges
-    and between the colours, with what speaks for them; best first."""
+    and between the colours, with their scores; best first."""
     h, w = at.shape
     edges = np.empty((ANGLES, h, w), np.float32)
     for a in range(ANGLES):

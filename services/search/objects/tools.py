@@ -31,15 +31,15 @@ PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 """Keys of a camera file."""
 UNUSED = ("depth_scale",)
-"""Keys that camera files of object data sets have besides, and that say nothing about the picture."""
+"""Other keys in camera files of object data sets, which say nothing about the picture."""
 CROPPED = 0.25
-"""How far outside the picture the principal point may lie, as a share of its size: pictures of objects are often cropped."""
+"""Maximum distance of the principal point outside the picture, as a share of its size: pictures of objects are often cropped."""
 RIGID = 1e-2
-"""Largest error of a rotation matrix that counts as rounding."""
+"""Maximum error of a rotation matrix that counts as rounding."""
 FURTHEST = 100.0
-"""Largest distance [m] of a start: a larger one is in other units."""
+"""Maximum distance [m] of a start: a larger one is in other units."""
 TIMES = 5.0
-"""Largest ratio of the lengths of silhouette and mask at the start: beyond it unit, camera or pose are wrong."""
+"""Maximum ratio of the lengths of silhouette and mask at the start: beyond it, unit, camera or pose are wrong."""
 COLOURS = {"tracking": (80, 220, 80), "occluded": (60, 180, 250), "doubtful": (60, 220, 250), "lost": (60, 60, 230)}
 """Blue, green, red of a contour in the video."""
 FIELDS = (
@@ -87,7 +87,7 @@ COMMON = (
     example="penumbra search refine --mesh cup.stl --mesh-unit mm --camera camera.json --init start.json --mask mask.png",
 )
 def refine(options: flags.Options) -> int:
-    """One pose on one mask or image: 0, whatever its state, or 2 for input that is wrong."""
+    """Finds one pose in a mask or image. Returns 0, whatever its state, or 2 for wrong input."""
     return _reported("refine", _refine, options)
 
 
@@ -103,7 +103,7 @@ def refine(options: flags.Options) -> int:
     example="penumbra search track --mesh cup.stl --camera camera.json --init start.json --masks masks --out track",
 )
 def track(options: flags.Options) -> int:
-    """The poses of a sequence, as a table and a video; the exit code as of `refine`."""
+    """The poses of a sequence, as a table and a video; returns the same codes as `refine`."""
     return _reported("track", _track, options)
 
 
@@ -169,7 +169,7 @@ def _track(options: flags.Options) -> None:
 
 
 def _given(options: flags.Options) -> tuple[RigidObject, CameraFiles, Array]:
-    """What both commands need: object, reader of the camera's files, start."""
+    """The inputs of both commands: object, reader of the camera's files, start."""
     metres, degrees = options.init_sigma
     if not (0 < metres < 10 and 0 < degrees < 360):
         raise ObjectFileError(f"--init-sigma: expected metres and degrees above 0, got {metres:g} and {degrees:g}")
@@ -284,8 +284,7 @@ def read_picture(path: Path, shape: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 class CameraFiles:
-    """Reads the masks and pictures of a camera as the pinhole pictures that it would have taken without distortion. k: their
-    intrinsics; shape: (height, width)."""
+    """Reads the masks and pictures of a camera, undistorted to pinhole pictures. k: their intrinsics; shape: (height, width)."""
 
     def __init__(self, lens: Lens):
         self.k, self.shape = Intrinsics(lens.fx, lens.fy, lens.cx, lens.cy), (lens.height, lens.width)
@@ -298,7 +297,7 @@ class CameraFiles:
 
     def occluder(self, path: Path | None) -> Bool | None:
         """The pixels (h, w) where the object may be hidden: those of a mask file, and those that the camera does not show; None
-        where there are neither. Raises ObjectFileError."""
+        if there are neither. Raises ObjectFileError."""
         covered, unseen = None if path is None else self.mask(path), self._undistort.unseen
         return covered if unseen is None else unseen if covered is None else covered | unseen
 
@@ -389,7 +388,7 @@ def check_start(rigid: RigidObject, T: Array, files: CameraFiles, mask: Bool | N
 
 
 def as_json(found: ObjectEstimate) -> dict[str, Any]:
-    """The result as the command prints it."""
+    """The result as the command prints it with --json."""
     return {
         "camera_from_object": found.T.tolist(),
         "covariance": found.covariance.tolist(),
@@ -399,7 +398,7 @@ def as_json(found: ObjectEstimate) -> dict[str, Any]:
 
 
 def as_text(found: ObjectEstimate) -> str:
-    """The result in words."""
+    """The result as text."""
     position, q = position_orientation(found.T)
     sigma = np.sqrt(np.diag(found.covariance))
     return "\n".join(
@@ -413,7 +412,7 @@ def as_text(found: ObjectEstimate) -> str:
 
 
 def row(name: str, found: ObjectEstimate) -> list[Any]:
-    """A line of the table: FIELDS."""
+    """A row of the table, see FIELDS."""
     position, q = position_orientation(found.T)
     sigma = np.sqrt(np.diag(found.covariance))
     return [name, found.state, f"{found.overlap:.4f}", *(f"{value:.6f}" for value in (*position, *q, *sigma))]
