@@ -1,4 +1,4 @@
-"""What every observer of this service answers, what it refuses, and how it calls its own state."""
+"""Interface of the observers: their estimate, the measurements that they refuse, and their states."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ Array = NDArray[np.floating[Any]]
 STATES: tuple[FusedState, ...] = ("tracking", "coasting", "lost")
 TRACKING, COASTING, LOST = range(len(STATES))
 FATES = ("accepted", "gated", "late", "duplicate", "nothing", "future", "pose", "information")
-"""What may become of a measurement: taken; too far from the prediction; older than the history; known already; observing nothing.
-The others are faults of its own, for which it is refused."""
+"""Outcomes of a measurement: used; too far from the prediction; older than the history; received before; observing nothing. The
+others are faults of the measurement, for which it is refused."""
 ACCEPTED, GATED, LATE, DUPLICATE, NOTHING, FUTURE, POSE_FAULT, INFORMATION_FAULT = range(len(FATES))
 PROMISED = 3.0
-"""Standard deviations of the position that tracking promises to be within its bound."""
+"""Number of standard deviations of the position that tracking promises to be within its bound."""
 NO_CLOCK = (1 << 63) - 1
-"""The latest stamp where nobody looks at a clock."""
+"""Latest accepted stamp if stamps are not compared with a clock."""
 ROUNDING = 1e-6
-"""What a rotation or a symmetric matrix without negative eigenvalues may be off by, relative to its largest entry. Chosen,
-not measured."""
+"""Maximum error of a rotation, or of a symmetric matrix without negative eigenvalues, relative to its largest entry. Chosen, not
+measured."""
 STRAIGHT = 0.35
-"""Turn [rad] over which the rest of a pose is taken to change with it as a covariance says. Chosen: from 0.2 to 0.6 make no
-difference."""
+"""Maximum rotation [rad] over which the rest of a pose depends linearly on it, as a covariance says. Chosen: values from 0.2 to
+0.6 make no difference."""
 
 
 class RefusedMeasurement(ValueError):
-    """A measurement that was refused for a fault of its own. `kind` groups equal faults, so that they can be counted."""
+    """A measurement that is refused for a fault of its own. `kind` groups equal faults, so that they can be counted."""
 
     def __init__(self, kind: str, text: str):
         super().__init__(text)
@@ -47,7 +47,7 @@ class RefusedMeasurement(ValueError):
 @dataclass(frozen=True)
 class Estimate:
     """The target at one moment. `T` (4, 4); `velocity` (6,): linear [m/s], angular [rad/s]; `covariance` (6, 6) of the pose error
-    (`shared.geometry.rigid`); `state`: tracking, coasting or lost; `sources`: those that have sent something."""
+    (`shared.geometry.rigid`); `state`: tracking, coasting or lost; `sources`: those that have sent a message."""
 
     T: rigid.Array
     velocity: Array
@@ -73,15 +73,15 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Limits:
-    """Where tracking ends.
+    """Limits of tracking.
 
     tracking_age : age [s] of the newest measurement above which the target is not tracked: three periods of a camera at 20 Hz and
         the delay of vision.
-    tracking_bound : what tracking promises [m]: PROMISED standard deviations of the position along its worst direction are
+    tracking_bound : bound [m] that tracking promises: PROMISED standard deviations of the position along its worst direction are
         within it. The cell file sets it.
-    lost_sigma : standard deviation of the position [m] along its worst direction beyond which it is no help as a place to look
-        at. Chosen, not measured.
-    lost_age : time [s] without a measurement after which nothing is known about a limb. Chosen, not measured.
+    lost_sigma : standard deviation of the position [m] along its worst direction above which it is no help for a search. Chosen,
+        not measured.
+    lost_age : time [s] without a measurement after which a limb's pose is unknown. Chosen, not measured.
     """
 
     tracking_age: float = 0.25
@@ -108,7 +108,7 @@ def state_of(age_s, covariance, limits):  # type: ignore[no-untyped-def]
 
 @dataclass
 class Counts:
-    """What became of the measurements of one source: see FATES; `refused` by kind."""
+    """Numbers of the measurements of one source by outcome, see FATES; `refused` by kind."""
 
     accepted: int = 0
     gated: int = 0
@@ -118,24 +118,24 @@ class Counts:
 
 
 class Log:
-    """Counts per source, and the stamp [ns] of the first measurement of each. names: of the senses."""
+    """Counts per source, and the stamp [ns] of the first measurement of each source. names: of the senses."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.counts = {name: Counts() for name in names}
         self.first_ns: dict[str, int] = {}
 
     def check(self, source: str) -> None:
-        """Raises ValueError for a source that is not known."""
+        """Raises ValueError for an unknown source."""
         if source not in self.counts:
             raise ValueError(f"source: expected one of {', '.join(self.counts)}, got {source!r}")
 
     def received(self, source: str, stamp_ns: int) -> None:
-        """Notes that a sense has sent something."""
+        """Notes that a sense has sent a message."""
         self.check(source)
         self.first_ns.setdefault(source, stamp_ns)
 
     def record(self, source: str, stamp_ns: int, fate: int) -> None:
-        """Counts a measurement by what became of it (which of FATES)."""
+        """Counts a measurement by its outcome (index of FATES)."""
         if fate >= FUTURE:
             self.refused(source, FATES[fate])
             return
@@ -152,9 +152,8 @@ class Log:
     def admitted(
         self, source: str, stamp_ns: int, T: Array, information: Array, now_ns: int | None = None
     ) -> tuple[Array, Array]:
-        """A measurement's pose (4, 4) and information (6, 6), symmetric. Raises RefusedMeasurement, having counted it, where
-        something is wrong with them, and ValueError on an unknown source. now_ns: the reader's clock, where the stamp is to be
-        compared."""
+        """A measurement's pose (4, 4) and information (6, 6), symmetric. Raises RefusedMeasurement, and counts it, if they have a
+        fault, and ValueError for an unknown source. now_ns: the reader's clock, if the stamp is to be compared with it."""
         self.check(source)
         T, information = shaped(T, (4, 4)), shaped(information, (6, 6))
         fate = fault(stamp_ns, T, information, latest(now_ns))
@@ -166,13 +165,13 @@ class Log:
 
 
 def shaped(values: Array, shape: tuple[int, ...]) -> Array:
-    """Contiguous numbers of this shape; what has another shape becomes none at all (NaN), which is a fault."""
+    """Contiguous numbers of this shape; an array of another shape becomes NaN, which is a fault."""
     values = np.ascontiguousarray(values, np.float64)
     return values if values.shape == shape else np.full(shape, np.nan)
 
 
 def latest(now_ns: int | None) -> int:
-    """Latest stamp [ns] that is believed at a time; None: without a clock. Clocks of one cell differ by MAX_FUTURE_S or less."""
+    """Latest stamp [ns] that is accepted at a time; None: without a clock. Clocks of one cell differ by MAX_FUTURE_S or less."""
     return NO_CLOCK if now_ns is None else now_ns + int(MAX_FUTURE_S * 1e9)
 
 
@@ -211,7 +210,7 @@ def fault(stamp_ns, T, information, latest_ns):  # type: ignore[no-untyped-def]
 
 
 def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int | None) -> RefusedMeasurement:
-    """What is wrong with a measurement that has a `fault`, in words."""
+    """The error for a measurement that has a `fault`, with a text that explains it."""
     if fate == FUTURE:
         ahead = f"{1e-9 * (stamp_ns - (now_ns or 0)):.3f} s; check the clocks of its publisher and of fusion (chrony, ptp4l)"
         text = f"stamp: expected at most {MAX_FUTURE_S} s ahead of the clock, got {ahead}"
@@ -228,9 +227,9 @@ def refusal(fate: int, stamp_ns: int, T: Array, information: Array, now_ns: int 
 
 
 def measured(message: Message, measures: Measures) -> tuple[Array, Array, Array | None]:
-    """The pose (4, 4) that a message of a sense reports, its information (6, 6), zero along what is not observed, and the step
-    (6,) to it from where that was linearised, None where nothing is said of that. Raises RefusedMeasurement where its covariance
-    is not symmetric and positive definite."""
+    """The pose (4, 4) in a message of a sense, its information (6, 6), zero along unobserved directions, and the step (6,) to it
+    from its point of linearisation, None if the message has none. Raises RefusedMeasurement for a covariance that is not
+    symmetric and positive definite."""
     of: Any = message
     match measures:
         case Measures.POSE:
@@ -244,8 +243,8 @@ def measured(message: Message, measures: Measures) -> tuple[Array, Array, Array 
 
 
 def stream_of(sense: Sense, message: Any, target: str, cell: Cell) -> str:
-    """The stream that a message of a sense belongs to: the sense, and the part of the cell that measured where a sense has
-    several. Raises RefusedMeasurement for a message of another target, frame or part of the cell."""
+    """The stream that a message of a sense belongs to: the sense, and, if it has several streams, the part of the cell that
+    measured. Raises RefusedMeasurement for a message of another target, frame or part of the cell."""
     expected, got = (target, cell.frame), (message.target, message.frame)
     if got != expected:
         raise RefusedMeasurement("frame", f"{sense.name}: expected target and frame {expected}, got {got!r:.120}")
@@ -259,8 +258,9 @@ def stream_of(sense: Sense, message: Any, target: str, cell: Cell) -> str:
 
 
 def straight(covariance: Array) -> Array:
-    """A pose's covariance (6, 6) in which its least certain turn is bound to the rest no farther than over STRAIGHT. With what a
-    pose leaves open, the roll of a limb say, the rest changes along a line only at first; beyond, it is open and nothing else."""
+    """A pose's covariance (6, 6) in which the rest depends on the least certain rotation only over STRAIGHT. If a pose leaves a
+    rotation open, such as the roll of a limb, the rest changes linearly with it only at first; beyond that, only the rotation
+    itself is uncertain."""
     variances, axes = np.linalg.eigh(covariance[3:, 3:])
     variance, near = float(variances[-1]), STRAIGHT**2
     if not variance > near:
@@ -271,7 +271,7 @@ def straight(covariance: Array) -> Array:
 
 
 def information(covariance: Array) -> Array:
-    """The inverse (n, n) of a covariance. Raises RefusedMeasurement where it is not symmetric and positive definite."""
+    """The inverse (n, n) of a covariance. Raises RefusedMeasurement if it is not symmetric and positive definite."""
     eigenvalues, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     low, high = eigenvalues[[0, -1]]
     if np.abs(covariance - covariance.T).max() > ROUNDING * high or low <= 1e-14 * high:

@@ -1,31 +1,32 @@
-"""The default observer's filter, compiled: an error-state Kalman filter that knows that the errors of a sense last.
+"""The default observer's filter, compiled: an error-state Kalman filter for senses with lasting errors.
 
 State: position p, rotation R, linear and angular velocity and acceleration, a bias of every sense, and the offset of a wrong one.
-Errors are along fixed axes, the rotation's applied from the left (`shared.geometry.rigid.perturb`). How they go on is in
+Errors are along fixed axes, the rotation's applied from the left (`shared.geometry.rigid.perturb`). Their motion model is in
 `motion.py`.
 
-A sense is wrong by nearly the same amount from one measurement to the next: a mask a pixel too large is a forearm 2 cm too near
-for as long as nobody moves. A filter that takes 100 such measurements a second for independent assumes a tenth of the error
-that they have, and then ignores the other sense. So the error of every measurement is split: a share `lasting` of
-its variance belongs to the sense's bias, a first-order Gauss-Markov process that the filter estimates, the rest is white. The
-bias is kept in units of the measurement's own standard deviation, which changes with distance and occlusion: a measurement of
-covariance L L' reads pose + sqrt(lasting) L bias + white noise.
+A sense is wrong by nearly the same amount from one measurement to the next: a mask that is a pixel too large puts a forearm 2 cm
+too near for as long as nobody moves. A filter that treats 100 such measurements a second as independent assumes a tenth of their
+error, and then ignores the other sense. So the error of every measurement is split: a share `lasting` of its variance belongs to
+the sense's bias, a first-order Gauss-Markov process that the filter estimates, and the rest is white. The bias is in units of the
+measurement's own standard deviation, which changes with distance and occlusion: a measurement of covariance L L' reads
+pose + sqrt(lasting) L bias + white noise.
 
-A measurement that the gate refuses and another sense contradicts is wrong, but how it changes may be right. From then on its
-sense reads pose + offset + bias + white noise, with an offset of which nothing is known at first and which stays but for a slow
-random walk. While it is on trial its measurements tell the offset and nothing of the pose, and those after it how the limb
-moves, as surely as their noise lets them. How fast the offset wanders is learned: a sense whose offset runs away tells nothing
-of the limb. The offset is given up where a measurement without it passes the gate, for the sense is right again, and where the
-sense or another one surprises: then the sense is not used until it is right again.
+A measurement that the gate refuses and another sense contradicts is wrong, but its changes may be right. From then on its sense
+reads pose + offset + bias + white noise. The offset is unknown at first, and constant except for a slow random walk. While the
+sense is on trial, its measurements update the offset and not the pose; later ones also update the motion of the limb, as far as
+their noise allows. The speed of the offset's walk is learned: a sense whose offset runs away says nothing about the limb. The
+offset is dropped when a measurement passes the gate without it, because the sense is right again, and when the sense or another
+one is surprising: then the sense is not used until it is right again.
 
-Three numbers adapt to the innovations, by whether each resembles the one before of the same sense. Those of a wrong sense, beside
-its offset, that resemble each other mean that it runs away: the offset's walk grows. Those of others that resemble each
-other mean that the filter lags behind the limb: the process noise grows, linear and angular each on its own, because otherwise a
-limb that turns would let a sense that is wrong about its position pass. Innovations that are too large and do not resemble each
-other mean that the sense is noisier than it says: its covariance grows, and is never less than what it says.
+Three factors adapt to the innovations, by whether each innovation resembles the one before of the same sense:
+- If those of a wrong sense, relative to its offset, resemble each other, the offset runs away: its walk grows.
+- If those of other senses resemble each other, the filter lags behind the limb: the process noise grows, separately for linear
+  and angular motion, because otherwise a limb that turns would let a sense with a wrong position pass.
+- If innovations are too large and do not resemble each other, the sense is noisier than it says: its covariance grows, and is
+  never smaller than the sense says.
 
-Everything works in place on the records of `records.py`; `history.py` calls `step` with what `measurement.py` makes of poses. The
-number of senses is that of the records. Functions write what they find to their last arguments.
+Everything works in place on the records of `records.py`; `history.py` calls `step` with the measurements that `measurement.py`
+makes of poses. The number of senses is that of the records. Functions write their results to their last arguments.
 
 Sources: error-state filter on SO(3): Sola, "Quaternion kinematics for the error-state Kalman filter" (2017), arXiv:1711.02508;
 coloured measurement noise by state augmentation: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
@@ -49,16 +50,16 @@ from penumbra.shared.geometry import so3
 from penumbra.shared.native import inner
 
 REFUSED_RATE = 30.0
-"""Factor on the rate at which the process noise grows while measurements are refused: all are, until the filter has caught up
-with the limb. Chosen: with 4 a hand that reaches 20 to 45 cm far within 0.3 s, after a rest of a second, is known again up to a
-picture later."""
+"""Factor on the growth rate of the process noise while measurements are refused: all are, until the filter has caught up with the
+limb. Chosen: with 4, a hand that reaches 20 to 45 cm within 0.3 s, after a rest of a second, is found again up to a picture
+later."""
 SWIFT, REMEMBERED = 100.0, 0.3
-"""Agility from which a limb is fast, and the share of the rate at which such a one calms down: a fast hand that rests will set
-out as it did before, and no picture shows it in time. Slow limbs have agilities up to 20. By the share of poses beyond three
-sigma: with 0.3 in place of 1 it is 0.05 in place of 1.0 % of those of a fast hand (12 runs of seed 8401)."""
+"""Agility above which a limb is fast, and factor on the rate at which its agility then decreases: a fast hand that rests will set
+out as before, and no picture shows it in time. Slow limbs have agilities up to 20. With 0.3 instead of 1, 0.05 % instead of 1.0 %
+of the poses of a fast hand are beyond three sigma (12 runs of seed 8401)."""
 SURPRISING = 2.0
-"""Squared Mahalanobis distance per direction (1 expected) from which a measurement does not change the process noise while
-another sense agrees better with the state: a sense with a small bias would make the state follow it. Chosen, not measured."""
+"""Squared Mahalanobis distance per direction (1 expected) above which a measurement does not change the process noise while
+another sense agrees better with the state: otherwise the state would follow a sense with a small bias. Chosen, not measured."""
 
 
 class State(NamedTuple):

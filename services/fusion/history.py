@@ -1,14 +1,14 @@
-"""The history of the default observer, compiled: measurements that come late and out of order.
+"""The history of the default observer, compiled, for measurements that come late and out of order.
 
-The filter goes back to a measurement's stamp, applies it, and replays what came after (`insert`). The result depends on the
-measurements and their stamps alone, never on the order of arrival (within the horizon): the whole state of the filter, what it
-refused included, is a function of the state before and the measurement (`filter.step`).
+The filter goes back to a measurement's stamp, applies it, and replays the later ones (`insert`). The result depends only on the
+measurements and their stamps, and not on the order of arrival (within the horizon): the whole state of the filter, including its
+refusals, is a function of the state before and the measurement (`filter.step`).
 
 A history is a ring of measurements in the order of stamp, source and position, each with the state after it. Its first entry is
 the newest one that is older than the horizon: nothing is inserted before it. `ring` (2,) holds the slot of the first entry and
 the number of entries.
 
-`clear_all`, `adopt`, `measure_all` and `estimate_all` are called from outside, for as many targets as there are.
+`clear_all`, `adopt`, `measure_all` and `estimate_all` are the entry points, for any number of targets.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from penumbra.shared.native import inner, kernel
 
 
 class Entries(NamedTuple):
-    """The history of one target: as `records.History`, without the first dimension."""
+    """The history of one target: `records.History` without the first dimension."""
 
     measurements: Any
     states: Any

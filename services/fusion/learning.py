@@ -1,7 +1,7 @@
-"""How the limbs of a recording move: the motion under which its measurements are most likely.
+"""Learns how the limbs of a recording move: the motion that makes its measurements most likely.
 
-The likelihood is that of the innovations of the observer's own filter, without gates, over the measurements that its gates pass
-forwards or backwards in time. Learned is what `MOTION` names; the agility is learned from the innovations on the way, as ever.
+The likelihood is that of the innovations of the observer's own filter, without gates, over the measurements that pass its gates
+forwards or backwards in time. The settings in `MOTION` are learned; the agility adapts to the innovations as usual.
 
 Source: Schweppe, "Evaluation of likelihood functions for Gaussian signals" (1965), DOI 10.1109/TIT.1965.1053737; the simplex of
 Nelder and Mead (1965), DOI 10.1093/comjnl/7.4.308.
@@ -24,30 +24,30 @@ from penumbra.services.fusion.settings import MOTION, FusionSettings
 from penumbra.services.fusion.smoother import BLOCK, Filter, NothingMeasuredError, Smoother
 
 PIECE = 2048
-"""Measurements after which the filter begins anew: it bounds the memory for their covariances."""
+"""Number of measurements after which the filter starts over: it bounds the memory for their covariances."""
 LEAST = 50
-"""Fewest measurements to learn from: some seconds of vision. Chosen, not measured; a minute and more is better."""
+"""Minimum number of measurements to learn from: some seconds of vision. Chosen, not measured; a minute or more is better."""
 STEPS = 400
-"""Largest number of likelihoods that are computed. Chosen: five numbers settle to a hundredth within two hundred."""
+"""Maximum number of likelihoods that are computed. Chosen: five numbers settle to a hundredth within two hundred."""
 
 
 @dataclass(frozen=True)
 class Learned:
-    """settings : with the learned motion. measurements : how many it was learned from. gain : by how much [nats] the mean
-    logarithm of their likelihood is larger than with the settings before."""
+    """settings : with the learned motion. measurements : number of measurements that it was learned from. gain : increase [nats]
+    of their mean log-likelihood over the settings before."""
 
     settings: FusionSettings
     measurements: int
     gain: float
 
     def described(self) -> dict[str, Any]:
-        """As it is written to a file."""
+        """The entries of its file."""
         return {name: getattr(self.settings, name) for name in MOTION} | {"measurements": self.measurements, "gain": self.gain}
 
 
 def learned(smoothers: Sequence[Smoother], settings: FusionSettings | None = None) -> Learned:
-    """The motion of all targets whose measurements the smoothers have taken. Raises NothingMeasuredError where they have fewer
-    than LEAST that can be used."""
+    """The motion of all targets whose measurements the smoothers have. Raises NothingMeasuredError if fewer than LEAST can be
+    used."""
     settings = settings or FusionSettings()
     pieces = [
         (smoother, segment[first : first + PIECE])
@@ -63,7 +63,7 @@ def learned(smoothers: Sequence[Smoother], settings: FusionSettings | None = Non
         tried = _settings(settings, x)
         return -sum(log_likelihood(smoother.filter(tried), piece) for smoother, piece in pieces) / count
 
-    from scipy.optimize import minimize  # here, because replaying needs none of it
+    from scipy.optimize import minimize  # imported here, because replaying does not need it
 
     begin = _numbers(settings)
     found = minimize(cost, begin, method="Nelder-Mead", options={"maxfev": STEPS, "xatol": 0.01, "fatol": 1e-5})
@@ -71,7 +71,7 @@ def learned(smoothers: Sequence[Smoother], settings: FusionSettings | None = Non
 
 
 def log_likelihood(filter: Filter, measurements: NDArray[np.void]) -> float:
-    """The logarithm of the likelihood [nats] of measurements (k,) but the first, each given those before it, up to a constant."""
+    """Log-likelihood [nats] of measurements (k,) except the first, each given those before it, up to a constant."""
     states, total = filter.run(measurements, np.zeros((len(measurements), 2))), 0.0
     for begin in range(0, len(measurements) - 1, BLOCK):
         after = slice(begin + 1, min(begin + BLOCK, len(measurements) - 1) + 1)
@@ -87,12 +87,12 @@ def log_likelihood(filter: Filter, measurements: NDArray[np.void]) -> float:
 
 
 def _numbers(settings: FusionSettings) -> Array:
-    """The learned fields as numbers (5,) without bounds."""
+    """The learned fields as unbounded numbers (5,)."""
     damping = settings.damping
     return np.append(np.log([*settings.jerk, *settings.motion_time]), math.log(damping / (1.0 - damping)))
 
 
 def _settings(settings: FusionSettings, x: Array) -> FusionSettings:
-    """The reverse of `_numbers`."""
+    """The inverse of `_numbers`."""
     a, b, c, d = np.exp(x[:4]).tolist()
     return replace(settings, jerk=(a, b), motion_time=(c, d), damping=1.0 / (1.0 + math.exp(-float(x[4]))))

@@ -1,9 +1,9 @@
 """A measurement of the default observer's filter, compiled: a pose of one sense, reduced to the directions that it observes, and
-how far another pose is from it along these.
+the error of another pose along these.
 
-A likelihood that leaves tens of degrees open may peak as far from where it was linearised, as that of a window of the skin does.
-Such a measurement keeps the pose at which that was, and how far `ahead` of it the peak is: taken at the peak, what it knows well
-would be turned as far, and many of them would lead the pose away together.
+A likelihood that leaves tens of degrees open may peak as far from its point of linearisation, as that of a window of the skin.
+Such a measurement keeps the pose of linearisation, and how far `ahead` of it the peak is. At the peak, the directions that it
+knows well would be turned as far, and many such measurements would lead the pose away together.
 """
 
 from __future__ import annotations

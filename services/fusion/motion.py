@@ -1,10 +1,10 @@
-"""How a limb moves, compiled.
+"""Motion model of a limb, compiled.
 
-Its velocity is that of a damped oscillator which white jerk drives: a limb speeds up and slows down smoothly, as in reaches, and
-one that is faster over the same ways takes less time. Its elbow stays within the upper arm's length of the shoulder.
+The velocity is that of a damped oscillator driven by white jerk: a limb speeds up and slows down smoothly, as in reaches, and a
+faster limb takes less time over the same distance. Its elbow stays within the upper arm's length of the shoulder.
 
 A motion is a position p (3,), a rotation R (3, 3), a velocity (6,) and an acceleration (6,), linear and angular, with the
-covariance of their errors in the order of `records.py`. `filter.py` takes its states on with it, `history.py` its estimates.
+covariance of their errors in the order of `records.py`. `filter.py` predicts its states with it, `history.py` its estimates.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from penumbra.shared.geometry import so3
 from penumbra.shared.native import inner
 
 HASTE = 0.2
-"""Power of the agility by which a motion is faster: way / duration^5 is the unit of a density of jerk^2, so that reaches over the
-same ways in half the time have 32 times the density."""
+"""Power of the agility by which a motion is faster: the unit of a density of jerk^2 is distance^2 / duration^5, so that reaches
+over the same distance in half the time have 32 times the density."""
 NODES = (0.5 - 0.1 * 15.0**0.5, 0.5, 0.5 + 0.1 * 15.0**0.5)
 """Nodes of the Gauss-Legendre quadrature with three of them on [0, 1]."""
 WEIGHTS = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)

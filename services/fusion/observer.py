@@ -1,6 +1,6 @@
-"""The default observer: takes poses of any rank, late and in any order, and answers with the pose at any moment.
+"""The default observer: takes poses of any rank, late and in any order, and gives the pose at any moment.
 
-The arithmetic is compiled (`filter.py`, `history.py`): a call does it for as many targets as it is given.
+The arithmetic is compiled (`filter.py`, `history.py`): one call handles all targets that it is given.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from penumbra.shared.geometry import rigid
 
 
 class Bank:
-    """The observers of n targets, which share nothing but the calls.
+    """The observers of n targets, which share only the calls.
 
-    subjects : what is known of each beforehand. senses : whose measurements are taken.
+    subjects : prior knowledge of each target. senses : senses whose measurements are used.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Bank:
         return len(self.logs)
 
     def forget(self, targets: slice = slice(None)) -> None:
-        """Begins anew with every target, or with some of them; their counts go on."""
+        """Starts over for all targets, or for some of them; their counts continue."""
         history.clear_all(*self._history.of(targets))
         for log in self.logs[targets]:
             log.first_ns.clear()
@@ -59,11 +59,11 @@ class Bank:
         now_ns: int | None = None,
         steps: Array | None = None,
     ) -> NDArray[np.int64]:
-        """Takes m poses T (m, 4, 4) with their information (m, 6, 6) and steps (m, 6), one after the other; their fates (m,), of
-        FATES.
+        """Takes m poses T (m, 4, 4) with their information (m, 6, 6) and steps (m, 6), one after the other. Returns their
+        outcomes (m,), indices of FATES.
 
-        targets, sources (m,) : which target each belongs to, and which of `names` it comes from; otherwise as
-        `ErrorStateObserver.measure`. What is refused is counted, and the others are taken.
+        targets, sources (m,) : target of each pose, and its sense, an index of `names`; otherwise as
+        `ErrorStateObserver.measure`. Refused poses are counted, and the others are used.
         """
         fates = np.empty(len(targets), np.int64)
         steps = np.zeros((len(targets), POSE)) if steps is None else steps
@@ -77,7 +77,7 @@ class Bank:
         return fates
 
     def adopt(self, target: int, message: FusedPose) -> None:
-        """As `ErrorStateObserver.adopt`, of one target."""
+        """As `ErrorStateObserver.adopt`, for one target."""
         known = np.array([(NEVER, 0.0)] * len(self.names), SENSE_ESTIMATE)
         for record, name in zip(known, self.names, strict=True):
             if (source := message.sources.get(name)) is not None:
@@ -98,18 +98,18 @@ class Bank:
         return out, senses
 
     def earliest_ns(self, target: int) -> int:
-        """As `ErrorStateObserver.earliest_ns`, of one target."""
+        """As `ErrorStateObserver.earliest_ns`, for one target."""
         first, count = self._history.rings[target]
         return int(self._history.states[target, first]["stamp_ns"]) if count else 0
 
     def innovation(self, target: int) -> tuple[float, int]:
-        """As `ErrorStateObserver.innovation`, of one target."""
+        """As `ErrorStateObserver.innovation`, for one target."""
         first, count = self._history.rings[target]
         newest = self._history.states[target, (first + count - 1) % self._history.states.shape[1]]
         return float(newest["distance"]), int(newest["rank"])
 
     def estimates(self, stamp_ns: int) -> list[Estimate]:
-        """The same, each with its sources, to be published."""
+        """The estimates of all targets, with their sources."""
         return self._described(slice(None), stamp_ns)
 
     def one(self, stamp_ns: int, target: int) -> Estimate:
@@ -131,10 +131,10 @@ class Bank:
 
 
 class ErrorStateObserver:
-    """Fuses the poses of the senses by how much each can be trusted now.
+    """Fuses the poses of the senses by how far each can be trusted at the moment.
 
-    home : expected pose (4, 4) before anything is known, with standard deviations `spread` (position [m], rotation [rad]).
-    senses : whose measurements are taken.
+    home : expected pose (4, 4) before the first measurement, with standard deviations `spread` (position [m], rotation [rad]).
+    senses : senses whose measurements are used.
     """
 
     def __init__(
@@ -167,13 +167,13 @@ class ErrorStateObserver:
         now_ns: int | None = None,
         step: Array | None = None,
     ) -> bool:
-        """Takes a pose T (4, 4) with its information (6, 6, zero along what is not observed). True if it was accepted.
+        """Takes a pose T (4, 4) with its information (6, 6, zero along unobserved directions). True if it was accepted.
 
         `step` (6,) is the pose error that leads to T from the pose at which its likelihood was linearised; None: it was at T.
-        `hidden` is not used: the information says how good the measurement is. `now_ns` is the reader's clock, where the stamp is
-        to be compared with it. Raises RefusedMeasurement, which is counted and leaves the state as it is, for a pose that is no
+        `hidden` is not used: the information says how good the measurement is. `now_ns` is the reader's clock, if the stamp is to
+        be compared with it. Raises RefusedMeasurement, which is counted and leaves the state unchanged, for a pose that is no
         rigid transform, an information that is not symmetric and positive semi-definite, and a stamp from the future; ValueError
-        on an unknown source.
+        for an unknown source.
         """
         self.log.check(source)
         T, information = shaped(T, (4, 4)), shaped(information, (POSE, POSE))
@@ -185,17 +185,17 @@ class ErrorStateObserver:
         return fate == ACCEPTED
 
     def adopt(self, message: FusedPose) -> None:
-        """Goes on from a pose that another observer of this target has published; what was known here is forgotten. Measurements
-        before its stamp are in it already, and count as late."""
+        """Continues from a pose that another observer of this target has published, and forgets its own state. Measurements
+        before that stamp are already in the pose, and count as late."""
         self._bank.adopt(self._target, message)
 
     def forget(self) -> None:
-        """Begins anew; the counts go on."""
+        """Starts over; the counts continue."""
         self._bank.forget(slice(self._target, self._target + 1))
 
     def innovation(self) -> tuple[float, int]:
-        """Squared Mahalanobis distance of the newest measurement's innovation (NIS) and its degrees of freedom: 0 and 0 where it
-        began the state."""
+        """Squared Mahalanobis distance of the newest measurement's innovation (NIS) and its degrees of freedom: 0 and 0 if it
+        started the state."""
         return self._bank.innovation(self._target)
 
     @property
@@ -204,9 +204,10 @@ class ErrorStateObserver:
         return self._bank.earliest_ns(self._target)
 
     def estimate(self, stamp_ns: int) -> Estimate:
-        """The pose at a stamp, from the measurements up to it. Disturbs nothing.
+        """The pose at a stamp, from the measurements up to it. Does not change the state.
 
-        A stamp before the history reads its oldest state. A source's weight is its share of the information that the senses
-        brought in the last `weight_time`, fading exponentially; information in nats, as `records.SENSE_STATE` defines its gain.
+        For a stamp before the history, the oldest state is used. A source's weight is its share of the information that the
+        senses brought in the last `weight_time`, with exponential decay; information in nats, as `records.SENSE_STATE` defines
+        its gain.
         """
         return self._bank.one(stamp_ns, self._target)

@@ -3,28 +3,29 @@
 Equations are named by their label in the paper, or by their section where they have none: x (6,) position and roll, pitch, yaw;
 y, g, z (12,) and C (12, 6) of both senses, vision first; R (12, 12) = diag(R_v, R_c); G = K (6, 12); P, Q (6, 6).
 
-What the paper leaves open or what cannot be done as printed, and what is done here:
-- equ:luenberger_pose, y^ = g(x^) + n: nobody knows the noise n(t), left out.
+Points that the paper leaves open or that cannot be done as printed, and what is done here:
+- equ:luenberger_pose, y^ = g(x^) + n: the noise n(t) is unknown and left out.
 - equ:luenberger_pose, "z in R^6": y has 12 entries, and so has z.
 - equ:luenberger_pose, x has angles that wrap: z is taken modulo 2 pi. They are singular at a pitch of 90 degrees.
-- equ:luenberger_pose has a gain G and equ:luenberger_estim a gain K, and nothing says that they are one: G = K.
+- equ:luenberger_pose has a gain G and equ:luenberger_estim a gain K, and the paper does not say that they are the same: G = K.
 - f, g and u are "nonlinear" and not given: both senses report poses, g(x) = [x; x] and C = [I; I]; f(x, u) = u, a constant
   velocity, and so A = 0. Nothing measures u: it is the rate of x^, smoothed.
 - Q is not given: Q = lambda^2 W_v, so that a fully hidden arm seen by the camera alone is followed with a rate of lambda. The
-  table of results asks for a fast one: out of the skin's range the fused error there equals the camera's.
-- f_v sums m^ - m over all pixels, so that a mask too large elsewhere makes up for what is hidden, and divides by zero where the
-  rendered mask is empty: here the share of m^ that is hidden, in [0, 1], as the search publishes it with every pose.
-- R_v = f_v W_v is zero when nothing is hidden, which believes the camera entirely: a floor of 1 cm and 1.4 degrees, what a camera
-  at 1.5 m can resolve. R_v then grows by W_v = 8 m^2 and 16 pi rad^2, so that a hundredth of the arm hidden gives the camera a
-  standard deviation of 28 cm: whenever the skin is in range it decides nearly alone. That is the paper's weighting, and kept.
+  table of results requires a fast one: out of the skin's range the fused error there equals the camera's.
+- f_v sums m^ - m over all pixels, so that a mask too large elsewhere compensates for hidden parts, and divides by zero if the
+  rendered mask is empty: here it is the share of m^ that is hidden, in [0, 1], as the search publishes it with every pose.
+- R_v = f_v W_v is zero if nothing is hidden, which trusts the camera entirely: it has a floor of 1 cm and 1.4 degrees, the
+  resolution of a camera at 1.5 m. R_v then grows by W_v = 8 m^2 and 16 pi rad^2, so that a hundredth of the arm hidden gives the
+  camera a standard deviation of 28 cm: whenever the skin is in range it decides nearly alone. That is the paper's weighting, and
+  is kept.
 - R_c = f_c(x^, theta) by Gaussian-process regression: its inverse is the information of the haptic pose, with `penumbra haptics
-  --method paper` that of the regression (`Regression` of services/haptics/paper_network.py). Along what the skin does not observe
-  it is zero, and R_c infinite; so R^-1 is used throughout, R never, and a sense that has nothing to say has a block of zeros.
+  --method paper` that of the regression (`Regression` of services/haptics/paper_network.py). Along directions that the skin does
+  not observe it is zero, and R_c infinite; so only R^-1 is used, never R, and a sense without information has a block of zeros.
 - Continuous time, with measurements that arrive one by one: between two of them y moves on with u, and an old one is dropped.
   The Riccati equation is integrated by backward Euler in information form, stable for any step and gain; the low-pass exactly.
 - Late measurements: a sense's older pose after a newer one is refused; y is not taken back to its stamp.
-- P_0 is not given: W_v. P has no scale of its own, since that of Q and W_v is arbitrary. What is published as covariance is what
-  the senses' own covariances become through the stationary weights of the two, growing with their age.
+- P_0 is not given: W_v. P has no scale of its own, since that of Q and W_v is arbitrary. The published covariance follows from
+  the senses' own covariances by the stationary weights of the two, and grows with their age.
 - The paper has no gate: every measurement is used.
 """
 
@@ -39,9 +40,9 @@ from penumbra.shared.contract.messages import FusedPose, Source
 from penumbra.shared.geometry import rigid
 
 STEP_S = 0.01
-"""Longest step [s] of the integration. Chosen: the backward Euler step is stable for any."""
+"""Maximum step [s] of the integration. Chosen: the backward Euler step is stable for any."""
 SENSES = {"vision": slice(0, 6), "haptic": slice(6, 12)}
-"""Rows of y, g, z and C, and blocks of R: the paper's two senses. This observer takes no others, whatever the table has."""
+"""Rows of y, g, z and C, and blocks of R: the paper's two senses. This observer uses no others, whatever the table contains."""
 C = np.vstack([np.eye(6), np.eye(6)])
 """C = dg/dx (section "Modified Luenberger-type Observer"), (12, 6)."""
 
@@ -62,12 +63,11 @@ class PaperSettings:
 
     W_v : noise of a fully hidden arm, position [m^2] and rotation [rad^2] (section "Numerical Simulation").
     omega_n, zeta : low-pass on the pose [rad/s] and its damping (the same section).
-    floor : least hidden share: 1.25e-5 of W_v is (1 cm)^2 and (1.4 degrees)^2.
+    floor : minimum hidden share: 1.25e-5 of W_v is (1 cm)^2 and (1.4 degrees)^2.
     rate : lambda [1/s] in Q = lambda^2 W_v: one camera period.
     velocity_time : time constant of the smoothing of u [s]. Chosen, not measured.
-    hold : for how long a measurement of each sense is used [s]: its delay and two of its periods.
-    acceleration : by which the published covariance grows with age, density [m^2/s^3] and [rad^2/s^3]. Chosen,
-        not measured.
+    hold : maximum age [s] at which a measurement is used, by sense: its delay and two of its periods.
+    acceleration : density [m^2/s^3] and [rad^2/s^3] with which the published covariance grows with age. Chosen, not measured.
     """
 
     W_v: tuple[float, ...] = (8.0, 8.0, 8.0, 16 * np.pi, 16 * np.pi, 16 * np.pi)
@@ -104,7 +104,7 @@ class _State:
 
 
 class PaperObserver:
-    """The interface of `observer.ErrorStateObserver`, the paper's equations."""
+    """The paper's equations with the interface of `observer.ErrorStateObserver`."""
 
     def __init__(self, home: rigid.Array, spread: tuple[float, float], settings: PaperSettings | None = None):
         self.settings = settings or PaperSettings()
@@ -113,14 +113,14 @@ class PaperObserver:
         self._home_covariance = np.diag(np.repeat(np.square(spread), 3))
         self._W_v = np.diag(self.settings.W_v)
         self._Q = self.settings.rate**2 * self._W_v
-        self._nobody = np.linalg.inv(1e3 * self._W_v)  # R^-1 of a sense that says next to nothing
+        self._nobody = np.linalg.inv(1e3 * self._W_v)  # R^-1 of a sense with almost no information
         self._hold_ns = {source: int(1e9 * seconds) for source, seconds in self.settings.hold}
         self.forget()
 
     def forget(self) -> None:
-        """Begins anew; the counts go on."""
+        """Starts over; the counts continue."""
         self._held: dict[str, _Held] = {}
-        self._ahead: list[_State] = []  # the state at the newest measurement, and as far ahead as somebody asked
+        self._ahead: list[_State] = []  # the state at the newest measurement, and those ahead of it, as far as requested
         self._covariance = self._home_covariance
         self._weights: dict[str, float] = {}
         self.log.first_ns.clear()
@@ -139,8 +139,7 @@ class PaperObserver:
 
         source : `vision` (R_v from the share `hidden`) or `haptic` (R_c from the information). `step` is not used. Raises
         RefusedMeasurement, which is counted, for a pose that is no rigid transform, an information that is not symmetric and
-        positive semi-definite, and a stamp ahead of the reader's clock `now_ns` (where it is given); ValueError on an unknown
-        source.
+        positive semi-definite, and a stamp ahead of the reader's clock `now_ns` (if given); ValueError for an unknown source.
         """
         T, information = self.log.admitted(source, stamp_ns, T, information, now_ns)
         before = self._held.get(source)
@@ -153,7 +152,7 @@ class PaperObserver:
         R_inverse = np.linalg.inv(self.R_v(hidden or 0.0)) if source == "vision" else R_c_inverse
         held = _Held(stamp_ns, y, R_inverse, np.linalg.pinv(R_c_inverse, rcond=1e-9, hermitian=True))
         if not self._ahead or stamp_ns - self._newest_ns() > self.settings.limits.lost_age * 1e9:
-            # P(t_0) = P_0: nothing known but home; the first step moves x^ to what is measured
+            # P(t_0) = P_0: only home is known; the first step moves x^ to the measurement
             x = _pose(self._home)
             self._held = {source: held}
             self._ahead = [_State(stamp_ns - int(STEP_S * 1e9), x, self._W_v, np.zeros(6), x, np.zeros(6))]
@@ -168,10 +167,10 @@ class PaperObserver:
         return True
 
     def adopt(self, message: FusedPose) -> None:
-        """Nothing: the paper's state is bound to the measurements in use. It waits for its own."""
+        """Does nothing: the paper's state is bound to the measurements in use, so that it waits for its own."""
 
     def estimate(self, stamp_ns: int) -> Estimate:
-        """The pose at a stamp, not before the newest measurement. Disturbs nothing."""
+        """The pose at a stamp, not before the newest measurement. Does not change later estimates."""
         sources = {}
         for name, since_ns in self.log.first_ns.items():
             newest_ns = self._held[name].stamp_ns if name in self._held else since_ns
@@ -193,8 +192,8 @@ class PaperObserver:
         return self._newest_ns() if self._held else 0
 
     def R_v(self, hidden: float) -> Array:
-        """R_v (6, 6) = f_v W_v of the share f_v in [0, 1] of the arm that is hidden, with a floor (section "Integration of
-        Perception Methods")."""
+        """R_v (6, 6) = f_v W_v for the hidden share f_v in [0, 1] of the arm, with a floor (section "Integration of Perception
+        Methods")."""
         return max(hidden, self.settings.floor) * self._W_v
 
     def _newest_ns(self) -> int:
@@ -214,7 +213,7 @@ class PaperObserver:
             state = self._step(state, end_ns)
         if stamp_ns <= state.stamp_ns:
             return state
-        h = (stamp_ns - state.stamp_ns) * 1e-9  # nothing to correct with: u takes x^ on while it is forgotten
+        h = (stamp_ns - state.stamp_ns) * 1e-9  # no measurement in use: x^ moves on with u, which decays
         decay = float(np.exp(-h / self.settings.velocity_time))
         x = state.x + self.settings.velocity_time * (1.0 - decay) * state.u
         smooth, rate = self._low_pass(state, x, h)
@@ -232,7 +231,7 @@ class PaperObserver:
     def _riccati(self, P: Array, h: float, R_inverse: Array) -> Array:
         """P (6, 6) after a step h [s] of equ:luenberger_estim, dP/dt = A P + P A' + Q - P C' R^-1 C P with A = df/dx = 0.
 
-        A sense that says next to nothing keeps P bounded where no other does.
+        A sense with almost no information keeps P bounded if no other does.
         """
         P = np.linalg.inv(P + h * self._Q)
         P = np.linalg.inv(P + h * (C.T @ R_inverse @ C) + h * self._nobody)
@@ -250,7 +249,7 @@ class PaperObserver:
         share = 1.0 - np.exp(-h / settings.velocity_time)
         u = state.u + share * ((x - state.x) / h - state.u)
         smooth, rate = self._low_pass(state, x, h)
-        turns = x - _wrapped(x)  # whole turns, taken off the pose and its low-pass alike
+        turns = x - _wrapped(x)  # whole turns, subtracted from the pose and from its low-pass
         return _State(stamp_ns, x - turns, P, u, smooth - turns, rate)
 
     def _low_pass(self, state: _State, x: Array, h: float) -> tuple[Array, Array]:
@@ -264,7 +263,7 @@ class PaperObserver:
         return x + a * c + b * s, (omega * b - damping * a) * c - (omega * a + damping * b) * s
 
     def _weigh(self) -> None:
-        """Covariance and weights of the senses in use, by the stationary solution's shares of their R^-1."""
+        """Computes covariance and weights of the senses in use, from the shares of their R^-1 in the stationary solution."""
         in_use = self._in_use(self._newest_ns())
         gather = np.linalg.inv(sum((held.R_inverse for held in in_use.values()), start=self._nobody))
         shares = {name: gather @ held.R_inverse for name, held in in_use.items()}
@@ -296,7 +295,7 @@ def _wrapped(x: Array) -> Array:
 
 
 def _rates(x: Array) -> Array:
-    """B (6, 6): a small change of x as a pose error (translation, rotation vector about fixed axes)."""
+    """B (6, 6): maps a small change of x to a pose error (translation, rotation vector about fixed axes)."""
     about_y, about_z = rigid.rotation((0.0, x[4], 0.0)), rigid.rotation((0.0, 0.0, x[5]))
     B = np.eye(6)
     B[3:, 3] = about_z @ about_y[:, 0]

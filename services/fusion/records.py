@@ -1,7 +1,7 @@
-"""The records that the default observer, `filter.py` and `history.py`, works on: settings, a measurement, a state, an estimate.
+"""Records of the default observer, `filter.py` and `history.py`: settings, measurement, state, estimate.
 
-What there is of every sense is a record in an array (n,) of its own, in the order of the table of senses, so that the compiled
-filter serves any number of them.
+The data of the senses are an array (n,) of records in the order of the table of senses, so that the compiled filter serves any
+number of them.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 POSE, MOTION = 6, 18  # sizes of the pose, and of the pose with its velocity and acceleration, within the state
 UNITS = (0.1, 0.1, 0.1, 1.0, 1.0, 1.0)
-"""Units [m, rad] in which translations and rotations compare: a turn by 1 rad moves the ends of a forearm by about 10 cm."""
+"""Units [m, rad] that make translations and rotations comparable: a turn by 1 rad moves the ends of a forearm by about 10 cm."""
 GATES = 3
-"""How many gates a sense has: see `senses.Errors`."""
+"""Number of gates of a sense, see `senses.Errors`."""
 NEVER = -(1 << 62)
-"""The stamp of what has not happened."""
+"""Stamp of an event that has not happened."""
 NOBODY = -1
-"""The row of no sense."""
+"""Row that stands for no sense."""
 
 
 def size(senses: int) -> int:
@@ -48,25 +48,25 @@ MODEL = np.dtype(
 SENSE_MODEL = np.dtype(
     [
         *((name, "f8") for name in ("lasting", "time_constant", "floor")),  # as in `senses.Errors`
-        ("threshold", "f8", (GATES, POSE + 1)),  # squared Mahalanobis distances that its `gate` lets pass, by rank
+        ("threshold", "f8", (GATES, POSE + 1)),  # maximum squared Mahalanobis distances of its `gate`, by rank
     ]
 )
-"""The same of one sense."""
+"""The settings of one sense."""
 
 MEASUREMENT = np.dtype(
     [
         ("stamp_ns", "i8"),
         ("source", "i8"),  # row of the table of senses
-        ("rank", "i8"),  # k, how many directions it observes; what follows has k rows in use
+        ("rank", "i8"),  # k, the number of directions that it observes; the fields below have k rows in use
         ("p", "f8", 3),
         ("R", "f8", (3, 3)),
         ("directions", "f8", (POSE, POSE)),  # unit vectors (k, 6), in UNITS
         ("basis", "f8", (POSE, POSE)),  # (k, 6): `basis @ error` has independent entries ...
         ("sigma", "f8", POSE),  # ... with these standard deviations (k,)
-        ("ahead", "f8", POSE),  # `basis @` the pose error from p, R to where its likelihood peaks (k,)
-        ("has_axis", "i8"),  # whether the rotation about `axis` is not observed (a limb's, where its roll is not seen)
+        ("ahead", "f8", POSE),  # `basis @` the pose error from p, R to the peak of its likelihood (k,)
+        ("has_axis", "i8"),  # whether the rotation about `axis` is not observed (a limb's, if its roll is not seen)
         ("axis", "f8", 3),
-        ("slides", "i8"),  # whether a translation is not observed (along a limb, where neither of its ends is seen)
+        ("slides", "i8"),  # whether a translation is not observed (along a limb, if neither of its ends is seen)
     ]
 )
 """One pose of one sense, reduced to the directions that it observes."""
@@ -76,33 +76,33 @@ STATE = np.dtype(
         ("stamp_ns", "i8"),  # NEVER: nothing is known yet
         ("accepted_ns", "i8"),  # stamp of the last accepted measurement of any sense
         ("passed", "i8"),  # whether the last measurement was accepted
-        ("distance", "f8"),  # its squared Mahalanobis distance, and how many directions that has: 0 where it began the state
+        ("distance", "f8"),  # its squared Mahalanobis distance and the number of its directions: 0 if it started the state
         ("rank", "i8"),
         ("p", "f8", 3),
         ("R", "f8", (3, 3)),
         ("velocity", "f8", POSE),
         ("acceleration", "f8", POSE),
         ("agility", "f8", 2),  # learned factors on the process noise, linear and angular
-        ("wrong", "i8"),  # row of the sense that is taken for wrong by an offset; NOBODY
+        ("wrong", "i8"),  # row of the sense that counts as wrong by an offset, or NOBODY
         ("wander", "f8", 2),  # learned factors on the variance of the offset's random walk, in position and rotation
-        ("offset", "f8", POSE),  # by which it is, in units of its standard deviation beforehand
+        ("offset", "f8", POSE),  # of that sense, in units of its prior standard deviation
     ]
 )
-"""The filter after one measurement, without the covariance (size, size) of all errors, which is an array of its own."""
+"""The filter after one measurement, without the covariance (size, size) of all errors, which is a separate array."""
 
 SENSE_STATE = np.dtype(
     [
         ("measured_ns", "i8"),  # stamp of the last measurement
         ("surprise", "f8"),  # its squared Mahalanobis distance per direction
-        ("rank", "i8"),  # and the directions that it observed: as of a MEASUREMENT
+        ("rank", "i8"),  # and the directions that it observed, as in a MEASUREMENT
         ("directions", "f8", (POSE, POSE)),
-        ("learned_ns", "i8"),  # stamp of the last measurement that agility and doubt were adapted to
-        ("accepted_ns", "i8"),  # and of the last accepted one
-        ("refused", "i8"),  # how many were refused since
+        ("learned_ns", "i8"),  # stamp of the last measurement to which agility and doubt were adapted
+        ("accepted_ns", "i8"),  # stamp of the last accepted measurement
+        ("refused", "i8"),  # number of measurements refused since
         ("refused_ns", "i8"),  # stamp of the first of them
-        ("unsteady", "i8"),  # whether they are off by no offset that stays
-        # information that it brought [nats], fading: by how much it made the logarithm of the volume of the pose's uncertainty
-        # smaller. It counts what was new: the hundredth measurement with the same error brings next to nothing
+        ("unsteady", "i8"),  # whether their offset is not constant
+        # information [nats] that it contributed, with decay: decrease of the logarithm of the volume of the pose's uncertainty.
+        # Only what is new counts: the hundredth measurement with the same error contributes almost nothing
         ("gain", "f8"),
         ("doubt", "f8"),  # learned factor on its covariance
         ("has_innovation", "i8"),
@@ -110,7 +110,7 @@ SENSE_STATE = np.dtype(
         ("bias", "f8", POSE),
     ]
 )
-"""What the filter knows of one sense after a measurement of any."""
+"""The filter's state of one sense after a measurement of any sense."""
 
 ESTIMATE = np.dtype(
     [
@@ -120,10 +120,10 @@ ESTIMATE = np.dtype(
         ("state", "i8"),  # which of STATES
     ]
 )
-"""What is answered for one target: `estimate.Estimate` in arrays."""
+"""The estimate of one target: `estimate.Estimate` as arrays."""
 
 SENSE_ESTIMATE = np.dtype([("accepted_ns", "i8"), ("weight", "f8")])
-"""The same of one sense; its stamp is that of its last accepted measurement, NEVER where there is none."""
+"""The estimate of one sense; its stamp is that of its last accepted measurement, NEVER if there is none."""
 
 
 class History(NamedTuple):
@@ -153,6 +153,6 @@ class History(NamedTuple):
         )
 
     def of(self, targets: slice) -> History:
-        """The histories of some of the targets, without a copy."""
+        """The histories of some of the targets, as views."""
         measurements, states, senses, P, rings = self
         return History(measurements[targets], states[targets], senses[targets], P[targets], rings[targets])

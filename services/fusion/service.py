@@ -1,4 +1,4 @@
-"""Wiring of the fusion service: measurements of the senses in, the fused pose out at 200 Hz and to whoever asks."""
+"""Connects fusion to the bus: measurements of the senses in, the fused pose out at 200 Hz and on request."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ NAME = "fusion"
 OBSERVERS = {"default": ErrorStateObserver, "paper": PaperObserver}
 PERIOD_S = 1.0 / topics.FUSED.rate_hz
 SILENCE_S = 0.025
-"""A replica publishes after the one before it in rank has been silent for so long [s], five periods: a frozen process counts as
+"""Time [s] of silence of the replica before it in rank after which a replica publishes, five periods: a frozen process counts as
 alive for ten times as long."""
 WAITING = 5
-"""A replica that publishes nothing looks at its own pose in every so many periods: it only has to know whether it has one."""
+"""Number of periods after which a replica that does not publish reads its own pose: it only has to know whether it has one."""
 SET_BACK_S = 0.05
 """A clock that goes back by more than this [s] was set; by less, it is being synchronised. Chosen, not measured."""
 
@@ -51,11 +51,11 @@ EXAMPLE = "penumbra fusion --cell table --observer paper"
 
 
 def start(node: ServiceNode, options: flags.Options, senses: Sequence[Sense] = SENSES) -> None:
-    """Wires one observer per target, and one timer for all. senses: whose measurements are taken; the paper's observer takes its
-    two alone. Raises CellError for a target that the cell does not have.
+    """Creates one observer per target, and one timer for all. senses: senses whose measurements are used; the paper's observer
+    uses only its two. Raises CellError for a target that the cell does not have.
 
-    Threads: the senses' readers, the timer and the answers share the observers of a `Group` under its lock; `state` and what is
-    known of other replicas belong to the timer; `Publishers` has a stream for each reader, which alone uses it.
+    Threads: the senses' readers, the timer and the answers share the observers of a `Group` under its lock; only the timer uses
+    `state` and the data on other replicas; `Publishers` has a stream for each reader, and only this reader uses it.
     """
     names = [node.cell.one("targets", options.target)] if options.target else list(node.cell.targets)
     if options.observer == "paper":
@@ -76,12 +76,12 @@ def start(node: ServiceNode, options: flags.Options, senses: Sequence[Sense] = S
                 fusion.take(stamp_ns, estimate, is_due)
 
     node.every(PERIOD_S, publish)
-    # a replica that takes over goes on with the pose: it does not begin with "lost" while the other one knows it
+    # a replica that takes over continues the pose: it does not start with "lost" while the other one knows the pose
     node.warm_when(lambda: all(fusion.state != "lost" for fusion in fusions))
 
 
 class Group:
-    """The observers of the cell's targets, of which all can be asked at once, and their clock now_ns()."""
+    """The observers of the cell's targets, which can all be asked at once, and their clock now_ns()."""
 
     def __init__(
         self,
@@ -102,8 +102,8 @@ class Group:
             self.observers = [ErrorStateObserver.of(self._bank, i) for i in range(len(subjects))]
 
     def now_ns(self) -> int:
-        """The time, asked with the lock held. Where the clock was set back, all that is known is of the future and
-        says nothing of the present: it is forgotten. Where it was set forward, it is too old."""
+        """The time; the caller holds the lock. If the clock was set back, all stamps are in the future and say nothing about the
+        present: the observers start over. If it was set forward, all measurements are too old."""
         stamp_ns = self._now_ns()
         if stamp_ns < self._last_ns - SET_BACK_S * 1e9:
             for observer in self.observers:
@@ -112,7 +112,7 @@ class Group:
         return stamp_ns
 
     def estimates(self) -> tuple[int, list[Estimate]]:
-        """The time [ns] and the estimates of all."""
+        """The time [ns] and the estimates of all targets."""
         with self.lock:
             stamp_ns = self.now_ns()
             if self._bank is not None:
@@ -121,15 +121,15 @@ class Group:
 
 
 class Publishers:
-    """The publisher of each stream: one process at a time. Two that do not know of each other would count every error twice. A
-    replica that takes over is accepted as soon as the one before it has been silent for a while."""
+    """The publisher of each stream: one process at a time. Two processes that do not know of each other would count every error
+    twice. A replica that takes over is accepted as soon as the one before it has been silent for a while."""
 
     def __init__(self) -> None:
         self._publishers: dict[str, tuple[str, float]] = {}
 
     def check(self, stream: str, publisher: str, now_s: float, silence_s: float) -> None:
-        """Raises RefusedMeasurement for a publisher while another one of this stream has published in the last silence_s. now_s:
-        of a clock that nobody sets."""
+        """Raises RefusedMeasurement for a publisher if another one of this stream has published in the last silence_s. now_s:
+        from a monotonic clock."""
         known, received_s = self._publishers.get(stream, (publisher, now_s))
         if known != publisher and now_s - received_s < silence_s:
             raise RefusedMeasurement(
@@ -141,8 +141,8 @@ class Publishers:
 
 
 class Fusion:
-    """One target: its observer, its measurements and its pose. Every replica receives the measurements, the stream's owner
-    publishes, and the next in rank where it is silent. One that has no pose yet goes on from what the others publish."""
+    """One target: its observer, its measurements and its pose. Every replica receives the measurements. The stream's owner
+    publishes, and if it is silent, the next replica in rank. A replica without a pose continues from the poses of the others."""
 
     def __init__(
         self, node: ServiceNode, target: str, group: Group, observer: ErrorStateObserver | PaperObserver, senses: Sequence[Sense]
@@ -159,7 +159,7 @@ class Fusion:
         node.add_report(target, self.describe)
 
     def on_measurement(self, sense: Sense, message: Any, names: dict[str, str]) -> None:
-        """Hands a measurement on to the observer, or the fact that a sense runs but observes nothing; what is refused is
+        """Passes a measurement to the observer, or the fact that a sense runs but observes nothing. Refused measurements are
         counted, and the first of each kind is logged."""
         log = self.observer.log
         try:
@@ -175,7 +175,7 @@ class Fusion:
             if found is None:
                 log.received(sense.name, message.stamp_ns)
                 return
-            hidden = getattr(message, "hidden", None)  # the share by which the paper's observer weighs the camera
+            hidden = getattr(message, "hidden", None)  # the share with which the paper's observer weights the camera
             try:
                 T, information, step = found
                 self.observer.measure(sense.name, message.stamp_ns, T, information, hidden, now_ns, step)
@@ -188,7 +188,7 @@ class Fusion:
         self._publishers.check(stream, publisher, time.monotonic(), sense.topic.stale_s)
 
     def _follow_others(self) -> None:
-        """Notes when another replica published last, and takes over its pose where this one has none."""
+        """Notes when another replica published last, and adopts its pose if this one has none."""
         if (count := self._others.drain()) == self._others_count:
             return
         self._others_count, self._others_s = count, time.monotonic()
@@ -207,7 +207,7 @@ class Fusion:
             self.node.log.warning(why, target=self.target, source=source, kind=error.kind, why=str(error))
 
     def describe(self) -> dict[str, Any]:
-        """For the health report: the state, and what became of the measurements of each source."""
+        """Fields of the health report: the state, and the outcomes of the measurements of each source."""
         return {"state": self.state, **{source: asdict(counts) for source, counts in self.observer.log.counts.items()}}
 
     def is_due(self) -> bool:
@@ -216,7 +216,7 @@ class Fusion:
         return time.monotonic() - self._others_s >= self.node.rank(self.target) * SILENCE_S
 
     def take(self, stamp_ns: int, estimate: Estimate, is_due: bool) -> None:
-        """Notes an estimate's state, and publishes it where that is due."""
+        """Notes an estimate's state, and publishes the estimate if that is due."""
         changed, self.state = (estimate.state == "lost") != (self.state == "lost"), estimate.state
         if not is_due:
             return
@@ -226,9 +226,9 @@ class Fusion:
             self.node.log.info("lost" if estimate.state == "lost" else "found", target=self.target, **counts)
 
     def answer(self, parameters: dict[str, str], payload: bytes) -> tuple[bytes, str]:
-        """The current pose, or with `stamp_ns=` that at the stamp of a picture, say, using all measurements received so far:
-        MessagePack of FusedPose, or JSON with `format=json`. Raises ValueError on another format, and on a stamp that is none or
-        out of reach."""
+        """The current pose, or with `stamp_ns=` the pose at that stamp, such as a picture's, using all measurements received so
+        far: MessagePack of FusedPose, or JSON with `format=json`. Raises ValueError for another format, and for a stamp that is
+        no number or outside the history."""
         form = parameters.get("format", "msgpack")
         if form not in ("msgpack", "json"):
             raise ValueError(f"format: expected msgpack or json, got {form!r}")
@@ -244,7 +244,7 @@ class Fusion:
 
 
 def _within(text: str, earliest_ns: int, now_ns: int) -> int:
-    """The stamp [ns] that is asked for. Raises ValueError where none is known there."""
+    """The requested stamp [ns]. Raises ValueError if no pose is known there."""
     if not text.isdecimal() or not earliest_ns <= int(text) <= now_ns:
         raise ValueError(f"stamp_ns: expected nanoseconds from {earliest_ns} to {now_ns}, got {text!r}; ask within the history")
     return int(text)

@@ -1,20 +1,21 @@
-"""The trajectory of a target afterwards: every pose from the measurements before and after it.
+"""The trajectory of a target from a whole recording: every pose uses the measurements before and after it.
 
-1. The observer's filter runs over all measurements in the order of their stamps, with its gates, and backwards in time. What
-   passes in one direction is used: a limb that sets out as nobody expected is refused at first in one, at last in the other, a
-   wrong sense in both. Where the filter began anew a segment begins; nothing is carried over from one to the next.
-2. The filter runs over the used measurements of each segment, without gates: forwards and backwards in time, which shows how
-   unsteady the limb is at each moment, and then forwards with the mean of both.
+1. The observer's filter runs over all measurements in the order of their stamps, with its gates, and backwards in time. A
+   measurement that passes in one direction is used: those of a limb that sets out unexpectedly are refused at first in one
+   direction and at last in the other, those of a wrong sense in both. A segment begins where the filter started over; nothing is
+   carried over to the next one.
+2. The filter runs over the used measurements of each segment: with gates, forwards and backwards in time, which shows how
+   unsteady the limb is at each moment, and then forwards without gates, with the larger agility of the two.
 3. A fixed-interval smoother goes back over the states of the filter: pose, velocity, acceleration, and the biases of the senses.
-4. Every measurement is judged by the smoothed state, its own part in it taken out: one that was used and does not agree is left
-   out, one that was refused and agrees is used. Where that changes something, it goes on with 2, at most PASSES times.
+4. Every measurement is judged by the smoothed state without its own part in it: one that was used and does not agree is left
+   out, one that was refused and agrees is used. If that changes something, 2 to 4 are repeated, at most PASSES times.
 
 A state x with the covariance P is one step before a predicted state, P_p = F P F' + Q, whose smoothed error is e and whose
 smoothed covariance is P_s. With C = P F' P_p^-1 its own smoothed error is C e, and its covariance P + C (P_s - P_p) C', here as
 (I - C F) P (I - C F)' + C (Q + P_s) C', which rounding does not make indefinite.
 
-Errors are along fixed axes and rotations are applied from the left, as in the filter. A covariance turns with the pose that it
-belongs to: the roll that no sense observes is about the axis of the limb where the smoothed pose has it.
+Errors are along fixed axes and rotations are applied from the left, as in the filter. A covariance turns with its pose: the roll
+that no sense observes is about the axis of the limb at the smoothed pose.
 
 Sources: Rauch, Tung, Striebel, "Maximum likelihood estimates of linear dynamic systems" (1965), equations (3.28) to (3.31), DOI
 10.2514/3.3166; error states on SO(3): Sola (2017), as in `filter.py`; residuals without a measurement's own part: Cook, Weisberg,
@@ -37,20 +38,20 @@ from penumbra.shared.contract.senses import SENSES, Sense
 from penumbra.shared.geometry import rigid, so3
 
 PASSES = 4
-"""Largest number of times that 2 and 3 are done. Chosen: what changes in later ones is a measurement or two."""
+"""Maximum number of times that 2 and 3 are done. Chosen: later ones change only a measurement or two."""
 FOREVER_S = 1e9
 """A horizon [s] beyond all recordings."""
 BLOCK = 256
-"""Number of states that are taken on at a time: it bounds the memory for their transitions."""
+"""Number of states that are predicted at a time: it bounds the memory for their transitions."""
 OWN = 0.01
-"""Share of a measurement's white noise below which what is left of it says nothing: nothing else measured that direction. Chosen,
-not measured."""
+"""Minimum variance of a residual, as a share of the measurement's white noise: below it, nothing else measured that direction.
+Chosen, not measured."""
 Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
 class NothingMeasuredError(ValueError):
-    """There is no measurement that a trajectory could be made of."""
+    """There is no measurement from which a trajectory could be made."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +63,14 @@ class States:
     P: Array
 
     def of(self, which: Indices | slice) -> States:
-        """Some of them."""
+        """A selection of the states."""
         return States(self.now[which], self.senses[which], self.P[which])
 
     def copy(self) -> States:
         return States(self.now.copy(), self.senses.copy(), self.P.copy())
 
     def error(self, i: int, of: States, j: int) -> Array:
-        """The error (size,) that state j of others has, if state i of these is true."""
+        """The error (size,) of state j of the others, if state i of these is true."""
         rotation = np.empty(3)
         a, b = self.now[i], of.now[j]
         so3.log(a["R"] @ b["R"].T, rotation)
@@ -78,7 +79,7 @@ class States:
         return np.concatenate([a["p"] - b["p"], rotation, *rates, biases.ravel(), a["offset"] - b["offset"]])
 
     def correct(self, i: int, error: Array, P: Array) -> None:
-        """Moves state i by an error (size,), and gives it a covariance that belongs to the pose before, and turns with it."""
+        """Moves state i by an error (size,), and gives it a covariance P of the pose before, which turns with it."""
         turn = rigid.rotation(error[3:6])
         now = self.now[i]
         now["p"] += error[:3]
@@ -92,7 +93,7 @@ class States:
 
 
 def turned(turn: Array, P: Array) -> Array:
-    """A covariance (size, size) of a pose that a rotation (3, 3) is applied to."""
+    """The covariance (size, size) of a pose after a rotation (3, 3) is applied to the pose."""
     W = np.eye(len(P))
     W[3:6, 3:6] = W[9:12, 9:12] = W[15:18, 15:18] = turn
     out: Array = W @ P @ W.T
@@ -111,7 +112,7 @@ class Taken:
     steps: Array
 
     def of(self, which: Indices | Flags) -> Taken:
-        """Some of them."""
+        """A selection of the measurements."""
         return Taken(self.sources[which], self.stamps_ns[which], self.T[which], self.information[which], self.steps[which])
 
     def __len__(self) -> int:
@@ -119,14 +120,14 @@ class Taken:
 
 
 def reversed_in_time(measurements: NDArray[np.void]) -> NDArray[np.void]:
-    """Measurements (k,) as of a limb that goes its way back: the last one first, at the stamp of the first one."""
+    """Measurements (k,) of a limb that moves backwards in time: the last one first, at the stamp of the first one."""
     back = measurements[::-1].copy()
     back["stamp_ns"] = measurements["stamp_ns"][0] + measurements["stamp_ns"][-1] - back["stamp_ns"]
     return back
 
 
 class Filter:
-    """The observer's filter over measurements that are all there. is_gated: whether it refuses what is too far off."""
+    """The observer's filter over a complete set of measurements. is_gated: whether it refuses those that are too far off."""
 
     def __init__(self, subject: Subject, settings: FusionSettings, senses: Sequence[Sense], is_gated: bool):
         self.one, self.senses = np.array([model(settings, subject)], MODEL), sense_models(senses)
@@ -135,7 +136,7 @@ class Filter:
             self.senses["threshold"] = np.inf
 
     def known(self, taken: Taken) -> tuple[NDArray[np.void], States, Indices]:
-        """The measurements that it knows (k,), the states after them, and the fates of all (m,), of FATES."""
+        """The measurements that it keeps (k,), the states after them, and the outcomes of all (m,), indices of FATES."""
         count, n = len(taken), len(self.senses)
         memory = History.empty(1, count + 1, n)
         history.clear_all(*memory)
@@ -153,8 +154,8 @@ class Filter:
         return self._run(measurements, self.senses, agility, len(measurements) + 1).of(slice(1, None))
 
     def learned(self, measurements: NDArray[np.void]) -> NDArray[np.void]:
-        """The STATEs after measurements (k,), with the agilities that the filter learns, which its gates make quicker to learn;
-        without covariances, which are large."""
+        """The STATEs after measurements (k,), with the agilities that the filter learns, faster with its gates; without
+        covariances, which are large."""
         return self._run(measurements, self._gated, np.zeros((len(measurements), 2)), 2).now[1:]
 
     def _run(self, measurements: NDArray[np.void], senses: NDArray[np.void], agility: Array, kept: int) -> States:
@@ -167,8 +168,8 @@ class Filter:
         return states
 
     def agility(self, measurements: NDArray[np.void]) -> Array:
-        """Agilities (k, 2) of the motion to each measurement (k,) with which it is as unsteady as the filter finds it in the mean
-        of both directions of time. Forwards it learns late that a limb sets out, backwards that it stops."""
+        """Agilities (k, 2) of the motion to each measurement (k,): the larger of those that the filter learns forwards and
+        backwards in time. Forwards it learns late that a limb sets out, backwards that it stops."""
         out = np.zeros((len(measurements), 2))
         before = self.learned(measurements)[:-1]
         after = self.learned(reversed_in_time(measurements))[-2::-1]
@@ -192,7 +193,7 @@ class Filter:
 
 
 class Segment:
-    """What lies between two beginnings: the states after each measurement that is used (k,), by those up to it, and by all."""
+    """The used measurements between two starts of the filter, with the filtered and the smoothed states after them (k,)."""
 
     def __init__(self, filter: Filter, measurements: NDArray[np.void]):
         self._filter = filter
@@ -207,8 +208,8 @@ class Segment:
                 smooth(self.smoothed, k, later, k - begin, F[k - begin], Q[k - begin], self.smoothed, k + 1)
 
     def at(self, stamps_ns: Indices) -> States:
-        """The smoothed states at stamps (m,), none of them before the first measurement; after the last one, predictions. A block
-        at a time: each state takes 15 kB on the way."""
+        """The smoothed states at stamps (m,), none of them before the first measurement; after the last one, predictions. Call it
+        with a block at a time: each state needs 15 kB in between."""
         nearest = np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1
         out, _, _ = self._filter.moved(self._filtered.of(nearest), stamps_ns)
         within = np.flatnonzero(nearest + 1 < len(self.stamps_ns))
@@ -219,8 +220,8 @@ class Segment:
         return out
 
     def agreement(self, measurements: NDArray[np.void], states: States, is_used: bool) -> Array:
-        """Squared Mahalanobis distances (m,) of measurements from the smoothed states at their stamps. is_used: they are in these
-        states; then each is compared with what the others say."""
+        """Squared Mahalanobis distances (m,) of measurements from the smoothed states at their stamps. is_used: whether the
+        states contain them; each is then compared with the states without it."""
         z, H, white = self._filter.linearised(measurements, states)
         first = MOTION + POSE * measurements["source"][:, None] + np.arange(POSE)
         rows = np.concatenate([np.broadcast_to(np.arange(POSE), first.shape), first], axis=1)
@@ -232,7 +233,8 @@ class Segment:
 
 
 def smooth(states: States, i: int, later: States, j: int, F: Array, Q: Array, smoothed: States, k: int) -> None:
-    """One step back, in place: state i, by the smoothed state k at the stamp of its prediction j, with F and Q (size, size)."""
+    """One step back, in place: smooths state i from the smoothed state k at the stamp of its prediction j, with F and Q (size,
+    size)."""
     P = states.P[i]
     C = np.linalg.solve(later.P[j], F @ P).T
     ahead = smoothed.error(k, later, j)
@@ -243,7 +245,7 @@ def smooth(states: States, i: int, later: States, j: int, F: Array, Q: Array, sm
 
 
 class Trajectory:
-    """The poses of a target at all stamps from `begin_ns` to `end_ns`, those of its first and last measurement that is used."""
+    """The poses of a target at all stamps from `begin_ns` to `end_ns`, those of its first and last used measurement."""
 
     def __init__(self, segments: Sequence[Segment], limits: Limits):
         self._segments, self._limits = segments, limits
@@ -251,8 +253,8 @@ class Trajectory:
         self.begin_ns, self.end_ns = int(segments[0].stamps_ns[0]), int(segments[-1].stamps_ns[-1])
 
     def estimates(self, stamps_ns: Indices) -> Iterator[Estimate]:
-        """The poses at ascending stamps. The state is of the measurement nearest in time, before or after. Where nothing measured
-        for so long that the filter began anew, they are predictions from before. Raises ValueError for stamps outside."""
+        """The poses at ascending stamps. Their state depends on the measurement nearest in time, before or after. In a gap after
+        which the filter started over, they are predictions from before. Raises ValueError for stamps outside."""
         if len(stamps_ns) and not self.begin_ns <= stamps_ns[0] <= stamps_ns[-1] <= self.end_ns:
             raise ValueError(f"stamps: expected {self.begin_ns} to {self.end_ns}, got {stamps_ns[0]} to {stamps_ns[-1]}")
         of = np.searchsorted(self._begins_ns, stamps_ns, side="right") - 1
@@ -273,10 +275,11 @@ class Trajectory:
 
 
 class Smoother:
-    """Takes all measurements of one target, in any order, and makes its trajectory of them.
+    """Takes all measurements of one target, in any order, and computes its trajectory.
 
-    subject : what is known of the target beforehand. senses : whose measurements are taken. log : what became of them, as of the
-    observer's; `reinstated`: how many of those that the gates refused are used after all, and `dismissed`, the other way round.
+    subject : prior knowledge of the target. senses : senses whose measurements are used. log : outcomes of the measurements, as
+    in the observer; `reinstated`: number of refused ones that are used after all, and `dismissed`: of accepted ones that are not
+    used.
     """
 
     def __init__(self, subject: Subject, settings: FusionSettings | None = None, senses: Sequence[Sense] = SENSES):
@@ -287,15 +290,15 @@ class Smoother:
         self.reinstated = self.dismissed = 0
 
     def measure(self, source: str, stamp_ns: int, T: Array, information: Array, step: Array | None = None) -> None:
-        """Takes a pose T (4, 4) with its information (6, 6) and step (6,), as `ErrorStateObserver.measure`; what is wrong with it
-        is counted by `trajectory`. Raises ValueError on an unknown source."""
+        """Takes a pose T (4, 4) with its information (6, 6) and step (6,), as `ErrorStateObserver.measure`; `trajectory` counts
+        its faults. Raises ValueError for an unknown source."""
         self.log.check(source)
         step = np.zeros(POSE) if step is None else shaped(step, (POSE,))
         which, T, information = self._names.index(source), shaped(T, (4, 4)), shaped(information, (POSE, POSE))
         self._measured.append((stamp_ns, which, T, information, step))
 
     def trajectory(self) -> Trajectory:
-        """The trajectory, from the measurements so far. Raises NothingMeasuredError where none of them can be used."""
+        """The trajectory, from the measurements so far. Raises NothingMeasuredError if none of them can be used."""
         measurements, parts, passed, used = self._gated()
         open_filter = self.filter(self._settings)
         for left in range(PASSES - 1, -1, -1):
@@ -311,7 +314,7 @@ class Smoother:
         return Trajectory(segments, self._subject.limits)
 
     def segments(self) -> list[NDArray[np.void]]:
-        """The measurements of each segment that the gates pass, forwards or backwards in time. Raises NothingMeasuredError where
+        """The measurements of each segment that pass the gates, forwards or backwards in time. Raises NothingMeasuredError if
         there are none."""
         measurements, parts, _, used = self._gated()
         return [measurements[mine[used[mine]]] for mine in parts if used[mine].any()]
@@ -321,8 +324,8 @@ class Smoother:
         return Filter(self._subject, settings, self._senses, is_gated=False)
 
     def _gated(self) -> tuple[NDArray[np.void], list[Indices], Flags, Flags]:
-        """What the filter with its gates makes of all: the measurements that it knows (m,), the indices of those of each segment,
-        which have passed, and which are to be used."""
+        """Runs the filter with its gates over all: the measurements that it keeps (m,), the indices of those of each segment, and
+        flags of those that passed and of those to be used."""
         if not self._measured:
             raise NothingMeasuredError(f"expected poses of {' or '.join(self._names)}, got none")
         stamps_ns, sources, T, information, steps = (np.array(column) for column in zip(*self._measured, strict=True))
@@ -340,13 +343,13 @@ class Smoother:
         for number, start in enumerate(starts[1:], 1):
             last = int(np.flatnonzero(passed[:start])[-1])
             age_s = 1e-9 * float(states.now["stamp_ns"][start] - states.now["stamp_ns"][last])
-            if age_s <= self._subject.limits.lost_age:  # all was refused until it began anew: it should have begun earlier
+            if age_s <= self._subject.limits.lost_age:  # all were refused until it started over: it should have started earlier
                 starts[number] = last + 1
                 used[last + 1 : start] = True
         return measurements, np.split(np.arange(len(used)), starts[1:]), passed, used
 
     def _judged(self, segment: Segment, measurements: NDArray[np.void], used: Flags) -> Flags:
-        """Which of the measurements of a segment (m,) are to be used, by those that were (m,)."""
+        """Flags (m,) of the measurements of a segment to be used, from those of the ones that were."""
         thresholds, out = sense_models(self._senses)["threshold"], used.copy()
         mine = measurements[used]
         keep = thresholds[mine["source"], 0, mine["rank"]]

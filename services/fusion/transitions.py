@@ -1,7 +1,7 @@
-"""What the smoother needs of the filter's steps, compiled: all steps of a run, the motion between two states, and what is
-left of a measurement at a state.
+"""The filter's steps for the smoother, compiled: all steps of a run, the motion between two states, and the residual of a
+measurement at a state.
 
-They are the filter's own (`filter.step`, `filter.predict`, `filter.linearised`), so that what is smoothed is what was filtered.
+They are the filter's own (`filter.step`, `filter.predict`, `filter.linearised`), so that smoother and filter have the same model.
 """
 
 from __future__ import annotations
