@@ -14,9 +14,9 @@ bent, only the forearms are compared.
 
 One rival is compared per picture: all eight at once would delay the first pictures of a limb that was just found, and it would
 have moved by then. The mirror image comes first, as it is the farthest away: a limb found again with the wrong tilt is 10 cm off.
-Once all were compared, every second comparison is of the least refuted rival, and refuted ones wait while others are left, so
-that a right rival wins within a few pictures. If all are refuted, pictures are skipped: a comparison costs as much as the pose
-itself. A limb that is not quite the mesh has its mirror image as a rival in each picture (`against_mirror`).
+Once all were compared, every second comparison is of the rival that the pictures prefer most to the pose, if any, so that a right
+rival wins within a few pictures. If all are refuted, pictures are skipped: a comparison costs as much as the pose itself. A limb
+that is not quite the mesh has its mirror image as a rival in each picture (`against_mirror`).
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Rivals:
     def forget(self) -> None:
         """Start over, as with another limb."""
         self._next = 0
-        self._is_least_due = False
+        self._is_repeat_due = False
         self._begin()
 
     def _begin(self) -> None:
@@ -136,14 +136,13 @@ class Rivals:
         return True
 
     def _chosen(self) -> int:
-        """The rival to compare: the next one not refuted; once all were compared, every second time the least refuted one."""
-        evidence = [-math.inf if known is None else known for known in self._evidence]
-        self._is_least_due = not self._is_least_due
-        if self._is_least_due and -math.inf < min(evidence) < REFUTED:
-            return evidence.index(min(evidence))
-        in_turn = [(self._next + k) % RIVALS for k in range(RIVALS)]
-        which = next((k for k in in_turn if evidence[k] < REFUTED), self._next)
-        self._next = (which + 1) % RIVALS
+        """The rival to compare: the next one in turn, but every second time the one that the pictures prefer most to the pose, if
+        there is one and all were compared."""
+        self._is_repeat_due = not self._is_repeat_due
+        compared = [evidence for evidence in self._evidence if evidence is not None]
+        if self._is_repeat_due and len(compared) == RIVALS and min(compared) < 0.0:
+            return compared.index(min(compared))
+        which, self._next = self._next, (self._next + 1) % RIVALS
         return which
 
     def _doubt(self, best: Fit, T: Array, covariance: Array, excess: float) -> Array:
