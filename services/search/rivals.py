@@ -14,9 +14,9 @@ bent, only the forearms are compared.
 
 One rival is compared per picture: all eight at once would delay the first pictures of a limb that was just found, and it would
 have moved by then. The mirror image comes first, as it is the farthest away: a limb found again with the wrong tilt is 10 cm off.
-Once all were compared, every second comparison is of the rival that the pictures prefer most to the pose, if any, so that a right
-rival wins within a few pictures. If all are refuted, pictures are skipped: a comparison costs as much as the pose itself. A limb
-that is not quite the mesh has its mirror image as a rival in each picture (`against_mirror`).
+Once all were compared, every second comparison is of a rival that the pictures clearly prefer to the pose, if there is one, so
+that a right one wins within a few pictures. If all are refuted, pictures are skipped: a comparison costs as much as the pose
+itself. A limb that is not quite the mesh has its mirror image as a rival in each picture (`against_mirror`).
 """
 
 from __future__ import annotations
@@ -137,10 +137,10 @@ class Rivals:
 
     def _chosen(self) -> int:
         """The rival to compare: the next one in turn, but every second time the one that the pictures prefer most to the pose, if
-        there is one and all were compared."""
+        they do so clearly and all were compared."""
         self._is_repeat_due = not self._is_repeat_due
         compared = [evidence for evidence in self._evidence if evidence is not None]
-        if self._is_repeat_due and len(compared) == RIVALS and min(compared) < 0.0:
+        if self._is_repeat_due and len(compared) == RIVALS and min(compared) < -MOST:
             return compared.index(min(compared))
         which, self._next = self._next, (self._next + 1) % RIVALS
         return which

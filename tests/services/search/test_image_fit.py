@@ -215,10 +215,7 @@ def test_a_bent_hand_leaves_the_roll_open_and_nothing_else():
     np.testing.assert_allclose(bent - straight, limits.rotation**2 * np.outer(axis, axis), atol=1e-12)
 
 
-LEFT_OPEN = pytest.mark.xfail(strict=True, reason="the edges are seen 0.31 px off at the true pose, which confirms none")
-
-
-@pytest.mark.parametrize("seed", [pytest.param(seed, marks=LEFT_OPEN if seed == 2 else ()) for seed in SEEDS])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_what_the_prediction_knows_stays_known_where_the_hand_is_hidden(visible, seed):
     shot = visible[seed]
     behind, image = with_hand_covered(shot)
