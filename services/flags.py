@@ -407,15 +407,16 @@ def complete_service(ctx: click.Context, param: click.Parameter, incomplete: str
     return [CompletionItem(process.name) for process in PROCESSES if process.name.startswith(incomplete)]
 
 
-CELL = Option(
-    "--cell",
-    envvar="PENUMBRA_CELL",
-    show_envvar=True,
-    default="table",
-    metavar="CELL",
-    shell_complete=complete_cell,
-    help="table, arm or a YAML file",
-)
+_CELL: dict[str, Any] = {
+    "envvar": "PENUMBRA_CELL",
+    "show_envvar": True,
+    "metavar": "CELL",
+    "shell_complete": complete_cell,
+    "help": "table, arm or a YAML file",
+}
+CELL = Option("--cell", default="table", **_CELL)
+RUNNING_CELL = Option("--cell", show_default="the only one that runs there, else table", **_CELL)
+"""CELL of commands that look at a running cell; its value is None where none is given."""
 SECURE = Option(
     "--secure",
     type=Path,
@@ -469,7 +470,9 @@ METRICS = Option(
 )
 JSON = Option("--json", is_flag=True, help="print JSON")
 COMMON = (CELL, *BUS, *LOG)
-"""Flags of every command that connects to the bus."""
+"""Flags of every process on the bus, and of commands that need a cell file."""
+LOOKING = (RUNNING_CELL, *BUS, *LOG)
+"""Flags of commands that look at a running cell."""
 
 
 @contextmanager

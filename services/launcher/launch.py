@@ -352,7 +352,7 @@ def run(options: flags.Options, forkserver: ForkServer) -> int:
             )
             with (
                 flags.metrics(options.metrics_port, lambda: launcher.watch.health.values()),
-                runs.recorded(cell.name, meeting_points(options), options.secure, logs_of),
+                runs.recorded(cell.name, cells.source(options.cell), meeting_points(options), options.secure, logs_of),
             ):
                 return launcher.run(options.seconds)
         except bus.BusError:
