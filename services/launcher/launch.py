@@ -286,13 +286,13 @@ def _notifier(descriptor: int | None) -> Callable[[str], None] | None:
 
 
 def check_port(node: Node, port: int) -> None:
-    """Raise bus.BusError if another router has the port."""
+    """Raise bus.BusError if another program has the port."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("127.0.0.1", port))
         except OSError:
-            raise bus.taken(node.connection.where) from None
+            raise bus.taken(*node.connection.connect) from None
 
 
 def wait_for_router(node: Node, fleet: Fleet, port: int) -> None:
