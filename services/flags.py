@@ -346,7 +346,11 @@ def explain(error: click.ClickException) -> str:
 def _reason(error: click.ClickException) -> str:
     match error:
         case click.NoSuchOption():
-            known = [name for param in error.ctx.command.get_params(error.ctx) for name in param.opts] if error.ctx else []
+            params = error.ctx.command.get_params(error.ctx) if error.ctx else []
+            word = error.option_name.lstrip("-")
+            if any(isinstance(param, click.Argument) and param.name == word for param in params):
+                return f"no option {error.option_name}; give the {word} without it, as a word of its own"
+            known = [name for param in params if isinstance(param, click.Option) for name in param.opts]
             return f"no option {error.option_name}{meant(error.option_name, known)}"
         case click.MissingParameter() if error.param is not None:
             hint = error.param.get_error_hint(error.ctx) if error.ctx else error.param.name or ""

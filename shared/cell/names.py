@@ -3,6 +3,7 @@ because importing the model of a whole cell takes longer than they run."""
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -60,8 +61,15 @@ def source(cell: str | Path) -> Path:
     path = built_in(cell) or Path(cell)
     if not is_file(path):
         ours = ", ".join(sorted(p.stem for p in BUILT_IN.glob("*.yaml")))
-        raise CellError(f"no cell {str(cell)!r}: give one of {ours}, or the path of a YAML file")
+        raise CellError(f"{_missing(path)}: give one of {ours}, or the path of a YAML file")
     return path
+
+
+def _missing(path: Path) -> str:
+    """What is wrong with a path where there is no file."""
+    if os.path.isdir(path):
+        return f"{path} is a folder"
+    return f"no such file {path}" if path.suffix or len(path.parts) > 1 else f"no cell {str(path)!r}"
 
 
 def built_in(cell: str | Path) -> Path | None:

@@ -54,6 +54,10 @@ def endpoint():
             ["fusion", "--cell", "nowhere"],
             "penumbra fusion: no cell 'nowhere': give one of arm, table, or the path of a YAML file",
         ),
+        (["check", "nope.yaml"], "penumbra check: no such file nope.yaml: give one of arm, table, or the path of a YAML file"),
+        (["check", "nope/cell"], "penumbra check: no such file nope/cell: give one of arm, table, or the path of a YAML file"),
+        (["check", "/"], "penumbra check: / is a folder: give one of arm, table, or the path of a YAML file"),
+        (["pose", "--target", "hand"], "penumbra pose: no option --target; give the target without it, as a word of its own"),
         (
             ["pose", "--connect", "nonsense"],
             "penumbra pose: endpoint: expected PROTOCOL/ADDRESS, as in tcp/127.0.0.1:7447, got 'nonsense'",
