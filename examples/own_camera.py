@@ -1,10 +1,9 @@
 """Publishes the images of a camera, or of a video file again and again, as a camera of the cell.
+They must have the size that the cell file gives: see docs/own-camera.md.
 
     penumbra up --cell mycell.yaml               # in another terminal; a cell file without `sim` starts no emulator
     python examples/own_camera.py 0              # /dev/video0
     python examples/own_camera.py video.mp4 --camera front
-
-The images must have the size that the cell file gives: see docs/own-camera.md.
 """
 
 import argparse
@@ -38,5 +37,9 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(KeyboardInterrupt):
-        main()
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            main()
+    except (LookupError, ValueError) as error:  # no such camera; images of another size
+        print(error, file=sys.stderr)
+        sys.exit(2)

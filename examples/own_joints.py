@@ -8,6 +8,7 @@ Put the call of your robot into `measure`. Angles are in radians, in the order o
 
 import contextlib
 import math
+import sys
 import time
 
 import numpy as np
@@ -23,6 +24,9 @@ def measure(joints: tuple[str, ...]) -> tuple[np.ndarray, int]:
 
 def main() -> None:
     with penumbra.connect() as cell:
+        if not cell.robots:
+            print(f"expected a cell with a robot, got {cell.name}, which has none", file=sys.stderr)
+            sys.exit(2)
         robot = cell.robot(cell.robots[0])
         print(f"robot {robot.name}: {', '.join(robot.joints)}", flush=True)
         while True:

@@ -346,7 +346,11 @@ def explain(error: click.ClickException) -> str:
 def _reason(error: click.ClickException) -> str:
     match error:
         case click.NoSuchOption():
-            known = [name for param in error.ctx.command.get_params(error.ctx) for name in param.opts] if error.ctx else []
+            params = error.ctx.command.get_params(error.ctx) if error.ctx else []
+            word = error.option_name.lstrip("-")
+            if any(isinstance(param, click.Argument) and param.name == word for param in params):
+                return f"no option {error.option_name}; give the {word} without it, as a word of its own"
+            known = [name for param in params if isinstance(param, click.Option) for name in param.opts]
             return f"no option {error.option_name}{meant(error.option_name, known)}"
         case click.MissingParameter() if error.param is not None:
             hint = error.param.get_error_hint(error.ctx) if error.ctx else error.param.name or ""
@@ -407,15 +411,16 @@ def complete_service(ctx: click.Context, param: click.Parameter, incomplete: str
     return [CompletionItem(process.name) for process in PROCESSES if process.name.startswith(incomplete)]
 
 
-CELL = Option(
-    "--cell",
-    envvar="PENUMBRA_CELL",
-    show_envvar=True,
-    default="table",
-    metavar="CELL",
-    shell_complete=complete_cell,
-    help="table, arm or a YAML file",
-)
+_CELL: dict[str, Any] = {
+    "envvar": "PENUMBRA_CELL",
+    "show_envvar": True,
+    "metavar": "CELL",
+    "shell_complete": complete_cell,
+    "help": "table, arm or a YAML file",
+}
+CELL = Option("--cell", default="table", **_CELL)
+RUNNING_CELL = Option("--cell", show_default="the only one that runs there, else table", **_CELL)
+"""CELL of commands that look at a running cell; its value is None where none is given."""
 SECURE = Option(
     "--secure",
     type=Path,
@@ -469,7 +474,9 @@ METRICS = Option(
 )
 JSON = Option("--json", is_flag=True, help="print JSON")
 COMMON = (CELL, *BUS, *LOG)
-"""Flags of every command that connects to the bus."""
+"""Flags of every process on the bus, and of commands that need a cell file."""
+LOOKING = (RUNNING_CELL, *BUS, *LOG)
+"""Flags of commands that look at a running cell."""
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from importlib.machinery import PathFinder
 from pathlib import Path
 
 import numpy as np
@@ -202,11 +203,18 @@ def _networks(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fa
 
 
 def _sources(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:
-    """Missing films and folders: they may be where the camera's process runs."""
+    """Missing films, folders and modules: they may be where the process that reads them runs."""
     for name, source in cell.sources.items():
         if source.is_played and not (path := source.path(cell.folder)).exists():
             what = f"expected a film or a folder of pictures, got nothing at {path}"
             yield document.fault(f"cameras.{name}.source.url", f"{what}; correct it, or put it there", is_warning=True)
+    cameras = {f"cameras.{name}": source for name, source in cell.sources.items()}
+    robots = {f"robots.{name}": source for name, source in cell.joint_sources.items()}
+    for part, each in (cameras | robots).items():
+        module = each.place.partition(":")[0]
+        if each.kind == "adapter" and not PathFinder.find_spec(module.partition(".")[0], [str(cell.folder), *sys.path]):
+            what = f"expected the module {module} beside the cell file or installed, got none"
+            yield document.fault(f"{part}.source.url", f"{what}; correct it, or put it there", is_warning=True)
 
 
 def _cameras(cell: cells.Cell, document: Document, near: Nearby) -> Iterator[Fault]:

@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from penumbra.services import flags
-from penumbra.services.command import check
+from penumbra.services.command import check, look
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.processes import PROCESSES
-from penumbra.shared.runtime import bus, running
+from penumbra.shared.runtime import bus, running, which
 
 ROOT = Path(__file__).parents[2]
 SHM_BYTES = 128 << 20
@@ -47,20 +47,21 @@ class Finding:
     flags.Option("--skin", is_flag=True, help="look at the pads of the running cell instead, by their voltages"),
     flags.Option("--seconds", type=flags.above_zero, default=6.0, help="with --skin: how long to listen, 2 to 3600"),
     flags.JSON,
-    *flags.COMMON,
+    *flags.LOOKING,
     example="penumbra doctor\npenumbra doctor --skin --seconds 10",
 )
 def main(options: flags.Options) -> int:
     """Print every finding; returns 1 if any failed."""
+    cell = look.file_of(options)
     if options.skin:
         from penumbra.services.skin import doctor
 
         if not 2.0 <= options.seconds <= 3600.0:
             flags.refuse(f"--seconds: expected 2 to 3600, got {options.seconds:g}")
-        return doctor.main(cells.load(options.cell), bus.connection(options), options.seconds, options.json)
+        return doctor.main(cells.load(cell), bus.connection(options), options.seconds, options.json)
     if flags.is_given("seconds"):
         flags.refuse("expected --skin beside --seconds, got --seconds alone")
-    found: Iterable[Finding] = findings(options.cell, bus.connection(options))
+    found: Iterable[Finding] = findings(cell, bus.connection(options))
     if options.json:
         found = list(found)
         print(json.dumps([asdict(finding) for finding in found]))
@@ -226,7 +227,12 @@ def _processes(cell: str, connection: bus.Connection) -> Iterator[Finding]:
         return
     with bus.open_session(connection, threading.Event(), lambda: None, 0.0) as session:
         instances = running.ask(session, name)
-    if not instances:
+        others = running.cells_at_work(session)
+    if not instances and others:
+        yield Finding(
+            "warn", f"no process of cell {name} runs there, where cells run: {', '.join(others)}", which.give(others[0])
+        )
+    elif not instances:
         yield Finding("warn", f"no process of cell {name} runs there", f"penumbra up --cell {cell}")
     for instance in instances:
         mend = f"penumbra restart {instance.service}" if instance.status == "down" else ""

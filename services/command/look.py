@@ -22,7 +22,7 @@ from penumbra.services import flags
 from penumbra.shared.cell import names
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.report import TopicReport
-from penumbra.shared.runtime import bus, running
+from penumbra.shared.runtime import bus, running, which
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -55,21 +55,21 @@ ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "st
         help="wait until the target is tracked, at most so long",
     ),
     flags.Option("--json", is_flag=True, help="print the answer as it is on the bus, one line a pose"),
-    *flags.COMMON,
+    *flags.LOOKING,
     example="penumbra pose --wait 30\npenumbra pose forearm --json",
 )
 def pose(options: flags.Options) -> int:
     """Print the pose; returns 0, or 3 if it is lost."""
     if options.watch and options.wait is not None:
         flags.refuse("expected --watch or --wait, got both")
-    cell = names.read(options.cell)
-    target = cell.target(options.target)
     patience_s = PATIENCE_S if options.wait is None else options.wait
     deadline = time.monotonic() + (options.wait or 0.0)
+    cell = names.read(options.cell) if options.cell else None
     with open_session(bus.connection(options), patience_s) as session:
         while True:
             try:
-                found = _ask_pose(session, cell.name, target)
+                cell = cell or which.names_of(session, None)
+                found = _ask_pose(session, cell.name, cell.target(options.target))
             except bus.BusError as error:
                 if not options.watch and time.monotonic() >= deadline:
                     raise
@@ -87,7 +87,7 @@ def pose(options: flags.Options) -> int:
 def _ask_pose(session: zenoh.Session, cell: str, target: str) -> dict[str, Any]:
     answers = bus.ask(session, topics.current_pose(cell, target), "format=json")
     if not answers:
-        raise bus.BusError(f"no answer for the pose of {target} in cell {cell}: {running.whats_there(session, cell, 'fusion')}")
+        raise bus.BusError(f"no answer for the pose of {target} in cell {cell}: {which.whats_there(session, cell, 'fusion')}")
     found: dict[str, Any] = json.loads(answers[0])
     return found
 
@@ -135,7 +135,7 @@ def _row(values: list[float], scale: float, spec: str, unit: str, spread: float 
     flags.Option("--hz", is_flag=True, help="measure what arrives, and print it with the state of the processes"),
     flags.Option("--seconds", type=flags.above_zero, default=3.0, help="with --hz: how long to listen"),
     flags.JSON,
-    *flags.COMMON,
+    *flags.LOOKING,
     example="penumbra topics --hz --seconds 5",
 )
 def list_topics(options: flags.Options) -> None:
@@ -149,7 +149,7 @@ def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.T
     """Print the known topics, or their traffic."""
     from penumbra.shared.cell import description
 
-    cell = description.load(options.cell)
+    cell = description.load(file_of(options))
     if options.hz:
         received, instances = listen(cell, bus.connection(options), options.seconds, known)
         if options.json:
@@ -237,6 +237,8 @@ def listen(
         assert node.session is not None
         node.stopping.wait(seconds)
         instances = [found for found in running.ask(node.session, cell.name) if found.instance != node.instance]
+        if not instances:
+            print(f"cell {cell.name}: {which.elsewhere(node.session, cell.name)}", file=sys.stderr)
         return node.report().topics, instances
 
 
@@ -311,23 +313,46 @@ def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dic
     ),
     flags.Argument("value", nargs=-1, help="of occlude, motion, speed, skin and board"),
     flags.JSON,
-    *flags.COMMON,
+    *flags.LOOKING,
     example="penumbra sim occlude 0.8\npenumbra sim state --json",
 )
 def sim(options: flags.Options) -> None:
     """Pass the command to the emulator, which decides what is possible."""
-    cell = names.read(options.cell)
     request = {"command": options.action} | ({"value": " ".join(options.value)} if options.value else {})
     with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:
-        answers = bus.ask(session, topics.control(cell.name), payload=json.dumps(request).encode())
+        cell = which.name_of(session, options.cell)
+        answers = bus.ask(session, topics.control(cell), payload=json.dumps(request).encode())
         if not answers:
-            raise bus.BusError(f"no emulator in cell {cell.name}: {running.whats_there(session, cell.name, 'emulator')}")
+            raise bus.BusError(f"no emulator in cell {cell}: {which.whats_there(session, cell, 'emulator')}")
     state = json.loads(answers[0])
     print(json.dumps(state) if options.json else "\n".join(f"{name:10} {_plain(value)}" for name, value in state.items()))
 
 
 def _plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
+
+
+def file_of(options: flags.Options) -> str:
+    """The cell that --cell names; without it the file of the only one that runs at the router, else the default, also where there
+    is no router. The file of a running cell is known if it is built in, or if `penumbra up` runs it on this machine. Raises
+    BusError for another one."""
+    if options.cell:
+        return str(options.cell)
+    connection = bus.connection(options)
+    try:
+        with open_session(connection, 0.0) as session:
+            name = running.only_cell(session)
+    except bus.BusError:  # the command reports it, if it needs a router
+        return names.DEFAULT
+    if name is None:
+        return names.DEFAULT
+    from penumbra.services.command import runs  # imports psutil, which `penumbra pose` does without
+
+    where = set(connection.connect or (connection.default,))
+    files = [run.file for run in runs.running() if run.cell == name and run.file and where & set(run.connect)]
+    if not files and not names.built_in(name):
+        raise bus.BusError(f"cell {name} runs at {connection.where}, and its file is not known here: {which.give(name)}")
+    return files[0] if files else name
 
 
 def open_session(connection: bus.Connection, patience_s: float = PATIENCE_S) -> zenoh.Session:

@@ -26,7 +26,7 @@ BEGAN_S = 1.0
 @dataclass(frozen=True)
 class Run:
     """A launcher: its process, that process's start time [s since the epoch], its cell, the endpoints at which the processes
-    meet, the folder of certificates, and the folder of logs if it runs in the background."""
+    meet, the folder of certificates, the folder of logs if it runs in the background, and the cell's file."""
 
     pid: int
     began: float
@@ -34,6 +34,7 @@ class Run:
     connect: tuple[str, ...]
     secure: str | None = None
     logs: str | None = None
+    file: str | None = None
 
 
 def folder() -> Path:
@@ -48,11 +49,11 @@ def logs_of(cell: str) -> Path:
 
 
 @contextlib.contextmanager
-def recorded(cell: str, connect: tuple[str, ...], secure: Path | None, logs: Path | None) -> Iterator[None]:
-    """Context in which `penumbra ps` and `penumbra down` find this launcher. If nothing can be written they do not, but the
-    launcher runs."""
+def recorded(cell: str, file: Path, connect: tuple[str, ...], secure: Path | None, logs: Path | None) -> Iterator[None]:
+    """Context in which `penumbra ps` and `penumbra down` find this launcher, and commands that look find its cell's file. If
+    nothing can be written they do not, but the launcher runs."""
     run = Run(os.getpid(), psutil.Process().create_time(), cell, connect, str(secure) if secure else None,
-              str(logs) if logs else None)  # fmt: skip
+              str(logs) if logs else None, str(file.resolve()))  # fmt: skip
     path = None
     with contextlib.suppress(OSError, RuntimeError):
         path = folder() / "run" / f"{run.pid}.json"

@@ -25,7 +25,7 @@ from penumbra.shared.contract import messages, topics
 from penumbra.shared.contract.labels import COLOURS, Label
 from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.lens import Undistortion
-from penumbra.shared.runtime import bus
+from penumbra.shared.runtime import bus, running, which
 from penumbra.shared.skin.layout import Skin, link_names, pad_poses
 
 PATIENCE_S = 5.0
@@ -52,12 +52,12 @@ def _picture(text: str) -> Path:
     flags.Argument("out", type=_picture, metavar="FILE", help="the picture to write (.png or .jpg)"),
     flags.Option("--camera", shell_complete=flags.complete_part("cameras"), show_default="its first", help="of the cell"),
     flags.Option("--target", shell_complete=flags.complete_part("targets"), show_default="its first", help="of the cell"),
-    *flags.COMMON,
+    *flags.LOOKING,
     example="penumbra snapshot cell.png --camera front",
 )
 def main(options: flags.Options) -> None:
     """Write the picture, and print its size."""
-    cell = cells.load(options.cell)
+    cell = cells.load(look.file_of(options))
     camera, target = cell.one("cameras", options.camera), cell.one("targets", options.target)
     with look.open_session(bus.connection(options)) as session:
         heard = listen(session, cell, camera, target)
@@ -107,10 +107,8 @@ def listen(session: zenoh.Session, cell: cells.Cell, camera: str, target: str) -
                 "volts": {name: message.volts.mean(axis=0) for name, message in voltages.items()},
             }
         time.sleep(0.01)
-    raise bus.BusError(
-        f"cell {cell.name}: expected {missing} within {PATIENCE_S:.0f} s, got none; check `penumbra topics --hz`, or start "
-        "`penumbra up`"
-    )
+    remedy = "check `penumbra topics --hz`" if running.ask(session, cell.name) else which.elsewhere(session, cell.name)
+    raise bus.BusError(f"cell {cell.name}: expected {missing} within {PATIENCE_S:.0f} s, got none; {remedy}")
 
 
 def draw(

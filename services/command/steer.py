@@ -10,9 +10,8 @@ from typing import Any
 
 from penumbra.services import flags
 from penumbra.services.command.look import open_session
-from penumbra.shared.cell import names
 from penumbra.shared.contract import access, topics
-from penumbra.shared.runtime import bus
+from penumbra.shared.runtime import bus, which
 
 ASK_S = 0.2
 PATIENCE_S = 10.0
@@ -31,7 +30,7 @@ PATIENCE_S = 10.0
     ),
     flags.Option("--all", is_flag=True, help="every service, also one that can run only once (emulator)"),
     flags.JSON,
-    *flags.COMMON,
+    *flags.LOOKING,
     example="penumbra restart fusion haptics",
 )
 def restart(options: flags.Options) -> int:
@@ -53,7 +52,7 @@ def _replicas(text: str) -> tuple[str, int]:
     "Changes the number of replicas of a service of the running `penumbra up`.",
     flags.Argument("replicas", type=_replicas, metavar="NAME=NUMBER", help="as in segmentation=2; 0 ends it"),
     flags.JSON,
-    *flags.COMMON,
+    *flags.LOOKING,
     example="penumbra scale segmentation=2",
 )
 def scale(options: flags.Options) -> int:
@@ -65,13 +64,13 @@ def scale(options: flags.Options) -> int:
 def _change(options: flags.Options, command: dict[str, Any]) -> int:
     """Request a change from every launcher of the cell, and print its progress until all are done; returns 1 if one of them
     failed."""
-    cell = names.read(options.cell)
-    key, name = topics.launcher(cell.name), secrets.token_hex(8)
     with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:
+        cell = which.name_of(session, options.cell)
+        key, name = topics.launcher(cell), secrets.token_hex(8)
         states = _ask(session, key, command | {"id": name})
         if not states:
             raise bus.BusError(
-                f"no launcher runs in cell {cell.name}: start `penumbra up`; containers are restarted by docker compose"
+                f"no launcher runs in cell {cell}: start `penumbra up`; containers are restarted by docker compose"
             )
         told, heard = "", time.monotonic()
         while not all(state["done"] for state in states):
@@ -83,7 +82,7 @@ def _change(options: flags.Options, command: dict[str, Any]) -> int:
             if answers := _ask(session, key, {"command": "state", "id": name}):
                 states, heard = answers, time.monotonic()
             elif time.monotonic() - heard > PATIENCE_S:
-                raise bus.BusError(f"the launcher of cell {cell.name} ended during the {states[0]['what']}")
+                raise bus.BusError(f"the launcher of cell {cell} ended during the {states[0]['what']}")
     if options.json:
         print(json.dumps(states))
     else:

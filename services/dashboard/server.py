@@ -137,7 +137,9 @@ class Server:
                 listening.listen(64)
             except OSError as error:
                 listening.close()
-                self.fault = f"the page cannot be served at {place.address}:{port} ({error.strerror}): give another --page"
+                if not self.fault:
+                    self.fault = f"the page cannot be served at {place.address}:{port} ({error.strerror}): give another --page"
+                    self._node.log.warning("the page waits for its port", why=self.fault)
                 may_move = error.errno == errno.EADDRINUSE and not place.is_chosen and waited_s >= NEWS_S
                 if may_move and (waited_s >= HANDOVER_S or not await asyncio.to_thread(self._is_second)):
                     port = 0

@@ -4,8 +4,10 @@ With --serial the voltages of pads go the way of the real skin: as bytes of thei
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,6 +17,7 @@ from penumbra.services.emulator.control import control
 from penumbra.services.emulator.pacing import Pacer, Time
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.topics import VOLTAGES
+from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 from penumbra.sim.world.world import TICK_NS, Sensors, Stream, World
 
@@ -24,6 +27,8 @@ PLAN_S = 10.0
 """Time [s] by which the limb's motion is planned ahead, in the frames' thread: planning must not delay the skin."""
 AHEAD_S = 0.1
 """Delay [s] of a command: frames until then may have been rendered already."""
+LEAVES_S = 2.0
+"""Time [s] that an emulator waits for one that has just ended: on another host it counts as alive for a second more."""
 AGAIN_S = 0.001
 """Period [s] of a turn, which waits by itself; this only keeps a failing one from busy-looping."""
 
@@ -49,6 +54,24 @@ FLAGS = (
 EXAMPLE = "penumbra emulator --cell table --seed 7 --occlude 0.5"
 
 
+def refuse_second(node: Node) -> None:
+    """Raise bus.BusError if the cell has an emulator already. Without a router there is none."""
+    with contextlib.ExitStack() as stack:
+        try:
+            session = stack.enter_context(bus.open_session(node.connection, node.stopping, lambda: None, 0.0))
+        except bus.BusError:  # the node waits for the router, or reports the fault
+            return
+        deadline = time.monotonic() + LEAVES_S
+        while any(reply.ok for reply in session.liveliness().get(topics.alive(node.cell.name, NAME))):
+            if time.monotonic() > deadline:
+                raise bus.BusError(
+                    f"cell {node.cell.name} at {node.connection.where} has an emulator already, and two would contradict each "
+                    "other: end that one first, or start its `penumbra up` with --replicas emulator=0"
+                )
+            if node.stopping.wait(0.1):
+                return
+
+
 def start(node: Node, options: flags.Options) -> None:
     """Threads: the skin's timer, one timer per camera and the answers share the world; motions and occluders have their own
     locks, and commands replace the data that the timers read.
@@ -56,6 +79,7 @@ def start(node: Node, options: flags.Options) -> None:
     Every stream has its own turn: the next data is prepared before its instant, as in a real sensor.
     """
     cell = node.cell
+    refuse_second(node)
     world = World(cell, options.seed)
     world.plan(PLAN_S)
     sensors = Sensors(world, node.now_ns())

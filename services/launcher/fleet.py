@@ -168,16 +168,14 @@ class Fleet:
             services = running
         strangers = [name for name in services if name not in running] if isinstance(services, list) else [services]
         if strangers:
-            raise ValueError(
-                f"restart: expected one of {', '.join(running) or 'no service'}, which run here, got {strangers[0]!s:.60}"
-            )
+            raise ValueError(f"expected one of {', '.join(running) or 'no service'}, which run here, got {strangers[0]!s:.60}")
         chosen = [name for name in running if name in services]
         return Change(f"restart of {', '.join(chosen) or 'nothing'}", self._one_after_another(chosen))
 
     def _scale(self, service: Any, number: Any) -> Change:
         if service not in self._kinds or not isinstance(number, int) or isinstance(number, bool):
             raise ValueError(
-                f"scale: expected NAME=NUMBER with NAME one of {', '.join(self._kinds)}, got {service!s:.60}={number!s:.60}"
+                f"expected NAME=NUMBER with NAME one of {', '.join(self._kinds)}, got {service!s:.60}={number!s:.60}"
             )
         self._kinds[service].check(service, number)
         return Change(f"scale {service} to {number}", self._to_number(service, number))

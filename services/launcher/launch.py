@@ -23,6 +23,7 @@ from penumbra.services.launcher.supervised import ProcessRow, Supervised
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.processes import LAUNCHER, PROCESSES, ROUTER, Process
+from penumbra.shared.contract.report import Report
 from penumbra.shared.runtime import bus, logs, page
 from penumbra.shared.runtime.connection import connect_by_environment
 from penumbra.shared.runtime.hang import HANG_S
@@ -286,13 +287,13 @@ def _notifier(descriptor: int | None) -> Callable[[str], None] | None:
 
 
 def check_port(node: Node, port: int) -> None:
-    """Raise bus.BusError if another router has the port."""
+    """Raise bus.BusError if another program has the port."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("127.0.0.1", port))
         except OSError:
-            raise bus.taken(node.connection.where) from None
+            raise bus.taken(*node.connection.connect) from None
 
 
 def wait_for_router(node: Node, fleet: Fleet, port: int) -> None:
@@ -330,7 +331,12 @@ def run(options: flags.Options, forkserver: ForkServer) -> int:
     logs_of = runs.logs_of(cell.name) if options.notify else None
     processes = fleet(cell, options, forkserver, runs.Logs(logs_of).write if logs_of else None)
     node = Node(LAUNCHER.name, cell, bus.Connection(connect=meeting_points(options), secure=options.secure))
-    with node.until_signal():
+    launchers: list[Launcher] = []  # filled once the bus is there; the metrics' port opens before anything starts
+
+    def health() -> list[Report]:
+        return [report for launcher in launchers for report in launcher.watch.health.values()]
+
+    with node.until_signal(), flags.metrics(options.metrics_port, health):
         try:
             forkserver.wait(FORKSERVER_S)
             if options.connect:
@@ -350,10 +356,9 @@ def run(options: flags.Options, forkserver: ForkServer) -> int:
                 page.key(options.secure, access.OPERATOR) if options.secure else None,
                 options.open,
             )
-            with (
-                flags.metrics(options.metrics_port, lambda: launcher.watch.health.values()),
-                runs.recorded(cell.name, meeting_points(options), options.secure, logs_of),
-            ):
+            launchers.append(launcher)
+            file = cells.source(options.cell)
+            with runs.recorded(cell.name, file, meeting_points(options), options.secure, logs_of):
                 return launcher.run(options.seconds)
         except bus.BusError:
             if not node.stopping.is_set():  # else: stopped before the router came

@@ -11,11 +11,10 @@ from typing import Any
 
 from penumbra.services import flags
 from penumbra.services.record.recorder import SAVE_S
-from penumbra.shared.cell import names
 from penumbra.shared.contract import access, topics
 from penumbra.shared.recording import reading
 from penumbra.shared.recording.reading import Recording
-from penumbra.shared.runtime import bus, running
+from penumbra.shared.runtime import bus, which
 
 FILE = flags.Argument("file", type=Path, metavar="FILE", help="a file of `penumbra record`")
 PATIENCE_S = 1.0
@@ -25,18 +24,18 @@ PATIENCE_S = 1.0
     "save",
     "Has the cell's recorder write the seconds that it keeps (`penumbra record --last`), and prints where.",
     flags.JSON,
-    *flags.COMMON,
+    *flags.LOOKING,
     example="penumbra record save",
 )
 def save(options: flags.Options) -> None:
     """Request a file from every recorder of the cell."""
-    cell = names.read(options.cell)
     request = json.dumps({"command": "save"}).encode()
     connection = replace(bus.connection(options), service=access.OPERATOR)
     with bus.open_session(connection, threading.Event(), lambda: None, PATIENCE_S) as session:
-        answers = bus.ask(session, topics.recorder(cell.name), payload=request, timeout_s=SAVE_S)
+        cell = which.name_of(session, options.cell)
+        answers = bus.ask(session, topics.recorder(cell), payload=request, timeout_s=SAVE_S)
         if not answers:
-            raise bus.BusError(f"no recorder in cell {cell.name}: {running.whats_there(session, cell.name, 'record')}")
+            raise bus.BusError(f"no recorder in cell {cell}: {which.whats_there(session, cell, 'record')}")
     for answer in map(json.loads, answers):
         print(json.dumps(answer) if options.json else f"{answer['file']}: {answer['seconds']} s")
 

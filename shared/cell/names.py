@@ -3,6 +3,7 @@ because importing the model of a whole cell takes longer than they run."""
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ from penumbra.shared.cell import document
 from penumbra.shared.cell.faults import CellError
 
 BUILT_IN = Path(__file__).parent / "built_in"
+DEFAULT = "table"
+"""The cell where none is named."""
 NAME = r"^[A-Za-z0-9_-]{1,64}$"
 """Pattern of a name in a cell file. Names become parts of keys and of file names."""
 
@@ -55,13 +58,24 @@ def one(cell: str, kind: str, known: Iterable[str], name: str | None) -> str:
 
 def source(cell: str | Path) -> Path:
     """YAML file of a built-in name (`table`, `arm`) or path. Raises CellError where there is none."""
-    path = BUILT_IN / f"{cell}.yaml"
+    path = built_in(cell) or Path(cell)
     if not is_file(path):
-        path = Path(cell)
-    if not is_file(path):
-        built_in = ", ".join(sorted(p.stem for p in BUILT_IN.glob("*.yaml")))
-        raise CellError(f"no cell {str(cell)!r}: give one of {built_in}, or the path of a YAML file")
+        ours = ", ".join(sorted(p.stem for p in BUILT_IN.glob("*.yaml")))
+        raise CellError(f"{_missing(path)}: give one of {ours}, or the path of a YAML file")
     return path
+
+
+def _missing(path: Path) -> str:
+    """What is wrong with a path where there is no file."""
+    if os.path.isdir(path):
+        return f"{path} is a folder"
+    return f"no such file {path}" if path.suffix or len(path.parts) > 1 else f"no cell {str(path)!r}"
+
+
+def built_in(cell: str | Path) -> Path | None:
+    """YAML file of a built-in name; None for any other text."""
+    path = BUILT_IN / f"{cell}.yaml"
+    return path if is_file(path) else None
 
 
 def is_file(path: Path) -> bool:

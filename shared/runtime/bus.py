@@ -57,12 +57,29 @@ class Refused(ValueError):
     """A query was answered with an error; the text is that of the answer."""
 
 
-def taken(endpoint: str) -> BusError:
-    """Error of a router whose port is in use."""
+def taken(*endpoints: str) -> BusError:
+    """Error of a router of whose ports one is in use."""
+    from penumbra.shared.runtime import diagnosis  # imports Python's TLS, which nothing else here needs
+
+    who = "another router runs there" if any(map(_has_router, endpoints)) else diagnosis.STRANGER
+    digits = endpoints[0].partition("#")[0].rpartition(":")[2]
+    other = min(int(digits) + 1, 65535) if digits.isdecimal() else 7448
     return BusError(
-        f"the port of {endpoint} is taken: another router runs there; stop it, or give another port "
-        "(penumbra up --port 7448; penumbra router --listen tcp/127.0.0.1:7448)"
+        f"the port of {', '.join(endpoints)} is taken: {who}; stop it, or give another port "
+        f"(penumbra up --port {other}; penumbra router --listen tcp/127.0.0.1:{other})"
     )
+
+
+def _has_router(endpoint: str) -> bool:
+    """Whether a router listens at an endpoint, with TLS or without."""
+    from penumbra.shared.runtime import diagnosis
+
+    plain = Connection("client", (f"tcp/{endpoint.partition('/')[2]}",))
+    try:
+        open_session(plain, threading.Event(), lambda: None, 0.0).close()
+    except BusError as error:
+        return diagnosis.WITHOUT_TLS in str(error)
+    return True
 
 
 def open_session(
@@ -83,7 +100,7 @@ def open_session(
             return _open(config)
         except zenoh.ZError as error:
             if "Address already in use" in str(error):
-                raise taken(", ".join(connection.listen) or connection.default) from None
+                raise taken(*(connection.listen or (connection.default,))) from None
             if "Unable to connect" not in str(error):
                 raise BusError(f"the Zenoh session does not open: {short(error)}") from None
         if stopping.is_set() or time.monotonic() > deadline:

@@ -13,6 +13,8 @@ from penumbra.shared.runtime.connection import Connection
 ATTEMPT_S = 0.5
 """Timeout [s] of one attempt to connect to an address."""
 START = "start `penumbra router` or `penumbra up`, or give --connect"
+STRANGER = "what listens there does not answer as a Zenoh router"
+WITHOUT_TLS = "without TLS: give --secure FOLDER with certificates of `penumbra certs`"
 BY_TCP = ("tcp", "tls", "ws")
 """Protocols for which a TCP connection shows whether a process listens."""
 
@@ -65,9 +67,9 @@ def _who_listens(endpoint: str, link: socket.socket, host: str, secure: Path | N
     except OSError:  # no TLS, or no answer
         if secure is not None or endpoint.startswith("tls/"):
             return f"no router at {endpoint} that speaks TLS: leave --secure out, or start it with --secure"
-        return f"no router at {endpoint}: what listens there does not answer as a Zenoh router: give another --connect"
+        return f"no router at {endpoint}: {STRANGER}: give another --connect"
     if secure is None:
-        return f"no router at {endpoint} without TLS: give --secure FOLDER with certificates of `penumbra certs`"
+        return f"no router at {endpoint} {WITHOUT_TLS}"
     return f"no router at {endpoint} that accepts the certificate in {secure}: use the folder of that router's `penumbra certs`"
 
 

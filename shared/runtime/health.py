@@ -16,6 +16,10 @@ from penumbra.shared.runtime.traffic import Traffic
 STATUSES = ("ok", "starting", "degraded", "down")
 LATELY_S = 30.0
 """Time [s] for which a fault affects the status."""
+TURNS = "turns"
+"""Kind of the counter of changes between publishers of a stream."""
+MOST_TURNS = 10
+"""Number of changes within LATELY_S up to which a publisher may just have been restarted."""
 
 
 class Lately:
@@ -42,9 +46,10 @@ class Lately:
 
 
 def counts(received: Mapping[str, Traffic], faults: Mapping[str, int]) -> dict[tuple[str, str], int]:
-    """Counters of faults: refused messages by key and kind, and exceptions."""
+    """Counters of faults: refused messages by key and kind, changes between publishers that should be one, and exceptions."""
     refused = {(key, kind): n for key, traffic in list(received.items()) for kind, n in list(traffic.bad.items())}
-    return refused | {("", kind): n for kind, n in list(faults.items())}
+    turns = {(key, TURNS): traffic.turns for key, traffic in list(received.items()) if traffic.is_exclusive}
+    return refused | turns | {("", kind): n for kind, n in list(faults.items())}
 
 
 def judge(
@@ -78,8 +83,16 @@ def judge(
             starting.append(f"waiting for {which}: {why}")
         else:
             degraded.append(f"nothing received on {which} yet")
-    for key in sorted({key for key, _ in grown if key}):
-        kinds = ", ".join(f"{n} {kind}" for (where, kind), n in sorted(grown.items()) if where == key)
+    contested: defaultdict[str, list[str]] = defaultdict(list)  # by pattern of keys
+    for (key, kind), n in sorted(grown.items()):
+        if kind == TURNS and n > MOST_TURNS:
+            contested[_pattern(key)].append(key)
+    for pattern, keys in contested.items():
+        which = _which(keys, pattern, sum(_pattern(key) == pattern for key, traffic in received.items() if traffic.is_exclusive))
+        only = ", ".join(received[keys[0]].publishers)
+        degraded.append(f"several publishers of {which} contradict each other: let only one publish it (of {only})")
+    for key in sorted({key for key, kind in grown if key and kind != TURNS}):
+        kinds = ", ".join(f"{n} {kind}" for (where, kind), n in sorted(grown.items()) if where == key and kind != TURNS)
         degraded.append(f"refused on {_short(key)} in the last {LATELY_S:.0f} s: {kinds}")
     if faults := ", ".join(f"{n} {kind}" for (where, kind), n in sorted(grown.items()) if not where):
         degraded.append(f"faults in the last {LATELY_S:.0f} s: {faults}")

@@ -28,11 +28,12 @@ M = TypeVar("M", bound=Message)
 
 @dataclass
 class Stream:
-    """One key that is read: the names in it, its counters, and its publishers."""
+    """One key that is read: the names in it, its counters, its publishers, and the last one of them."""
 
     names: dict[str, str]
     traffic: Traffic
     guard: Guard
+    publisher: bytes | None = None
 
     def __post_init__(self) -> None:
         self.names_with = functools.lru_cache(PUBLISHERS)(self._names_with)
@@ -76,6 +77,9 @@ class Inbox:
             raise BadMessage("key", f"expected one of the cell's {len(self.streams)} keys, got {key!r:.120}")
         publisher, number = sender_of(sample)
         stream.traffic.missed(stream.guard.admit(publisher, number, now_s))
+        if publisher != stream.publisher:
+            stream.traffic.turns += stream.publisher is not None
+            stream.publisher = publisher
         kind, payload = self.topic.message, sample.payload
         size = len(payload)
         if not size and sample.kind == zenoh.SampleKind.DELETE:

@@ -1,4 +1,4 @@
-"""State of a cell's processes, queried from outside: for `penumbra doctor`, `penumbra topics --hz` and the Python client."""
+"""Running cells and the state of their processes, queried from outside: for the commands that look, and the Python client."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import zenoh
 
 from penumbra.shared.contract import report, topics
+from penumbra.shared.contract.processes import ROUTER
 from penumbra.shared.runtime import bus
 
 ANSWER_S = 1.0
@@ -47,18 +48,22 @@ def ask(session: zenoh.Session, cell: str) -> list[Instance]:
 
 def cells_there(session: zenoh.Session) -> list[str]:
     """Names of the cells that have a process on the bus."""
+    return sorted({cell for cell, _ in _services_there(session)})
+
+
+def cells_at_work(session: zenoh.Session) -> list[str]:
+    """Names of the cells that have a process on the bus beside a router, which serves all cells."""
+    return sorted({cell for cell, service in _services_there(session) if service != ROUTER.name})
+
+
+def only_cell(session: zenoh.Session) -> str | None:
+    """Name of the only cell at work; None where there are none or several."""
+    found = cells_at_work(session)
+    return found[0] if len(found) == 1 else None
+
+
+def _services_there(session: zenoh.Session) -> list[tuple[str, str]]:
+    """Cell and service of every process on the bus."""
     replies = session.liveliness().get(topics.alive("*"), timeout=ANSWER_S)
-    return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None})
-
-
-def whats_there(session: zenoh.Session, cell: str, service: str) -> str:
-    """Remedy where a service does not answer, depending on which processes, or which other cells, are on this router."""
-    running = sorted({instance.service for instance in ask(session, cell)})
-    if service in running:
-        return f"{service} runs, and has nothing to answer yet: see `penumbra topics --hz`"
-    if running:
-        return f"its processes are {', '.join(running)}: start `penumbra {service}`"
-    others = cells_there(session)
-    if others:
-        return f"no process of it is on this router, where cells run: {', '.join(others)}; give --cell {others[0]}, or its file"
-    return "no process of any cell is on this router: start `penumbra up`"
+    tokens = [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
+    return [(cell, service) for _, cell, _, service, _ in tokens]

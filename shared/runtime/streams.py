@@ -13,6 +13,7 @@ import zenoh
 
 from penumbra.shared.cell import description as cell
 from penumbra.shared.contract.messages import BadMessage, Message
+from penumbra.shared.contract.processes import PROCESSES
 from penumbra.shared.contract.topics import Topic
 from penumbra.shared.runtime.fitness import LOOK_S
 from penumbra.shared.runtime.guard import Guard
@@ -25,6 +26,8 @@ from penumbra.shared.runtime.sender import Sender
 from penumbra.shared.runtime.tap import Tap
 from penumbra.shared.runtime.traffic import Traffic
 
+REPLICATED = {process.name for process in PROCESSES if process.beside}
+"""Services whose replicas share streams, and take them over from each other."""
 Handler = Callable[[Any, dict[str, str]], None]
 
 
@@ -137,8 +140,13 @@ class Streams:
         expression = next(iter(keys)) if len(keys) == 1 else topic.at(cell=self._cell.name, **names)
         is_expected = topic.is_expected(self._cell) and not from_others  # other publishers are optional
         stale_s = topic.stale_s if is_expected else math.inf
+        is_exclusive = not REPLICATED & set(topic.publishers)
         streams = {
-            key: Stream(found, self._count(key, Traffic(stale_s, topic.publishers)), Guard(self.rate_hz(topic, found)))
+            key: Stream(
+                found,
+                self._count(key, Traffic(stale_s, topic.publishers, is_exclusive=is_exclusive)),
+                Guard(self.rate_hz(topic, found)),
+            )
             for key, found in keys.items()
         }
         inbox = Inbox(topic, expression, depth(len(keys)), streams, self._now_ns, self._refused, self._failed, from_others)

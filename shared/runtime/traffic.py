@@ -40,7 +40,8 @@ class Traffic:
     """Counters of one key that is received or published. `stale_s`: age after which it is missing; `publishers`: the services
     that may publish it, where it is read; `bad`: refused messages by kind; `dropped`: gaps in the publishers' numbers, None where
     unknown; `delay_s`: from the last message's measurement to its arrival; `is_read`: whether this process reads it now; what
-    another replica reads is never stale."""
+    another replica reads is never stale; `is_exclusive`: whether one publisher at a time is expected, rather than replicas that
+    share the stream; `turns`: how often another publisher than before sent a message."""
 
     stale_s: float
     publishers: tuple[str, ...] = ()
@@ -50,6 +51,8 @@ class Traffic:
     stamp_ns: int | None = None
     delay_s: float = math.nan
     is_read: bool = True
+    is_exclusive: bool = False
+    turns: int = 0
     rate: Rate = field(default_factory=Rate)
 
     def record(self, stamp_ns: int, now_ns: int | None) -> None:

@@ -172,6 +172,23 @@ def test_own_camera_says_what_it_expected_where_there_is_no_camera(router, tmp_p
     assert "expected images from" in done.stderr and "Traceback" not in done.stderr
 
 
+def test_an_example_says_what_the_cell_does_not_have_and_which_images_it_expects(router, tmp_path):
+    path = tmp_path / "small.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 20, (64, 48))
+    writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    with small("table", router) as chain, chain.fusion():
+        for words, told in (
+            (["own_joints.py"], "expected a cell with a robot, got table, which has none"),
+            (["own_camera.py", str(path), "--camera", "back"], "no camera 'back'; cell table has: front"),
+            (["own_camera.py", str(path)], "camera front: expected"),
+        ):
+            command = [sys.executable, str(EXAMPLES / words[0]), *words[1:]]
+            environment = {**os.environ, "PENUMBRA_CONNECT": router}
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
+            assert done.returncode == 2 and told in done.stderr and "Traceback" not in done.stderr, done.stderr
+
+
 def test_the_adapter_of_an_sdk_publishes_what_its_camera_takes(router, tmp_path):
     """Pylon emulates a camera, whose pictures are a moving ramp of grey."""
     pytest.importorskip("pypylon")

@@ -198,6 +198,9 @@ WARNINGS = {
     "a camera that looks away": ("table", "look_at: [0.05, 0.0, 0.15]", "look_at: [0.35, -5, 0.9]", "look_at", "sees none"),
     "a camera that looks beside": ("table", "look_at: [0.05, 0.0, 0.15]", "look_at: [0.8, 0, 0.15]", "look_at", "sees most"),
     "a film elsewhere": ("table", LOOK, LOOK + "    source: {url: 'file:a.mp4'}\n", "source:", "got nothing at"),
+    "an adapter elsewhere": (
+        "table", LOOK, LOOK + "    source: {url: 'adapter:my_camera:Camera'}\n", "source:", "expected the module my_camera beside"
+    ),
     "a pad far away": ("table", P3, P3.replace("0.12", "3.0"), "  p3:", "nothing can reach it"),
     "a pad turned over": ("table", P3, P3.replace("0.0]}", "0.0], rpy: [3.1416, 0, 0]}"), "  p3:", "points away from it"),
     "a home elsewhere": ("table", "position: [0.0, 0.0, 0.20]", "position: [0.0, 0.0, 2.0]", "home:", "in or near sim.motion"),

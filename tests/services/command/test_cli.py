@@ -15,9 +15,9 @@ import click
 import pytest
 
 from penumbra.services import flags, progress
-from penumbra.services.command import cli, doctor, look
+from penumbra.services.command import cli, doctor, look, runs, snapshot
 from penumbra.shared.cell import description as cells
-from penumbra.shared.contract import processes, topics
+from penumbra.shared.contract import outline, processes, topics
 from penumbra.shared.perception import landmarks
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
@@ -40,8 +40,9 @@ def endpoint():
     router = Node("router", CELL, bus.Connection("router", listen=(where,)))
     worker = Node("worker", CELL, bus.Connection(connect=(where,)))
     start(worker)
+    worker.answer(topics.description("table"), lambda parameters, payload: (outline.of(CELL).encode(), "application/json"))
     with router, worker:
-        wait_for(lambda: router.query(topics.current_pose("table", "forearm")), 5, "the service")
+        wait_for(lambda: router.query(topics.description("table")), 5, "the service")
         yield where
 
 
@@ -53,7 +54,10 @@ def endpoint():
             ["fusion", "--cell", "nowhere"],
             "penumbra fusion: no cell 'nowhere': give one of arm, table, or the path of a YAML file",
         ),
-        (["pose", "leg"], "penumbra pose: cell table has no target 'leg': it has forearm"),
+        (["check", "nope.yaml"], "penumbra check: no such file nope.yaml: give one of arm, table, or the path of a YAML file"),
+        (["check", "nope/cell"], "penumbra check: no such file nope/cell: give one of arm, table, or the path of a YAML file"),
+        (["check", "/"], "penumbra check: / is a folder: give one of arm, table, or the path of a YAML file"),
+        (["pose", "--target", "hand"], "penumbra pose: no option --target; give the target without it, as a word of its own"),
         (
             ["pose", "--connect", "nonsense"],
             "penumbra pose: endpoint: expected PROTOCOL/ADDRESS, as in tcp/127.0.0.1:7447, got 'nonsense'",
@@ -294,6 +298,69 @@ def test_watch_prints_pose_after_pose_until_ctrl_c(endpoint):
     finally:
         watch.kill()
         watch.communicate()
+
+
+@pytest.mark.parametrize("flag", [[], ["--cell", "table"]])
+def test_a_target_that_the_cell_does_not_have_is_one_line_with_those_that_it_has(endpoint, flag, capsys):
+    assert cli.main(["pose", "leg", "--connect", endpoint, *flag]) == 2
+    assert capsys.readouterr().err == "penumbra pose: cell table has no target 'leg': it has forearm\n"
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A router with a cell of one's own as the only one, whose services answer like fusion and the emulator: its file and its
+    endpoint."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.delenv("PENUMBRA_CELL", raising=False)
+    path = tmp_path / "mine.yaml"
+    path.write_text(cells.source("table").read_text().replace("name: table", "name: mine", 1))
+    cell, where = cells.load(path), f"tcp/127.0.0.1:{free_port()}"
+    router = Node("router", cell, bus.Connection("router", listen=(where,)))
+    fusion = Node("fusion", cell, bus.Connection(connect=(where,)))
+    start(fusion)
+    fusion.answer(topics.description("mine"), lambda parameters, payload: (outline.of(cell).encode(), "application/json"))
+    fusion.answer(topics.control("mine"), lambda parameters, payload: b'{"speed": 1}')
+    with router, fusion:
+        wait_for(lambda: router.query(topics.control("mine"), payload=b"{}"), 5, "the services")
+        yield path, where
+
+
+def test_commands_that_look_take_the_only_cell_that_runs(own, capsys):
+    path, where = own
+    with runs.recorded("mine", path, (where,), None, None):
+        for argv, word in (
+            (["pose"], "forearm"),
+            (["sim", "state"], "speed"),
+            (["topics"], "penumbra/mine/camera/front/frame"),
+            (["topics", "--hz", "--seconds", "0.5"], "penumbra/mine/target/forearm/pose/fused"),
+            (["doctor"], "cell mine: "),
+        ):
+            assert cli.main([*argv, "--connect", where]) == 0
+            assert word in capsys.readouterr().out, argv
+
+
+def test_a_running_cell_whose_file_is_elsewhere_is_named_with_what_to_give(own, capsys):
+    _, where = own
+    assert cli.main(["pose", "--connect", where]) == 0, "the bus has all that it needs"
+    for argv in (["topics"], ["snapshot", "out.png"], ["doctor"]):
+        assert cli.main([*argv, "--connect", where]) == 2
+        assert capsys.readouterr().err == (
+            f"penumbra {argv[0]}: cell mine runs at {where}, and its file is not known here: give --cell FILE.yaml, the file of "
+            "cell mine\n"
+        )
+
+
+def test_a_cell_that_does_not_run_where_another_does_is_named_with_what_to_give(own, monkeypatch, capsys):
+    _, where = own
+    monkeypatch.setattr(snapshot, "PATIENCE_S", 0.1)
+    remedy = "where cells run: mine; give --cell FILE.yaml, the file of cell mine"
+    for argv in (["pose"], ["topics", "--hz", "--seconds", "0.1"], ["snapshot", "out.png"]):
+        cli.main([*argv, "--cell", "table", "--connect", where])
+        assert remedy in capsys.readouterr().err, argv
+    found = list(doctor._processes("table", bus.Connection(connect=(where,))))
+    assert [(each.text, each.mend) for each in found] == [
+        ("no process of cell table runs there, where cells run: mine", "give --cell FILE.yaml, the file of cell mine")
+    ]
 
 
 def test_a_pose_that_no_process_answers_names_the_cells_and_processes_that_run(endpoint, capsys):

@@ -497,7 +497,7 @@ def test_the_links_of_a_secured_cell_are_printed_for_those_who_hold_its_certific
 # ---- the port
 
 
-def test_a_port_that_is_taken_is_reported_and_waited_for(served: Served):
+def test_a_port_that_is_taken_is_reported_and_waited_for(served: Served, caplog):
     port = free_port()
     with socket.socket() as other:
         other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -508,6 +508,7 @@ def test_a_port_that_is_taken_is_reported_and_waited_for(served: Served):
             wait_for(lambda: f"the page cannot be served at 127.0.0.1:{port}" in str(node.health()["reasons"]), 30, "the reason")
             other.close()
             assert address(node) == f"http://127.0.0.1:{port}/"
+            assert caplog.text.count("the page waits for its port") == 1
             assert not node.health()["reasons"]
         finally:
             node.close()

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from penumbra.services.emulator import service
 from penumbra.services.emulator.control import COMMANDS, control
 from penumbra.services.emulator.pacing import Pacer, Time
 from penumbra.services.skin.driver import Line
@@ -195,6 +196,18 @@ def test_the_emulator_publishes_every_stream_of_the_cell_on_its_beat_and_in_time
         periods = np.diff(stamps) / (50e6 if stream[0] == "frame" else 5e6)
         np.testing.assert_allclose(periods, np.maximum(np.round(periods), 1), atol=1e-6)  # some may be left out, none is between
         assert smallest_age_ms(stream) > 0.0  # and none comes before its time
+
+
+def test_a_second_emulator_of_a_cell_is_refused_and_one_that_leaves_is_waited_for(router):
+    cell, connection = cells.load("table"), bus.Connection(connect=(router,))
+    first, second = Node("emulator", cell, connection), Node("emulator", cell, connection)
+    with first:
+        with pytest.raises(bus.BusError, match=r"cell table at .* has an emulator already, and two would contradict each other"):
+            service.refuse_second(second)
+        leaving = threading.Timer(0.3, first.close)
+        leaving.start()
+        service.refuse_second(second)
+        leaving.join()
 
 
 def test_the_emulator_obeys_control_queries_and_refuses_others(emulator):

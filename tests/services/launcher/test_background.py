@@ -7,6 +7,7 @@ import psutil
 import pytest
 
 from penumbra.services.command import cli, machine, runs
+from penumbra.shared.cell import names
 from penumbra.shared.contract.processes import PROCESSES
 from penumbra.tests.support.live import free_port, wait_for
 
@@ -69,7 +70,7 @@ def test_nothing_that_runs_is_said_in_a_line(capfd):
 
 
 def test_records_of_launchers_that_are_gone_are_removed(state):
-    with runs.recorded("table", ("tcp/127.0.0.1:1",), None, None):
+    with runs.recorded("table", names.source("table"), ("tcp/127.0.0.1:1",), None, None):
         (run,) = runs.running()
         assert (run.cell, run.pid, run.logs) == ("table", os.getpid(), None)
         path = state / "penumbra" / "run" / f"{os.getpid()}.json"

@@ -191,10 +191,10 @@ def test_a_hung_process_is_ended_by_force_when_it_is_replaced(launched):
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["restart", "magic"], "penumbra restart: restart: expected one of worker, which run here, got magic"),
+        (["restart", "magic"], "penumbra restart: expected one of worker, which run here, got magic"),
         (
             ["scale", "magic=2"],
-            "penumbra scale: scale: expected NAME=NUMBER with NAME one of worker, sensor, meeting, got magic=2",
+            "penumbra scale: expected NAME=NUMBER with NAME one of worker, sensor, meeting, got magic=2",
         ),
         (["scale", "worker=65"], "penumbra scale: worker: expected 0 to 64, got 65"),
         (["scale", "meeting=0"], "penumbra scale: meeting: expected 1, got 0: all other processes meet there"),

@@ -56,6 +56,26 @@ def test_an_impossible_address_and_an_unknown_host_are_distinguished(endpoint, w
     assert diagnosis.no_router(bus.Connection(connect=(endpoint,))).startswith(f"no router at {endpoint}: {words}")
 
 
+@pytest.mark.parametrize(
+    ("is_router", "is_secure", "words"),
+    [
+        (True, False, "another router runs there"),
+        (True, True, "another router runs there"),
+        (False, False, "what listens there does not answer as a Zenoh router"),
+    ],
+)
+def test_a_port_that_is_taken_is_reported_with_who_has_it(folders, is_router, is_secure, words):
+    secure = folders[0] if is_secure else None
+    with contextlib.ExitStack() as stack:
+        port = free_port() if is_router else stack.enter_context(listener())
+        endpoint = f"{'tls' if is_secure else 'tcp'}/127.0.0.1:{port}"
+        asked = bus.Connection("router", listen=(endpoint,), secure=secure)
+        if is_router:
+            stack.enter_context(bus.open_session(asked, threading.Event(), lambda: None, 5.0))
+        with pytest.raises(bus.BusError, match=rf"the port of {endpoint} is taken: {words}; stop it.* --port {port + 1};"):
+            bus.open_session(asked, threading.Event(), lambda: None, 0.0)
+
+
 def test_a_port_where_nothing_listens_is_reported_with_what_to_start():
     where = f"tcp/127.0.0.1:{free_port()}"
     assert diagnosis.no_router(bus.Connection(connect=(where,))) == (

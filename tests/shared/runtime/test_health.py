@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 from rich.console import Console
@@ -18,7 +19,7 @@ from penumbra.services.command import cli, doctor
 from penumbra.services.launcher import display
 from penumbra.services.launcher.supervised import Supervised
 from penumbra.shared.cell import description as cells
-from penumbra.shared.contract import topics
+from penumbra.shared.contract import messages, topics
 from penumbra.shared.contract.report import Report
 from penumbra.shared.runtime import bus, health, progress, running
 from penumbra.shared.runtime.node import Node
@@ -95,6 +96,29 @@ def test_every_reason_names_what_is_missing_and_since_when():
             "fusion: waiting",
         ],
     )
+
+
+def test_two_publishers_of_a_sensors_stream_degrade_its_reader_and_replicas_that_share_one_do_not(client):
+    reader, emulator, driver = (client(name) for name in ("haptics", "emulator", "driver"))
+    for topic in (topics.VOLTAGES, topics.FUSED):
+        reader.subscribe(topic, lambda message, names: None)
+    volts = np.ones((1, len(CELL.pad_types[CELL.pads["p0"].type].electrodes)), np.float32)
+    told = "several publishers of skin/p0/voltages contradict each other: let only one publish it (of emulator, skin, driver)"
+
+    def publish(*publishers: Node) -> None:
+        for node in publishers:
+            message = messages.Voltages(stamp_ns=time.time_ns(), period_ns=1_000_000, volts=volts)
+            node.publish(topics.VOLTAGES, message, pad="p0")
+            node.publish(topics.FUSED, pose(), target="forearm")
+
+    def received() -> int:
+        return reader.report().topics[topics.VOLTAGES.at(cell="table", pad="p0")].count
+
+    with reader, emulator, driver:
+        wait_for(lambda: received() > 2 * health.MOST_TURNS, 5, "one publisher's messages", act=lambda: publish(emulator))
+        assert told not in reader.report().reasons
+        wait_for(lambda: told in reader.report().reasons, 5, "the reason", act=lambda: publish(emulator, driver))
+        assert "several publishers of target" not in str(reader.report().reasons)
 
 
 def test_missing_inputs_of_one_kind_are_one_reason():

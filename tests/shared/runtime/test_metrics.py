@@ -143,9 +143,11 @@ def test_a_port_that_is_none_is_refused_in_one_line(text):
     assert f"--metrics-port: expected a port from 1 to 65535, or ADDRESS:PORT as in 0.0.0.0:9464, got {text!r}" in err
 
 
-def test_a_port_that_is_taken_is_reported_in_one_line(served):
-    port = served(list)
-    process = started("router", "--listen", f"tcp/127.0.0.1:{free_port()}", "--metrics-port", str(port))
+@pytest.mark.parametrize("service", ["router", "up"])
+def test_a_port_that_is_taken_is_reported_in_one_line_before_anything_starts(service, served):
+    port, endpoint = served(list), f"tcp/127.0.0.1:{free_port()}"
+    where = ["--listen", endpoint] if service == "router" else ["--port", endpoint.rpartition(":")[2]]
+    process = started(service, *where, "--metrics-port", str(port))
     _, err = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, len(err.splitlines())) == (2, 1)
     assert f"--metrics-port 127.0.0.1:{port} cannot be opened (Address already in use): give another one" in err
