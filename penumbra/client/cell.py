@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Mapping
 from dataclasses import replace
 from types import TracebackType
@@ -36,6 +37,8 @@ class CellBase:
 
     def __init__(self, session: zenoh.Session, connection: bus.Connection, outline: Outline):
         self._session, self._connection, self._outline = session, connection, outline
+        # at the latest at the end of the program: in an interpreter that has ended, calls from Zenoh's thread would block forever
+        self._close_session = weakref.finalize(self, session.close)
         self._closing = threading.Event()
         self._opening = threading.Lock()  # guards the session for publishing
         self._publishing: zenoh.Session | None = None
@@ -165,7 +168,7 @@ class CellBase:
 
     def _leave(self) -> None:
         self._closing.set()
-        self._session.close()
+        self._close_session()
         with self._opening:
             if self._publishing is not None:
                 self._publishing.close()

@@ -4,6 +4,9 @@ import asyncio
 import contextlib
 import dataclasses
 import math
+import os
+import subprocess
+import sys
 import threading
 import time
 from functools import partial
@@ -246,6 +249,13 @@ def test_an_iterator_that_nobody_holds_ends_its_subscription(numbered):
         slot = poses._slot
         del poses
         wait_for(lambda: slot.is_closed, 5, "the end of the subscription")
+
+
+def test_a_program_that_still_holds_poses_when_it_ends_exits(table):
+    program = "import penumbra; cell = penumbra.connect(timeout=30); poses = cell.poses(timeout=30); next(poses)"
+    environment = {**os.environ, "PENUMBRA_CONNECT": where(table)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_closing_the_cell_ends_a_loop_in_another_thread(cell):
