@@ -60,7 +60,8 @@ class AsyncCell(CellBase):
     def poses(self, target: str | None = None, *, timeout: float | None = None) -> AsyncPoses:
         """As `Cell.poses`, for `async for`."""
         name = self._target(target)
-        return AsyncPoses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
+        with self._reading():
+            return AsyncPoses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
 
     async def pose(self, *, at: int | None = None, target: str | None = None, timeout: float = 1.0) -> Pose:
         """As `Cell.pose`."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from types import TracebackType
 from typing import Self, TypeVar
@@ -19,6 +20,7 @@ from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.messages import FusedPose, decode
 from penumbra.shared.contract.outline import Outline
 from penumbra.shared.runtime import bus, running
+from penumbra.shared.runtime.connection import short
 
 FRAMES_UNDER_WAY = 3
 """Number of images of each camera in shared memory: one that is written and two that are read."""
@@ -149,6 +151,14 @@ class CellBase:
                 self._publishing = bus.open_session(connection, self._closing, lambda: None, PUBLISH_S)
             return self._publishing
 
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Raises bus.BusError in place of Zenoh's error where the session is closed."""
+        try:
+            yield
+        except zenoh.ZError as error:
+            raise bus.BusError(f"cell {self.name} cannot be read ({short(error)}): is the cell closed?") from None
+
     def _why_silent(self) -> str:
         """Reason why no poses arrive, as text."""
         if not self._session.info.routers_zid():
@@ -158,13 +168,15 @@ class CellBase:
     def _ask_pose(self, at: int | None, target: str | None, timeout: float) -> Pose:
         name = self._target(target)
         parameters = "" if at is None else f"stamp_ns={at}"
-        answers = bus.ask(self._session, topics.current_pose(self.name, name), parameters, timeout_s=timeout)
+        with self._reading():
+            answers = bus.ask(self._session, topics.current_pose(self.name, name), parameters, timeout_s=timeout)
         if not answers:
             raise TimeoutError(f"no pose of {name} within {timeout:g} s: {self._why_silent()}")
         return Pose.of(decode(FusedPose, answers[0]))
 
     def _ask_health(self) -> tuple[running.Instance, ...]:
-        return tuple(running.ask(self._session, self.name))
+        with self._reading():
+            return tuple(running.ask(self._session, self.name))
 
     def _leave(self) -> None:
         self._closing.set()
@@ -189,9 +201,11 @@ class Cell(CellBase):
 
         Raises:
             LookupError: The cell has no target of this name.
+            BusError: The cell is closed.
         """
         name = self._target(target)
-        return Poses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
+        with self._reading():
+            return Poses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
 
     def pose(self, *, at: int | None = None, target: str | None = None, timeout: float = 1.0) -> Pose:
         """Asks fusion for the pose of a target. The answer uses all measurements that fusion has received so far.
@@ -205,11 +219,16 @@ class Cell(CellBase):
             TimeoutError: Nobody answered; the text says why.
             LookupError: The cell has no target of this name.
             ValueError: The time is outside of fusion's history.
+            BusError: The cell is closed.
         """
         return self._ask_pose(at, target, timeout)
 
     def health(self) -> tuple[running.Instance, ...]:
-        """The state of each process of the cell: `service`, `instance`, `status` (ok, starting, degraded or down), `reasons`."""
+        """The state of each process of the cell: `service`, `instance`, `status` (ok, starting, degraded or down), `reasons`.
+
+        Raises:
+            BusError: The cell is closed.
+        """
         return self._ask_health()
 
     def close(self) -> None:

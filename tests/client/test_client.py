@@ -286,6 +286,25 @@ def test_the_async_client_asks_and_times_out_like_the_other(table):
     asyncio.run(main())
 
 
+def test_a_closed_cell_is_read_no_more(table):
+    with penumbra.connect(endpoint=where(table), timeout=30) as cell:
+        pass
+    for read in (cell.poses, cell.pose, cell.health):
+        with pytest.raises(penumbra.BusError, match=r"cell table cannot be read \(session closed\): is the cell closed\?"):
+            read()
+
+    async def main() -> None:
+        async with penumbra.aconnect(endpoint=where(table), timeout=30) as cell:
+            pass
+        with pytest.raises(penumbra.BusError, match="is the cell closed"):
+            cell.poses()
+        for read in (cell.pose, cell.health):
+            with pytest.raises(penumbra.BusError, match="is the cell closed"):
+                await read()
+
+    asyncio.run(main())
+
+
 def test_a_cancelled_aconnect_leaves_no_session_and_no_thread():
     async def main() -> None:
         async def never() -> None:
