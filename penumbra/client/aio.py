@@ -44,7 +44,7 @@ class AsyncPoses(Subscription):
                     else:
                         await changed.wait()
         except TimeoutError:
-            raise self._silence() from None
+            raise await asyncio.to_thread(self._silence) from None
 
     async def __aenter__(self) -> Self:
         return self

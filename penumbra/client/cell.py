@@ -26,6 +26,8 @@ FRAMES_UNDER_WAY = 3
 """Number of images of each camera in shared memory: one that is written and two that are read."""
 PUBLISH_S = 3.0
 """Maximum time [s] that a program's first message waits for the router."""
+LOOK_S = 0.2
+"""Maximum time [s] of a look for fusion where no pose arrives: a program that stops a robot then waits for the reason."""
 
 Sensor = TypeVar("Sensor", Camera, Robot, Pad)
 
@@ -160,15 +162,19 @@ class CellBase:
             raise bus.BusError(f"cell {self.name} cannot be read ({short(error)}): is the cell closed?") from None
 
     def _why_silent(self) -> str:
-        """Reason why no poses arrive, as text."""
-        if not self._session.info.routers_zid():
-            return f"the router at {self._connection.where} does not answer; poses go on when it is back"
-        return f"nobody publishes it in cell {self.name}: is `penumbra fusion` running?"
+        """Reason why no poses arrive, as far as it can be found, as text. Raises bus.BusError where the cell is closed."""
+        with self._reading():
+            if not self._session.info.routers_zid():
+                return f"the router at {self._connection.where} does not answer; poses go on when it is back"
+            if running.ask(self._session, self.name, "fusion", LOOK_S):
+                return f"fusion of cell {self.name} runs: give a longer timeout, or see `penumbra doctor`"
+        return f"no fusion of cell {self.name} answers: start `penumbra fusion` or `penumbra up`"
 
     def _ask_pose(self, at: int | None, target: str | None, timeout: float) -> Pose:
         name = self._target(target)
         parameters = "" if at is None else f"stamp_ns={at}"
-        with self._reading():
+        answers: list[bytes] = []
+        with self._reading(), contextlib.suppress(bus.TimedOut):
             answers = bus.ask(self._session, topics.current_pose(self.name, name), parameters, timeout_s=timeout)
         if not answers:
             raise TimeoutError(f"no pose of {name} within {timeout:g} s: {self._why_silent()}")

@@ -199,12 +199,21 @@ def test_a_silent_cell_times_out_says_why_and_the_same_iterator_goes_on(router):
             cell = stack.enter_context(penumbra.connect(endpoint=router, timeout=30))
             poses = cell.poses(timeout=0.5)
             next(poses)
-        with pytest.raises(TimeoutError, match=r"no pose for 0.5 s: nobody publishes it in cell table: is `penumbra fusion`"):
+        with pytest.raises(TimeoutError, match=r"no pose for 0.5 s: no fusion of cell table answers: start `penumbra fusion`"):
             [next(poses) for _ in range(10)]
-        with pytest.raises(TimeoutError, match=r"no pose of forearm within 0.2 s"):
+        with pytest.raises(TimeoutError, match=r"no pose of forearm within 0.2 s: no fusion of cell table answers"):
             cell.pose(timeout=0.2)
         with chain.fusion():
             assert next(poses).target == "forearm"
+
+
+def test_a_timeout_shorter_than_a_pose_takes_does_not_call_fusion_missing(cell):
+    with pytest.raises(TimeoutError, match="no pose for 0 s: fusion of cell table runs: give a longer timeout"):
+        for _ in range(1000):
+            next(cell.poses(timeout=0))
+    with pytest.raises(TimeoutError, match="no pose of forearm within 1e-06 s: fusion of cell table runs: give a longer timeout"):
+        for _ in range(1000):
+            cell.pose(timeout=1e-6)
 
 
 def test_a_lost_router_is_named_and_poses_resume_when_it_is_back():
