@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -362,8 +363,12 @@ def test_without_router_fusion_or_the_right_cell_the_error_says_which_is_missing
         penumbra.connect(endpoint=nowhere, timeout=0.1)
     with pytest.raises(penumbra.BusError, match=f"no cell runs at {router}: start `penumbra up`"):
         penumbra.connect(endpoint=router, timeout=0.1)
-    with pytest.raises(penumbra.BusError, match=r"expected the name of a cell or its YAML file, got 'a/b'"):
-        penumbra.connect("a/b", endpoint=router)
+    number: Any = 42
+    for wrong, got in (("a/b", "'a/b'"), (number, r"42 \(int\)")):
+        with pytest.raises(penumbra.BusError, match=rf"expected the name of a cell \(.*\) or its YAML file, got {got}$"):
+            penumbra.connect(wrong, endpoint=router)
+    with pytest.raises(penumbra.CellError, match=r"no cell 'missing\.yaml'"):
+        penumbra.connect("missing.yaml", endpoint=router)
     with small("table", router) as table:
         with pytest.raises(penumbra.BusError, match=f"no fusion in cell table at {router}"):
             penumbra.connect(endpoint=router, timeout=0.5)
