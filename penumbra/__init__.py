@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from penumbra.client.pose import Pose, State
     from penumbra.client.poses import Poses
     from penumbra.client.publish import Camera, Pad, Robot
+    from penumbra.shared.cell.faults import CellError
     from penumbra.shared.contract.messages import Source
     from penumbra.shared.runtime.connection import BusError
     from penumbra.shared.runtime.running import Instance
@@ -29,6 +30,7 @@ __all__ = [
     "BusError",
     "Camera",
     "Cell",
+    "CellError",
     "Instance",
     "Pad",
     "Pose",
@@ -47,6 +49,7 @@ _HOMES = {
     "penumbra.client.pose": ("Pose", "State"),
     "penumbra.client.poses": ("Poses",),
     "penumbra.client.publish": ("Camera", "Pad", "Robot"),
+    "penumbra.shared.cell.faults": ("CellError",),
     "penumbra.shared.contract.messages": ("Source",),
     "penumbra.shared.runtime.connection": ("BusError",),
     "penumbra.shared.runtime.running": ("Instance",),

@@ -44,7 +44,7 @@ class AsyncPoses(Subscription):
                     else:
                         await changed.wait()
         except TimeoutError:
-            raise self._silence() from None
+            raise await asyncio.to_thread(self._silence) from None
 
     async def __aenter__(self) -> Self:
         return self
@@ -60,7 +60,8 @@ class AsyncCell(CellBase):
     def poses(self, target: str | None = None, *, timeout: float | None = None) -> AsyncPoses:
         """As `Cell.poses`, for `async for`."""
         name = self._target(target)
-        return AsyncPoses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
+        with self._reading():
+            return AsyncPoses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
 
     async def pose(self, *, at: int | None = None, target: str | None = None, timeout: float = 1.0) -> Pose:
         """As `Cell.pose`."""

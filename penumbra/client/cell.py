@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Mapping
+import weakref
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from types import TracebackType
 from typing import Self, TypeVar
@@ -18,11 +20,14 @@ from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.messages import FusedPose, decode
 from penumbra.shared.contract.outline import Outline
 from penumbra.shared.runtime import bus, running
+from penumbra.shared.runtime.connection import short
 
 FRAMES_UNDER_WAY = 3
 """Number of images of each camera in shared memory: one that is written and two that are read."""
 PUBLISH_S = 3.0
 """Maximum time [s] that a program's first message waits for the router."""
+LOOK_S = 0.2
+"""Maximum time [s] of a look for fusion where no pose arrives: a program that stops a robot then waits for the reason."""
 
 Sensor = TypeVar("Sensor", Camera, Robot, Pad)
 
@@ -36,6 +41,8 @@ class CellBase:
 
     def __init__(self, session: zenoh.Session, connection: bus.Connection, outline: Outline):
         self._session, self._connection, self._outline = session, connection, outline
+        # at the latest at the end of the program: in an interpreter that has ended, calls from Zenoh's thread would block forever
+        self._close_session = weakref.finalize(self, session.close)
         self._closing = threading.Event()
         self._opening = threading.Lock()  # guards the session for publishing
         self._publishing: zenoh.Session | None = None
@@ -146,26 +153,40 @@ class CellBase:
                 self._publishing = bus.open_session(connection, self._closing, lambda: None, PUBLISH_S)
             return self._publishing
 
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Raises bus.BusError in place of Zenoh's error where the session is closed."""
+        try:
+            yield
+        except zenoh.ZError as error:
+            raise bus.BusError(f"cell {self.name} cannot be read ({short(error)}): is the cell closed?") from None
+
     def _why_silent(self) -> str:
-        """Reason why no poses arrive, as text."""
-        if not self._session.info.routers_zid():
-            return f"the router at {self._connection.where} does not answer; poses go on when it is back"
-        return f"nobody publishes it in cell {self.name}: is `penumbra fusion` running?"
+        """Reason why no poses arrive, as far as it can be found, as text. Raises bus.BusError where the cell is closed."""
+        with self._reading():
+            if not self._session.info.routers_zid():
+                return f"the router at {self._connection.where} does not answer; poses go on when it is back"
+            if running.ask(self._session, self.name, "fusion", LOOK_S):
+                return f"fusion of cell {self.name} runs: give a longer timeout, or see `penumbra doctor`"
+        return f"no fusion of cell {self.name} answers: start `penumbra fusion` or `penumbra up`"
 
     def _ask_pose(self, at: int | None, target: str | None, timeout: float) -> Pose:
         name = self._target(target)
         parameters = "" if at is None else f"stamp_ns={at}"
-        answers = bus.ask(self._session, topics.current_pose(self.name, name), parameters, timeout_s=timeout)
+        answers: list[bytes] = []
+        with self._reading(), contextlib.suppress(bus.TimedOut):
+            answers = bus.ask(self._session, topics.current_pose(self.name, name), parameters, timeout_s=timeout)
         if not answers:
             raise TimeoutError(f"no pose of {name} within {timeout:g} s: {self._why_silent()}")
         return Pose.of(decode(FusedPose, answers[0]))
 
     def _ask_health(self) -> tuple[running.Instance, ...]:
-        return tuple(running.ask(self._session, self.name))
+        with self._reading():
+            return tuple(running.ask(self._session, self.name))
 
     def _leave(self) -> None:
         self._closing.set()
-        self._session.close()
+        self._close_session()
         with self._opening:
             if self._publishing is not None:
                 self._publishing.close()
@@ -186,9 +207,11 @@ class Cell(CellBase):
 
         Raises:
             LookupError: The cell has no target of this name.
+            BusError: The cell is closed.
         """
         name = self._target(target)
-        return Poses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
+        with self._reading():
+            return Poses(self._session, topics.FUSED.at(cell=self.name, target=name), timeout, self._why_silent)
 
     def pose(self, *, at: int | None = None, target: str | None = None, timeout: float = 1.0) -> Pose:
         """Asks fusion for the pose of a target. The answer uses all measurements that fusion has received so far.
@@ -202,11 +225,16 @@ class Cell(CellBase):
             TimeoutError: Nobody answered; the text says why.
             LookupError: The cell has no target of this name.
             ValueError: The time is outside of fusion's history.
+            BusError: The cell is closed.
         """
         return self._ask_pose(at, target, timeout)
 
     def health(self) -> tuple[running.Instance, ...]:
-        """The state of each process of the cell: `service`, `instance`, `status` (ok, starting, degraded or down), `reasons`."""
+        """The state of each process of the cell: `service`, `instance`, `status` (ok, starting, degraded or down), `reasons`.
+
+        Raises:
+            BusError: The cell is closed.
+        """
         return self._ask_health()
 
     def close(self) -> None:

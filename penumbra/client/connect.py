@@ -44,7 +44,9 @@ def connect(
             may use `math.inf`.
 
     Raises:
-        BusError: The router, fusion or the cell is missing, or several cells run there. The text says which, and what to do.
+        BusError: The router, fusion or the cell is missing, several cells run there, or an argument cannot be used. The text says
+            which, and what to do.
+        CellError: The YAML file cannot be read or has faults; a ValueError. The text names file and line.
     """
     return Cell(*Search.of(cell, endpoint, secure, timeout).run())
 
@@ -113,13 +115,15 @@ class Search:
 
 
 def _name(cell: str | Path | None) -> str | None:
-    """Name of a cell that is given by its name or its YAML file. Raises BusError for any other text."""
-    if cell is None or not str(cell):
+    """Name of a cell, given by its name or its YAML file. Raises BusError for other values, CellError for a faulty file."""
+    if cell is None or cell == "":
         return None
-    if Path(cell).suffix in (".yaml", ".yml"):
+    is_text = isinstance(cell, str | Path)
+    if is_text and Path(cell).suffix in (".yaml", ".yml"):
         from penumbra.shared.cell import description  # slow to import, and needed for this only
 
         return description.load(cell).name
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", str(cell)):
-        raise bus.BusError(f"expected the name of a cell or its YAML file, got {str(cell)!r}: letters, digits, _ and -")
+    if not is_text or not re.fullmatch(r"[A-Za-z0-9_-]+", str(cell)):
+        got = repr(str(cell)) if is_text else f"{cell!r:.60} ({type(cell).__name__})"
+        raise bus.BusError(f"expected the name of a cell (letters, digits, _ and -) or its YAML file, got {got}")
     return str(cell)

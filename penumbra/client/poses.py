@@ -1,7 +1,7 @@
 """Subscription to poses. Only the newest pose is kept, and only poses that are taken are decoded.
 
-Zenoh hands a sample to a callback in a thread of its own. The callback only replaces the content of a slot and wakes the reader,
-so a slow reader delays nobody and finds the newest pose, never a queue.
+Zenoh's thread calls a function for each sample. The function only replaces the content of a slot and wakes the reader, so a slow
+reader delays nobody and finds the newest pose, never a queue.
 """
 
 from __future__ import annotations
@@ -84,7 +84,9 @@ class Subscription:
         self._last_ns: int | None = None
         self._logged: set[str] = set()
         self._refusal = ""
-        subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(self._slot.put, self._slot.close))
+        # in Zenoh's own thread: Python would wait at the end of the program for a thread of the callback's
+        handler = zenoh.handlers.Callback(self._slot.put, self._slot.close, indirect=False)
+        subscriber = session.declare_subscriber(key, handler)
         # a subscriber with a callback lives as long as the session unless it is undeclared
         self._end = weakref.finalize(self, _undeclare, subscriber)
         self._end.atexit = False

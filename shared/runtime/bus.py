@@ -36,6 +36,7 @@ __all__ = [
     "BusError",
     "Connection",
     "Refused",
+    "TimedOut",
     "ask",
     "configuration",
     "connection",
@@ -51,10 +52,16 @@ RUNTIME = "(rx: (handover: app), app: (worker_threads: 2))"
 """Zenoh's threads in a client. The thread that waits for the socket also reads the messages. By default it wakes another thread
 for that, and a third one that finds nothing to do. A router keeps the default, so that a reader that waits for space on one link
 does not block the others."""
+TOO_LATE = "Timeout"
+"""Text of the error with which Zenoh itself answers a query when its time is over."""
 
 
 class Refused(ValueError):
     """A query was answered with an error; the text is that of the answer."""
+
+
+class TimedOut(Refused):
+    """Nobody answered a query in time."""
 
 
 def taken(*endpoints: str) -> BusError:
@@ -127,7 +134,8 @@ def _open(config: zenoh.Config) -> zenoh.Session:
 def ask(
     session: zenoh.Session, key: str, parameters: str = "", payload: bytes | None = None, timeout_s: float = 1.0
 ) -> list[bytes]:
-    """Payloads of all answers to a query. Raises Refused where the only answers are errors."""
+    """Payloads of all answers to a query. Raises Refused where the only answers are errors, TimedOut where somebody could have
+    answered and nobody did in time."""
     selector = f"{key}?{parameters}" if parameters else key
     answers, errors = [], []
     # every answerer counts, also where several processes answer on the same key
@@ -143,7 +151,8 @@ def ask(
         elif reply.err is not None:
             errors.append(reply.err.payload.to_bytes().decode(errors="replace"))
     if errors and not answers:
-        raise Refused(errors[0])
+        refusals = [error for error in errors if error != TOO_LATE]
+        raise Refused(refusals[0]) if refusals else TimedOut(f"no answer within {timeout_s:g} s")
     return answers
 
 

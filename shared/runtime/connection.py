@@ -137,7 +137,7 @@ def configuration(connection: Connection) -> zenoh.Config:
         if endpoint.partition("/")[0] not in protocols:  # Zenoh would retry it forever
             raise BusError(
                 f"endpoint: expected PROTOCOL/ADDRESS, as in {connection.default}, got {endpoint!r}; "
-                f"protocols{' with --secure' if connection.secure else ''}: {', '.join(protocols)}"
+                f"protocols{' with certificates' if connection.secure else ''}: {', '.join(protocols)}"
             )
     if connection.secure is not None:
         settings |= _secure(connection.secure, access.holder(connection.service, mode == "router"), mode)
@@ -165,8 +165,8 @@ def _secure(folder: Path, holder: str, mode: str) -> dict[str, Any]:
         except OSError as error:
             names = ", ".join(file.name for file in files.values())
             raise BusError(
-                f"--secure {folder}: expected {names}, got no readable {path.name} ({error.strerror}); make them with `penumbra "
-                f"certs --out {folder}`, or copy them from where they were made"
+                f"certificates in {folder}: expected {names}, got no readable {path.name} ({error.strerror}); make them with "
+                f"`penumbra certs --out {folder}`, or copy them from where they were made"
             ) from None
     tls = {
         "root_ca_certificate": str(files["ca"]),

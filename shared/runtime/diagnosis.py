@@ -12,9 +12,10 @@ from penumbra.shared.runtime.connection import Connection
 
 ATTEMPT_S = 0.5
 """Timeout [s] of one attempt to connect to an address."""
-START = "start `penumbra router` or `penumbra up`, or give --connect"
+OTHER = "give another endpoint (--connect, in Python endpoint=)"
+START = f"start `penumbra router` or `penumbra up`, or {OTHER}"
 STRANGER = "what listens there does not answer as a Zenoh router"
-WITHOUT_TLS = "without TLS: give --secure FOLDER with certificates of `penumbra certs`"
+WITHOUT_TLS = "without TLS: give a folder of `penumbra certs` (--secure FOLDER, in Python secure=)"
 BY_TCP = ("tcp", "tls", "ws")
 """Protocols for which a TCP connection shows whether a process listens."""
 
@@ -66,8 +67,8 @@ def _who_listens(endpoint: str, link: socket.socket, host: str, secure: Path | N
         )
     except OSError:  # no TLS, or no answer
         if secure is not None or endpoint.startswith("tls/"):
-            return f"no router at {endpoint} that speaks TLS: leave --secure out, or start it with --secure"
-        return f"no router at {endpoint}: {STRANGER}: give another --connect"
+            return f"no router at {endpoint} that speaks TLS: leave --secure (in Python secure=) out, or start it with --secure"
+        return f"no router at {endpoint}: {STRANGER}: {OTHER}"
     if secure is None:
         return f"no router at {endpoint} {WITHOUT_TLS}"
     return f"no router at {endpoint} that accepts the certificate in {secure}: use the folder of that router's `penumbra certs`"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import zenoh
@@ -34,15 +35,16 @@ class Instance:
         return f"{self.service} {self.instance}: {self.status}" + (f": {'; '.join(self.reasons)}" if self.reasons else "")
 
 
-def ask(session: zenoh.Session, cell: str) -> list[Instance]:
-    """All instances of a cell, by service. An instance that is on the bus but does not answer within ANSWER_S is down."""
+def ask(session: zenoh.Session, cell: str, service: str = "*", timeout_s: float = ANSWER_S) -> list[Instance]:
+    """All instances of a cell, or of one of its services. An instance that is on the bus but does not answer in time is down."""
     found = {}
-    for reply in session.liveliness().get(topics.alive(cell), timeout=ANSWER_S):
+    for reply in session.liveliness().get(topics.alive(cell, service), timeout=timeout_s):
         if reply.ok is not None:
-            service, instance = str(reply.ok.key_expr).split("/")[-2:]
-            found[instance] = Instance(service, instance, "down", (f"hangs: no answer within {ANSWER_S:g} s",))
-    for each in map(report.read, bus.ask(session, topics.health(cell), timeout_s=ANSWER_S)):
-        found[each.instance] = Instance(each.service, each.instance, each.status, tuple(each.reasons))
+            name, instance = str(reply.ok.key_expr).split("/")[-2:]
+            found[instance] = Instance(name, instance, "down", (f"hangs: no answer within {timeout_s:g} s",))
+    with contextlib.suppress(bus.TimedOut):
+        for each in map(report.read, bus.ask(session, topics.health(cell, service), timeout_s=timeout_s)):
+            found[each.instance] = Instance(each.service, each.instance, each.status, tuple(each.reasons))
     return sorted(found.values(), key=lambda each: (each.service, each.instance))
 
 

@@ -4,9 +4,13 @@ import asyncio
 import contextlib
 import dataclasses
 import math
+import os
+import subprocess
+import sys
 import threading
 import time
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -196,12 +200,21 @@ def test_a_silent_cell_times_out_says_why_and_the_same_iterator_goes_on(router):
             cell = stack.enter_context(penumbra.connect(endpoint=router, timeout=30))
             poses = cell.poses(timeout=0.5)
             next(poses)
-        with pytest.raises(TimeoutError, match=r"no pose for 0.5 s: nobody publishes it in cell table: is `penumbra fusion`"):
+        with pytest.raises(TimeoutError, match=r"no pose for 0.5 s: no fusion of cell table answers: start `penumbra fusion`"):
             [next(poses) for _ in range(10)]
-        with pytest.raises(TimeoutError, match=r"no pose of forearm within 0.2 s"):
+        with pytest.raises(TimeoutError, match=r"no pose of forearm within 0.2 s: no fusion of cell table answers"):
             cell.pose(timeout=0.2)
         with chain.fusion():
             assert next(poses).target == "forearm"
+
+
+def test_a_timeout_shorter_than_a_pose_takes_does_not_call_fusion_missing(cell):
+    with pytest.raises(TimeoutError, match="no pose for 0 s: fusion of cell table runs: give a longer timeout"):
+        for _ in range(1000):
+            next(cell.poses(timeout=0))
+    with pytest.raises(TimeoutError, match="no pose of forearm within 1e-06 s: fusion of cell table runs: give a longer timeout"):
+        for _ in range(1000):
+            cell.pose(timeout=1e-6)
 
 
 def test_a_lost_router_is_named_and_poses_resume_when_it_is_back():
@@ -248,6 +261,13 @@ def test_an_iterator_that_nobody_holds_ends_its_subscription(numbered):
         wait_for(lambda: slot.is_closed, 5, "the end of the subscription")
 
 
+def test_a_program_that_still_holds_poses_when_it_ends_exits(table):
+    program = "import penumbra; cell = penumbra.connect(timeout=30); poses = cell.poses(timeout=30); next(poses)"
+    environment = {**os.environ, "PENUMBRA_CONNECT": where(table)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_closing_the_cell_ends_a_loop_in_another_thread(cell):
     seen: list[penumbra.Pose] = []
     thread = threading.Thread(target=lambda: seen.extend(pose for pose in cell.poses()))
@@ -272,6 +292,25 @@ def test_the_async_client_asks_and_times_out_like_the_other(table):
         with pytest.raises(StopAsyncIteration):
             for _ in range(2):
                 await anext(kept)
+
+    asyncio.run(main())
+
+
+def test_a_closed_cell_is_read_no_more(table):
+    with penumbra.connect(endpoint=where(table), timeout=30) as cell:
+        pass
+    for read in (cell.poses, cell.pose, cell.health):
+        with pytest.raises(penumbra.BusError, match=r"cell table cannot be read \(session closed\): is the cell closed\?"):
+            read()
+
+    async def main() -> None:
+        async with penumbra.aconnect(endpoint=where(table), timeout=30) as cell:
+            pass
+        with pytest.raises(penumbra.BusError, match="is the cell closed"):
+            cell.poses()
+        for read in (cell.pose, cell.health):
+            with pytest.raises(penumbra.BusError, match="is the cell closed"):
+                await read()
 
     asyncio.run(main())
 
@@ -324,8 +363,12 @@ def test_without_router_fusion_or_the_right_cell_the_error_says_which_is_missing
         penumbra.connect(endpoint=nowhere, timeout=0.1)
     with pytest.raises(penumbra.BusError, match=f"no cell runs at {router}: start `penumbra up`"):
         penumbra.connect(endpoint=router, timeout=0.1)
-    with pytest.raises(penumbra.BusError, match=r"expected the name of a cell or its YAML file, got 'a/b'"):
-        penumbra.connect("a/b", endpoint=router)
+    number: Any = 42
+    for wrong, got in (("a/b", "'a/b'"), (number, r"42 \(int\)")):
+        with pytest.raises(penumbra.BusError, match=rf"expected the name of a cell \(.*\) or its YAML file, got {got}$"):
+            penumbra.connect(wrong, endpoint=router)
+    with pytest.raises(penumbra.CellError, match=r"no cell 'missing\.yaml'"):
+        penumbra.connect("missing.yaml", endpoint=router)
     with small("table", router) as table:
         with pytest.raises(penumbra.BusError, match=f"no fusion in cell table at {router}"):
             penumbra.connect(endpoint=router, timeout=0.5)

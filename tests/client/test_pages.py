@@ -1,5 +1,6 @@
 """What the pages about the client show works as it stands there."""
 
+import inspect
 import os
 import re
 import subprocess
@@ -10,12 +11,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import penumbra
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
 from penumbra.tests.support.live import PATIENCE_S, wait_for
 from penumbra.tests.support.small import small
 
 ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize(
+    ("call", "function"),
+    [("penumbra.connect", penumbra.connect), ("cell.poses", penumbra.Cell.poses), ("cell.pose", penumbra.Cell.pose)],
+)
+def test_the_page_shows_the_signature_that_a_function_has(call, function):
+    parameters = [each for each in inspect.signature(function).parameters.values() if each.name != "self"]
+    signature = inspect.Signature([each.replace(annotation=inspect.Parameter.empty) for each in parameters])
+    assert f"`{call}{signature}`" in (ROOT / "docs" / "python.md").read_text()
 
 
 def blocks(page: str, language: str) -> list[str]:

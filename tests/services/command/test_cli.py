@@ -205,7 +205,7 @@ def test_no_router_is_one_line_that_says_how_to_start_one(capsys):
     assert cli.main(["pose", "--connect", where]) == 2
     assert capsys.readouterr().err == (
         f"penumbra pose: no router at {where}: nothing listens there: start `penumbra router` or `penumbra up`, or give "
-        "--connect\n"
+        "another endpoint (--connect, in Python endpoint=)\n"
     )
 
 

@@ -354,7 +354,10 @@ def test_the_waiting_for_a_router_says_which_certificates_are_expected(folder):
 @pytest.mark.parametrize(
     ("connection", "reason"),
     [
-        (bus.Connection(connect=("tcp/127.0.0.1:7447",)), "endpoint: .* got 'tcp/127.0.0.1:7447'; protocols with --secure: tls$"),
+        (
+            bus.Connection(connect=("tcp/127.0.0.1:7447",)),
+            "endpoint: .* got 'tcp/127.0.0.1:7447'; protocols with certificates: tls$",
+        ),
         (bus.Connection("peer"), "--mode: expected client or router with --secure"),
         (
             bus.Connection(service="fusion", secure=Path("nowhere")),

@@ -325,6 +325,20 @@ def test_a_query_is_answered_and_a_refusal_carries_its_text(node):
     assert list(server.health()["faults"].values()) == [1]
 
 
+def test_a_query_that_is_not_answered_in_time_is_distinguished_from_a_refused_one(node):
+    server, asker, over = node("server").open(), node().open(), threading.Event()
+    server.answer("penumbra/table/slow", lambda parameters, payload: str(over.wait(30)).encode())
+
+    def ask() -> str:
+        try:
+            return str(asker.query("penumbra/table/slow", timeout_s=0.2))
+        except bus.TimedOut as error:
+            return str(error)
+
+    wait_for(lambda: ask() == "no answer within 0.2 s", 5, "the query to be late")
+    over.set()
+
+
 def test_a_query_that_nobody_answers_returns_at_once_with_nothing(node):
     asker = node().open()
     timeout_s = 60.0

@@ -79,7 +79,8 @@ def test_a_port_that_is_taken_is_reported_with_who_has_it(folders, is_router, is
 def test_a_port_where_nothing_listens_is_reported_with_what_to_start():
     where = f"tcp/127.0.0.1:{free_port()}"
     assert diagnosis.no_router(bus.Connection(connect=(where,))) == (
-        f"no router at {where}: nothing listens there: start `penumbra router` or `penumbra up`, or give --connect"
+        f"no router at {where}: nothing listens there: start `penumbra router` or `penumbra up`, or give another endpoint "
+        "(--connect, in Python endpoint=)"
     )
 
 
@@ -91,13 +92,13 @@ def test_a_server_that_is_no_router_is_reported():
 def test_a_plain_connection_to_a_secured_router_is_advised_to_use_secure(folders):
     with listener(folders[0]) as port:
         said = diagnosis.no_router(bus.Connection(connect=(f"tcp/127.0.0.1:{port}",)))
-    assert said.endswith("without TLS: give --secure FOLDER with certificates of `penumbra certs`")
+    assert said.endswith("without TLS: give a folder of `penumbra certs` (--secure FOLDER, in Python secure=)")
 
 
 def test_a_secured_connection_to_a_plain_router_is_advised_to_leave_secure_out(folders):
     with listener() as port:
         said = diagnosis.no_router(bus.Connection(connect=(f"tls/127.0.0.1:{port}",), secure=folders[0]))
-    assert said.endswith("that speaks TLS: leave --secure out, or start it with --secure")
+    assert said.endswith("that speaks TLS: leave --secure (in Python secure=) out, or start it with --secure")
 
 
 def test_a_router_of_another_authority_is_distinguished_from_one_of_ours(folders):
