@@ -3,6 +3,7 @@
 import functools
 import itertools
 import json
+import re
 import subprocess
 import threading
 from dataclasses import replace
@@ -211,6 +212,23 @@ def _in_process(path, *words):
     done = subprocess.run(command, capture_output=True, text=True, timeout=10 * PATIENCE_S)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def test_in_process_a_service_s_log_has_time_level_and_service_and_can_be_json(tmp_path):
+    """A pad that falls silent in the middle is left out."""
+    silent_ns = 10**18 + 10**9
+    said = [
+        each
+        for each in on_the_bus(TABLE, 5, 3.0, frames=False)
+        if each.topic is not topics.VOLTAGES or each.names["pad"] != "p0" or each.stamp_ns < silent_ns
+    ]
+    path = recorded(tmp_path / "silent.mcap", "table", said)
+    command = penumbra_command("replay", str(path), "--in-process")
+    text = subprocess.run(command, capture_output=True, text=True, timeout=10 * PATIENCE_S, check=True).stderr
+    assert re.search(r"^\S+Z warning haptics: left out what=p0 why=silent$", text, re.MULTILINE), text
+    command = penumbra_command("replay", str(path), "--in-process", "--log-format", "json")
+    lines = subprocess.run(command, capture_output=True, text=True, timeout=10 * PATIENCE_S, check=True).stderr.splitlines()
+    assert {"what": "p0", "why": "silent"} in [json.loads(line)["fields"] for line in lines]
 
 
 def test_how_far_tracks_are_apart_counts_poses_of_the_same_moment_that_are_not_lost():
