@@ -48,7 +48,7 @@ def _seconds(text: str) -> float:
     "(penumbra up --replicas emulator=0) make today's poses of it. With --in-process the methods run here, without a bus, and to "
     "the bit the same every time; what they make is compared with what was recorded. With --smooth nothing is played: the best "
     "trajectory afterwards is made of the senses' poses in the file, or beside --in-process of those of today's methods. The "
-    "exit code is 1 where a file had no end.",
+    "exit code is 1 where a file is damaged or has no end.",
     flags.Argument(
         "file", nargs=-1, required=True, type=Path, metavar="FILE ...", help="one file, or those that follow each other"
     ),
@@ -104,7 +104,7 @@ def _seconds(text: str) -> float:
     "penumbra replay run.mcap --smooth --motion motion.json",
 )
 def main(options: flags.Options) -> int:
-    """Play, and print what was played; returns 1 if a file had no end."""
+    """Play, and print what was played; returns 1 if a file is damaged or has no end."""
     logs.configure(options.log_level, options.log_format, "replay")
     if options.out is not None and not (options.in_process or options.smooth):
         flags.refuse("expected --in-process or --smooth beside --out, got --out alone")

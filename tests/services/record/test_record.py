@@ -14,6 +14,7 @@ import msgspec
 import pytest
 
 from penumbra.services import flags
+from penumbra.services.command import cli
 from penumbra.services.record import service
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import access, messages, report, topics
@@ -324,3 +325,17 @@ def test_mend_writes_a_whole_file_beside_one_that_has_no_end(router, tmp_path):
     assert Recording(tmp_path / "run-mended.mcap").is_indexed
     again = subprocess.run(penumbra_command("record", "mend", str(whole)), capture_output=True, text=True)
     assert again.returncode == 2 and "is there already" in again.stderr
+
+
+def test_info_and_mend_say_what_is_missing_of_a_damaged_file(tmp_path, capsys):
+    path = written(tmp_path / "run.mcap", "table", on_the_bus(CELL, 1, 4.0, frames=False))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 1000] = bytes(1000)
+    path.write_bytes(data)
+    assert cli.main(["record", "info", str(path), "--json"]) == 1
+    (gap,) = json.loads(capsys.readouterr().out)["gaps"]
+    assert gap["begin"] <= len(data) // 2 < gap["end"] and gap["seconds"] > 0.1
+    assert cli.main(["record", "info", str(path)]) == 1
+    assert f"bytes {gap['begin']} to {gap['end']} are damaged" in capsys.readouterr().out
+    assert cli.main(["record", "mend", str(path)]) == 0
+    assert f"is damaged after byte {gap['begin']}: {gap['seconds']:.2f} s of messages are missing" in capsys.readouterr().out
