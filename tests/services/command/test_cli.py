@@ -16,6 +16,7 @@ import pytest
 
 from penumbra.services import flags, progress
 from penumbra.services.command import cli, doctor, look
+from penumbra.services.emulator.control import COMMANDS
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import processes, topics
 from penumbra.shared.perception import landmarks
@@ -371,14 +372,21 @@ def test_sim_passes_the_command_on_and_prints_the_answer_or_the_refusal(endpoint
         request = json.loads(payload)
         if request["command"] != "occlude":
             raise ValueError("expected occlude")
-        return json.dumps({"occlude": request["value"]}).encode()
+        return json.dumps({"occlusion": request["value"], "occlusion_now": 0.123, "motion": "on"}).encode()
 
     with Node("emulator", CELL, bus.Connection(connect=(endpoint,))) as emulator:
         emulator.answer(topics.control("table"), control)
         wait_for(lambda: cli.main(["sim", "occlude", "0.8", "--connect", endpoint]) == 0, 5, "the answer")
-        assert capsys.readouterr().out.splitlines()[-1] == "occlude    0.8"
-        assert cli.main(["sim", "fly", "--connect", endpoint]) == 2
+        assert capsys.readouterr().out.splitlines()[-2:] == ["occlusion  0.8, and now 0.12", "motion     on"]
+        assert cli.main(["sim", "pause", "--connect", endpoint]) == 2
         assert capsys.readouterr().err == "penumbra sim: expected occlude\n"
+
+
+def test_sim_refuses_a_command_that_the_emulator_does_not_have_in_its_own_words(capsys):
+    assert tuple(COMMANDS) == look.ACTIONS
+    assert cli.main(["sim", "bogus"]) == 2
+    what = "COMMAND: expected occlude, motion, pause, resume, speed, skin, board or state, got 'bogus'"
+    assert capsys.readouterr().err == f"penumbra sim: {what} (see penumbra sim --help)\n"
 
 
 def test_sim_without_an_emulator_says_what_to_start(endpoint, capsys):
