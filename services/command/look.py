@@ -145,10 +145,11 @@ def list_topics(options: flags.Options) -> None:
 
 
 def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.TOPICS) -> None:
-    """Print the known topics, or their traffic."""
+    """Print the known topics that the cell can have, or their traffic."""
     from penumbra.shared.cell import description
 
     cell = description.load(options.cell)
+    known = [topic for topic in known if topic.is_expected(cell)]
     if options.hz:
         received, instances = listen(cell, bus.connection(options), options.seconds, known)
         if options.json:

@@ -22,6 +22,7 @@ from penumbra.shared.contract import processes, topics
 from penumbra.shared.perception import landmarks
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
+from penumbra.tests.support import numbered
 from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 from penumbra.tests.support.nodes import pose_json, start
 
@@ -359,6 +360,16 @@ def test_topics_lists_the_keys_that_the_cell_has_and_no_other(capsys):
     assert {row["topic"] for row in rows} == {topic.name for topic in topics.TOPICS} - {"joints"}, "the table has no robot"
     user = Node("user", CELL)
     assert sorted(row["key"] for row in rows) == sorted(key for topic in topics.TOPICS for key in user.keys(topic, {}))
+
+
+def test_topics_of_a_cell_without_pads_and_emulator_are_neither_listed_nor_expected(endpoint, tmp_path, capsys):
+    path = str(numbered.cell(tmp_path))
+    assert cells.load(path).sim is None
+    assert cli.main(["topics", "--cell", path, "--json"]) == 0
+    assert {row["topic"] for row in json.loads(capsys.readouterr().out)} == {"frame", "mask", "vision", "fused"}
+    assert cli.main(["topics", "--cell", path, "--hz", "--seconds", "0.1", "--json", "--connect", endpoint]) == 0
+    found = json.loads(capsys.readouterr().out)["topics"]
+    assert not [key for key in found if key.endswith(("haptic", "truth", "voltages"))]
 
 
 def test_topics_hz_measures_what_arrives(endpoint, capsys):
