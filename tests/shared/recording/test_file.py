@@ -329,6 +329,16 @@ def test_a_file_that_is_damaged_and_cut_off_says_both(chunks, tmp_path):
     assert mended.fault and not left_of(tmp_path / "mended.mcap")[1]
 
 
+def test_without_an_index_messages_whose_topics_only_a_damaged_part_named_are_counted(chunks, tmp_path):
+    path, index = chunks
+    (tmp_path / "both.mcap").write_bytes(damaged(path, index[0].chunk_start_offset + 60)[: index[-1].chunk_start_offset])
+    recording = Recording(tmp_path / "both.mcap")
+    found = sum(1 for _ in recording.entries())
+    left_out = int(recording.fault.partition("left out: ")[2].split()[0])
+    assert left_out > 0 and recording.fault.endswith("messages whose topics only a damaged part named")
+    assert found + left_out < sum(1 for _ in Recording(path).entries())
+
+
 def test_a_mended_file_has_an_index_and_all_that_could_be_read(path, tmp_path):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[:-1000])
