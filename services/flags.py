@@ -340,10 +340,11 @@ def refuse(text: str) -> NoReturn:
 def explain(error: click.ClickException) -> str:
     """One line: the command, what was expected, and where to find help."""
     path = error.ctx.command_path if isinstance(error, click.UsageError) and error.ctx else "penumbra"
-    return f"{path}: {_reason(error)} (see {path} --help)"
+    return f"{path}: {reason(error)} (see {path} --help)"
 
 
-def _reason(error: click.ClickException) -> str:
+def reason(error: click.ClickException) -> str:
+    """What was expected and what came, without the command."""
     match error:
         case click.NoSuchOption():
             params = error.ctx.command.get_params(error.ctx) if error.ctx else []

@@ -62,6 +62,8 @@ def start(node: Node, options: flags.Options) -> None:
     for name, source in sources(node.cell, options).items():
         camera = node.cell.cameras[name]
         folder = node.cell.folder if options.source is None else Path.cwd()
+        if (source.is_played or source.kind == "v4l2") and not source.path(folder).exists():
+            node.log.warning("nothing is there yet: it is waited for", camera=name, source=source.url)
         reader = Reader(
             name,
             camera,
@@ -94,7 +96,10 @@ def sources(cell: cells.Cell, options: flags.Options) -> dict[str, cells.CameraS
     given = {"loop": options.loop or None, "rate_hz": options.rate, "latency": options.latency}
     given = {key: value for key, value in given.items() if value is not None}
     if options.source is not None:
-        return {cell.one("cameras", options.camera): _checked({"url": options.source, **given})}
+        source = _checked({"url": options.source, **given})
+        if source.is_played and not source.path(Path.cwd()).exists():
+            raise cells.CellError(f"--source: expected a film or a folder of pictures, got nothing at {source.place}")
+        return {cell.one("cameras", options.camera): source}
     found = cell.sources
     if options.camera is not None:
         name = cell.one("cameras", options.camera)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import zenoh
-from click.shell_completion import CompletionItem
 
 from penumbra.services import flags
 from penumbra.shared.cell import names
@@ -146,10 +145,11 @@ def list_topics(options: flags.Options) -> None:
 
 
 def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.TOPICS) -> None:
-    """Print the known topics, or their traffic."""
+    """Print the known topics that the cell can have, or their traffic."""
     from penumbra.shared.cell import description
 
     cell = description.load(file_of(options))
+    known = [topic for topic in known if topic.is_expected(cell)]
     if options.hz:
         received, instances = listen(cell, bus.connection(options), options.seconds, known)
         if options.json:
@@ -308,8 +308,8 @@ def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dic
     flags.Argument(
         "action",
         metavar="COMMAND",
-        help="occlude, motion, pause, resume, speed, skin, board or state",
-        shell_complete=lambda ctx, param, text: [CompletionItem(name) for name in ACTIONS if name.startswith(text)],
+        choices=ACTIONS,
+        help=flags.any_of(ACTIONS),
     ),
     flags.Argument("value", nargs=-1, help="of occlude, motion, speed, skin and board"),
     flags.JSON,
@@ -317,7 +317,7 @@ def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dic
     example="penumbra sim occlude 0.8\npenumbra sim state --json",
 )
 def sim(options: flags.Options) -> None:
-    """Pass the command to the emulator, which decides what is possible."""
+    """Pass the command to the emulator, which decides what values are possible."""
     request = {"command": options.action} | ({"value": " ".join(options.value)} if options.value else {})
     with open_session(replace(bus.connection(options), service=access.OPERATOR)) as session:
         cell = which.name_of(session, options.cell)
@@ -325,7 +325,15 @@ def sim(options: flags.Options) -> None:
         if not answers:
             raise bus.BusError(f"no emulator in cell {cell}: {which.whats_there(session, cell, 'emulator')}")
     state = json.loads(answers[0])
-    print(json.dumps(state) if options.json else "\n".join(f"{name:10} {_plain(value)}" for name, value in state.items()))
+    print(json.dumps(state) if options.json else "\n".join(_settings(state)))
+
+
+def _settings(state: dict[str, Any]) -> list[str]:
+    """The emulator's answer in lines. The occluder takes a moment to its place: its share now stands behind the one that was
+    set."""
+    if (now := state.pop("occlusion_now", None)) is not None:
+        state["occlusion"] = f"{state['occlusion']}, and now {now:.2f}"
+    return [f"{name:10} {_plain(value)}" for name, value in state.items()]
 
 
 def _plain(value: Any) -> str:

@@ -42,18 +42,20 @@ def control(world: World, payload: bytes, time_s: float, serial: SerialBoards | 
         world.occlude(None if value == "auto" else _number(command, value), time_s)
     elif command == "motion":
         if value not in ("on", "off"):
-            raise ValueError(f"motion: expected {COMMANDS[command]}, got {value!r}")
+            raise ValueError(f"motion: expected {COMMANDS[command]}, got {_got(value)}")
         world.set_motion(value == "on", time_s)
     elif command == "speed":
         world.set_speed(_number(command, value), time_s)
     elif command == "skin":
         if not isinstance(value, str):
-            raise ValueError(f"skin: expected {COMMANDS['skin']}, got {value!r}")
+            raise ValueError(f"skin: expected {COMMANDS['skin']}, got {_got(value)}")
         world.break_skin(value, time_s)
     elif command == "board":
         if serial is None:
             raise ValueError("board: no boards are served: start the emulator with --serial")
-        serial.fault(str(value))
+        if not isinstance(value, str):
+            raise ValueError(f"board: expected {COMMANDS['board']}, got {_got(value)}")
+        serial.fault(value)
     elif command in ("pause", "resume"):
         world.set_paused(command == "pause", time_s)
     elif command != "state":
@@ -67,7 +69,11 @@ def _number(command: str, value: Any) -> float:
             raise ValueError
         return float(value)
     except (TypeError, ValueError):
-        raise ValueError(f"{command}: expected {COMMANDS[command]}, got {value!r}") from None
+        raise ValueError(f"{command}: expected {COMMANDS[command]}, got {_got(value)}") from None
+
+
+def _got(value: Any) -> str:
+    return "nothing" if value is None else repr(value)
 
 
 def _expected(got: str) -> str:

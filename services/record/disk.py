@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -71,15 +72,18 @@ class Disk:
         probe.unlink()
 
     def write(self, entries: Iterable[Entry], now_ns: int) -> None:
-        """Write entries, to the next file if the current one is due to end. Entries are lost, and counted, while the disk is
-        full."""
+        """Write entries, to the next file if the current one is due to end. A file begins with its first entry: where nothing
+        comes, none is left. Entries are lost, and counted, while the disk is full."""
         now_s = time.monotonic()
         file = self._file
         if file is not None and (file.size >= self._limits.roll_bytes or now_s - self._began_s >= self._limits.roll_s):
             self.close()
+        waiting = iter(entries)
+        if (first := next(waiting, None)) is None:
+            return
+        waiting = itertools.chain([first], waiting)
         if self._file is None and now_s - self._tried_s >= AGAIN_S:
             self._begin(now_ns, now_s)
-        waiting = iter(entries)
         if self._file is not None:
             try:
                 for entry in waiting:

@@ -71,7 +71,7 @@ class Recorder:
         if command != "save":
             raise ValueError(f'expected {{"command": "save"}}, got {command!r}')
         if self._last is None:
-            raise ValueError(f"this recorder writes all to {self._disk.name}: only one with --last keeps anything back")
+            raise ValueError(f"this recorder writes all to {self._disk.folder}: only one with --last keeps anything back")
         with self._lock:
             self._wishes.append(wish := Wish())
         return {"file": wish.wait(SAVE_S), "seconds": round(self._last.span_s, 1)}
@@ -81,6 +81,8 @@ class Recorder:
         self.turn()
         with self._lock:
             self._disk.close()
+            if self._last is None and not self._disk.files:
+                self._log.warning("nothing was recorded, and no file written")
 
     def describe(self) -> dict[str, Any]:
         """For the health report."""

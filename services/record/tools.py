@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +42,13 @@ def save(options: flags.Options) -> None:
 
 @flags.command(
     "info",
-    "Prints what a file holds. The exit code is 1 where its end is missing.",
+    "Prints what a file holds. The exit code is 1 where it is damaged or its end is missing.",
     FILE,
     flags.JSON,
     example="penumbra record info run.mcap",
 )
 def info(options: flags.Options) -> int:
-    """Print the contents; returns 1 if the end is missing."""
+    """Print the contents; returns 1 if a part or the end is missing."""
     found = described(Recording(options.file))
     if options.json:
         print(json.dumps(found))
@@ -58,6 +58,8 @@ def info(options: flags.Options) -> int:
         print(f"{'seconds':24} {found['seconds']}")
         for topic, count in found["messages"].items():
             print(f"{topic:44} {count}")
+        for gap in found["gaps"]:
+            print(f"bytes {gap['begin']} to {gap['end']} are damaged: {gap['seconds']:.2f} s of messages are missing")
         print(found["fault"] or "the file is whole")
     return int(bool(found["fault"]))
 
@@ -76,12 +78,14 @@ def described(recording: Recording) -> dict[str, Any]:
         "messages": dict(sorted(counts.items())),
         "is_indexed": recording.is_indexed,
         "fault": recording.fault,
+        "gaps": [asdict(gap) for gap in recording.gaps],
     }
 
 
 @flags.command(
     "mend",
-    "Writes all that can be read of a file whose recorder was killed to a new, whole file with an index, and reads that again.",
+    "Writes all that can be read of a file that is damaged or whose recorder was killed to a new, whole file with an index, and "
+    "reads that again.",
     FILE,
     flags.Option("-o", "--out", type=Path, metavar="FILE", show_default="FILE-mended.mcap", help="what to write"),
     example="penumbra record mend run.mcap",

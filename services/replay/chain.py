@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import click
+
 from penumbra.services import flags
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import processes, topics
@@ -21,6 +23,7 @@ from penumbra.shared.contract.topics import Topic
 from penumbra.shared.perception.lookout import MAX_PIXELS
 from penumbra.shared.recording.reading import Played
 from penumbra.shared.runtime import logs
+from penumbra.shared.runtime.bus import BusError
 from penumbra.shared.runtime.hang import HANG_S
 from penumbra.shared.runtime.node import ServiceNode
 
@@ -47,7 +50,7 @@ class Replay:
     """Clock, message queue and subscribers of a replay.
 
     services: the services to run, if the cell has work for them; arguments: their flags. hear: called with every delivered
-    message; None: messages are kept in `heard`, in order.
+    message; None: messages are kept in `heard`, in order. Raises BusError for flags that a service does not have.
     """
 
     def __init__(
@@ -70,7 +73,12 @@ class Replay:
             if (process := processes.find(name)) is not None and not process.is_needed(cell):
                 continue
             module = importlib.import_module(f"penumbra.services.{name}.service")
-            module.start(ReplayNode(self, name), flags.parse(module.FLAGS, [*DEFAULTS.get(name, ()), *chosen.get(name, ())]))
+            words = [*DEFAULTS.get(name, ()), *chosen.get(name, ())]
+            try:
+                options = flags.parse(module.FLAGS, words)
+            except click.ClickException as error:
+                raise BusError(f"--{name}: {flags.reason(error)} (see penumbra {name} --help)") from None
+            module.start(ReplayNode(self, name), options)
 
     def run(self, recording: Iterable[tuple[Topic, dict[str, str], Message]]) -> list[Heard]:
         """Play messages in the order of their stamps, each delivered after its sensor's delay; returns `heard`."""

@@ -21,8 +21,9 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.topics import Topic
 from penumbra.shared.recording import provenance
+from penumbra.shared.recording.faults import RecordingError
 from penumbra.shared.recording.reading import ABOUT, Played, Recording
-from penumbra.shared.runtime import bus
+from penumbra.shared.runtime import bus, logs
 
 PATIENCE_S = 1.0
 NAMES = tuple(topic.name for topic in topics.TOPICS)
@@ -47,7 +48,7 @@ def _seconds(text: str) -> float:
     "(penumbra up --replicas emulator=0) make today's poses of it. With --in-process the methods run here, without a bus, and to "
     "the bit the same every time; what they make is compared with what was recorded. With --smooth nothing is played: the best "
     "trajectory afterwards is made of the senses' poses in the file, or beside --in-process of those of today's methods. The "
-    "exit code is 1 where a file had no end.",
+    "exit code is 1 where a file is damaged or has no end.",
     flags.Argument(
         "file", nargs=-1, required=True, type=Path, metavar="FILE ...", help="one file, or those that follow each other"
     ),
@@ -75,7 +76,12 @@ def _seconds(text: str) -> float:
     ),
     *(
         flags.Option(
-            f"--{service}", default="", metavar="FLAGS", help=f"with --in-process: flags of {service}, such as '--log-level info'"
+            f"--{service}",
+            type=shlex.split,
+            default="",
+            show_default=False,
+            metavar="FLAGS",
+            help=f"with --in-process: flags of {service}, quoted as one word; penumbra {service} --help lists them",
         )
         for service in SERVICES
     ),
@@ -98,19 +104,32 @@ def _seconds(text: str) -> float:
     "penumbra replay run.mcap --smooth --motion motion.json",
 )
 def main(options: flags.Options) -> int:
-    """Play, and print what was played; returns 1 if a file had no end."""
+    """Play, and print what was played; returns 1 if a file is damaged or has no end."""
+    logs.configure(options.log_level, options.log_format, "replay")
     if options.out is not None and not (options.in_process or options.smooth):
         flags.refuse("expected --in-process or --smooth beside --out, got --out alone")
     if options.motion is not None and not options.smooth:
         flags.refuse("expected --smooth beside --motion, got --motion alone")
-    if options.smooth and (options.sensors or options.topics or options.loop):
-        flags.refuse("expected --smooth without --sensors, --topics and --loop; --in-process smooths what the sensors said")
+    if (options.in_process or options.smooth) and (options.sensors or options.topics or options.loop or flags.is_given("rate")):
+        flags.refuse(
+            "expected --in-process and --smooth without --sensors, --topics, --loop and --rate: "
+            "--in-process always takes only what the sensors said, and neither is played in real time"
+        )
+    for service in SERVICES:
+        if getattr(options, service) and not options.in_process:
+            flags.refuse(f"expected --in-process beside --{service}, got --{service} alone")
     if options.sensors and options.topics:
         flags.refuse("expected --sensors or --topics, got both")
     if options.out is not None and options.out.exists():
         raise bus.BusError(f"{options.out} is there already: give another --out")
     recordings = [Recording(path) for path in options.file]
     cell = cells.load(options.cell) if options.cell else recordings[0].cell()
+    for recording in recordings:
+        if recording.about["cell"] != cell.name:
+            raise RecordingError(
+                f"{recording.path}: expected a recording of cell {cell.name}, got one of cell {recording.about['cell']}: "
+                "replay the files of each cell by themselves, without --cell or with that cell"
+            )
     play = _here if options.in_process or options.smooth else _live
     found = play(options, recordings, cell)
     found["faults"] = [recording.fault for recording in recordings if recording.fault]
@@ -127,7 +146,7 @@ def _here(options: flags.Options, recordings: Sequence[Recording], cell: cells.C
         if smoothing is not None and not options.in_process:
             found = smooth.smooth(_messages(recordings, smooth.READ, options.from_s), recordings, writer, smoothing)
         else:
-            arguments = {service: shlex.split(getattr(options, service)) for service in SERVICES}
+            arguments = {service: getattr(options, service) for service in SERVICES}
             messages = _messages(recordings, topics.TOPICS, options.from_s)
             found = in_process.play(cell, messages, arguments, writer=writer, smoothing=smoothing)
     finally:
@@ -171,13 +190,16 @@ def _live(options: flags.Options, recordings: Sequence[Recording], cell: cells.C
 
 
 def _messages(recordings: Iterable[Recording], wanted: Sequence[Topic], from_s: float) -> Iterator[Played]:
-    """The messages of all files as one sequence."""
-    begins_ns = None
+    """The messages of all files as one sequence. Raises RecordingError if the files end before `from_s`."""
+    begins_ns = ends_ns = None
     for recording in recordings:
         for each in recording.messages(wanted):
-            begins_ns = each.received_ns if begins_ns is None else begins_ns
+            begins_ns, ends_ns = each.received_ns if begins_ns is None else begins_ns, each.received_ns
             if each.received_ns >= begins_ns + round(from_s * 1e9):
                 yield each
+    if begins_ns is not None and ends_ns is not None and ends_ns < begins_ns + round(from_s * 1e9):
+        length_s = (ends_ns - begins_ns) * 1e-9
+        raise RecordingError(f"--from {from_s:g}: the recording is {length_s:.1f} s long: give fewer seconds")
 
 
 def _print(found: dict[str, Any], as_json: bool) -> None:

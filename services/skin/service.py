@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from penumbra.services import flags
@@ -56,6 +57,9 @@ def start(node: Node, options: flags.Options) -> None:
     if not 0 < options.cycles <= 60_000:
         raise cells.CellError(f"--cycles: expected 1 to 60000, got {options.cycles}")
     for pad, readers in pads(node.cell, options.device, options.pad).items():
+        for reader in readers:
+            if not Path(str(reader.port)).exists():
+                node.log.warning("no such device yet: it is waited for; is the board plugged in?", pad=pad, port=reader.port)
         session = Session(node, pad, readers, options.cycles)
         node.add_report(pad, session.describe)
         node.every(BACKOFF_S[0], partial(Session.run, session), math.inf)

@@ -308,7 +308,7 @@ PROCESSES = (
             Tool("info", "what a file holds, and whether it is whole", "penumbra.services.record.tools:info", extra="record"),
             Tool(
                 "mend",
-                "a whole file of one whose recorder was killed",
+                "a whole file of one that is damaged or whose recorder was killed",
                 "penumbra.services.record.tools:mend",
                 extra="record",
             ),

@@ -50,7 +50,7 @@ class Topic:
     slow_hz: float
     qos: QoS = QoS.LATEST_WINS
     by_camera: bool = False
-    needs: Literal["cameras", "pads"] | None = None
+    needs: Literal["cameras", "pads", "sim"] | None = None
 
     def is_expected(self, cell: Cell) -> bool:
         """Whether a cell has the parts that the publishers of this topic need: without them the topic is not missing."""
@@ -80,7 +80,7 @@ JOINTS = Topic("joints", "penumbra/{cell}/robot/{robot}/joints", messages.Joints
 VOLTAGES = Topic("voltages", "penumbra/{cell}/skin/{pad}/voltages", messages.Voltages, 50, 32, 0.1,
                  ("emulator", "skin", "driver"), "electrode amplitudes [V], 1 kHz in batches", Priority.SIGNAL, 0)  # fmt: skip
 TRUTH = Topic("truth", "penumbra/{cell}/target/{target}/truth", messages.Truth, 50, 16, 0.2, ("emulator",),
-              "what the emulator knows", Priority.SIGNAL, 5)  # fmt: skip
+              "what the emulator knows", Priority.SIGNAL, 5, needs="sim")  # fmt: skip
 MASK = Topic("mask", "penumbra/{cell}/camera/{camera}/mask", messages.Mask, 20, 1, 0.3, ("segmentation",),
              "class indices of a window of a frame", Priority.IMAGE, 0)  # fmt: skip
 VISION = Topic("vision", "penumbra/{cell}/target/{target}/pose/vision", messages.VisionPose, 20, 4, 0.3, ("search", "posecnn"),

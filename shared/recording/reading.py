@@ -1,20 +1,25 @@
-"""Reader of recorded files, also of those whose end is missing."""
+"""Reader of recorded files, also of those that are damaged or whose end is missing."""
 
 from __future__ import annotations
 
 import io
+import mmap
+import re
 import struct
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import zstandard
 from mcap import records
-from mcap.exceptions import McapError
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import breakup_chunk
+from mcap.summary import Summary
 
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import topics
@@ -28,10 +33,24 @@ from penumbra.shared.runtime.bus import topic_of
 
 ABOUT, CELL = "penumbra", "cell.yaml"
 """Names of the metadata and of the attached cell file."""
-LARGEST = 1 << 30
-"""Maximum size of a record [bytes]. A larger length indicates damage."""
+HEAD = struct.Struct("<BQ")
+"""Beginning of a record: its opcode, and the length [bytes] of what follows."""
+CHUNK = re.compile(rb"\x06.{36}\x04\0\0\0zstd", re.DOTALL)
+"""Beginning of a chunk: opcode; length, times, size and checksum; name of the compression. Reading resumes there after damage."""
+READ: dict[Opcode, Any] = {Opcode.METADATA: records.Metadata, Opcode.ATTACHMENT: records.Attachment, Opcode.CHUNK: records.Chunk}
+"""Records that are read from a file; others are skipped."""
 BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, OverflowError, EOFError)
 """Exceptions that a damaged file can cause."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A damaged part of a file that was left out, from byte `begin` to `end`. seconds: from the last message before it to the
+    first one after it."""
+
+    begin: int
+    end: int
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -49,14 +68,15 @@ class Played:
 class Recording:
     """A file of `penumbra record`.
 
-    about: its metadata. attachments: by name. fault: what is wrong with its end, as far as it was read; empty where nothing is.
-    unread: number of messages that this release cannot decode, by kind.
+    about: its metadata. attachments: by name. fault: what is damaged or missing, as far as it was read; empty where nothing is.
+    gaps: the damaged parts, as far as it was read. unread: number of messages that this release cannot decode, by kind.
 
     Raises RecordingError for any other file.
     """
 
     def __init__(self, path: Path):
         self.path, self.fault = path, ""
+        self.gaps: list[Gap] = []
         self.about: Mapping[str, str] = {}
         self.attachments: dict[str, bytes] = {}
         self.unread: dict[str, int] = {}
@@ -81,16 +101,13 @@ class Recording:
     @property
     def is_indexed(self) -> bool:
         """Whether the file ends with an index, as a file that was closed does."""
-        try:
-            with self.path.open("rb") as file:
-                return make_reader(file).get_summary() is not None
-        except (*BROKEN, OSError):
-            return False
+        return self._summary() is not None
 
     def cell(self) -> cells.Cell:
         """The recorded cell: from its original file where that exists unchanged, else from the attached copy. Raises CellError
-        where the copy refers to other files beside the original."""
-        attached = self.attachments[CELL]
+        where the copy refers to other files beside the original, and RecordingError where damage has destroyed the copy."""
+        if (attached := self.attachments.get(CELL)) is None:
+            raise RecordingError(f"{self.path}: expected the attachment {CELL}, got none: give --cell {self.about['cell']}")
         for path in (cells.BUILT_IN / f"{self.about['cell']}.yaml", Path(self.about["cell_file"])):
             if path.is_file() and path.read_bytes() == attached:
                 return cells.load(path)
@@ -100,9 +117,10 @@ class Recording:
             return cells.load(path)
 
     def entries(self) -> Iterator[Entry]:
-        """All entries in the order in which they were written, up to the first damage."""
+        """All entries in the order in which they were written, except those in damaged parts."""
         schemas: dict[int, records.Schema] = {}
         channels: dict[int, Channel] = {}
+        nameless = 0
         for record in self._records():
             match record:
                 case records.Schema():
@@ -111,9 +129,13 @@ class Recording:
                     schema = schemas[record.schema_id]
                     about = tuple(record.metadata.items())
                     channels[record.id] = Channel(record.topic, record.message_encoding, schema.name, schema.data, about)
-                case records.Message():
+                case records.Message() if record.channel_id in channels:
                     found = channels[record.channel_id]
                     yield Entry(found, record.log_time, record.publish_time, record.data, record.sequence)
+                case records.Message():
+                    nameless += 1
+        if nameless:
+            self.fault += f"; left out: {nameless} messages whose topics only a damaged part named"
 
     def messages(self, wanted: Collection[Topic] = topics.TOPICS) -> Iterator[Played]:
         """Messages of the wanted topics as they were on the bus, in order of arrival. Messages that this release cannot decode
@@ -136,14 +158,85 @@ class Recording:
             raise RecordingError(f"{self.path}: none of its {sum(self.unread.values())} messages can be read: {self._reason}")
 
     def _records(self) -> Iterator[Any]:
-        self.fault = ""
+        """The records that matter. After damage, those of the index that name schemas and channels, as the damaged chunk may have
+        named them, and then the records from the next chunk on."""
+        self.fault, self.gaps = "", []
+        last_ns = None
         with self.path.open("rb") as file:
-            try:
-                yield from StreamReader(file, validate_crcs=True, record_size_limit=LARGEST).records
-            except BROKEN as error:
-                size = file.seek(0, io.SEEK_END)
-                why = f"{type(error).__name__}: {error}".removesuffix(": ")
-                self.fault = f"{self.path} has no end ({why} before byte {size}): its recorder was killed, or it is damaged"
+            size = file.seek(0, io.SEEK_END)
+            file.seek(max(0, size - len(MAGIC)))
+            has_end = size >= 2 * len(MAGIC) and file.read() == MAGIC
+            size -= len(MAGIC) if has_end else 0
+            at = sound = searched = len(MAGIC)  # sound: the end of the last chunk whose checksum is right
+            damaged_at = None
+            while at < size:
+                try:
+                    record, after = _record(file, at, size)
+                    found = breakup_chunk(record, validate_crc=True) if isinstance(record, records.Chunk) else [record]
+                except BROKEN:
+                    damaged_at = sound  # what is skipped may have been skipped because of a wrong length
+                    at = _next_chunk(file, searched, size)
+                    searched = at + 1
+                    continue
+                if isinstance(record, records.Chunk):
+                    if damaged_at is not None:
+                        if (summary := self._summary()) is not None:
+                            yield from (*summary.schemas.values(), *summary.channels.values())
+                        self._add_gap(damaged_at, at, last_ns, record.message_start_time)
+                        damaged_at = None
+                    last_ns, sound, searched = record.message_end_time, after, after
+                yield from found
+                at = after
+        if damaged_at is not None and has_end:
+            self._add_gap(damaged_at, size, last_ns, None)
+        self.fault = self._described(has_end, size if damaged_at is None else damaged_at)
+
+    def _add_gap(self, begin: int, end: int, last_ns: int | None, next_ns: int | None) -> None:
+        """Note a damaged part. last_ns, next_ns: time of the message before and after it; None at the beginning and at the end of
+        a file, whose times the index has, if there is one."""
+        summary = self._summary() if last_ns is None or next_ns is None else None
+        about = summary.statistics if summary is not None else None
+        last_ns = about.message_start_time if last_ns is None and about is not None else last_ns
+        next_ns = about.message_end_time if next_ns is None and about is not None else next_ns
+        seconds = 0.0 if last_ns is None or next_ns is None else max(0.0, (next_ns - last_ns) * 1e-9)
+        self.gaps.append(Gap(begin, end, round(seconds, 3)))
+
+    def _described(self, has_end: bool, breaks_off: int) -> str:
+        """What is wrong with the file. breaks_off: byte at which a file without an end can no longer be read."""
+        what = []
+        if self.gaps:
+            more = f" and in {len(self.gaps) - 1} other places" if len(self.gaps) > 1 else ""
+            seconds = sum(gap.seconds for gap in self.gaps)
+            what.append(f"is damaged after byte {self.gaps[0].begin}{more}: {seconds:.2f} s of messages are missing")
+        if not has_end:
+            what.append(f"has no end (it breaks off after byte {breaks_off}): its recorder was killed, or it was cut off")
+        return f"{self.path} {', and '.join(what)}" if what else ""
+
+    def _summary(self) -> Summary | None:
+        """The index at the end of the file; None where there is none that can be read."""
+        try:
+            with self.path.open("rb") as file:
+                return make_reader(file).get_summary()
+        except (*BROKEN, OSError):
+            return None
+
+
+def _record(file: BinaryIO, at: int, size: int) -> tuple[Any, int]:
+    """The record at a byte of a file of `size` bytes, None for one that does not matter, and the byte after it. Raises one of
+    BROKEN."""
+    file.seek(at)
+    opcode, length = HEAD.unpack(file.read(HEAD.size))
+    kind, after = READ.get(Opcode(opcode)), at + HEAD.size + length
+    if after > size:
+        raise EndOfFile
+    return (kind.read(ReadDataStream(io.BytesIO(file.read(length)))) if kind else None), after
+
+
+def _next_chunk(file: BinaryIO, at: int, size: int) -> int:
+    """The first byte from `at` on where a chunk seems to begin; `size` where none does."""
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        found = CHUNK.search(data, at)
+        return found.start() if found else size
 
 
 class _Source(NamedTuple):

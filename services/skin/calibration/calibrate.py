@@ -127,7 +127,7 @@ def _recorded(cell: cells.Cell, options: flags.Options) -> dict[str, Recording]:
     """On-axis rows of each pad in a CSV file; rows at an angle or from a plane scan are for `characterise`."""
     pad = cell.one("pads", options.pad)
     kind = cell.pad_types[cell.pads[pad].type]
-    found = recording.read(options.csv, list(kind.electrodes))
+    found = recording.read(options.csv, list(kind.electrodes), "--csv")
     named = found.labels["pad"]
     if (named != "").any() and options.pad is None:
         unknown = sorted(set(named) - set(cell.pads))

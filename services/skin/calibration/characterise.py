@@ -113,7 +113,7 @@ def _characterise(options: flags.Options) -> None:
         about = f"emulated pad {pad} of cell {cell.name}, {target}, seed {options.seed}"
         recording.write(options.out / "recording.csv", recorded, about)
     else:
-        recorded = recording.read(options.data, list(cell.pad_types[cell.pads[pad].type].electrodes))
+        recorded = recording.read(options.data, list(cell.pad_types[cell.pads[pad].type].electrodes), "--data")
         if (recorded.labels["pad"] != "").any():
             recorded = recorded.where(recorded.labels["pad"] == pad)
     result = characterise(cell, pad, recorded, options.out)

@@ -48,12 +48,15 @@ LABELS = ("pad", "object", "scan")
 NUMBERS = ("angle_deg", "x_m", "y_m")
 
 
-def read(path: Path, electrodes: Sequence[str]) -> Recording:
-    """Read a recording of these electrodes from a file. Raises RecordingError with the line that cannot be read."""
+def read(path: Path, electrodes: Sequence[str], flag: str) -> Recording:
+    """Read a recording of these electrodes from the file that a flag names. Raises RecordingError with the line that cannot be
+    read."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: expected a CSV file: {error}") from None
+        why = error.strerror if isinstance(error, OSError) else "it is no text in UTF-8"
+        what = f"the column distance_m and {', '.join(electrodes)} [V]"
+        raise RecordingError(f"{flag} {path}: expected a CSV file with {what}; it cannot be read: {why}") from None
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
     if len(lines) < 2:
         raise RecordingError(f"{path}: expected a line of column names and samples below it, got {len(lines)} lines")

@@ -1,5 +1,6 @@
 """`penumbra camera` as a process on the bus: what it publishes, what it says of its cameras, and which publisher wins."""
 
+import itertools
 import subprocess
 from types import SimpleNamespace
 
@@ -16,7 +17,7 @@ from penumbra.shared.contract import messages, report, topics
 from penumbra.shared.runtime import bus, metrics
 from penumbra.shared.runtime.node import Node
 from penumbra.tests.support import injected, numbered
-from penumbra.tests.support.live import PATIENCE_S, penumbra_command, penumbra_up, stays, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, penumbra_up, stays, wait_for
 from penumbra.tests.support.numbered import camera_process, viewer
 
 
@@ -97,6 +98,17 @@ def test_a_missing_device_is_a_reason_at_once_and_the_process_waits_for_it(tmp_p
     with viewer(path, router) as seen, camera_process(path, router, "--source", "v4l2:/dev/video97"):
         assert "no device /dev/video97: is the camera plugged in?" in seen.waits_for_reason("no device")
         assert seen.front()["opened"] == 0
+
+
+def test_a_missing_film_of_the_cell_file_is_named_before_there_is_a_router(tmp_path):
+    path = numbered.cell(tmp_path, {"url": "file:nope.mp4"})
+    command = penumbra_command("camera", "--cell", str(path), "--connect", f"tcp/127.0.0.1:{free_port()}")
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as popen:
+        assert popen.stderr is not None
+        said = list(itertools.takewhile(lambda line: "waiting for the router" not in line, popen.stderr))
+        popen.terminate()
+        popen.communicate(timeout=PATIENCE_S)
+    assert any("nothing is there yet" in line and "source=file:nope.mp4" in line for line in said), said
 
 
 # ---- who publishes a camera
@@ -192,6 +204,7 @@ def test_flags_change_the_sources_of_the_cell_file(tmp_path):
         ({}, "no camera of cell numbered has a source: give --source SOURCE, or `source:` of the camera in the cell file"),
         ({"camera": "front"}, "camera front of cell numbered has no source: give --source"),
         ({"source": "webcam"}, r"--source: expected v4l2:/dev/video0, rtsp://HOST/PATH, .*, got 'webcam'"),
+        ({"source": "file:nope.mp4"}, "--source: expected a film or a folder of pictures, got nothing at nope.mp4"),
         ({"source": "v4l2:/dev/video0", "loop": True}, "--loop: expected it with file: or folder: only, got it with v4l2:"),
         ({"source": "v4l2:/dev/video0", "rate": 3.0}, "--rate: expected it with file: or folder: only"),
         ({"source": "v4l2:/dev/video0", "latency": -1.0}, "--latency: expected a number of at least 0, got -1"),

@@ -16,11 +16,13 @@ import pytest
 
 from penumbra.services import flags, progress
 from penumbra.services.command import cli, doctor, look, runs, snapshot
+from penumbra.services.emulator.control import COMMANDS
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import outline, processes, topics
 from penumbra.shared.perception import landmarks
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
+from penumbra.tests.support import numbered
 from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 from penumbra.tests.support.nodes import pose_json, start
 
@@ -427,6 +429,16 @@ def test_topics_lists_the_keys_that_the_cell_has_and_no_other(capsys):
     assert sorted(row["key"] for row in rows) == sorted(key for topic in topics.TOPICS for key in user.keys(topic, {}))
 
 
+def test_topics_of_a_cell_without_pads_and_emulator_are_neither_listed_nor_expected(endpoint, tmp_path, capsys):
+    path = str(numbered.cell(tmp_path))
+    assert cells.load(path).sim is None
+    assert cli.main(["topics", "--cell", path, "--json"]) == 0
+    assert {row["topic"] for row in json.loads(capsys.readouterr().out)} == {"frame", "mask", "vision", "fused"}
+    assert cli.main(["topics", "--cell", path, "--hz", "--seconds", "0.1", "--json", "--connect", endpoint]) == 0
+    found = json.loads(capsys.readouterr().out)["topics"]
+    assert not [key for key in found if key.endswith(("haptic", "truth", "voltages"))]
+
+
 def test_topics_hz_measures_what_arrives(endpoint, capsys):
     assert cli.main(["topics", "--hz", "--seconds", "1", "--connect", endpoint]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if "pose/fused" in line).split()
@@ -438,14 +450,21 @@ def test_sim_passes_the_command_on_and_prints_the_answer_or_the_refusal(endpoint
         request = json.loads(payload)
         if request["command"] != "occlude":
             raise ValueError("expected occlude")
-        return json.dumps({"occlude": request["value"]}).encode()
+        return json.dumps({"occlusion": request["value"], "occlusion_now": 0.123, "motion": "on"}).encode()
 
     with Node("emulator", CELL, bus.Connection(connect=(endpoint,))) as emulator:
         emulator.answer(topics.control("table"), control)
         wait_for(lambda: cli.main(["sim", "occlude", "0.8", "--connect", endpoint]) == 0, 5, "the answer")
-        assert capsys.readouterr().out.splitlines()[-1] == "occlude    0.8"
-        assert cli.main(["sim", "fly", "--connect", endpoint]) == 2
+        assert capsys.readouterr().out.splitlines()[-2:] == ["occlusion  0.8, and now 0.12", "motion     on"]
+        assert cli.main(["sim", "pause", "--connect", endpoint]) == 2
         assert capsys.readouterr().err == "penumbra sim: expected occlude\n"
+
+
+def test_sim_refuses_a_command_that_the_emulator_does_not_have_in_its_own_words(capsys):
+    assert tuple(COMMANDS) == look.ACTIONS
+    assert cli.main(["sim", "bogus"]) == 2
+    what = "COMMAND: expected occlude, motion, pause, resume, speed, skin, board or state, got 'bogus'"
+    assert capsys.readouterr().err == f"penumbra sim: {what} (see penumbra sim --help)\n"
 
 
 def test_sim_without_an_emulator_says_what_to_start(endpoint, capsys):

@@ -14,6 +14,7 @@ import msgspec
 import pytest
 
 from penumbra.services import flags
+from penumbra.services.command import cli
 from penumbra.services.record import service
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import access, messages, report, topics
@@ -22,7 +23,7 @@ from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 from penumbra.shared.runtime.sender import Sender
 from penumbra.tests.support.injected import full, small_disk
-from penumbra.tests.support.live import PATIENCE_S, penumbra_command, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 from penumbra.tests.support.nodes import node_command, pose
 from penumbra.tests.support.recorded import on_the_bus
 from penumbra.tests.support.recorded import recorded as written
@@ -122,7 +123,7 @@ def test_only_the_topics_that_are_named_are_recorded(router, publisher, tmp_path
         with watching.open():
             send_until(publisher, lambda: heard(watching) >= 5, "poses on the bus")
         assert not any(key.endswith("fused") for key in node.report().topics)
-    assert not poses(path)
+    assert not path.exists()
 
 
 def test_a_message_that_no_reader_would_take_is_recorded_as_it_is(router, publisher, tmp_path):
@@ -198,6 +199,19 @@ def test_files_follow_each_other_by_size_and_nothing_is_lost_between_them(router
     assert all(Recording(part).is_indexed and Recording(part).attachments for part in parts)
     found = [each.position[0] for part in parts for each in poses(part)]
     assert found == pytest.approx([0.001 * (round(found[0] / 0.001) + i) for i in range(len(found))])
+
+
+def test_where_nothing_came_there_is_no_file_and_the_log_says_so(tmp_path):
+    """Without a router, ended by Ctrl-C."""
+    command = penumbra_command("record", "-o", str(tmp_path / "run.mcap"), "--connect", f"tcp/127.0.0.1:{free_port()}")
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as popen:
+        assert popen.stderr is not None
+        lines = [next(line for line in popen.stderr if "waiting for the router" in line)]
+        popen.send_signal(signal.SIGINT)
+        _, rest = popen.communicate(timeout=PATIENCE_S)
+    assert popen.returncode == 0, lines
+    assert "nothing was recorded, and no file written" in rest
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_file_that_is_there_is_not_overwritten(router, publisher, tmp_path):
@@ -277,8 +291,7 @@ def test_memory_is_bounded_by_bytes_too(router, publisher, tmp_path):
 
 
 def test_a_recorder_that_writes_everything_keeps_nothing_back(router, tmp_path):
-    with recorder(router, "-o", str(tmp_path / "run.mcap")) as node:
-        wait_for(lambda: recorded(node)["file"], 10, "a file")
+    with recorder(router, "-o", str(tmp_path / "run.mcap")):
         done = ask_for_the_last(router)
     assert done.returncode == 2 and "only one with --last keeps anything back" in done.stderr
 
@@ -324,3 +337,17 @@ def test_mend_writes_a_whole_file_beside_one_that_has_no_end(router, tmp_path):
     assert Recording(tmp_path / "run-mended.mcap").is_indexed
     again = subprocess.run(penumbra_command("record", "mend", str(whole)), capture_output=True, text=True)
     assert again.returncode == 2 and "is there already" in again.stderr
+
+
+def test_info_and_mend_say_what_is_missing_of_a_damaged_file(tmp_path, capsys):
+    path = written(tmp_path / "run.mcap", "table", on_the_bus(CELL, 1, 4.0, frames=False))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 1000] = bytes(1000)
+    path.write_bytes(data)
+    assert cli.main(["record", "info", str(path), "--json"]) == 1
+    (gap,) = json.loads(capsys.readouterr().out)["gaps"]
+    assert gap["begin"] <= len(data) // 2 < gap["end"] and gap["seconds"] > 0.1
+    assert cli.main(["record", "info", str(path)]) == 1
+    assert f"bytes {gap['begin']} to {gap['end']} are damaged" in capsys.readouterr().out
+    assert cli.main(["record", "mend", str(path)]) == 0
+    assert f"is damaged after byte {gap['begin']}: {gap['seconds']:.2f} s of messages are missing" in capsys.readouterr().out

@@ -3,6 +3,7 @@
 import functools
 import itertools
 import json
+import re
 import subprocess
 import threading
 from dataclasses import replace
@@ -144,11 +145,28 @@ def test_stamps_move_and_the_time_between_samples_shrinks_with_the_rate():
         (["--sensors", "--topics", "fused"], "expected --sensors or --topics, got both"),
         (["--out", "x.mcap"], "expected --in-process or --smooth beside --out"),
         (["--from", "-1"], "expected seconds from the beginning"),
+        (["--smooth", "--from", "1000"], "--from 1000: the recording is 0.5 s long"),
+        (["--in-process", "--sensors"], "expected --in-process and --smooth without --sensors, --topics, --loop and --rate"),
+        (["--in-process", "--rate", "2"], "--in-process always takes only what the sensors said"),
+        (["--fusion", "--observer paper"], "expected --in-process beside --fusion, got --fusion alone"),
+        (["--in-process", "--fusion", "'"], "--fusion: No closing quotation"),
+        (["--in-process", "--cell", "arm"], "run.mcap: expected a recording of cell arm, got one of cell table"),
     ],
 )
 def test_what_cannot_be_played_is_refused(words, text, path, capsys):
     assert cli.main(["replay", str(path), *words]) == 2
     assert text in capsys.readouterr().err
+
+
+def test_a_flag_that_a_method_does_not_have_is_refused_with_where_its_flags_are_listed(path, capsys):
+    assert cli.main(["replay", str(path), "--in-process", "--fusion", "--bogus"]) == 2
+    assert capsys.readouterr().err == "penumbra replay: --fusion: no option --bogus (see penumbra fusion --help)\n"
+
+
+def test_files_of_two_cells_are_not_played_as_one(path, tmp_path, capsys):
+    other = recorded(tmp_path / "arm.mcap", "arm", [])
+    assert cli.main(["replay", str(path), str(other), "--smooth"]) == 2
+    assert "arm.mcap: expected a recording of cell table, got one of cell arm" in capsys.readouterr().err
 
 
 def test_what_is_no_recording_is_refused(tmp_path, capsys):
@@ -211,6 +229,23 @@ def _in_process(path, *words):
     done = subprocess.run(command, capture_output=True, text=True, timeout=10 * PATIENCE_S)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def test_in_process_a_service_s_log_has_time_level_and_service_and_can_be_json(tmp_path):
+    """A pad that falls silent in the middle is left out."""
+    silent_ns = 10**18 + 10**9
+    said = [
+        each
+        for each in on_the_bus(TABLE, 5, 3.0, frames=False)
+        if each.topic is not topics.VOLTAGES or each.names["pad"] != "p0" or each.stamp_ns < silent_ns
+    ]
+    path = recorded(tmp_path / "silent.mcap", "table", said)
+    command = penumbra_command("replay", str(path), "--in-process")
+    text = subprocess.run(command, capture_output=True, text=True, timeout=10 * PATIENCE_S, check=True).stderr
+    assert re.search(r"^\S+Z warning haptics: left out what=p0 why=silent$", text, re.MULTILINE), text
+    command = penumbra_command("replay", str(path), "--in-process", "--log-format", "json")
+    lines = subprocess.run(command, capture_output=True, text=True, timeout=10 * PATIENCE_S, check=True).stderr.splitlines()
+    assert {"what": "p0", "why": "silent"} in [json.loads(line)["fields"] for line in lines]
 
 
 def test_how_far_tracks_are_apart_counts_poses_of_the_same_moment_that_are_not_lost():

@@ -140,8 +140,8 @@ def test_a_recording_in_which_no_sense_has_seen_the_target_is_refused_and_no_fil
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--sensors"], "expected --smooth without --sensors, --topics and --loop"),
-        (["--loop"], "--in-process smooths what the sensors said"),
+        (["--sensors"], "expected --in-process and --smooth without --sensors, --topics, --loop and --rate"),
+        (["--loop"], "neither is played in real time"),
         (["--out", "README.md"], "README.md is there already: give another --out"),
     ],
 )

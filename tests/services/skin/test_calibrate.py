@@ -155,7 +155,7 @@ def test_recordings_are_read_in_every_layout_that_is_documented(tmp_path_factory
         rows.append(separator.join(["p3", *(cell.replace(".", point) for cell in (where, *map(str, row), "40"))]))
     path = tmp_path_factory.mktemp("csv") / "r.csv"
     path.write_text("\ufeff" + "\n".join(rows))
-    found = recording.read(path, ELECTRODES)
+    found = recording.read(path, ELECTRODES, "--csv")
     np.testing.assert_allclose(found.gap, gaps)
     np.testing.assert_allclose(found.volts, volts)
     assert set(found.labels["pad"]) == {"p3"} and found.notes == ("columns passed over: humidity",)
@@ -165,7 +165,7 @@ def test_a_recording_that_is_written_is_read_the_same(tmp_path):
     before = made([1.0] * 5, samples=20)
     before.numbers["angle_deg"][:20] = 30.0
     recording.write(tmp_path / "deep" / "r.csv", before, "made")
-    after = recording.read(tmp_path / "deep" / "r.csv", ELECTRODES)
+    after = recording.read(tmp_path / "deep" / "r.csv", ELECTRODES, "--csv")
     np.testing.assert_allclose(after.gap, before.gap)
     np.testing.assert_allclose(after.volts, before.volts, atol=1e-6)
     np.testing.assert_allclose(after.numbers["angle_deg"], before.numbers["angle_deg"])
@@ -191,7 +191,7 @@ def test_a_bad_recording_is_refused_with_its_line(tmp_path, text, complaint):
     path = tmp_path / "r.csv"
     path.write_text(text)
     with pytest.raises(RecordingError, match=complaint):
-        recording.read(path, ELECTRODES)
+        recording.read(path, ELECTRODES, "--csv")
 
 
 # ---- the command and the cell file
@@ -251,7 +251,9 @@ def test_what_cannot_be_calibrated_leaves_the_cell_file_alone(tmp_path, own_cell
     for arguments, text in (
         ([], "electrode p0/t: no contrast"),
         (["--pad", "p9"], "no pad 'p9'"),
-        (["--csv", str(tmp_path / "none.csv")], "expected a CSV file"),
+        (["--csv", str(tmp_path / "none.csv")], "none.csv: expected a CSV file with the column distance_m and "),
+        (["--csv", str(tmp_path)], f"--csv {tmp_path}: expected a CSV file"),
+        (["--csv", str(tmp_path / "none.csv")], "it cannot be read: No such file or directory\n"),
     ):
         assert cli.main(["skin", "calibrate", "--cell", str(own_cell), "--csv", str(tmp_path / "r.csv"), *arguments]) == 2
         assert text in capsys.readouterr().err

@@ -1,5 +1,7 @@
 """The driver of the sensing boards against emulated ones: on a line with a simulated clock, and on real pseudo-terminals."""
 
+import itertools
+import subprocess
 import threading
 import time
 from contextlib import contextmanager
@@ -21,7 +23,7 @@ from penumbra.shared.runtime.node import Node
 from penumbra.shared.skin import board
 from penumbra.sim.skin.board import FAULTS, Board, Tank
 from penumbra.tests.support.boards import SimulatedPort
-from penumbra.tests.support.live import PATIENCE_S, free_port, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 
 CELL = cells.load("table")
 ELECTRODES = ["c", "r", "l", "t", "b"]
@@ -341,6 +343,17 @@ def test_the_service_publishes_voltages_of_its_pad_with_the_times_of_the_measure
     assert [entry["resonance_hz"] for entry in report["boards"]] == pytest.approx(
         [device.tank.resonance_hz for device in emulated()], rel=5e-4
     )
+
+
+def test_a_missing_board_is_named_before_there_is_a_router(tmp_path):
+    port = tmp_path / "tty"
+    command = penumbra_command("skin", "--pad", "p3", "--device", str(port), "--connect", f"tcp/127.0.0.1:{free_port()}")
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as popen:
+        assert popen.stderr is not None
+        said = list(itertools.takewhile(lambda line: "waiting for the router" not in line, popen.stderr))
+        popen.terminate()
+        popen.communicate(timeout=PATIENCE_S)
+    assert any("no such device yet" in line and f"port={port}" in line for line in said), said
 
 
 def test_a_board_that_is_pulled_out_is_reported_and_read_again_when_it_is_back(heard, tmp_path):

@@ -255,7 +255,7 @@ def test_of_a_killed_writer_all_that_was_flushed_is_read(said, tmp_path):
     found = [entry for entry in Recording(path).entries() if entry.channel.topic not in ("/scene", "/camera/side/calibration")]
     assert [entry.data for entry in found[1:]] == [entry.data for entry in whole], "the first is where things stand"
     messages, fault = left_of(path)
-    assert messages and "its recorder was killed, or it is damaged" in fault
+    assert messages and "its recorder was killed, or it was cut off" in fault
     assert not Recording(path).is_indexed
 
 
@@ -271,12 +271,72 @@ def test_a_file_cut_at_any_byte_is_read_up_to_its_last_whole_chunk(path, tmp_pat
     assert counts == sorted(counts, reverse=True) and counts[0] == len(list(Recording(path).messages()))
 
 
-def test_a_damaged_byte_ends_the_reading_and_is_reported(path, tmp_path):
+@pytest.fixture(scope="module")
+def chunks(said, tmp_path_factory):
+    """A file of many chunks, and the first byte of each."""
+    path = tmp_path_factory.mktemp("recording") / "chunks.mcap"
+    file = new_file(path, "arm")
+    for number, entry in enumerate(entries(ARM, sorted(said, key=lambda each: each.received_ns))):
+        file.write(entry)
+        if number % 20 == 0:
+            file.flush()
+    file.close()
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and len(summary.chunk_indexes) > 6
+    return path, summary.chunk_indexes
+
+
+def damaged(path, at, length=40):
     data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    (tmp_path / "damaged.mcap").write_bytes(data)
-    messages, fault = left_of(tmp_path / "damaged.mcap")
-    assert fault and len(messages) < len(list(Recording(path).messages()))
+    data[at : at + length] = bytes(byte ^ 0xA5 for byte in data[at : at + length])
+    return data
+
+
+@pytest.mark.parametrize("offset", [0, 3, 60], ids=["its opcode", "its length", "its content"])
+@pytest.mark.parametrize("which", [0, 4, -1])
+def test_a_damaged_chunk_is_left_out_and_reported_with_its_place_and_the_rest_is_read(chunks, which, offset, tmp_path):
+    path, index = chunks
+    hurt = index[which]
+    (tmp_path / "damaged.mcap").write_bytes(damaged(path, hurt.chunk_start_offset + offset))
+    recording = Recording(tmp_path / "damaged.mcap")
+    lost = [each for each in Recording(path).entries() if hurt.message_start_time <= each.log_ns <= hurt.message_end_time]
+    found = list(recording.entries())
+    assert len(list(Recording(path).entries())) - len(lost) <= len(found) < len(list(Recording(path).entries()))
+    (gap,) = recording.gaps
+    assert gap.begin <= hurt.chunk_start_offset < gap.end
+    assert gap.seconds >= round((hurt.message_end_time - hurt.message_start_time) * 1e-9, 3)
+    assert f"is damaged after byte {gap.begin}: {gap.seconds:.2f} s of messages are missing" in recording.fault
+    assert "no end" not in recording.fault
+
+
+def test_a_wrong_length_beside_the_chunks_loses_none_of_them(chunks, tmp_path):
+    path, index = chunks
+    after = index[3].chunk_start_offset + index[3].chunk_length
+    (tmp_path / "damaged.mcap").write_bytes(damaged(path, after + 3, 1))
+    recording = Recording(tmp_path / "damaged.mcap")
+    assert len(list(recording.entries())) == len(list(Recording(path).entries()))
+    assert f"is damaged after byte {after}: " in recording.fault
+
+
+def test_a_file_that_is_damaged_and_cut_off_says_both(chunks, tmp_path):
+    path, index = chunks
+    cut = damaged(path, index[2].chunk_start_offset + 60)[: index[-1].chunk_start_offset + 20]
+    (tmp_path / "both.mcap").write_bytes(cut)
+    messages, fault = left_of(tmp_path / "both.mcap")
+    assert messages and "is damaged after byte" in fault and "and has no end (it breaks off after byte" in fault
+    mended = reading.mend(tmp_path / "both.mcap", tmp_path / "mended.mcap")
+    assert mended.fault and not left_of(tmp_path / "mended.mcap")[1]
+
+
+def test_without_an_index_messages_whose_topics_only_a_damaged_part_named_are_counted(chunks, tmp_path):
+    path, index = chunks
+    (tmp_path / "both.mcap").write_bytes(damaged(path, index[0].chunk_start_offset + 60)[: index[-1].chunk_start_offset])
+    recording = Recording(tmp_path / "both.mcap")
+    found = sum(1 for _ in recording.entries())
+    left_out = int(recording.fault.partition("left out: ")[2].split()[0])
+    assert left_out > 0 and recording.fault.endswith("messages whose topics only a damaged part named")
+    assert found + left_out < sum(1 for _ in Recording(path).entries())
 
 
 def test_a_mended_file_has_an_index_and_all_that_could_be_read(path, tmp_path):
