@@ -65,7 +65,7 @@ def _fit(signal, precision, first, centroids, peak, a2, points, covariances):  #
     x, b, row, step = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for s in range(len(signal)):
         for k in range(len(first) - 1):
-            # Start at the gap given by the strongest electrode alone.
+            # Start at the gap that the strongest electrode has by itself.
             d = EXPECTED_GAP
             for e in range(first[k], first[k + 1]):
                 if precision[s, e] > 0.0 and signal[s, e] * math.sqrt(precision[s, e]) > 3.0:

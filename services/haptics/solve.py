@@ -179,8 +179,8 @@ def _descend(  # type: ignore[no-untyped-def]
     signal, variance, distrust, doubt, error, T_prior, information, size_prior, size_information, coarse, fine,
     T, size, logs, rows, z,
 ):  # fmt: skip
-    """Run the steps of `Solver.solve` from the given pose T and size; writes the final ones with their logs, derivatives and
-    residuals, and returns the cost."""
+    """The steps of `Solver.solve`, from the pose T and size that are given to those that are found, with the logs, derivatives
+    and residuals there; returns the cost."""
     network = (index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip)
     pads, given = (own_size, scale, pad_of, T_world_pads), (signal, variance, distrust, doubt, error)
     prior = (T_prior, information, size_prior, size_information)
@@ -199,7 +199,7 @@ def _descend(  # type: ignore[no-untyped-def]
                 for j in range(8):
                     gain -= 0.5 * step[i] * H[i, j] * step[j]
             if gain < CONVERGED:
-                if not is_coarse:  # first-order update
+                if not is_coarse:  # to first order
                     for e in range(n):
                         for i in range(8):
                             logs[e] += rows[e, i] * step[i]
@@ -234,8 +234,8 @@ def _descend(  # type: ignore[no-untyped-def]
 
 @inner
 def _predict(network, pads, T, size, has_rows, logs, rows):  # type: ignore[no-untyped-def]
-    """Write the logs (n,) of the signals at a pose (4, 4) and size (2,); with has_rows also their derivatives (n, 8) along the
-    world's axes, which cost four times as much."""
+    """The logs (n,) of the signals at a pose (4, 4) and size (2,), and with has_rows their derivatives (n, 8) along the world's
+    axes, which cost four times as much."""
     index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip = network
     own_size, scale, pad_of, T_world_pads = pads
     T_pads_target = np.zeros((len(T_world_pads), 4, 4))
@@ -265,7 +265,7 @@ def _predict(network, pads, T, size, has_rows, logs, rows):  # type: ignore[no-u
 
 @inner
 def _move(T, size, step, T_there, size_there):  # type: ignore[no-untyped-def]
-    """Write the pose (4, 4) and size (2,) after a step (8,), as `geometry.perturb` moves a pose."""
+    """Writes the pose (4, 4) and size (2,) a step (8,) away, as `geometry.perturb` moves a pose."""
     turn = np.empty((3, 3))
     so3.exp(step[3:6], turn)
     T_there[:] = T
@@ -277,7 +277,7 @@ def _move(T, size, step, T_there, size_there):  # type: ignore[no-untyped-def]
 
 @inner
 def _step(H, g, step):  # type: ignore[no-untyped-def]
-    """Write the step (8,) with H step = g, for a symmetric positive definite H (Cholesky without square roots), limited to
+    """Writes the step (8,) with H step = g, for a symmetric positive definite H (Cholesky without square roots), no longer than
     FARTHEST_STEP."""
     L, d = np.empty((8, 8)), np.empty(8)
     for j in range(8):
@@ -308,7 +308,7 @@ def _step(H, g, step):  # type: ignore[no-untyped-def]
 
 @inner
 def _posterior(given, prior, T, size, logs, rows, is_coarse, H, g, z):  # type: ignore[no-untyped-def]
-    """Write the information (8, 8) and gradient (8,) of voltages and prior, and the residuals (n,); returns the cost."""
+    """Writes the information (8, 8) and gradient (8,) of voltages and prior, and the residuals (n,); returns the cost."""
     signal, variance, distrust, doubt, error = given
     T_prior, information, size_prior, size_information = prior
     H[:], g[:] = 0.0, 0.0
@@ -330,8 +330,8 @@ def _posterior(given, prior, T, size, logs, rows, is_coarse, H, g, z):  # type: 
 
 @kernel("f8[n], f8[n], f8[n], f8[n], f8[n], f8[n], f8[n, 8], b1, f8, out f8[8, 8], out f8[8], out f8[n] -> f8")
 def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coarse, lasting, H, g, z):  # type: ignore[no-untyped-def]
-    """Add the information (8, 8) and gradient (8,) by the target's pose error in the world and its size, write the residuals (n,)
-    and return the robust cost."""
+    """Adds the information (8, 8) and gradient (8,) about the target's pose error in the world and its size, writes residuals
+    (n,) and returns the robust cost."""
     cost = 0.0
     for e in range(len(signal)):
         if not math.isfinite(variance[e]):
@@ -353,7 +353,7 @@ def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coar
         total *= distrust[e]
         square = residual * residual / total
         trust = 1.0
-        if square > OUTLIER * OUTLIER and coarse:  # Huber's cost, which is convex
+        if square > OUTLIER * OUTLIER and coarse:  # Huber's, which has no minima of its own
             cost += OUTLIER * (math.sqrt(square) - 0.5 * OUTLIER)
             trust = OUTLIER / math.sqrt(square)
         elif square > OUTLIER * OUTLIER:

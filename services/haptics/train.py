@@ -146,8 +146,8 @@ class Scenes:
 
 @kernel("""f8[s, n, 3], f8[s, n, 3], f8[s, 4, 4], f8[s, 2], f8[m, 3, 3], f8[3, m], f8[m], f8[m, 7, 3], out f8[s], out b1[s]""")
 def _gaps(electrodes, normals_out, T, factors, corners, centers, radii, normals, out, ahead):  # type: ignore[no-untyped-def]
-    """Write the smallest gaps (s,) of electrodes (s, n, 3) to a surface at poses (s, 4, 4), stretched by factors (s, 2) along x
-    and across (approximate if stretched), and whether the nearest point lies in front of its electrode, whose pad has the normal
+    """Writes the smallest gaps (s,) of electrodes (s, n, 3) to a surface at poses (s, 4, 4), stretched by factors (s, 2) along x
+    and across (about, where it is stretched), and whether the nearest point lies in front of its electrode, whose pad looks along
     normals_out (s, n, 3)."""
     n = electrodes.shape[1]
     distance, local, nearest, gradient = np.empty(n), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))

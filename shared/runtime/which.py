@@ -18,11 +18,11 @@ def name_of(session: zenoh.Session, cell: str | None) -> str:
 
 
 def names_of(session: zenoh.Session, cell: str | None) -> Names:
-    """Names of a cell like `name_of`, those of the only one that runs by fusion's description. Raises CellError, and BusError
-    where fusion does not answer."""
-    name = None if cell else running.only_cell(session)
-    if name is None:
-        return names.read(cell or names.DEFAULT)
+    """Names of a cell like `name_of`; those of the only one that runs come from fusion's description unless it is built in.
+    Raises CellError, and BusError where fusion does not answer."""
+    name = cell or running.only_cell(session) or names.DEFAULT
+    if cell or names.built_in(name):
+        return names.read(name)
     try:
         answers = bus.ask(session, topics.description(name), timeout_s=running.ANSWER_S)
     except bus.Refused:  # fusion is not ready yet
