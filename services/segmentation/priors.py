@@ -17,6 +17,7 @@ from penumbra.shared.geometry import raster, rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.shared.perception.lookout import NEAR_M, Window
+from penumbra.shared.perception.prediction import deviation
 from penumbra.shared.perception.robot_depth import RobotDepth
 
 SHARP_PX = 4.0
@@ -82,18 +83,6 @@ def silhouette(
     height, width = shape
     found = raster.silhouette(points, mesh.faces, (k.fx, k.fy, k.cx, k.cy), (0, 0, width, height))
     return blurred(found.astype(np.float32), deviation(points, T_camera_target[:3, 3], covariance, k))
-
-
-def deviation(points: Array, origin: Array, covariance: Array, k: Intrinsics) -> tuple[float, float]:
-    """Standard deviations [px] in x and y, as root mean squares over points (n, 3) [m] of a body in the camera's frame, from the
-    covariance (6, 6) of its pose (rotations about its origin (3,)) along the camera's axes."""
-    X, Y, Z = points.T
-    zero = np.zeros_like(Z)
-    out = []
-    for by_point in (np.column_stack([k.fx / Z, zero, -k.fx * X / Z**2]), np.column_stack([zero, k.fy / Z, -k.fy * Y / Z**2])):
-        by_pose = np.hstack([by_point, np.cross(points - origin, by_point)])
-        out.append(float(np.sqrt(np.mean(np.sum((by_pose @ covariance) * by_pose, axis=1)))))
-    return out[0], out[1]
 
 
 def blurred(shares: NDArray[np.float32], sigma: tuple[float, float]) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,7 +14,8 @@ from penumbra.shared.cell.description import Camera, Cell
 from penumbra.shared.contract.messages import FusedPose
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
-from penumbra.shared.perception.prediction import predict
+from penumbra.shared.perception.intrinsics import Intrinsics
+from penumbra.shared.perception.prediction import deviation, predict
 
 STEP = 16
 """Grid [px of the window] of a window's position, the stride of the coarsest of five layers. The sides are multiples of it too,
@@ -24,9 +26,9 @@ MAX_PIXELS = 224 * 224
 """Maximum number of pixels of a window around targets. A larger target is shown at a coarser scale."""
 MAX_PIXELS_WIDE = 320 * 240
 """Maximum number of pixels of a window of the whole frame, or around all targets' homes, while a target is lost."""
-HOME_SIGMAS = 2.0
-"""Maximum distance from its home, in standard deviations, of the search for a lost target. A limb further away would not be taken
-for the target."""
+SIGMAS = 2.0
+"""Distance, in standard deviations, from its prediction or its home, at which a target is still in the window. Chosen: a limb
+further from its home would not be taken for the target."""
 ARM_M = 0.09
 """Width [m] of the belly of a forearm (circumference 0.28 to 0.31 m), and of a hand with adducted thumb (ANSUR II, Gordon et al.
 2014)."""
@@ -34,7 +36,7 @@ WIDEST_ARM_PX = 56
 """Maximum width [px] of an arm in a window, that of the training. A wider arm is shown at a coarser scale, at which the network
 sees more than smooth skin at once."""
 MARGIN_M = 0.04
-"""Margin around the target [m], for the error of the prediction and for surroundings that show the contour."""
+"""Minimum margin around the target [m], for surroundings that show the contour."""
 NEAR_M = 0.1
 """Minimum distance [m] from the camera of all parts of a target that is projected."""
 
@@ -107,7 +109,7 @@ class Lookout:
         for name, target in cell.targets.items():
             corners = corners_of(anatomy.target_mesh(target, cell).vertices)
             home, spread = rigid.apply(target.home.transform, corners), target.home_spread
-            room = HOME_SIGMAS * np.hypot(spread.position, spread.rotation * np.abs(corners).max())
+            room = SIGMAS * np.hypot(spread.position, spread.rotation * np.abs(corners).max())
             region = corners_of(np.vstack([home - room, home + room]))
             if _is_in_picture(self._camera, region):
                 self._boxes[name], self._homes[name] = corners, (np.eye(4), region)
@@ -148,7 +150,9 @@ class Lookout:
         """The window that `look` would select for a frame of this stamp."""
         known = self.predicted(stamp_ns)
         sure = [(T, self._boxes[name]) for name, (T, _) in known.items()]
-        found = window_around(self._camera, sure, self._window, self._most) if len(sure) == len(self._boxes) else None
+        spread = [covariance for _, covariance in known.values()]
+        is_known = len(sure) == len(self._boxes)
+        found = window_around(self._camera, sure, self._window, self._most, spread) if is_known else None
         return found or self._wide([name for name in self._boxes if name not in known], sure)
 
     def _wide(self, lost: Iterable[str] = (), sure: Iterable[tuple[Array, Array]] = ()) -> Window:
@@ -166,23 +170,33 @@ def _is_in_picture(camera: Camera, region: Array) -> bool:
 
 
 def window_around(
-    camera: Camera, targets: Iterable[tuple[Array, Array]], previous: Window | None = None, most: int = MAX_PIXELS
+    camera: Camera,
+    targets: Iterable[tuple[Array, Array]],
+    previous: Window | None = None,
+    most: int = MAX_PIXELS,
+    covariances: Iterable[Array] = (),
 ) -> Window | None:
     """Window of at most `most` pixels, before its sides are rounded up, around targets, given as (T_world_target (4, 4), corners
-    (8, 3) of their box), with a margin of MARGIN_M. Arms of ARM_M are at most WIDEST_ARM_PX wide.
+    (8, 3) of their box), with a margin of MARGIN_M or, if that is more, SIGMAS standard deviations of the first ones' poses by
+    their covariances (6, 6). Arms of ARM_M are at most WIDEST_ARM_PX wide.
 
     The previous window is kept while it contains the targets and is not much too large: the recurrent state is worth more the
     less the window moves. None where no target is in the picture, or one is too near to be projected.
     """
     low, high, arm_px = np.array([np.inf, np.inf]), np.array([-np.inf, -np.inf]), 0.0
-    for T_world_target, corners in targets:
-        points = rigid.apply(rigid.inverse(camera.T_world_camera) @ T_world_target, corners)
+    T_camera_world, k = rigid.inverse(camera.T_world_camera), Intrinsics.of_window(camera, 0, 0, 1)
+    axes = np.kron(np.eye(2), T_camera_world[:3, :3])
+    for (T_world_target, corners), covariance in itertools.zip_longest(targets, covariances):
+        T = T_camera_world @ T_world_target
+        points = rigid.apply(T, corners)
         if points[:, 2].min() < NEAR_M:
             return None
         focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
         pixels = points[:, :2] / points[:, 2:] * focal + centre
         metre_px = focal / points[:, 2].mean()
         margin, arm_px = MARGIN_M * metre_px, max(arm_px, ARM_M * float(metre_px.max()))
+        if covariance is not None:
+            margin = np.maximum(margin, SIGMAS * np.array(deviation(points, T[:3, 3], axes @ covariance @ axes.T, k)))
         low, high = np.minimum(low, pixels.min(axis=0) - margin), np.maximum(high, pixels.max(axis=0) + margin)
     return window_of(camera, low, high, arm_px, previous, most)
 

@@ -10,6 +10,7 @@ from penumbra.shared.cell import description
 from penumbra.shared.contract.messages import FusedPose
 from penumbra.shared.geometry import rigid
 from penumbra.shared.perception.lookout import (
+    MAX_PIXELS,
     MAX_PIXELS_WIDE,
     STEP,
     Lookout,
@@ -66,17 +67,23 @@ def test_a_target_out_of_the_picture_has_no_window_and_the_whole_frame_is_coarse
     assert whole_frame(camera) == Window(0, 0, 320, 240, 2)
 
 
-def fused(T: rigid.Array, state: Any = "tracking", stamp_ns: int = S) -> FusedPose:
+def fused(T: rigid.Array, state: Any = "tracking", stamp_ns: int = S, sigma: float = 0.001) -> FusedPose:
+    """The pose with standard deviations `sigma`, in m and rad."""
     position, orientation = rigid.position_orientation(T)
     return FusedPose(
         stamp_ns=stamp_ns, target="forearm", frame="world", position=position, orientation=orientation,
-        velocity=np.zeros(6), covariance=np.eye(6), state=state, sources={},
+        velocity=np.zeros(6), covariance=sigma**2 * np.eye(6), state=state, sources={},
     )  # fmt: skip
 
 
 def pixels_of(camera: description.Camera, points: np.ndarray) -> np.ndarray:
     local = rigid.apply(rigid.inverse(camera.T_world_camera), points)
     return local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+
+def holds(window: Window, pixels: np.ndarray) -> bool:
+    """Whether all pixels (n, 2), x and y, lie in a window."""
+    return bool((pixels > (window.x0, window.y0)).all() and (pixels < (window.right, window.bottom)).all())
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +103,7 @@ def test_a_lost_target_is_looked_for_around_its_home(far):
     for _ in range(50):
         T = rigid.perturb(target.home.transform, np.repeat([0.12, 0.4], 3) * rng.uniform(-1.0, 1.0, 6))
         pixels = pixels_of(far.cameras["front"], rigid.apply(T, limb))
-        assert (pixels > (first.x0, first.y0)).all() and (pixels < (first.right, first.bottom)).all()
+        assert holds(first, pixels)
     lookout.add(fused(target.home.transform, "lost"))
     assert lookout.look(S) == first
 
@@ -111,6 +118,20 @@ def test_a_known_target_is_looked_at_until_its_pose_is_old(far):
     )
     assert near.scale < wide.scale
     assert lookout.look(2 * S) == wide
+
+
+def test_a_target_that_is_uncertain_is_in_the_window_wherever_it_may_be(far):
+    lookout, camera = Lookout(far, "front"), far.cameras["front"]
+    T, limb = rigid.from_rpy((0.05, 0.02, 0.25), (0.1, 0.0, 0.3)), anatomy.target_mesh(far.targets["forearm"], far).vertices
+    lookout.add(fused(T))
+    near = lookout.look(S)
+    lookout.add(fused(T, "coasting", sigma=0.1))
+    wide = lookout.look(S)
+    assert wide.width * wide.height < 1.5 * MAX_PIXELS
+    for side in (-0.19, 0.19):  # within two standard deviations
+        moved = rigid.perturb(T, np.array([*(side * camera.T_world_camera[:3, 0]), 0.0, 0.0, 0.0]))
+        pixels = pixels_of(camera, rigid.apply(moved, limb))
+        assert not holds(near, pixels) and holds(wide, pixels)
 
 
 def test_with_fewer_pixels_a_known_target_is_seen_coarser_and_a_lost_one_as_before(far):
