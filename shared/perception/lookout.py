@@ -1,4 +1,5 @@
-"""Image window for the segmentation: around the predicted targets, or around their homes when they are lost."""
+"""Image window for the segmentation: around the predicted targets, wider around those that nothing measures any more, or around
+their homes when they are lost."""
 
 from __future__ import annotations
 
@@ -150,7 +151,7 @@ class Lookout:
         """The window that `look` would select for a frame of this stamp."""
         known = self.predicted(stamp_ns)
         sure = [(T, self._boxes[name]) for name, (T, _) in known.items()]
-        spread = [covariance for _, covariance in known.values()]
+        spread = [covariance if self._poses[name].state == "coasting" else None for name, (_, covariance) in known.items()]
         is_known = len(sure) == len(self._boxes)
         found = window_around(self._camera, sure, self._window, self._most, spread) if is_known else None
         return found or self._wide([name for name in self._boxes if name not in known], sure)
@@ -174,11 +175,11 @@ def window_around(
     targets: Iterable[tuple[Array, Array]],
     previous: Window | None = None,
     most: int = MAX_PIXELS,
-    covariances: Iterable[Array] = (),
+    covariances: Iterable[Array | None] = (),
 ) -> Window | None:
     """Window of at most `most` pixels, before its sides are rounded up, around targets, given as (T_world_target (4, 4), corners
-    (8, 3) of their box), with a margin of MARGIN_M or, if that is more, SIGMAS standard deviations of the first ones' poses by
-    their covariances (6, 6). Arms of ARM_M are at most WIDEST_ARM_PX wide.
+    (8, 3) of their box), with a margin of MARGIN_M or, if that is more, SIGMAS standard deviations of their poses. covariances
+    (6, 6 each): of the first targets' poses, None for those that are known. Arms of ARM_M are at most WIDEST_ARM_PX wide.
 
     The previous window is kept while it contains the targets and is not much too large: the recurrent state is worth more the
     less the window moves. None where no target is in the picture, or one is too near to be projected.

@@ -120,7 +120,7 @@ def test_a_known_target_is_looked_at_until_its_pose_is_old(far):
     assert lookout.look(2 * S) == wide
 
 
-def test_a_target_that_is_uncertain_is_in_the_window_wherever_it_may_be(far):
+def test_a_target_that_nothing_measures_is_in_the_window_wherever_it_may_be(far):
     lookout, camera = Lookout(far, "front"), far.cameras["front"]
     T, limb = rigid.from_rpy((0.05, 0.02, 0.25), (0.1, 0.0, 0.3)), anatomy.target_mesh(far.targets["forearm"], far).vertices
     lookout.add(fused(T))
@@ -128,6 +128,8 @@ def test_a_target_that_is_uncertain_is_in_the_window_wherever_it_may_be(far):
     lookout.add(fused(T, "coasting", sigma=0.1))
     wide = lookout.look(S)
     assert wide.width * wide.height < 1.5 * MAX_PIXELS
+    lookout.add(fused(T, sigma=0.1))
+    assert lookout.look(S) == near, "a tracked one is seen or felt there"
     for side in (-0.19, 0.19):  # within two standard deviations
         moved = rigid.perturb(T, np.array([*(side * camera.T_world_camera[:3, 0]), 0.0, 0.0, 0.0]))
         pixels = pixels_of(camera, rigid.apply(moved, limb))
