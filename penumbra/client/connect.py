@@ -62,7 +62,14 @@ class Search:
 
     @classmethod
     def of(cls, cell: str | Path | None, endpoint: str | None, secure: str | Path | None, timeout: float) -> Search:
-        """As `connect`, with its defaults."""
+        """As `connect`, with its defaults. Raises bus.BusError."""
+        for name, value, types, what in (
+            ("endpoint", endpoint, str, "text, as in 'tcp/192.168.0.7:7447'"),
+            ("secure", secure, str | Path, "a folder"),
+            ("timeout", timeout, int | float, "seconds"),
+        ):
+            if value is not None and not isinstance(value, types):
+                raise bus.BusError(f"{name}: expected {what}, got {value!r:.60} ({type(value).__name__})")
         connection = bus.Connection(
             connect=tuple(endpoint.split()) if endpoint else connect_by_environment(),
             secure=Path(secure) if secure else secure_by_environment(),
