@@ -22,7 +22,7 @@ from penumbra.services import flags
 from penumbra.services.command import check, look
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.processes import PROCESSES
-from penumbra.shared.runtime import bus, running, which
+from penumbra.shared.runtime import bus, running
 
 ROOT = Path(__file__).parents[2]
 SHM_BYTES = 128 << 20
@@ -230,7 +230,7 @@ def _processes(cell: str, connection: bus.Connection) -> Iterator[Finding]:
         others = running.cells_at_work(session)
     if not instances and others:
         yield Finding(
-            "warn", f"no process of cell {name} runs there, where cells run: {', '.join(others)}", which.give(others[0])
+            "warn", f"no process of cell {name} runs there, where cells run: {', '.join(others)}", f"give --cell {others[0]}"
         )
     elif not instances:
         yield Finding("warn", f"no process of cell {name} runs there", f"penumbra up --cell {cell}")

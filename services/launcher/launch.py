@@ -20,6 +20,7 @@ from penumbra.services.launcher import background, display
 from penumbra.services.launcher.fleet import Fleet, Kind
 from penumbra.services.launcher.forkserver import ForkServer
 from penumbra.services.launcher.supervised import ProcessRow, Supervised
+from penumbra.shared.cell import DEFAULT
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.processes import LAUNCHER, PROCESSES, ROUTER, Process
@@ -267,7 +268,7 @@ def meeting_points(options: flags.Options) -> tuple[str, ...]:
 def pose_command(options: flags.Options) -> str:
     """The command that prints the pose of this cell, in another terminal."""
     words = ["penumbra pose"]
-    words += ["--cell", str(options.cell)] if options.cell != "table" else []
+    words += ["--cell", str(options.cell)] if options.cell != DEFAULT else []
     own = options.port == PORT and not options.connect
     words += [] if own else [word for at in meeting_points(options) for word in ("--connect", at)]
     words += ["--secure", str(options.secure)] if options.secure else []

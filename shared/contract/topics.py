@@ -10,6 +10,7 @@ from penumbra.shared.contract import messages
 
 if TYPE_CHECKING:
     from penumbra.shared.cell.description import Cell
+    from penumbra.shared.contract.outline import Outline
 
 
 class QoS(Enum):
@@ -52,7 +53,7 @@ class Topic:
     by_camera: bool = False
     needs: Literal["cameras", "pads", "sim"] | None = None
 
-    def is_expected(self, cell: Cell) -> bool:
+    def is_expected(self, cell: Cell | Outline) -> bool:
         """Whether a cell has the parts that the publishers of this topic need: without them the topic is not missing."""
         return self.needs is None or bool(getattr(cell, self.needs))
 

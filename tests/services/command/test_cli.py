@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import click
@@ -286,6 +287,24 @@ def test_pose_loads_nothing_that_takes_longer_than_its_answer(endpoint):
     assert result.stdout.splitlines()[-1] == "[]", result
 
 
+@pytest.mark.parametrize("module", ["penumbra.services.command.cli", "click", "zenoh", "numpy"])
+def test_ctrl_c_during_the_imports_ends_a_command_without_a_traceback(module):
+    entry = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]["penumbra"]
+    script = f"""
+import os, pkgutil, signal, sys
+class Interrupter:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has it ignored in its background
+main = pkgutil.resolve_name({entry!r})
+sys.meta_path.insert(0, Interrupter())
+sys.exit(main())
+"""
+    result = run("pose", code=script)
+    assert (result.returncode, result.stderr) == (130, "")
+
+
 def test_watch_prints_pose_after_pose_until_ctrl_c(endpoint):
     command = penumbra_command("pose", "--watch", "--json", "--connect", endpoint)
     # a shell starts what runs in its background with Ctrl-C ignored: not so here, wherever the tests run
@@ -341,11 +360,19 @@ def test_commands_that_look_take_the_only_cell_that_runs(own, capsys):
             assert word in capsys.readouterr().out, argv
 
 
-def test_a_running_cell_whose_file_is_elsewhere_is_named_with_what_to_give(own, capsys):
+@pytest.mark.parametrize("cell", [[], ["--cell", "mine"]])
+def test_a_running_cell_whose_file_is_elsewhere_is_described_by_fusion_or_named_with_what_to_give(own, cell, capsys):
     _, where = own
-    assert cli.main(["pose", "--connect", where]) == 0, "the bus has all that it needs"
-    for argv in (["topics"], ["snapshot", "out.png"], ["doctor"]):
-        assert cli.main([*argv, "--connect", where]) == 2
+    for argv, word in (
+        (["pose"], "forearm"),
+        (["sim", "state"], "speed"),
+        (["topics"], "penumbra/mine/target/forearm/truth"),
+        (["topics", "--hz", "--seconds", "0.5"], "penumbra/mine/target/forearm/truth"),
+    ):
+        assert cli.main([*argv, "--connect", where, *cell]) == 0
+        assert word in capsys.readouterr().out, argv
+    for argv in (["snapshot", "out.png"], ["doctor"]):
+        assert cli.main([*argv, "--connect", where, *cell]) == 2
         assert capsys.readouterr().err == (
             f"penumbra {argv[0]}: cell mine runs at {where}, and its file is not known here: give --cell FILE.yaml, the file of "
             "cell mine\n"
@@ -355,13 +382,16 @@ def test_a_running_cell_whose_file_is_elsewhere_is_named_with_what_to_give(own, 
 def test_a_cell_that_does_not_run_where_another_does_is_named_with_what_to_give(own, monkeypatch, capsys):
     _, where = own
     monkeypatch.setattr(snapshot, "PATIENCE_S", 0.1)
-    remedy = "where cells run: mine; give --cell FILE.yaml, the file of cell mine"
-    for argv in (["pose"], ["topics", "--hz", "--seconds", "0.1"], ["snapshot", "out.png"]):
+    remedy = "where cells run: mine; give --cell mine"
+    for argv in (["pose"], ["sim", "state"], ["restart"], ["topics", "--hz", "--seconds", "0.1"], ["snapshot", "out.png"]):
         cli.main([*argv, "--cell", "table", "--connect", where])
         assert remedy in capsys.readouterr().err, argv
+    for argv in (["pose"], ["sim", "state"], ["restart"]):
+        assert cli.main([*argv, "--cell", "mini", "--connect", where]) == 2
+        assert remedy in capsys.readouterr().err, "a name that is neither built in nor a file may be that of a running cell"
     found = list(doctor._processes("table", bus.Connection(connect=(where,))))
     assert [(each.text, each.mend) for each in found] == [
-        ("no process of cell table runs there, where cells run: mine", "give --cell FILE.yaml, the file of cell mine")
+        ("no process of cell table runs there, where cells run: mine", "give --cell mine")
     ]
 
 
