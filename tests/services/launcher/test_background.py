@@ -2,6 +2,7 @@
 
 import json
 import os
+import subprocess
 
 import psutil
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from penumbra.services.command import cli, machine, runs
 from penumbra.shared.cell import names
 from penumbra.shared.contract.processes import PROCESSES
-from penumbra.tests.support.live import free_port, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 
 NOTHING = [f"--replicas={process.name}=0" for process in PROCESSES if process.replicas and process.name != "router"]
 
@@ -56,6 +57,18 @@ def test_a_cell_that_does_not_start_in_the_background_says_why(capfd):
     taken = free_port()
     assert cli.main(["up", "--detach", "--connect", f"tcp/127.0.0.1:{taken}", "--replicas=magic=1"]) == 2
     assert "--replicas magic=1: expected one of emulator" in capfd.readouterr().err
+
+
+def test_a_cell_that_waits_for_its_router_in_the_background_says_so_is_listed_and_can_be_ended(capfd):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = penumbra_command("up", "--detach", "--connect", endpoint, *NOTHING, "--replicas=fusion=1")
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as starter:
+        assert starter.stdout is not None
+        assert starter.stdout.readline() == f"waiting for the router at {endpoint}\n"
+        assert [run.cell for run in runs.running()] == ["table"]
+        assert cli.main(["down"]) == 0
+        assert starter.wait(PATIENCE_S) == 1
+    assert runs.running() == []
 
 
 def test_nothing_that_runs_is_said_in_a_line(capfd):
