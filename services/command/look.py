@@ -44,7 +44,8 @@ ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "st
 
 @flags.command(
     "pose",
-    "Prints the current fused pose of a target. The exit code is 3 where the pose is lost.",
+    "Prints the current fused pose of a target. The exit code is 3 where the pose is lost, and 1 where --wait ends with "
+    "a coasting one.",
     flags.Argument(
         "target", required=False, shell_complete=flags.complete_part("targets"), help="of the cell; its first where none is named"
     ),
@@ -62,7 +63,7 @@ ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "st
     example="penumbra pose --wait 30\npenumbra pose forearm --json",
 )
 def pose(options: flags.Options) -> int:
-    """Print the pose; returns 0, or 3 if it is lost."""
+    """Print the pose; returns 0, or 3 if it is lost, or 1 if it was to be tracked and is coasting."""
     if options.watch and options.wait is not None:
         flags.refuse("expected --watch or --wait, got both")
     patience_s = PATIENCE_S if options.wait is None else options.wait
@@ -83,7 +84,7 @@ def pose(options: flags.Options) -> int:
                 if is_over:
                     _print_pose(found, options)
                 if is_over and not options.watch:
-                    return LOST if found["state"] == "lost" else 0
+                    return LOST if found["state"] == "lost" else int(options.wait is not None and found["state"] != "tracking")
             time.sleep(WATCH_S)
 
 
