@@ -428,7 +428,7 @@ RUNNING_CELL = Option(
     show_default=f"the only one that runs there, else {DEFAULT}",
     **_CELL | {"help": "table, arm, a YAML file, or the name of a cell that runs there"},
 )
-"""CELL of commands that look at a running cell; its value is None where none is given."""
+"""CELL of commands and processes beside a running cell; its value is None where none is given."""
 SECURE = Option(
     "--secure",
     type=Path,
@@ -484,6 +484,8 @@ METRICS = Option(
 JSON = Option("--json", is_flag=True, help="print JSON")
 COMMON = (CELL, *BUS, *LOG)
 """Flags of every process on the bus."""
+JOINING = (RUNNING_CELL, *BUS, *LOG)
+"""Flags of processes that join a running cell."""
 MEASURING = (CELL, *BUS, QUIET_LOG_LEVEL, LOG_FORMAT)
 """Flags of commands that need a cell file."""
 LOOKING = (RUNNING_CELL, *BUS, QUIET_LOG_LEVEL, LOG_FORMAT)

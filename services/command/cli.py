@@ -170,7 +170,7 @@ class Service(flags.Group):
             package = importlib.import_module(module.__name__.rpartition(".")[0])
             self.help = (package.__doc__ or self._process.about).partition("\n\n")[0]
             self.example = getattr(module, "EXAMPLE", self.example)
-            self.params = [*module.FLAGS, flags.METRICS, *flags.COMMON]
+            self.params = [*module.FLAGS, flags.METRICS, *(flags.JOINING if self._process.joins else flags.COMMON)]
         return super().parse_args(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -190,7 +190,12 @@ class Service(flags.Group):
             return 0
         from penumbra.services import run
 
-        return run.serve(self._process, flags.Options(**values), flags.words())
+        options = flags.Options(**values)
+        if options.cell is None:
+            from penumbra.services.command import look
+
+            options.cell = look.file_of(options, self._process.name)
+        return run.serve(self._process, options, flags.words())
 
 
 class Bench(flags.Group):

@@ -343,11 +343,11 @@ def _plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def file_of(options: flags.Options) -> str:
+def file_of(options: flags.Options, service: str = access.VIEWER) -> str:
     """The cell that --cell names; without it the file of the only one that runs at the router, else the default, also where there
     is no router. The file of a running cell is known if it is built in, or if `penumbra up` runs it on this machine. Raises
-    BusError for another one."""
-    name, file = _name_and_file(options)
+    BusError for another one. service: who asks."""
+    name, file = _name_and_file(options, service)
     if file is None:
         where = bus.connection(options).where
         raise bus.BusError(
@@ -367,11 +367,11 @@ def _parts(options: flags.Options) -> Cell | Outline:
         return which.described(session, name)
 
 
-def _name_and_file(options: flags.Options) -> tuple[str, str | None]:
+def _name_and_file(options: flags.Options, service: str = access.VIEWER) -> tuple[str, str | None]:
     """As `file_of`, with the name or file that was given; no file for a running cell whose file is not known here."""
     if options.cell and not names.is_bare(options.cell):
         return options.cell, options.cell
-    connection = bus.connection(options)
+    connection = replace(bus.connection(options), service=service)
     there: list[str] = []
     # without a router: the command reports it, if it needs one
     with contextlib.suppress(bus.BusError), open_session(connection, 0.0) as session:

@@ -21,7 +21,7 @@ from penumbra.services.emulator.control import COMMANDS
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import outline, processes, topics
 from penumbra.shared.perception import landmarks
-from penumbra.shared.runtime import bus
+from penumbra.shared.runtime import bus, running
 from penumbra.shared.runtime.node import Node
 from penumbra.tests.support import numbered
 from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
@@ -358,6 +358,20 @@ def test_commands_that_look_take_the_only_cell_that_runs(own, capsys):
         ):
             assert cli.main([*argv, "--connect", where]) == 0
             assert word in capsys.readouterr().out, argv
+
+
+def test_a_recorder_beside_a_running_cell_takes_the_only_one(own, tmp_path):
+    path, where = own
+    command = penumbra_command("record", "--connect", where, "--out", str(tmp_path / "run.mcap"))
+    with runs.recorded("mine", path, (where,), None, None), subprocess.Popen(command, stderr=subprocess.PIPE) as recorder:
+        try:
+            connection = bus.Connection(connect=(where,))
+            with look.open_session(connection) as session:
+                wait_for(lambda: running.ask(session, "mine", "record"), PATIENCE_S, "the recorder of the cell")
+        finally:
+            recorder.terminate()
+    assert recorder.returncode == 0
+    assert run("record", "--connect", where).returncode == 2, "its file is not known here any more"
 
 
 @pytest.mark.parametrize("cell", [[], ["--cell", "mine"]])
