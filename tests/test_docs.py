@@ -192,6 +192,13 @@ def texts(path: Path) -> Iterator[str]:
                 yield text
 
 
+def test_every_command_of_compose_with_a_profile_names_a_router():
+    text = "".join(path.read_text() for path in (*PAGES, ROOT / "compose.yaml"))
+    commands = re.findall(r"docker compose [^\n`#]*--profile [^\n`#]*", text)
+    assert len(commands) >= 4
+    assert not [each for each in commands if not re.search("--profile (router|zenohd)", each)], "a profile replaces that of .env"
+
+
 def test_every_command_that_a_message_or_a_docstring_mentions_can_be_given(capsys):
     files = [
         path for floor in ("services", "sim", "shared", "penumbra/client", "examples") for path in (ROOT / floor).rglob("*.py")
