@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from packaging.requirements import Requirement
-from rich.console import Console
 from rich.markup import escape
 
 from penumbra.services import flags
@@ -66,7 +65,7 @@ def main(options: flags.Options) -> int:
         found = list(found)
         print(json.dumps([asdict(finding) for finding in found]))
         return int(any(finding.status == "fail" for finding in found))
-    console = Console(highlight=False, soft_wrap=True)
+    console = look.console(highlight=False, soft_wrap=True)
     failed = False
     for finding in found:
         mend = f" -> {finding.mend}" if finding.mend else ""

@@ -11,7 +11,7 @@ import string
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -26,6 +26,7 @@ from penumbra.shared.runtime import bus, running, which
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from penumbra.shared.cell.description import Cell
     from penumbra.shared.contract.outline import Outline
@@ -135,7 +136,7 @@ def _row(values: list[float], scale: float, spec: str, unit: str, spread: float 
 
 @flags.command(
     "topics",
-    "Lists the cell's topics, and with --hz what really arrives.",
+    "Lists the cell's topics, and with --hz what really arrives. A narrow terminal shows fewer columns than a pipe.",
     flags.Option("--hz", is_flag=True, help="measure what arrives, and print it with the state of the processes"),
     flags.Option("--seconds", type=flags.above_zero, default=3.0, help="with --hz: how long to listen"),
     flags.JSON,
@@ -165,15 +166,21 @@ def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.T
         print(json.dumps([_described(key, topic) for key, topic in rows]))
         return
     from rich.markup import escape
-    from rich.table import Table
 
-    table = Table("topic", "key", "message", "Hz", "slow link", "quality of service", "priority", "stale after", "from", "what",
-                  box=None)  # fmt: skip
-    for key, topic in rows:
-        table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", f"{topic.slow_hz:g}",
-                      topic.qos.name.lower().replace("_", " "), topic.priority.name.lower(), f"{topic.stale_s:g} s",
-                      " or ".join(topic.publishers), escape(topic.about))  # fmt: skip
-    console().print(table)
+    columns = {
+        "topic": [topic.name for _, topic in rows],
+        "key": [key for key, _ in rows],
+        "message": [topic.message.__name__ for _, topic in rows],
+        "Hz": [f"{topic.rate_hz:g}" for _, topic in rows],
+        "slow link": [f"{topic.slow_hz:g}" for _, topic in rows],
+        "quality of service": [topic.qos.name.lower().replace("_", " ") for _, topic in rows],
+        "priority": [topic.priority.name.lower() for _, topic in rows],
+        "stale after": [f"{topic.stale_s:g} s" for _, topic in rows],
+        "from": [" or ".join(topic.publishers) for _, topic in rows],
+        "what": [escape(topic.about) for _, topic in rows],
+    }
+    out = console()
+    out.print(table_of(columns, ("quality of service", "priority", "slow link", "stale after", "from", "what", "message"), out))
 
 
 def keys(topic: topics.Topic, cell: Cell | Outline) -> list[str]:
@@ -200,10 +207,10 @@ def _described(key: str, topic: topics.Topic) -> dict[str, Any]:
 
 def _show_traffic(received: dict[str, TopicReport], instances: list[running.Instance], known: Sequence[topics.Topic]) -> None:
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Column, Table
 
     out = console()
-    table = Table("key", "Hz", "expected", "delay ms", "dropped", "bad", box=None)
+    table = Table(Column("key", overflow="fold"), "Hz", "expected", "delay ms", "dropped", "bad", box=None)
     for key, row in received.items():
         expected = bus.topic_of(key, known)
         if row.count or row.bad or "*" not in key:
@@ -220,11 +227,31 @@ def _show_traffic(received: dict[str, TopicReport], instances: list[running.Inst
     out.print(table)
 
 
-def console() -> Console:
-    """A console as wide as the terminal; in a file or pipe so wide that no row breaks and no key is cut."""
+def console(**settings: Any) -> Console:
+    """A console as wide as the terminal; in a file or pipe so wide that no row breaks and no key is cut. A pipe whose reader ends
+    raises BrokenPipeError, as `print` does. settings: of rich."""
     from rich.console import Console
 
-    return Console(width=None if sys.stdout.isatty() else PIPED_COLUMNS)
+    class Quiet(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    return Quiet(width=None if sys.stdout.isatty() else PIPED_COLUMNS, **settings)
+
+
+def table_of(columns: Mapping[str, Sequence[str]], expendable: Sequence[str], out: Console) -> Table:
+    """A table with all columns, or without the first `expendable` ones as far as the terminal is too narrow for them."""
+    from rich.table import Table
+
+    shown = dict(columns)
+    for name in (None, *expendable):
+        shown.pop(name or "", None)
+        table = Table(*shown, box=None)
+        for row in zip(*shown.values(), strict=True):
+            table.add_row(*row)
+        if out.measure(table, options=out.options.update(max_width=PIPED_COLUMNS)).maximum <= out.width:
+            break
+    return table
 
 
 def listen(

@@ -2,6 +2,7 @@
 
 import functools
 import importlib.metadata
+import io
 import json
 import math
 import os
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import click
 import pytest
+from rich.console import Console
 
 from penumbra.services import flags, progress
 from penumbra.services.command import cli, doctor, look, runs, snapshot
@@ -560,6 +562,27 @@ def test_a_command_ends_quietly_when_its_reader_does(endpoint):
     watch.stdout.close()
     assert watch.stderr.read() == ""
     assert watch.wait(PATIENCE_S) == 0
+
+
+@pytest.mark.parametrize("command", ["topics", "doctor", "pose"])
+def test_a_command_whose_reader_is_gone_ends_quietly(command, endpoint):
+    asked = subprocess.Popen(
+        penumbra_command(command, "--connect", endpoint), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert asked.stdout is not None
+    asked.stdout.close()
+    assert (asked.communicate(timeout=PATIENCE_S)[1], asked.returncode) == ("", 0)
+
+
+def test_a_narrow_terminal_shows_fewer_columns_before_it_cuts_one():
+    columns = {"key": ["penumbra/table/camera/front/frame"], "Hz": ["20"], "from": ["emulator"], "what": ["one image"]}
+    for width, expected in ((80, list(columns)), (55, ["key", "Hz", "from"]), (40, ["key", "Hz"])):
+        text = io.StringIO()
+        out = Console(width=width, file=text)
+        out.print(look.table_of(columns, ("what", "from"), out))
+        heads, row = text.getvalue().splitlines()
+        assert heads.split() == expected
+        assert row.split()[0] == columns["key"][0]
 
 
 @pytest.mark.parametrize("argv", [["topics"], ["--help"], ["pose", "--json"]])
