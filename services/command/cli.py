@@ -309,13 +309,17 @@ def _is_ours(error: Exception) -> bool:
 def _explain_import(command: str, argv: list[str], error: ImportError) -> int:
     """Name the extra that installs the missing package; an error in our own code is raised as it is."""
     name = (error.name or "").partition(".")[0]
-    if not name or (name == "penumbra" and error.name != f"penumbra.services.{command}"):
+    tool = processes.tool(command, argv[0]) if argv else None
+    entry = tool or COMMANDS.get(command)
+    if entry is None or not name:
         raise error
-    if error.name == f"penumbra.services.{command}":
+    module = entry.module if isinstance(entry, Process) else entry.function
+    if error.name == ".".join(module.split(".")[:3]):  # its folder, which an image of another process does not have
         print(f"penumbra {command}: not part of this installation", file=sys.stderr)
         return 2
-    tool = processes.tool(command, argv[0]) if argv else None
-    extra = (tool or COMMANDS[command]).extra
+    if name == "penumbra":
+        raise error
+    extra = entry.extra
     words = f"{command} {tool.name}" if tool else command
     print(f"penumbra {words}: {name} is not installed: pip install -e '.[{extra}]'", file=sys.stderr)
     return 2

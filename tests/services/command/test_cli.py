@@ -233,6 +233,24 @@ def test_training_without_torch_names_the_extra_for_training(command):
     assert (result.returncode, result.stderr) == (2, f"penumbra {command}: torch is not installed: pip install -e '.[{extra}]'\n")
 
 
+@pytest.mark.parametrize(
+    ("command", "folder"), [("up", "launcher"), ("fusion", "fusion"), ("replay", "replay"), ("record save", "record")]
+)
+def test_a_command_whose_folder_an_image_does_not_have_says_so(command, folder):
+    code = f"""
+import sys
+from penumbra.services.command.cli import main
+class Without:
+    def find_spec(self, name, path=None, target=None):
+        if name == "penumbra.services.{folder}":
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Without())
+sys.exit(main(sys.argv[1:]))
+"""
+    result = run(*command.split(), code=code)
+    assert (result.returncode, result.stderr) == (2, f"penumbra {command.split()[0]}: not part of this installation\n")
+
+
 def test_an_import_error_in_our_own_code_is_not_explained_away():
     with pytest.raises(ImportError):
         cli._explain_import(
