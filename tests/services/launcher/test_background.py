@@ -8,6 +8,7 @@ import psutil
 import pytest
 
 from penumbra.services.command import cli, machine, runs
+from penumbra.services.launcher import background
 from penumbra.shared.cell import names
 from penumbra.shared.contract.processes import PROCESSES
 from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
@@ -69,6 +70,25 @@ def test_a_cell_that_waits_for_its_router_in_the_background_says_so_is_listed_an
         assert cli.main(["down"]) == 0
         assert starter.wait(PATIENCE_S) == 1
     assert runs.running() == []
+
+
+def test_a_slow_start_is_told_in_few_lines(monkeypatch, tmp_path, capsys):
+    def told(lines):
+        said, say = os.pipe()
+        with os.fdopen(say, "w") as pipe, subprocess.Popen(["sleep", "60"]) as launcher:
+            pipe.writelines(f"{line}\n" for line in lines)
+            pipe.flush()
+            try:
+                assert background._follow(launcher, said, tmp_path / "log") == 0
+            finally:
+                launcher.kill()
+                os.close(said)
+        return capsys.readouterr().out.splitlines()[:-1]
+
+    lines = ["waiting for a (0.1 s)", "waiting for a (0.2 s)", "waiting for b", "waiting for c", "up: cell"]
+    assert told(lines) == ["waiting for a (0.1 s)"]
+    monkeypatch.setattr(background, "TELL_S", 0.0)
+    assert told(lines) == ["waiting for a (0.1 s)", "waiting for b", "waiting for c"]
 
 
 def test_nothing_that_runs_is_said_in_a_line(capfd):
