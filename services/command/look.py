@@ -324,7 +324,7 @@ def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dic
                 if routers & known:
                     return []
                 known |= routers
-                return [{"router": at, "cells": running.cells_there(session), "why": ""}]
+                return [{"router": at, "cells": running.cells_at_work(session), "why": ""}]
         except bus.BusError as error:
             reasons.append(str(error))
     return [{"router": place.connect[0], "cells": [], "why": reasons[0]}] if reasons else []
