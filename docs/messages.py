@@ -11,6 +11,8 @@ import msgspec
 
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.messages import VERSION, Array, Message
+from penumbra.shared.contract.processes import LAUNCHER, PROCESSES
+from penumbra.shared.runtime.guard import IDENTITY_BYTES, NUMBER_BYTES
 
 PAGE = Path(__file__).with_suffix(".md")
 HEAD = f"""# Messages
@@ -25,6 +27,10 @@ covariances are ordered x, y, z, rotation about x, y, z of that frame.
 A reader refuses and counts a message with another version, an unknown or missing field, a wrong dtype or shape, a
 number that is not finite or out of range, or a stamp that is too old or ahead of its clock by more than 0.5 s.
 
+Publishers attach {IDENTITY_BYTES + NUMBER_BYTES} bytes to each message: {IDENTITY_BYTES} random ones, the same in all
+messages of a publisher on a key, and a number that counts them (little-endian). Readers find losses and repetitions by
+them. A program may leave the attachment out: then each of its stamps must be newer than the one before.
+
 ## Topics
 
 | topic | key | message | rate [1/s] | stale after [s] | published by | slow link [1/s] | what |
@@ -35,8 +41,10 @@ QUERIES = """
 
 ## Queries
 
-| query | key |
-|---|---|
+A refusal is an error reply, whose payload is the reason as text.
+
+| query | key | answered by | what |
+|---|---|---|---|
 """
 
 
@@ -46,17 +54,29 @@ def page() -> str:
         f"{topic.stale_s:g} | {', '.join(topic.publishers)} | {topic.slow_hz:g} | {topic.about} |"
         for topic in topics.TOPICS
     ]
-    queries = [f"| {name.replace('_', ' ')} | `{key}` |" for name, key in topics.QUERYABLES.items()]
+    queries = [
+        f"| {name.replace('_', ' ')} | `{key}` | {_answering(name)} | {_text(getattr(topics, name))} |"
+        for name, key in topics.QUERYABLES.items()
+    ]
+    queries += [f"| health | `{topics.health('{cell}', '{service}', '{instance}')}` | every process | {_text(topics.health)} |"]
     kinds = dict.fromkeys(topic.message for topic in (*topics.TOPICS, topics.SMOOTHED))
     return "\n".join([HEAD.rstrip("\n"), *rows, QUERIES.rstrip("\n"), *queries, *(_message(kind) for kind in kinds)]) + "\n"
+
+
+def _answering(query: str) -> str:
+    return ", ".join(process.name for process in (*PROCESSES, LAUNCHER) if query in process.answers)
+
+
+def _text(documented: object) -> str:
+    """The docstring of a function or message in one line."""
+    return re.sub(r"\s+", " ", documented.__doc__ or "").strip()
 
 
 def _message(kind: type[Message]) -> str:
     hints = typing.get_type_hints(kind, include_extras=True)
     names = [each.encode_name for each in msgspec.structs.fields(kind)]
     rows = "\n".join(f"| `{name}` | {_type(hints[name])} |" for name in names)
-    about = re.sub(r"\s+", " ", kind.__doc__ or "").strip()
-    return f"\n## {kind.__name__}\n\n{about} At most {kind.MAX_BYTES:,} bytes.\n\n| field | type |\n|---|---|\n{rows}"
+    return f"\n## {kind.__name__}\n\n{_text(kind)} At most {kind.MAX_BYTES:,} bytes.\n\n| field | type |\n|---|---|\n{rows}"
 
 
 def _type(hint: Any) -> str:

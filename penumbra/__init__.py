@@ -9,8 +9,8 @@
 What a program uses is below, and is loaded when it is first used: services import `penumbra.shared` and never the client.
 """
 
-import importlib
-from typing import TYPE_CHECKING
+TYPE_CHECKING = False
+"""As that of `typing`, without its import: the command `penumbra` reports no Ctrl-C well before it has imported this package."""
 
 if TYPE_CHECKING:
     from penumbra.client.aio import AsyncCell, AsyncPoses, aconnect
@@ -61,6 +61,8 @@ def __getattr__(name: str) -> object:
     home = next((home for home, names in _HOMES.items() if name in names), None)
     if home is None:
         raise AttributeError(f"module 'penumbra' has no attribute {name!r}")
+    import importlib
+
     found = globals()[name] = getattr(importlib.import_module(home), name)
     return found
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from penumbra.services.command.cli import main
+from penumbra.services.command import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -2,6 +2,6 @@
 
 import sys
 
-from penumbra.services.command.cli import main
+from penumbra.services.command import main
 
 sys.exit(main())

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 import click
 from click.shell_completion import CompletionItem
 
+from penumbra.shared.cell import BUILT_IN, DEFAULT
 from penumbra.shared.contract.processes import PROCESSES
 from penumbra.shared.runtime import logs
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 Options = SimpleNamespace
 """The values of a command's flags and arguments, by name."""
-CELLS = Path(__file__).parents[1] / "shared" / "cell" / "built_in"
 ROUTER = "tcp/127.0.0.1:7447"
 """Default router, as shown by help; `shared.runtime.connection` has it too, but is slow to import."""
 COMMAND_LINE = click.core.ParameterSource.COMMANDLINE
@@ -286,12 +286,15 @@ def command(
     name: str, about: str, *params: click.Parameter, example: str
 ) -> Callable[[Callable[[Options], int | None]], Command]:
     """Decorator that makes the command `penumbra NAME` from a function of its options, which returns the exit code, None for 0.
+    Where the command has the flags of LOG, they are applied.
 
     about: the help text; line breaks within a paragraph do not matter; example: a working command line, or several lines.
     """
 
     def make(function: Callable[[Options], int | None]) -> Command:
         def callback(**values: Any) -> int:
+            if "log_level" in values:
+                logs.configure(values["log_level"], values["log_format"], name)
             return function(Options(**values)) or 0
 
         return Command(name, example, callback=callback, params=list(params), help=_kept(about))
@@ -386,7 +389,7 @@ def meant(word: str, known: Iterable[str]) -> str:
 
 def complete_cell(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """The built-in cells, and the shell's own completion of files for a cell file."""
-    names = [path.stem for path in sorted(CELLS.glob("*.yaml")) if path.stem.startswith(incomplete)]
+    names = [path.stem for path in sorted(BUILT_IN.glob("*.yaml")) if path.stem.startswith(incomplete)]
     return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
 
@@ -396,8 +399,8 @@ def complete_part(part: str) -> Callable[[click.Context, click.Parameter, str], 
     def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         import yaml
 
-        cell = str(ctx.params.get("cell") or os.environ.get("PENUMBRA_CELL") or "table")
-        path = CELLS / f"{cell}.yaml"
+        cell = str(ctx.params.get("cell") or os.environ.get("PENUMBRA_CELL") or DEFAULT)
+        path = BUILT_IN / f"{cell}.yaml"
         try:
             names = yaml.safe_load((path if path.is_file() else Path(cell)).read_text())[part]
         except (OSError, yaml.YAMLError, KeyError, TypeError):
@@ -419,9 +422,13 @@ _CELL: dict[str, Any] = {
     "shell_complete": complete_cell,
     "help": "table, arm or a YAML file",
 }
-CELL = Option("--cell", default="table", **_CELL)
-RUNNING_CELL = Option("--cell", show_default="the only one that runs there, else table", **_CELL)
-"""CELL of commands that look at a running cell; its value is None where none is given."""
+CELL = Option("--cell", default=DEFAULT, **_CELL)
+RUNNING_CELL = Option(
+    "--cell",
+    show_default=f"the only one that runs there, else {DEFAULT}",
+    **_CELL | {"help": "table, arm, a YAML file, or the name of a cell that runs there"},
+)
+"""CELL of commands and processes beside a running cell; its value is None where none is given."""
 SECURE = Option(
     "--secure",
     type=Path,
@@ -453,18 +460,19 @@ BUS = (
     Option("-c", "--config", type=Path, metavar="FILE", section="Bus", help="Zenoh configuration (JSON5)"),
     SECURE,
 )
-LOG = (
-    Option("--log-level", choices=logs.LEVELS, default="info", section="Log", help="the least important lines to write"),
-    Option(
-        "--log-format",
-        choices=logs.FORMATS,
-        envvar="PENUMBRA_LOG_FORMAT",
-        show_envvar=True,
-        default="text",
-        section="Log",
-        help="json: one object a line",
-    ),
+LOG_LEVEL = Option("--log-level", choices=logs.LEVELS, default="info", section="Log", help="the least important lines to write")
+QUIET_LOG_LEVEL = Option("--log-level", choices=logs.LEVELS, default="warning", section="Log", help=LOG_LEVEL.help)
+"""LOG_LEVEL of commands that print an answer."""
+LOG_FORMAT = Option(
+    "--log-format",
+    choices=logs.FORMATS,
+    envvar="PENUMBRA_LOG_FORMAT",
+    show_envvar=True,
+    default="text",
+    section="Log",
+    help="json: one object a line",
 )
+LOG = (LOG_LEVEL, LOG_FORMAT)
 METRICS = Option(
     "--metrics-port",
     type=address,
@@ -475,8 +483,12 @@ METRICS = Option(
 )
 JSON = Option("--json", is_flag=True, help="print JSON")
 COMMON = (CELL, *BUS, *LOG)
-"""Flags of every process on the bus, and of commands that need a cell file."""
-LOOKING = (RUNNING_CELL, *BUS, *LOG)
+"""Flags of every process on the bus."""
+JOINING = (RUNNING_CELL, *BUS, *LOG)
+"""Flags of processes that join a running cell."""
+MEASURING = (CELL, *BUS, QUIET_LOG_LEVEL, LOG_FORMAT)
+"""Flags of commands that need a cell file."""
+LOOKING = (RUNNING_CELL, *BUS, QUIET_LOG_LEVEL, LOG_FORMAT)
 """Flags of commands that look at a running cell."""
 
 

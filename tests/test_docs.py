@@ -169,7 +169,9 @@ NOW = [page for page in PAGES if page.name != "CHANGELOG.md"]
 
 
 @pytest.mark.parametrize("page", NOW, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_every_command_on_a_page_can_be_given(page):
+def test_every_command_on_a_page_can_be_given(page, tmp_path, monkeypatch):
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    monkeypatch.chdir(tmp_path)  # as some flags make their folder
     added = {f"penumbra {name}" for name in re.findall(r'^ *NAME = "(\w+)"', page.read_text(), re.MULTILINE)}  # by the page
     wrong = {
         shlex.join(words): found
@@ -190,6 +192,13 @@ def texts(path: Path) -> Iterator[str]:
                 yield "".join(str(part.value) if isinstance(part, ast.Constant) else "X" for part in parts)
             case ast.Constant(value=str(text)) if id(node) not in inside:
                 yield text
+
+
+def test_every_command_of_compose_with_a_profile_names_a_router():
+    text = "".join(path.read_text() for path in (*PAGES, ROOT / "compose.yaml"))
+    commands = re.findall(r"docker compose [^\n`#]*--profile [^\n`#]*", text)
+    assert len(commands) >= 4
+    assert not [each for each in commands if not re.search("--profile (router|zenohd)", each)], "a profile replaces that of .env"
 
 
 def test_every_command_that_a_message_or_a_docstring_mentions_can_be_given(capsys):

@@ -1,5 +1,6 @@
 """The Kubernetes manifests: as the table of processes says, valid for the API, whole once their kustomizations are applied."""
 
+import re
 import runpy
 from pathlib import Path
 
@@ -94,6 +95,14 @@ def test_a_container_has_no_rights_but_the_driver_of_the_boards(folder):
         assert container["securityContext"]["readOnlyRootFilesystem"]
         assert (container["securityContext"].get("capabilities") == {"drop": ["ALL"]}) == (name != "skin")
         assert {volume["name"] for volume in pod["volumes"]} == {mount["name"] for mount in container["volumeMounts"]}
+
+
+def test_the_page_of_deployment_names_every_folder_and_makes_every_secret():
+    page = (FOLDER.parents[1] / "docs" / "deployment.md").read_text()
+    assert set(KUSTOMIZATIONS) == set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE))
+    (made,) = re.findall(r"for service in (.*); do", page)
+    text = "".join(path.read_text() for path in (FOLDER / "secure").glob("*.yaml"))
+    assert {f"penumbra-{name}" for name in made.split()} == set(re.findall(r"secretName: (\S+)", text))
 
 
 def test_with_tls_each_pod_has_the_certificate_of_its_own_and_everything_goes_by_tls():

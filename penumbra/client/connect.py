@@ -15,7 +15,7 @@ from penumbra.client.cell import Cell
 from penumbra.shared.contract import outline, topics
 from penumbra.shared.contract.messages import BadMessage
 from penumbra.shared.contract.outline import Outline
-from penumbra.shared.runtime import bus
+from penumbra.shared.runtime import bus, running
 from penumbra.shared.runtime.connection import connect_by_environment, secure_by_environment
 
 ANSWER_S = 1.0
@@ -62,7 +62,14 @@ class Search:
 
     @classmethod
     def of(cls, cell: str | Path | None, endpoint: str | None, secure: str | Path | None, timeout: float) -> Search:
-        """As `connect`, with its defaults."""
+        """As `connect`, with its defaults. Raises bus.BusError."""
+        for name, value, types, what in (
+            ("endpoint", endpoint, str, "text, as in 'tcp/192.168.0.7:7447'"),
+            ("secure", secure, str | Path, "a folder"),
+            ("timeout", timeout, int | float, "seconds"),
+        ):
+            if value is not None and not isinstance(value, types):
+                raise bus.BusError(f"{name}: expected {what}, got {value!r:.60} ({type(value).__name__})")
         connection = bus.Connection(
             connect=tuple(endpoint.split()) if endpoint else connect_by_environment(),
             secure=Path(secure) if secure else secure_by_environment(),
@@ -98,11 +105,7 @@ class Search:
 
     def _nobody(self, session: zenoh.Session) -> str:
         """Reason why there is no answer, as text."""
-        services: dict[str, set[str]] = {}
-        for reply in session.liveliness().get(topics.alive("*"), timeout=ANSWER_S):
-            if reply.ok is not None:
-                _, cell, _, service, _ = str(reply.ok.key_expr).split("/")
-                services.setdefault(cell, set()).add(service)
+        services = running.services_at_work(session)
         where, names = self.connection.whereabouts, ", ".join(sorted(services))
         if not services:
             return f"no cell runs {where}: start `penumbra up`"

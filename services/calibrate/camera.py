@@ -34,7 +34,7 @@ GOOD_FOCUS = 0.005
     *outcome.WRITING,
     *boards.FLAGS,
     boards.MEASURED,
-    *flags.COMMON,
+    *flags.MEASURING,
     example="penumbra calibrate camera --cell mine.yaml --pictures lens --dry-run\n"
     "penumbra calibrate camera --cell mine.yaml --camera front --square-measured 39.8mm --save lens",
 )

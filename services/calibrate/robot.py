@@ -52,7 +52,7 @@ GOOD_M, GOOD_RAD = 0.003, math.radians(0.3)
     *outcome.WRITING,
     *boards.FLAGS,
     boards.MEASURED,
-    *flags.COMMON,
+    *flags.MEASURING,
     example="penumbra calibrate hand-eye --cell mine.yaml --pictures poses --dry-run\n"
     "penumbra calibrate hand-eye --cell mine.yaml --camera front --robot panda --save poses",
 )

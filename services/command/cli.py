@@ -170,7 +170,7 @@ class Service(flags.Group):
             package = importlib.import_module(module.__name__.rpartition(".")[0])
             self.help = (package.__doc__ or self._process.about).partition("\n\n")[0]
             self.example = getattr(module, "EXAMPLE", self.example)
-            self.params = [*module.FLAGS, flags.METRICS, *flags.COMMON]
+            self.params = [*module.FLAGS, flags.METRICS, *(flags.JOINING if self._process.joins else flags.COMMON)]
         return super().parse_args(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -190,7 +190,12 @@ class Service(flags.Group):
             return 0
         from penumbra.services import run
 
-        return run.serve(self._process, flags.Options(**values), flags.words())
+        options = flags.Options(**values)
+        if options.cell is None:
+            from penumbra.services.command import look
+
+            options.cell = look.file_of(options, self._process.name)
+        return run.serve(self._process, options, flags.words())
 
 
 class Bench(flags.Group):
@@ -304,13 +309,17 @@ def _is_ours(error: Exception) -> bool:
 def _explain_import(command: str, argv: list[str], error: ImportError) -> int:
     """Name the extra that installs the missing package; an error in our own code is raised as it is."""
     name = (error.name or "").partition(".")[0]
-    if not name or (name == "penumbra" and error.name != f"penumbra.services.{command}"):
+    tool = processes.tool(command, argv[0]) if argv else None
+    entry = tool or COMMANDS.get(command)
+    if entry is None or not name:
         raise error
-    if error.name == f"penumbra.services.{command}":
+    module = entry.module if isinstance(entry, Process) else entry.function
+    if error.name == ".".join(module.split(".")[:3]):  # its folder, which an image of another process does not have
         print(f"penumbra {command}: not part of this installation", file=sys.stderr)
         return 2
-    tool = processes.tool(command, argv[0]) if argv else None
-    extra = (tool or COMMANDS[command]).extra
+    if name == "penumbra":
+        raise error
+    extra = entry.extra
     words = f"{command} {tool.name}" if tool else command
     print(f"penumbra {words}: {name} is not installed: pip install -e '.[{extra}]'", file=sys.stderr)
     return 2

@@ -15,14 +15,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from packaging.requirements import Requirement
-from rich.console import Console
 from rich.markup import escape
 
 from penumbra.services import flags
 from penumbra.services.command import check, look
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.processes import PROCESSES
-from penumbra.shared.runtime import bus, running, which
+from penumbra.shared.runtime import bus, running
 
 ROOT = Path(__file__).parents[2]
 SHM_BYTES = 128 << 20
@@ -66,7 +65,7 @@ def main(options: flags.Options) -> int:
         found = list(found)
         print(json.dumps([asdict(finding) for finding in found]))
         return int(any(finding.status == "fail" for finding in found))
-    console = Console(highlight=False, soft_wrap=True)
+    console = look.console(highlight=False, soft_wrap=True)
     failed = False
     for finding in found:
         mend = f" -> {finding.mend}" if finding.mend else ""
@@ -230,7 +229,7 @@ def _processes(cell: str, connection: bus.Connection) -> Iterator[Finding]:
         others = running.cells_at_work(session)
     if not instances and others:
         yield Finding(
-            "warn", f"no process of cell {name} runs there, where cells run: {', '.join(others)}", which.give(others[0])
+            "warn", f"no process of cell {name} runs there, where cells run: {', '.join(others)}", f"give --cell {others[0]}"
         )
     elif not instances:
         yield Finding("warn", f"no process of cell {name} runs there", f"penumbra up --cell {cell}")

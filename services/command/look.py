@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
@@ -10,29 +11,33 @@ import string
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import zenoh
 
 from penumbra.services import flags
-from penumbra.shared.cell import names
+from penumbra.shared.cell import DEFAULT, names
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.report import TopicReport
 from penumbra.shared.runtime import bus, running, which
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from penumbra.shared.cell.description import Cell
+    from penumbra.shared.contract.outline import Outline
 
 PATIENCE_S = 1.0
 """Time [s] that a command waits for the router before it reports that there is none."""
 WATCH_S = 0.1
 WIDE = 72
 """Columns of a pose in words."""
+PIPED_COLUMNS = 1000
+"""Maximum columns of a table that goes into a file or pipe."""
 LOST = 3
 """Exit code of a lost pose."""
 ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "state")
@@ -40,7 +45,8 @@ ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "st
 
 @flags.command(
     "pose",
-    "Prints the current fused pose of a target. The exit code is 3 where the pose is lost.",
+    "Prints the current fused pose of a target. The exit code is 3 where the pose is lost, and 1 where --wait ends with "
+    "a coasting one.",
     flags.Argument(
         "target", required=False, shell_complete=flags.complete_part("targets"), help="of the cell; its first where none is named"
     ),
@@ -58,16 +64,16 @@ ACTIONS = ("occlude", "motion", "pause", "resume", "speed", "skin", "board", "st
     example="penumbra pose --wait 30\npenumbra pose forearm --json",
 )
 def pose(options: flags.Options) -> int:
-    """Print the pose; returns 0, or 3 if it is lost."""
+    """Print the pose; returns 0, or 3 if it is lost, or 1 if it was to be tracked and is coasting."""
     if options.watch and options.wait is not None:
         flags.refuse("expected --watch or --wait, got both")
     patience_s = PATIENCE_S if options.wait is None else options.wait
     deadline = time.monotonic() + (options.wait or 0.0)
-    cell = names.read(options.cell) if options.cell else None
+    cell = names.read(options.cell) if options.cell and not names.is_bare(options.cell) else None
     with open_session(bus.connection(options), patience_s) as session:
         while True:
             try:
-                cell = cell or which.names_of(session, None)
+                cell = cell or which.names_of(session, options.cell)
                 found = _ask_pose(session, cell.name, cell.target(options.target))
             except bus.BusError as error:
                 if not options.watch and time.monotonic() >= deadline:
@@ -79,7 +85,7 @@ def pose(options: flags.Options) -> int:
                 if is_over:
                     _print_pose(found, options)
                 if is_over and not options.watch:
-                    return LOST if found["state"] == "lost" else 0
+                    return LOST if found["state"] == "lost" else int(options.wait is not None and found["state"] != "tracking")
             time.sleep(WATCH_S)
 
 
@@ -130,7 +136,7 @@ def _row(values: list[float], scale: float, spec: str, unit: str, spread: float 
 
 @flags.command(
     "topics",
-    "Lists the cell's topics, and with --hz what really arrives.",
+    "Lists the cell's topics, and with --hz what really arrives. A narrow terminal shows fewer columns than a pipe.",
     flags.Option("--hz", is_flag=True, help="measure what arrives, and print it with the state of the processes"),
     flags.Option("--seconds", type=flags.above_zero, default=3.0, help="with --hz: how long to listen"),
     flags.JSON,
@@ -146,9 +152,7 @@ def list_topics(options: flags.Options) -> None:
 
 def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.TOPICS) -> None:
     """Print the known topics that the cell can have, or their traffic."""
-    from penumbra.shared.cell import description
-
-    cell = description.load(file_of(options))
+    cell = _parts(options)
     known = [topic for topic in known if topic.is_expected(cell)]
     if options.hz:
         received, instances = listen(cell, bus.connection(options), options.seconds, known)
@@ -162,18 +166,24 @@ def show_topics(options: flags.Options, known: Sequence[topics.Topic] = topics.T
         print(json.dumps([_described(key, topic) for key, topic in rows]))
         return
     from rich.markup import escape
-    from rich.table import Table
 
-    table = Table("topic", "key", "message", "Hz", "slow link", "quality of service", "priority", "stale after", "from", "what",
-                  box=None)  # fmt: skip
-    for key, topic in rows:
-        table.add_row(topic.name, key, topic.message.__name__, f"{topic.rate_hz:g}", f"{topic.slow_hz:g}",
-                      topic.qos.name.lower().replace("_", " "), topic.priority.name.lower(), f"{topic.stale_s:g} s",
-                      " or ".join(topic.publishers), escape(topic.about))  # fmt: skip
-    _console().print(table)
+    columns = {
+        "topic": [topic.name for _, topic in rows],
+        "key": [key for key, _ in rows],
+        "message": [topic.message.__name__ for _, topic in rows],
+        "Hz": [f"{topic.rate_hz:g}" for _, topic in rows],
+        "slow link": [f"{topic.slow_hz:g}" for _, topic in rows],
+        "quality of service": [topic.qos.name.lower().replace("_", " ") for _, topic in rows],
+        "priority": [topic.priority.name.lower() for _, topic in rows],
+        "stale after": [f"{topic.stale_s:g} s" for _, topic in rows],
+        "from": [" or ".join(topic.publishers) for _, topic in rows],
+        "what": [escape(topic.about) for _, topic in rows],
+    }
+    out = console()
+    out.print(table_of(columns, ("quality of service", "priority", "slow link", "stale after", "from", "what", "message"), out))
 
 
-def keys(topic: topics.Topic, cell: Cell) -> list[str]:
+def keys(topic: topics.Topic, cell: Cell | Outline) -> list[str]:
     """The keys of a topic in a cell; empty if the cell has no such part."""
     fields = [name for _, name, _, _ in string.Formatter().parse(topic.key) if name and name != "cell"]
     parts = itertools.product(*(getattr(cell, f"{name}s") for name in fields))
@@ -197,10 +207,10 @@ def _described(key: str, topic: topics.Topic) -> dict[str, Any]:
 
 def _show_traffic(received: dict[str, TopicReport], instances: list[running.Instance], known: Sequence[topics.Topic]) -> None:
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    console = _console()
-    table = Table("key", "Hz", "expected", "delay ms", "dropped", "bad", box=None)
+    out = console()
+    table = Table(Column("key", overflow="fold"), "Hz", "expected", "delay ms", "dropped", "bad", box=None)
     for key, row in received.items():
         expected = bus.topic_of(key, known)
         if row.count or row.bad or "*" not in key:
@@ -209,28 +219,48 @@ def _show_traffic(received: dict[str, TopicReport], instances: list[running.Inst
             table.add_row(
                 key, f"{row.rate_hz:.1f}", f"{expected.rate_hz:g}" if expected else "", delay, str(row.dropped or 0), bad
             )
-    console.print(table)
+    out.print(table)
     table = Table("process", "instance", "status", "reasons", box=None)
     for instance in instances:
         table.add_row(instance.service, instance.instance, instance.status, escape("; ".join(instance.reasons)))
-    console.print()
-    console.print(table)
+    out.print()
+    out.print(table)
 
 
-def _console() -> Console:
-    """A console as wide as the terminal; in a file or pipe wide enough that no row breaks."""
+def console(**settings: Any) -> Console:
+    """A console as wide as the terminal; in a file or pipe so wide that no row breaks and no key is cut. A pipe whose reader ends
+    raises BrokenPipeError, as `print` does. settings: of rich."""
     from rich.console import Console
 
-    return Console(width=None if sys.stdout.isatty() else 200)
+    class Quiet(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    return Quiet(width=None if sys.stdout.isatty() else PIPED_COLUMNS, **settings)
+
+
+def table_of(columns: Mapping[str, Sequence[str]], expendable: Sequence[str], out: Console) -> Table:
+    """A table with all columns, or without the first `expendable` ones as far as the terminal is too narrow for them."""
+    from rich.table import Table
+
+    shown = dict(columns)
+    for name in (None, *expendable):
+        shown.pop(name or "", None)
+        table = Table(*shown, box=None)
+        for row in zip(*shown.values(), strict=True):
+            table.add_row(*row)
+        if out.measure(table, options=out.options.update(max_width=PIPED_COLUMNS)).maximum <= out.width:
+            break
+    return table
 
 
 def listen(
-    cell: Cell, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic]
+    cell: Cell | Outline, connection: bus.Connection, seconds: float, known: Sequence[topics.Topic]
 ) -> tuple[dict[str, TopicReport], list[running.Instance]]:
     """The counters of every key of the known topics after listening for `seconds`, and the states of the cell's processes."""
     from penumbra.shared.runtime.node import Node
 
-    node = Node("topics", cell, connection)
+    node = Node("topics", cast("Cell", cell), connection)  # it reads no part of a cell that an outline lacks
     for topic in known:
         node.subscribe(topic, lambda message, names: None)
     with node.open(PATIENCE_S):
@@ -294,7 +324,7 @@ def _rows(place: bus.Connection, patience_s: float, known: set[str]) -> list[dic
                 if routers & known:
                     return []
                 known |= routers
-                return [{"router": at, "cells": running.cells_there(session), "why": ""}]
+                return [{"router": at, "cells": running.cells_at_work(session), "why": ""}]
         except bus.BusError as error:
             reasons.append(str(error))
     return [{"router": place.connect[0], "cells": [], "why": reasons[0]}] if reasons else []
@@ -340,27 +370,47 @@ def _plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def file_of(options: flags.Options) -> str:
+def file_of(options: flags.Options, service: str = access.VIEWER) -> str:
     """The cell that --cell names; without it the file of the only one that runs at the router, else the default, also where there
     is no router. The file of a running cell is known if it is built in, or if `penumbra up` runs it on this machine. Raises
-    BusError for another one."""
-    if options.cell:
-        return str(options.cell)
-    connection = bus.connection(options)
-    try:
-        with open_session(connection, 0.0) as session:
-            name = running.only_cell(session)
-    except bus.BusError:  # the command reports it, if it needs a router
-        return names.DEFAULT
-    if name is None:
-        return names.DEFAULT
+    BusError for another one. service: who asks."""
+    name, file = _name_and_file(options, service)
+    if file is None:
+        where = bus.connection(options).where
+        raise bus.BusError(
+            f"cell {name} runs at {where}, and its file is not known here: give --cell FILE.yaml, the file of cell {name}"
+        )
+    return file
+
+
+def _parts(options: flags.Options) -> Cell | Outline:
+    """The cell like `file_of`; where its file is not known, fusion's description of it."""
+    from penumbra.shared.cell import description
+
+    name, file = _name_and_file(options)
+    if file is not None:
+        return description.load(file)
+    with open_session(bus.connection(options)) as session:
+        return which.described(session, name)
+
+
+def _name_and_file(options: flags.Options, service: str = access.VIEWER) -> tuple[str, str | None]:
+    """As `file_of`, with the name or file that was given; no file for a running cell whose file is not known here."""
+    if options.cell and not names.is_bare(options.cell):
+        return options.cell, options.cell
+    connection = replace(bus.connection(options), service=service)
+    there: list[str] = []
+    # without a router: the command reports it, if it needs one
+    with contextlib.suppress(bus.BusError), open_session(connection, 0.0) as session:
+        there = running.cells_at_work(session)
+    name = options.cell or (there[0] if len(there) == 1 else DEFAULT)
+    if name not in there:
+        return name, name  # whoever reads this file says that there is none
     from penumbra.services.command import runs  # imports psutil, which `penumbra pose` does without
 
     where = set(connection.connect or (connection.default,))
     files = [run.file for run in runs.running() if run.cell == name and run.file and where & set(run.connect)]
-    if not files and not names.built_in(name):
-        raise bus.BusError(f"cell {name} runs at {connection.where}, and its file is not known here: {which.give(name)}")
-    return files[0] if files else name
+    return name, files[0] if files else name if names.built_in(name) else None
 
 
 def open_session(connection: bus.Connection, patience_s: float = PATIENCE_S) -> zenoh.Session:

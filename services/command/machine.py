@@ -19,7 +19,7 @@ from click.shell_completion import CompletionItem
 
 from penumbra.services import flags
 from penumbra.services.command import runs
-from penumbra.services.command.look import open_session
+from penumbra.services.command.look import console, open_session
 from penumbra.services.command.runs import Run
 from penumbra.shared.contract import report, topics
 from penumbra.shared.contract.processes import LAUNCHER
@@ -63,7 +63,6 @@ def ps(options: flags.Options) -> None:
     elif not found:
         print("no cell runs on this machine: start one with `penumbra up`")
     else:
-        from rich.console import Console
         from rich.markup import escape
         from rich.table import Table
 
@@ -71,7 +70,7 @@ def ps(options: flags.Options) -> None:
         for row in found:
             table.add_row(row.cell, row.process, str(row.pid), row.state, f"{100 * row.cpu:.0f}", f"{row.memory_mb:.0f}",
                           _duration(row.uptime_s), str(row.restarts), escape(row.note))  # fmt: skip
-        Console(width=None if sys.stdout.isatty() else 200).print(table)
+        console().print(table)
 
 
 def rows(run: Run) -> list[Row]:

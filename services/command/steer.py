@@ -11,7 +11,7 @@ from typing import Any
 from penumbra.services import flags
 from penumbra.services.command.look import open_session
 from penumbra.shared.contract import access, topics
-from penumbra.shared.runtime import bus, which
+from penumbra.shared.runtime import bus, running, which
 
 ASK_S = 0.2
 PATIENCE_S = 10.0
@@ -69,9 +69,10 @@ def _change(options: flags.Options, command: dict[str, Any]) -> int:
         key, name = topics.launcher(cell), secrets.token_hex(8)
         states = _ask(session, key, command | {"id": name})
         if not states:
-            raise bus.BusError(
-                f"no launcher runs in cell {cell}: start `penumbra up`; containers are restarted by docker compose"
-            )
+            remedy = which.elsewhere(session, cell)
+            if running.ask(session, cell):
+                remedy = "start `penumbra up`; containers are restarted by docker compose"
+            raise bus.BusError(f"no launcher runs in cell {cell}: {remedy}")
         told, heard = "", time.monotonic()
         while not all(state["done"] for state in states):
             now = "; ".join(state["doing"] for state in states if not state["done"])

@@ -6,6 +6,7 @@ that, the launcher has ended, and its log says why.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import select
@@ -23,6 +24,8 @@ UP = "up: "
 """Prefix of the launcher's last line, which names what is up."""
 PATIENCE_S = 120.0
 """Time [s] after which a start that is not finished is reported; it continues. A first start compiles."""
+TELL_S = 2.0
+"""Minimum time [s] between two lines about the start: on a slow machine what is waited for changes every moment."""
 ENDS_S = 10.0
 NUMBERS = re.compile(r"[\d.]+ m?s\b")
 """Durations in the launcher's lines."""
@@ -64,7 +67,8 @@ def start(cell: str, argv: Sequence[str]) -> int:
 def _follow(launcher: subprocess.Popen[bytes], said: int, log: Path) -> int:
     """Print the launcher's lines until the cell is up, or the launcher has ended."""
     deadline = time.monotonic() + PATIENCE_S
-    text, last = "", ""
+    text = last = shown = ""
+    told = -math.inf
     while select.select([said], [], [], max(0.0, deadline - time.monotonic()))[0]:
         part = os.read(said, 4096).decode(errors="replace")
         if not part:
@@ -77,8 +81,10 @@ def _follow(launcher: subprocess.Popen[bytes], said: int, log: Path) -> int:
             if line.startswith(UP):
                 print(f"{line.removeprefix(UP)} (pid {launcher.pid}): see penumbra ps, logs and down")
                 return 0
-            if NUMBERS.sub("", line) != NUMBERS.sub("", last):  # skip lines in which only durations changed
-                print(line, flush=True)
             last = line
+            # skip lines in which only durations changed
+            if NUMBERS.sub("", line) != NUMBERS.sub("", shown) and time.monotonic() - told >= TELL_S:
+                print(line, flush=True)
+                shown, told = line, time.monotonic()
     print(f"not up after {PATIENCE_S:.0f} s, and still running (pid {launcher.pid}): {last}; see penumbra logs", file=sys.stderr)
     return 1

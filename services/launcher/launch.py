@@ -20,6 +20,7 @@ from penumbra.services.launcher import background, display
 from penumbra.services.launcher.fleet import Fleet, Kind
 from penumbra.services.launcher.forkserver import ForkServer
 from penumbra.services.launcher.supervised import ProcessRow, Supervised
+from penumbra.shared.cell import DEFAULT
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import access, topics
 from penumbra.shared.contract.processes import LAUNCHER, PROCESSES, ROUTER, Process
@@ -267,7 +268,7 @@ def meeting_points(options: flags.Options) -> tuple[str, ...]:
 def pose_command(options: flags.Options) -> str:
     """The command that prints the pose of this cell, in another terminal."""
     words = ["penumbra pose"]
-    words += ["--cell", str(options.cell)] if options.cell != "table" else []
+    words += ["--cell", str(options.cell)] if options.cell != DEFAULT else []
     own = options.port == PORT and not options.connect
     words += [] if own else [word for at in meeting_points(options) for word in ("--connect", at)]
     words += ["--secure", str(options.secure)] if options.secure else []
@@ -336,10 +337,14 @@ def run(options: flags.Options, forkserver: ForkServer) -> int:
     def health() -> list[Report]:
         return [report for launcher in launchers for report in launcher.watch.health.values()]
 
-    with node.until_signal(), flags.metrics(options.metrics_port, health):
+    record = runs.recorded(cell.name, cells.source(options.cell), meeting_points(options), options.secure, logs_of)
+    notify = _notifier(options.notify)
+    with node.until_signal(), flags.metrics(options.metrics_port, health), record:
         try:
             forkserver.wait(FORKSERVER_S)
             if options.connect:
+                if notify is not None:
+                    notify(f"waiting for the router {node.connection.whereabouts}")
                 check_alone(node.open(), processes)
             else:
                 check_port(node, options.port)
@@ -351,15 +356,13 @@ def run(options: flags.Options, forkserver: ForkServer) -> int:
                 processes,
                 Console(),
                 options.keep_going,
-                _notifier(options.notify),
+                notify,
                 pose_command(options),
                 page.key(options.secure, access.OPERATOR) if options.secure else None,
                 options.open,
             )
             launchers.append(launcher)
-            file = cells.source(options.cell)
-            with runs.recorded(cell.name, file, meeting_points(options), options.secure, logs_of):
-                return launcher.run(options.seconds)
+            return launcher.run(options.seconds)
         except bus.BusError:
             if not node.stopping.is_set():  # else: stopped before the router came
                 raise

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import psutil
 
 from penumbra.services.launcher.forkserver import Forked, ForkServer, environment
+from penumbra.shared.contract.processes import LAUNCHER
 from penumbra.shared.contract.report import Report
 from penumbra.shared.runtime import logs
 
@@ -77,6 +78,7 @@ class Supervised:
         self._started = self._due = self._heard = 0.0
         self._hangs = self._hung = ""
         self._last_words: deque[str] = deque(maxlen=20)
+        self._log = logs.get(LAUNCHER.name)
         self._usage: psutil.Process | None = None
         self._listener: threading.Thread | None = None
 
@@ -156,9 +158,11 @@ class Supervised:
 
     def _ended(self, code: int, now: float) -> None:
         self.clear()
-        words = next((logs.sentence(line.strip()) for line in reversed(self._last_words) if line.strip()), "")
+        last = next((line.strip() for line in reversed(self._last_words) if line.strip()), "")
+        words = "" if logs.is_routine(last) else logs.sentence(last)
         why = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         self.note = f"{self._hung}{why}: {words}".removesuffix(": ")
+        self._log.warning("a process ended", process=self.name, why=self.note)
         if code == ASKED_FOR_NOTHING or self.restart == "never":
             self.state = "failed"
             return

@@ -23,7 +23,7 @@ from penumbra.shared.contract.topics import Topic
 from penumbra.shared.recording import provenance
 from penumbra.shared.recording.faults import RecordingError
 from penumbra.shared.recording.reading import ABOUT, Played, Recording
-from penumbra.shared.runtime import bus, logs
+from penumbra.shared.runtime import bus
 
 PATIENCE_S = 1.0
 NAMES = tuple(topic.name for topic in topics.TOPICS)
@@ -105,7 +105,6 @@ def _seconds(text: str) -> float:
 )
 def main(options: flags.Options) -> int:
     """Play, and print what was played; returns 1 if a file is damaged or has no end."""
-    logs.configure(options.log_level, options.log_format, "replay")
     if options.out is not None and not (options.in_process or options.smooth):
         flags.refuse("expected --in-process or --smooth beside --out, got --out alone")
     if options.motion is not None and not options.smooth:

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from penumbra.shared.body import urdf
+from penumbra.shared.cell import BUILT_IN as BUILT_IN
 from penumbra.shared.cell import document, names
 from penumbra.shared.cell.document import Document
 from penumbra.shared.cell.explain import explain
@@ -33,7 +34,6 @@ from penumbra.shared.cell.fields import (
     Vector3,
     Whole,
 )
-from penumbra.shared.cell.names import BUILT_IN as BUILT_IN
 from penumbra.shared.cell.names import is_file
 from penumbra.shared.cell.names import source as source
 from penumbra.shared.cell.pads import Pad, PadType

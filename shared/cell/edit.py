@@ -10,10 +10,10 @@ from typing import Any
 
 import yaml
 
-from penumbra.shared.cell import description, document
+from penumbra.shared.cell import BUILT_IN, description, document
 from penumbra.shared.cell.document import Document
 from penumbra.shared.cell.faults import CellError
-from penumbra.shared.cell.names import BUILT_IN, source
+from penumbra.shared.cell.names import source
 
 
 def destination(cell: str | Path, out: Path | None) -> Path:

@@ -9,12 +9,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from penumbra.shared.cell import document
+from penumbra.shared.cell import BUILT_IN, document
 from penumbra.shared.cell.faults import CellError
 
-BUILT_IN = Path(__file__).parent / "built_in"
-DEFAULT = "table"
-"""The cell where none is named."""
 NAME = r"^[A-Za-z0-9_-]{1,64}$"
 """Pattern of a name in a cell file. Names become parts of keys and of file names."""
 
@@ -76,6 +73,11 @@ def built_in(cell: str | Path) -> Path | None:
     """YAML file of a built-in name; None for any other text."""
     path = BUILT_IN / f"{cell}.yaml"
     return path if is_file(path) else None
+
+
+def is_bare(cell: str | Path) -> bool:
+    """Whether a cell is given by a name alone, as one that runs may be: it is neither built in nor a file."""
+    return _is_name(cell) and not built_in(cell) and not is_file(Path(cell))
 
 
 def is_file(path: Path) -> bool:

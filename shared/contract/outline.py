@@ -40,7 +40,8 @@ class PadOutline:
 @dataclass(frozen=True)
 class Outline:
     """A cell: its name and fixed frame, and its targets, cameras, robots (joints in the order of `Joints.position`) and pads by
-    name, in the order of the cell file. wire_version: of the messages on its bus."""
+    name, in the order of the cell file. sim: whether the emulator can stand in for its sensors. wire_version: of the messages on
+    its bus."""
 
     name: str
     frame: str
@@ -48,6 +49,7 @@ class Outline:
     cameras: dict[str, CameraOutline]
     robots: dict[str, tuple[str, ...]]
     pads: dict[str, PadOutline]
+    sim: bool = False
     wire_version: int = VERSION
 
     def encode(self) -> bytes:
@@ -71,6 +73,7 @@ def of(cell: Cell) -> Outline:
         },
         robots={name: tuple(robot.joints) for name, robot in cell.robots.items()},
         pads={name: PadOutline(tuple(type.electrodes), type.chain.adc_reference) for name, type in types.items()},
+        sim=cell.sim is not None,
     )
 
 

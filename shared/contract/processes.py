@@ -72,7 +72,8 @@ class Process:
     cell without which it has nothing to do; `vision`: vision method that it belongs to, None for all; `replicas`: number that
     `penumbra up` starts; `restart`: whether it is restarted after a crash; `flags`: passed on by `penumbra up`; `starter`: flag
     of `penumbra up` that starts one, where it is not started by default; `beside`: whether a second instance may run and share
-    the streams with the first; `is_required`: whether the cell is disconnected without it; `tools`: commands of the service;
+    the streams with the first; `joins`: whether it joins a cell that runs already, and without --cell takes the only one at the
+    router; `is_required`: whether the cell is disconnected without it; `tools`: commands of the service;
     `trained_by`: tool that trains its weights; `answers`: names of the queryables that it answers beside its health
     (`shared.contract.topics.QUERYABLES`); `metrics`: metrics from its report; `in_compose`: whether `docker compose` runs it;
     `imports_sim`: whether its image contains the simulated world.
@@ -88,6 +89,7 @@ class Process:
     flags: tuple[Flag, ...] = ()
     starter: Starter | None = None
     beside: bool = True
+    joins: bool = False
     is_required: bool = False
     tools: tuple[Tool, ...] = ()
     trained_by: str | None = None
@@ -294,6 +296,7 @@ PROCESSES = (
             value="[ENDPOINT]",
         ),
         beside=False,
+        joins=True,
         in_compose=False,
     ),
     Process(
@@ -303,6 +306,7 @@ PROCESSES = (
         replicas=0,  # fills a disk: only where it is asked for
         starter=Starter("record", "record too, into a file or folder", passes="--out", without=".", value="[FILE.mcap|FOLDER]"),
         beside=False,
+        joins=True,
         tools=(
             Tool("save", "have `record --last` write what it keeps", "penumbra.services.record.tools:save", extra="record"),
             Tool("info", "what a file holds, and whether it is whole", "penumbra.services.record.tools:info", extra="record"),
@@ -324,6 +328,7 @@ PROCESSES = (
         "dashboard",
         "a web page that shows the cell and steers it",
         extra="dashboard",
+        joins=True,
         flags=(Flag("page", "where the web page is served: [ADDRESS:]PORT"),),
         tools=(
             Tool(

@@ -10,6 +10,7 @@ from penumbra.shared.contract import messages
 
 if TYPE_CHECKING:
     from penumbra.shared.cell.description import Cell
+    from penumbra.shared.contract.outline import Outline
 
 
 class QoS(Enum):
@@ -52,7 +53,7 @@ class Topic:
     by_camera: bool = False
     needs: Literal["cameras", "pads", "sim"] | None = None
 
-    def is_expected(self, cell: Cell) -> bool:
+    def is_expected(self, cell: Cell | Outline) -> bool:
         """Whether a cell has the parts that the publishers of this topic need: without them the topic is not missing."""
         return self.needs is None or bool(getattr(cell, self.needs))
 
@@ -104,31 +105,36 @@ QUERYABLES = {
     "launcher": "penumbra/{cell}/launcher/control",
     "recorder": "penumbra/{cell}/record/control",
 }
-"""Keys of the queryables beside the health query, by their names in `shared.contract.processes`."""
+"""Keys of the queryables beside the health query, by their names in `shared.contract.processes`. The function of the same name
+says what is asked and answered."""
 
 
 def current_pose(cell: str, target: str) -> str:
-    """Queryable: the current fused pose, MessagePack of FusedPose, or JSON with `?format=json`."""
+    """The current fused pose: MessagePack of FusedPose, or JSON with `?format=json`; with `stamp_ns=NANOSECONDS` at a
+    moment of the last second."""
     return QUERYABLES["current_pose"].format(cell=cell, target=target)
 
 
 def description(cell: str = "*") -> str:
-    """Queryable: summary of the cell, JSON of `shared.contract.outline.Outline`, for programs that do not have the cell file."""
+    """Summary of the cell, JSON of `shared.contract.outline.Outline`, for programs that do not have the cell file."""
     return QUERYABLES["description"].format(cell=cell)
 
 
 def control(cell: str) -> str:
-    """Queryable of the emulator: requests of `penumbra sim`, JSON in and out."""
+    """Request of `penumbra sim`, JSON as in `{"command": "occlude", "value": "0.8"}`; the answer is the emulator's settings,
+    as of `penumbra sim state --json`."""
     return QUERYABLES["control"].format(cell=cell)
 
 
 def launcher(cell: str) -> str:
-    """Queryable of `penumbra up`: requests of `penumbra restart` and `penumbra scale`, JSON in and out."""
+    """Request of `penumbra restart` or `penumbra scale`, JSON as in `{"command": "restart", "services": ["fusion"], "id": "a1"}`
+    or `{"command": "scale", "service": "segmentation", "number": 2, "id": "a2"}`; the answer is the change's report (`what`,
+    `doing`, `error`, `done`), and `{"command": "state", "id": "a1"}` asks for it again."""
     return QUERYABLES["launcher"].format(cell=cell)
 
 
 def recorder(cell: str) -> str:
-    """Queryable of `penumbra record`: requests of `penumbra record save`, JSON in and out."""
+    """Request of `penumbra record save`, JSON `{"command": "save"}`; the answer names the `file` and its `seconds`."""
     return QUERYABLES["recorder"].format(cell=cell)
 
 
@@ -143,5 +149,5 @@ def beat(cell: str, service: str = "*", instance: str = "*") -> str:
 
 
 def health(cell: str, service: str = "*", instance: str = "*") -> str:
-    """Queryable: the health and metrics of one running instance, JSON."""
+    """The health and metrics of one running instance, JSON."""
     return f"penumbra/{cell}/{service}/{instance}/health"

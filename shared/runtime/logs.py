@@ -19,6 +19,7 @@ from functools import partial
 from typing import Any, TextIO
 
 _TIME = re.compile(r'(?:\{"time": ")?(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z)')
+_ROUTINE = re.compile(_TIME.pattern + r'(?:", "level": "| )(?:debug|info)\b')
 LEVELS = ("debug", "info", "warning", "error")
 FORMATS = ("text", "json")
 
@@ -96,6 +97,11 @@ def sentence(line: str) -> str:
         return str(json.loads(line)["message"])
     except (ValueError, TypeError, KeyError):
         return line
+
+
+def is_routine(line: str) -> bool:
+    """Whether a line is a log line below a warning."""
+    return _ROUTINE.match(line) is not None
 
 
 def time_of(line: str) -> str | None:

@@ -48,24 +48,23 @@ def ask(session: zenoh.Session, cell: str, service: str = "*", timeout_s: float 
     return sorted(found.values(), key=lambda each: (each.service, each.instance))
 
 
-def cells_there(session: zenoh.Session) -> list[str]:
-    """Names of the cells that have a process on the bus."""
-    return sorted({cell for cell, _ in _services_there(session)})
+def services_at_work(session: zenoh.Session) -> dict[str, set[str]]:
+    """Services of each cell that have a process on the bus, without routers, which serve all cells."""
+    found: dict[str, set[str]] = {}
+    for reply in session.liveliness().get(topics.alive("*"), timeout=ANSWER_S):
+        if reply.ok is not None:
+            _, cell, _, service, _ = str(reply.ok.key_expr).split("/")
+            if service != ROUTER.name:
+                found.setdefault(cell, set()).add(service)
+    return found
 
 
 def cells_at_work(session: zenoh.Session) -> list[str]:
-    """Names of the cells that have a process on the bus beside a router, which serves all cells."""
-    return sorted({cell for cell, service in _services_there(session) if service != ROUTER.name})
+    """Names of the cells that have a process on the bus beside a router."""
+    return sorted(services_at_work(session))
 
 
 def only_cell(session: zenoh.Session) -> str | None:
     """Name of the only cell at work; None where there are none or several."""
     found = cells_at_work(session)
     return found[0] if len(found) == 1 else None
-
-
-def _services_there(session: zenoh.Session) -> list[tuple[str, str]]:
-    """Cell and service of every process on the bus."""
-    replies = session.liveliness().get(topics.alive("*"), timeout=ANSWER_S)
-    tokens = [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
-    return [(cell, service) for _, cell, _, service, _ in tokens]

@@ -4,36 +4,44 @@ from __future__ import annotations
 
 import zenoh
 
-from penumbra.shared.cell import names
+from penumbra.shared.cell import DEFAULT, names
 from penumbra.shared.cell.names import Names
 from penumbra.shared.contract import outline, topics
 from penumbra.shared.contract.messages import BadMessage
+from penumbra.shared.contract.outline import Outline
 from penumbra.shared.runtime import bus, running
 
 
 def name_of(session: zenoh.Session, cell: str | None) -> str:
-    """Name of a cell that is given by a built-in name or its file; None means the only one that runs, else the default. Raises
+    """Name of a cell that is given by its name or its file; None means the only one that runs, else the default. Raises
     CellError."""
-    return names.read(cell).name if cell else running.only_cell(session) or names.DEFAULT
+    if not cell:
+        return running.only_cell(session) or DEFAULT
+    return cell if names.is_bare(cell) else names.read(cell).name
 
 
 def names_of(session: zenoh.Session, cell: str | None) -> Names:
-    """Names of a cell like `name_of`; those of the only one that runs come from fusion's description unless it is built in.
+    """Names of a cell like `name_of`; they come from fusion's description where no file is given and the cell is not built in.
     Raises CellError, and BusError where fusion does not answer."""
-    name = cell or running.only_cell(session) or names.DEFAULT
-    if cell or names.built_in(name):
+    name = cell or running.only_cell(session) or DEFAULT
+    if (cell and not names.is_bare(cell)) or names.built_in(name):
         return names.read(name)
+    found = described(session, name)
+    return Names(found.name, found.targets)
+
+
+def described(session: zenoh.Session, name: str) -> Outline:
+    """Fusion's description of a running cell. Raises BusError where it does not answer."""
     try:
         answers = bus.ask(session, topics.description(name), timeout_s=running.ANSWER_S)
     except bus.Refused:  # fusion is not ready yet
         answers = []
     if not answers:
-        raise bus.BusError(f"no answer for the targets of cell {name}: {whats_there(session, name, 'fusion')}")
+        raise bus.BusError(f"no description of cell {name}: {whats_there(session, name, 'fusion')}")
     try:
-        found = outline.decode(answers[0])
+        return outline.decode(answers[0])
     except BadMessage as error:
         raise bus.BusError(str(error)) from None
-    return Names(found.name, found.targets)
 
 
 def whats_there(session: zenoh.Session, cell: str, service: str) -> str:
@@ -50,10 +58,5 @@ def elsewhere(session: zenoh.Session, cell: str) -> str:
     """Remedy where no process of a cell is on this router, depending on which other cells are."""
     others = [each for each in running.cells_at_work(session) if each != cell]
     if others:
-        return f"no process of it is on this router, where cells run: {', '.join(others)}; {give(others[0])}"
+        return f"no process of it is on this router, where cells run: {', '.join(others)}; give --cell {others[0]}"
     return "no process of any cell is on this router: start `penumbra up`"
-
-
-def give(cell: str) -> str:
-    """The words that tell a user how to name a cell that runs."""
-    return f"give --cell {cell}" if names.built_in(cell) else f"give --cell FILE.yaml, the file of cell {cell}"

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -364,6 +364,11 @@ def test_without_router_fusion_or_the_right_cell_the_error_says_which_is_missing
     with pytest.raises(penumbra.BusError, match=f"no cell runs at {router}: start `penumbra up`"):
         penumbra.connect(endpoint=router, timeout=0.1)
     number: Any = 42
+    for name, what in (("endpoint", "text, as in 'tcp/192.168.0.7:7447'"), ("secure", "a folder")):
+        with pytest.raises(penumbra.BusError, match=f"^{name}: expected {what}, got 42 \\(int\\)$"):
+            penumbra.connect(**{name: number})
+    with pytest.raises(penumbra.BusError, match=r"^timeout: expected seconds, got '3' \(str\)$"):
+        penumbra.connect(timeout=cast(Any, "3"))
     for wrong, got in (("a/b", "'a/b'"), (number, r"42 \(int\)")):
         with pytest.raises(penumbra.BusError, match=rf"expected the name of a cell \(.*\) or its YAML file, got {got}$"):
             penumbra.connect(wrong, endpoint=router)

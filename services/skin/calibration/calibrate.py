@@ -80,7 +80,7 @@ def _gap(text: str) -> float:
     flags.Option("--out", type=Path, metavar="FILE", show_default="the cell file itself", help="write the cell here"),
     flags.Option("--dry-run", is_flag=True, help="print, write nothing"),
     flags.JSON,
-    *flags.COMMON,
+    *flags.MEASURING,
     example="penumbra skin calibrate --cell mine.yaml --pad p0 --csv recording.csv",
 )
 def main(options: flags.Options) -> int:

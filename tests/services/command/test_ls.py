@@ -6,6 +6,9 @@ from typing import Any
 import pytest
 
 from penumbra.services.command import cli
+from penumbra.shared.cell import description as cells
+from penumbra.shared.runtime import bus
+from penumbra.shared.runtime.node import Node
 from penumbra.tests.support import hosts
 from penumbra.tests.support.live import free_port, wait_for
 
@@ -29,11 +32,25 @@ def test_another_host_finds_a_router_that_announces_itself_and_no_other(monkeypa
             40,
             "the router that announces itself",
         )
-        assert found == {"tcp/10.77.9.1:7447": ["table"]}
+        assert found == {"tcp/10.77.9.1:7447": ""}, "no cell runs yet"
         named = listed(laptop.penumbra("ls", "--json", "--connect", "tcp/10.77.9.1:7448"))
-        assert named["tcp/10.77.9.1:7448"] == ["table"]
+        assert named["tcp/10.77.9.1:7448"] == ""
         again = listed(laptop.penumbra("ls", "--json", "--connect", "tcp/10.77.9.1:7447"))
-        assert again == {"tcp/10.77.9.1:7447": ["table"]}, "one router is listed once"
+        assert again == {"tcp/10.77.9.1:7447": ""}, "one router is listed once"
+
+
+def test_a_router_alone_is_no_cell(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    where = f"tcp/127.0.0.1:{free_port()}"
+
+    def cells_found():
+        assert cli.main(["ls", "--json", "--connect", where, "--seconds", "0.1"]) == 0
+        return next(row["cells"] for row in json.loads(capsys.readouterr().out) if row["router"] == where)
+
+    with Node("router", cells.load("table"), bus.Connection("router", listen=(where,))):
+        assert cells_found() == []
+        with Node("fusion", cells.load("arm"), bus.Connection(connect=(where,))):
+            wait_for(lambda: cells_found() == ["arm"], 5, "the cell with a process")
 
 
 def test_where_there_is_no_router_each_that_was_asked_for_says_why(monkeypatch, tmp_path, router, capsys):

@@ -2,14 +2,16 @@
 
 import json
 import os
+import subprocess
 
 import psutil
 import pytest
 
 from penumbra.services.command import cli, machine, runs
+from penumbra.services.launcher import background
 from penumbra.shared.cell import names
 from penumbra.shared.contract.processes import PROCESSES
-from penumbra.tests.support.live import free_port, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
 
 NOTHING = [f"--replicas={process.name}=0" for process in PROCESSES if process.replicas and process.name != "router"]
 
@@ -56,6 +58,37 @@ def test_a_cell_that_does_not_start_in_the_background_says_why(capfd):
     taken = free_port()
     assert cli.main(["up", "--detach", "--connect", f"tcp/127.0.0.1:{taken}", "--replicas=magic=1"]) == 2
     assert "--replicas magic=1: expected one of emulator" in capfd.readouterr().err
+
+
+def test_a_cell_that_waits_for_its_router_in_the_background_says_so_is_listed_and_can_be_ended(capfd):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    command = penumbra_command("up", "--detach", "--connect", endpoint, *NOTHING, "--replicas=fusion=1")
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as starter:
+        assert starter.stdout is not None
+        assert starter.stdout.readline() == f"waiting for the router at {endpoint}\n"
+        assert [run.cell for run in runs.running()] == ["table"]
+        assert cli.main(["down"]) == 0
+        assert starter.wait(PATIENCE_S) == 1
+    assert runs.running() == []
+
+
+def test_a_slow_start_is_told_in_few_lines(monkeypatch, tmp_path, capsys):
+    def told(lines):
+        said, say = os.pipe()
+        with os.fdopen(say, "w") as pipe, subprocess.Popen(["sleep", "60"]) as launcher:
+            pipe.writelines(f"{line}\n" for line in lines)
+            pipe.flush()
+            try:
+                assert background._follow(launcher, said, tmp_path / "log") == 0
+            finally:
+                launcher.kill()
+                os.close(said)
+        return capsys.readouterr().out.splitlines()[:-1]
+
+    lines = ["waiting for a (0.1 s)", "waiting for a (0.2 s)", "waiting for b", "waiting for c", "up: cell"]
+    assert told(lines) == ["waiting for a (0.1 s)"]
+    monkeypatch.setattr(background, "TELL_S", 0.0)
+    assert told(lines) == ["waiting for a (0.1 s)", "waiting for b", "waiting for c"]
 
 
 def test_nothing_that_runs_is_said_in_a_line(capfd):

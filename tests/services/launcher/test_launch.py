@@ -26,7 +26,7 @@ from penumbra.shared.contract.messages import Truth
 from penumbra.shared.contract.processes import PROCESSES
 from penumbra.shared.contract.report import Report, TopicReport
 from penumbra.shared.perception.accuracy import accuracy
-from penumbra.shared.runtime import bus
+from penumbra.shared.runtime import bus, logs
 from penumbra.shared.runtime.node import Node
 from penumbra.tests.support.live import PATIENCE_S, connect, free_port, penumbra_command, service_of, stays, wait_for
 from penumbra.tests.support.nodes import node_command, pose
@@ -37,6 +37,10 @@ ALWAYS_CRASHES = "import sys; sys.exit('out of luck')"
 REFUSES = "import sys; print('cell table has no camera: it has front', file=sys.stderr); sys.exit(2)"
 SLEEPS = "import time; print('up', flush=True); time.sleep(600)"
 IGNORES_SIGTERM = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(600)"
+LOGS_AND_SLEEPS = (
+    "import time; from penumbra.shared.runtime import logs; logs.configure('info', '{form}'); "
+    "logs.get('sleeper').info('on the bus'); time.sleep(600)"
+)
 HAS_A_CHILD = (
     "import subprocess, sys, time; subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)']); time.sleep(600)"
 )
@@ -70,14 +74,20 @@ def supervise():
     supervised.stop(started)
 
 
-def test_a_killed_process_is_started_again_and_the_reason_reported(supervise):
-    process = python("sleeper", SLEEPS)
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_a_killed_process_is_started_again_and_the_reason_reported_and_logged(supervise, form, capsys):
+    logs.configure()
+    lines: list[str] = []
+    process = Supervised("sleeper", [sys.executable, "-c", LOGS_AND_SLEEPS.format(form=form)], write=lines.append)
     until = supervise(process)
+    until(lambda: lines, PATIENCE_S, "its line")
     first = process.pid
+    assert first is not None
     os.kill(first, signal.SIGKILL)
     until(lambda: process.pid not in (None, first), 2, "another process")
     assert process.restarts == 1
-    assert process.note == "killed by SIGKILL"
+    assert process.note == "killed by SIGKILL", "and not what it said when all was well"
+    assert 'launcher: a process ended process=sleeper why="killed by SIGKILL"' in capsys.readouterr().err
 
 
 def test_a_crash_loop_is_reported_slows_down_and_leaves_the_others_alone(supervise):
