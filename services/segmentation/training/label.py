@@ -431,7 +431,7 @@ class Folder:
     "segmentation label",
     "Makes frames and masks for `penumbra segmentation train --data` from films of your own arms.\n\n" + (__doc__ or ""),
     flags.Argument("films", type=Path, nargs=-1, required=True, metavar="FILM...", help="films, or single pictures"),
-    flags.Option("--out", type=Path, default=Path("labels"), help="folder to write images/, masks/ and check/ to"),
+    flags.Option("--out", type=flags.folder, default=Path("labels"), help="folder to write images/, masks/ and check/ to"),
     flags.Option(
         "--every", type=flags.positive, metavar="N", show_default=f"{RATE_HZ:.0f} a second", help="label every Nth frame"
     ),

@@ -38,6 +38,7 @@ BROKEN = {
     "two colons": ("table", "name: table", "name: ta: ble", "name: ta", "put a text with a colon in quotes"),
     "an open bracket": ("table", "0.0, 0.15]", "0.0, 0.15", "pad_types:", "close the bracket"),
     "an indentation": ("table", "    height: 480", "   height: 480", "   height", "indentation of the keys before"),
+    "two documents": ("table", "frame: world", "---\nframe: world", "---", "another after a line `---`; remove that line"),
     "a number in words": ("table", "width: 640", "width: wide", "width:", "expected a whole number, got 'wide'"),
     "half a pixel": ("table", "width: 640", "width: 640.5", "width:", "expected a whole number, got 640.5"),
     "a boolean": ("table", "rate_hz: 20", "rate_hz: yes", "rate_hz:", "expected a number, got true"),
