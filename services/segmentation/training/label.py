@@ -318,6 +318,8 @@ def pictures(path: Path, every: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         yield 0, files.read(path)
         return
     film = cv2.VideoCapture(str(path))
+    if not film.isOpened():
+        raise files.FileError(f"{path}: expected a picture or a film, got a file of which OpenCV reads no frame")
     for number in itertools.count():
         if not film.grab():
             break

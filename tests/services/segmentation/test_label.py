@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from penumbra.services.segmentation import files
+from penumbra.services.segmentation import files
 from penumbra.services.segmentation.training import label, models, recordings
 from penumbra.services.segmentation.training.label import Colours
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
@@ -201,6 +202,14 @@ def test_films_without_hands_are_told(finder, tmp_path, capsys):
     cv2.imwrite(str(film), np.full((240, 320, 3), 128, np.uint8))
     assert label.main([str(film), "--out", str(tmp_path / "labels")]) == 2
     assert "found no hand" in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_film_is_not_a_film_without_hands(tmp_path):
+    (tmp_path / "film.mp4").write_bytes(b"no film")
+    with pytest.raises(
+        files.FileError, match=r"film\.mp4: expected a picture or a film, got a file of which OpenCV reads no frame"
+    ):
+        list(label.pictures(tmp_path / "film.mp4", 1))
 
 
 def test_bare_skin_beyond_the_elbow_is_the_upper_arm():
