@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from penumbra.services.segmentation import files
-from penumbra.services.segmentation import files
 from penumbra.services.segmentation.training import label, models, recordings
 from penumbra.services.segmentation.training.label import Colours
 from penumbra.shared.contract.labels import TARGET_LABELS, UNLABELLED, Label
