@@ -8,6 +8,7 @@ from penumbra.shared.cell import names
 from penumbra.shared.cell.names import Names
 from penumbra.shared.contract import outline, topics
 from penumbra.shared.contract.messages import BadMessage
+from penumbra.shared.contract.processes import ROUTER
 from penumbra.shared.runtime import bus, running
 
 
@@ -38,7 +39,7 @@ def names_of(session: zenoh.Session, cell: str | None) -> Names:
 
 def whats_there(session: zenoh.Session, cell: str, service: str) -> str:
     """Remedy where a service does not answer, depending on which processes, or which other cells, are on this router."""
-    services = sorted({instance.service for instance in running.ask(session, cell)})
+    services = sorted({instance.service for instance in running.ask(session, cell)} - {ROUTER.name})  # which serves all cells
     if service in services:
         return f"{service} runs, and has nothing to answer yet: see `penumbra topics --hz`"
     if services:

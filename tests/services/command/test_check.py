@@ -62,7 +62,7 @@ BROKEN = {
         "table", LOOK, LOOK + "    source: {url: 'http://192.0.2.1/film'}\n", "source:", "expected v4l2:/dev/video0, rtsp://HOST/PATH"
     ),
     "a source mistyped": ("table", LOOK, LOOK + "    source: {url: 'flie:a.mp4'}\n", "source:", "did you mean file"),
-    "a source in a word": ("table", LOOK, LOOK + "    source: file:a.mp4\n", "source:", "a map with url, loop, rate_hz, latency"),
+    "a source in a word": ("table", LOOK, LOOK + "    source: file:a.mp4\n", "source:", "'file:a.mp4'; write {url: file:a.mp4}"),
     "an adapter without a class": (
         "table", LOOK, LOOK + "    source: {url: 'adapter:my_camera'}\n", "source:", "as in adapter:my_camera:Camera"
     ),

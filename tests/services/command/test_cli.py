@@ -20,7 +20,7 @@ from penumbra.services.emulator.control import COMMANDS
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import outline, processes, topics
 from penumbra.shared.perception import landmarks
-from penumbra.shared.runtime import bus
+from penumbra.shared.runtime import bus, running
 from penumbra.shared.runtime.node import Node
 from penumbra.tests.support import numbered
 from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_command, wait_for
@@ -397,6 +397,23 @@ def test_a_cell_that_does_not_run_where_another_does_is_named_with_what_to_give(
     assert [(each.text, each.mend) for each in found] == [
         ("no process of cell table runs there, where cells run: mine", "give --cell FILE.yaml, the file of cell mine")
     ]
+
+
+def test_where_several_cells_run_at_a_router_they_are_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("PENUMBRA_CELL", raising=False)
+    found = []
+    for name in ("left", "right"):
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(cells.source("table").read_text().replace("name: table", f"name: {name}", 1))
+        found.append(cells.load(path))
+    where = f"tcp/127.0.0.1:{free_port()}"
+    left, right = (Node("fusion", cell, bus.Connection(connect=(where,))) for cell in found)
+    with Node("router", CELL, bus.Connection("router", listen=(where,))) as router, left, right:
+        session = router.session
+        assert session is not None
+        wait_for(lambda: running.cells_at_work(session) == ["left", "right"], 5, "both cells")
+        assert cli.main(["pose", "--connect", where]) == 2
+    assert "where cells run: left, right; give --cell FILE.yaml, the file of cell left" in capsys.readouterr().err
 
 
 def test_a_pose_that_no_process_answers_names_the_cells_and_processes_that_run(endpoint, capsys):
