@@ -39,10 +39,10 @@ def names_of(session: zenoh.Session, cell: str | None) -> Names:
 
 def whats_there(session: zenoh.Session, cell: str, service: str) -> str:
     """Remedy where a service does not answer, depending on which processes, or which other cells, are on this router."""
-    services = sorted({instance.service for instance in running.ask(session, cell)} - {ROUTER.name})  # which serves all cells
+    services = sorted({instance.service for instance in running.ask(session, cell)})
     if service in services:
         return f"{service} runs, and has nothing to answer yet: see `penumbra topics --hz`"
-    if services:
+    if services not in ([], [ROUTER.name]):  # a router serves all cells
         return f"its processes are {', '.join(services)}: start `penumbra {service}`"
     return elsewhere(session, cell)
 
