@@ -40,6 +40,6 @@ if __name__ == "__main__":
     try:
         with contextlib.suppress(KeyboardInterrupt):
             main()
-    except (LookupError, ValueError) as error:  # no such camera; images of another size
+    except (penumbra.BusError, LookupError, ValueError) as error:  # no router; no such camera; images of another size
         print(error, file=sys.stderr)
         sys.exit(2)

@@ -35,5 +35,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(KeyboardInterrupt):
-        main()
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            main()
+    except penumbra.BusError as error:  # no router, no cell
+        sys.exit(str(error))

@@ -7,6 +7,7 @@ Put the call of your electronics into `measure`. Boards of this project's kind n
 """
 
 import contextlib
+import sys
 import time
 
 import numpy as np
@@ -34,5 +35,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(KeyboardInterrupt):
-        main()
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            main()
+    except penumbra.BusError as error:  # no router, no cell
+        sys.exit(str(error))

@@ -5,6 +5,7 @@ python examples/read_poses.py
 """
 
 import contextlib
+import sys
 import time
 
 import penumbra
@@ -24,5 +25,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(KeyboardInterrupt):
-        main()
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            main()
+    except penumbra.BusError as error:  # no router, no cell
+        sys.exit(str(error))

@@ -100,6 +100,27 @@ def positive(text: str) -> int:
     return int(text)
 
 
+def folder(text: str) -> Path:
+    """Type of a flag: a folder to write to, which is made where it is missing."""
+    _no_file_at(Path(text), "a folder to write to")
+    return Path(text)
+
+
+def output(text: str) -> Path:
+    """Type of a flag: a file to write, whose folder is made where it is missing."""
+    path = Path(text)
+    if path.is_dir():
+        raise ValueError(f"expected a file to write, got the folder {text}; add the file's name")
+    _no_file_at(path.parent, "a file to write in a folder")
+    return path
+
+
+def _no_file_at(folder: Path, what: str) -> None:
+    for place in (folder, *folder.parents):
+        if place.exists() and not place.is_dir():
+            raise ValueError(f"expected {what}, got {place}, which is a file; give another name")
+
+
 def _number(text: str, is_good: Callable[[float], bool], what: str) -> float:
     try:
         value = float(text)

@@ -41,6 +41,10 @@ LEAST_TURN = np.radians(3.0)
 solution."""
 GOOD_TURN = np.radians(10.0)
 """The same standard deviation [rad] below which the result is poor."""
+WORST_M, WORST_TURN = 0.05, np.radians(5.0)
+"""Standard deviations of the camera's position [m] and rotation [rad] above which pairs do not belong together: even few and flat
+views of a good board are ten times better."""
+SUSPECTS = "are the joints those of the pictures, is the board fixed to the link, and is its square as long as said?"
 ROUNDS = 8
 """Number of fits that find the outliers, each with the weights from the previous one."""
 RUNS, NEARBY = 5, 1e-3
@@ -178,7 +182,14 @@ def solve(pairs: Sequence[Pair], resamples: int = 200, rng: np.random.Generator 
     # each pair gives 6 numbers, and the result has 12: residuals are smaller than the errors
     covariance = len(pairs) / (len(pairs) - 2.0) * np.cov(offsets, rowvar=False)
     rms = float(np.sqrt(np.mean(corners.residuals(X, Z) ** 2)))
-    return HandEye(X, Z, covariance[:6, :6], covariance[6:, 6:], rms, residuals, left_out, tuple(notes))
+    found = HandEye(X, Z, covariance[:6, :6], covariance[6:, 6:], rms, residuals, left_out, tuple(notes))
+    metres, radians = found.spread
+    if metres > WORST_M or radians > WORST_TURN:
+        raise CalibrationError(
+            f"expected pairs that fit one place of the camera, got one that is uncertain by {metres:.2g} m and "
+            f"{np.degrees(radians):.2g} degrees: {SUSPECTS}"
+        )
+    return found
 
 
 def _apart(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Pair]]:
@@ -195,8 +206,8 @@ def _apart(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Pair]]:
     if is_off.sum() > MOST_BAD * len(pairs):
         names = ", ".join(pair.name for pair, off in zip(pairs, is_off, strict=True) if off)
         raise CalibrationError(
-            f"expected pairs that fit one place of the camera, got {is_off.sum()} of {len(pairs)} that do not ({names}): are the "
-            "joints those of the pictures, is the board fixed to the link, and is its square as long as said?"
+            f"expected pairs that fit one place of the camera, got {is_off.sum()} of {len(pairs)} that do not ({names}): "
+            f"{SUSPECTS}"
         )
     return [p for p, off in zip(pairs, is_off, strict=True) if not off], [p for p, off in zip(pairs, is_off, strict=True) if off]
 

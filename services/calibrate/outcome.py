@@ -21,7 +21,7 @@ FOLDER = flags.Option(
     help="pictures of the board as the camera takes them; without it they come from the running cell",
 )
 SAVE = flags.Option(
-    "--save", type=Path, metavar="FOLDER", help="keep the pictures that came from the running cell, for --pictures"
+    "--save", type=flags.folder, metavar="FOLDER", help="keep the pictures that came from the running cell, for --pictures"
 )
 WRITING = (
     flags.Option("--out", type=Path, metavar="FILE", show_default="the cell file itself", help="write the cell here"),

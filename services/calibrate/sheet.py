@@ -50,6 +50,8 @@ def write(board: Board, path: Path, page: str = "A4") -> None:
     """Write the PDF of a board in the middle of a page. Raises CalibrationError if it does not fit, or cannot be written."""
     width, height = board.size
     room = [each - 2.0 * MARGIN / POINT for each in PAGES[page]]
+    if path.suffix.lower() != ".pdf":
+        raise CalibrationError(f"--out: expected a name that ends with .pdf, got {path}: the board is exact only as a PDF")
     fits = {turn: width <= room[turn] * POINT + 1e-9 and height <= room[1 - turn] * POINT + 1e-9 for turn in (0, 1)}
     if not any(fits.values()):
         larger = f"expected at most {1e3 * max(room) * POINT:.0f} x {1e3 * min(room) * POINT:.0f} mm on {page}"

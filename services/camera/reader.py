@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Literal
@@ -34,6 +35,8 @@ FASTER = 2.0
 """Factor on the cell file's rate above which pictures arrive too fast."""
 FOLLOW = 0.05
 """Weight of the newest picture in the rate."""
+REMEMBERED = 100
+"""Number of refusals that are not logged again: a film or a folder that loops brings each one again."""
 EMPTY_S = 0.001
 """Delay [s] after a read without a picture, which may return at once."""
 
@@ -67,6 +70,7 @@ class Reader:
         self._state: State = "opening"
         self._since_s = time.monotonic()  # start of this state, or time of the last picture
         self._why = self._refusal = ""
+        self._logged: deque[str] = deque(maxlen=REMEMBERED)
         self._stamps: Stamps = ""
         self._sender_latency_s: float | None = None
         self._last_ns = 0
@@ -112,8 +116,8 @@ class Reader:
             now_s, now_ns = time.monotonic(), time.time_ns()
             self._received += 1
             if came_s is not None:
-                period_s = now_s - came_s
-                self._period_s += (FOLLOW if self._period_s else 1.0) * (period_s - self._period_s)
+                usual_s = self._period_s or 1.0 / self._camera.rate_hz  # a film that was held up at the start catches up at once
+                self._period_s = usual_s + FOLLOW * (now_s - came_s - usual_s)
             came_s = now_s
             self._stamps = feed.stamps
             self._sender_latency_s = getattr(feed, "sender_latency_s", None)
@@ -156,8 +160,9 @@ class Reader:
 
     def _refuse(self, why: str) -> None:
         self._refused += 1
-        if why != self._refusal:
+        if why not in self._logged:
             self._log(why)
+            self._logged.append(why)
         self._refusal = why
 
     def _lose(self, why: str) -> None:

@@ -97,8 +97,9 @@ def sources(cell: cells.Cell, options: flags.Options) -> dict[str, cells.CameraS
     given = {key: value for key, value in given.items() if value is not None}
     if options.source is not None:
         source = _checked({"url": options.source, **given})
-        if source.is_played and not source.path(Path.cwd()).exists():
-            raise cells.CellError(f"--source: expected a film or a folder of pictures, got nothing at {source.place}")
+        if source.is_played and not (path := source.path(Path.cwd())).exists():
+            what = f"expected a film or a folder of pictures, got nothing at {path}"
+            raise cells.CellError(f"--source: {what}; correct it, or put it there")
         return {cell.one("cameras", options.camera): source}
     found = cell.sources
     if options.camera is not None:

@@ -414,6 +414,23 @@ def _name_and_file(options: flags.Options, service: str = access.VIEWER) -> tupl
 
 
 def open_session(connection: bus.Connection, patience_s: float = PATIENCE_S) -> zenoh.Session:
-    """A session with the router. Raises BusError if there is none after `patience_s`."""
+    """A session with the router. Raises BusError if there is none after `patience_s`, with the cells that this machine runs at
+    other endpoints."""
     nothing: Callable[[], None] = lambda: None  # noqa: E731
-    return bus.open_session(connection, threading.Event(), nothing, patience_s)
+    try:
+        return bus.open_session(connection, threading.Event(), nothing, patience_s)
+    except bus.BusError as error:
+        raise bus.BusError("\n".join([str(error), *_elsewhere(connection)])) from None
+
+
+def _elsewhere(connection: bus.Connection) -> list[str]:
+    """What to give for each cell that `penumbra up` runs on this machine at other endpoints than a connection's."""
+    from penumbra.services.command import runs  # imports psutil, which is not needed where there is a router
+
+    asked = set(connection.connect or (connection.default,))
+    flags_of = {
+        run.cell: f"--connect {run.connect[0]}" + (f" --secure {run.secure}" if run.secure else "")
+        for run in runs.running()
+        if run.connect and not asked & set(run.connect)
+    }
+    return [f"cell {cell} runs on this machine at another endpoint: give {words}" for cell, words in flags_of.items()]

@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 from penumbra.services import flags
 from penumbra.services.emulator.control import control
@@ -45,7 +44,7 @@ FLAGS = (
     ),
     flags.Option(
         "--serial-folder",
-        type=Path,
+        type=flags.folder,
         metavar="DIR",
         help="where links to the pseudo-terminals are made, named p0-0 for the first board of pad p0",
     ),

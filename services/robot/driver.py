@@ -4,11 +4,11 @@ An adapter of one's own is a class with these three methods, in a module beside 
 It is named as `adapter:MODULE:CLASS`:
 
     class MyRobot:
-        def __init__(self):                       # connects; raises OSError where it cannot
+        def __init__(self):                       # connects; an exception where it cannot
             self.sdk = mysdk.connect("192.168.0.5", timeout=2)
 
         def read(self):                           # waits for the next measurement, at most a second
-            state = self.sdk.wait_state()         # raises OSError where the robot is gone
+            state = self.sdk.wait_state()         # an exception where the robot is gone
             joints = dict(zip(state.joint_names, state.angles))        # by name, in radians (or metres)
             return joints, state.controller_time                       # seconds of its own clock, or None
 
@@ -21,8 +21,9 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from penumbra.shared.cell.description import CellError, JointSource
 from penumbra.shared.runtime.adapter import load
@@ -116,6 +117,33 @@ class Franka:
         del self._robot  # libfranka closes with its last reference
 
 
+class Adapted:
+    """A robot by a user's class, whose exceptions count as a lost robot."""
+
+    def __init__(self, kind: type[Any]):
+        self._kind = kind.__name__
+        self._own = self._guarded("", kind)
+
+    def read(self) -> Reading:
+        got = self._guarded(".read", self._own.read)
+        match got:
+            case (dict() as joints, (int() | float() | None) as clock_s):
+                return self._guarded(".read", lambda: {str(name): float(angle) for name, angle in joints.items()}), clock_s
+        what = "expected (joints, clock_s), a dict of angles by name and a number or None"
+        raise OSError(f"{self._kind}.read: {what}, got {type(got).__name__}")
+
+    def close(self) -> None:
+        self._guarded(".close", self._own.close)
+
+    def _guarded(self, what: str, call: Callable[[], Any]) -> Any:
+        try:
+            return call()
+        except OSError:  # in the adapter's own words
+            raise
+        except Exception as error:
+            raise OSError(f"{self._kind}{what}: {type(error).__name__}: {error}") from error
+
+
 DRIVERS: dict[str, tuple[type[UniversalRobots] | type[Franka], str, str, str]] = {
     "ur": (UniversalRobots, "rtde_receive", "ur", ""),
     "panda": (Franka, "panda_py", "panda", "panda_"),
@@ -127,8 +155,7 @@ def opener(source: JointSource, folder: Path) -> Callable[[], Driver]:
     """A function that connects to a source; folder: additional search path for an adapter's module. Raises CellError if a package
     or the adapter's class is missing."""
     if source.kind == "adapter":
-        connect: Callable[[], Driver] = load(source.place, folder, "docs/robot-joints.md")
-        return connect
+        return partial(Adapted, load(source.place, folder, "docs/robot-joints.md"))
     driver, module, extra, _ = DRIVERS[source.kind]
     if importlib.util.find_spec(module) is None:
         raise CellError(f"{source.url}: {module} is not installed: pip install -e '.[{extra}]'")

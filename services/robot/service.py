@@ -7,6 +7,8 @@ the cell file under `source:` of the robot: then `penumbra up` starts this proce
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -19,6 +21,7 @@ from penumbra.services import flags
 from penumbra.services.robot import driver
 from penumbra.services.robot.clock import ControllerClock
 from penumbra.services.robot.driver import Driver, Reading
+from penumbra.shared.body import urdf
 from penumbra.shared.cell import description as cells
 from penumbra.shared.cell.explain import explain
 from penumbra.shared.contract.messages import Joints
@@ -32,7 +35,12 @@ switched on."""
 TOLD_EVERY = 60
 """Number of attempts after which a missing controller is logged again."""
 LARGEST = 100.0
-"""Maximum joint angle [rad]; a larger one, beyond sixteen turns, is probably in degrees."""
+"""Maximum joint angle [rad] of a joint without limits; a larger one, beyond sixteen turns, is probably in degrees."""
+BEYOND = 0.5
+"""Distance [rad or m] beyond a joint's limits in the URDF up to which it is believed: limits differ between controllers and
+URDFs, degrees and millimetres are farther away."""
+SILENT_S = 3.0
+"""Time [s] without a measurement after which a robot counts as faulty: a driver's `read` takes a second at most."""
 
 FLAGS = (
     flags.Option(
@@ -104,12 +112,16 @@ class Session:
     def __init__(self, node: Node, name: str, source: cells.JointSource, folder: Path):
         self._node, self._name, self._source = node, name, source
         self._open = driver.opener(source, folder)
-        self._joints = node.cell.robots[name].joints
+        robot = node.cell.robots[name]
+        self._joints = robot.joints
+        moving = urdf.read(cells.urdf_path(robot, node.cell.folder)).joints
+        self._limits = {joint.name: (joint.lower, joint.upper) for joint in moving}
         self._prefix = driver.prefix(source)
         self._state, self._fault = "connecting", ""
         self._connected = 0
         self._delay_s, self._failures = BACKOFF_S[0], 0
         self._last_ns = 0
+        self._last_s = time.monotonic()
         self._is_clocked = False
         self._late_ms = 0.0
 
@@ -119,10 +131,12 @@ class Session:
         try:
             found = self._open()
             self._connected += 1
-            self._node.log.info("connected", robot=self._name, source=self._source.url)
-            clock = ControllerClock()
+            is_first, clock = True, ControllerClock()
             while not self._node.stopping.is_set():
                 reading = found.read()
+                if is_first:
+                    self._node.log.info("connected", robot=self._name, source=self._source.url)
+                is_first, self._last_s = False, time.monotonic()
                 self._take(reading, clock, self._node.now_ns())
         except OSError as error:
             self._lost(str(error))
@@ -135,7 +149,7 @@ class Session:
     def _take(self, reading: Reading, clock: ControllerClock, arrival_ns: int) -> None:
         """Publish a measurement that has all joints of the cell."""
         joints, clock_s = reading
-        q, self._fault = matched(joints, self._joints, self._prefix)
+        q, self._fault = matched(joints, self._joints, self._prefix, self._limits)
         stamp_ns = clock.stamp(clock_s, arrival_ns)
         self._is_clocked, self._late_ms = clock_s is not None, (arrival_ns - stamp_ns) * 1e-6
         self._failures = 0
@@ -153,7 +167,10 @@ class Session:
 
     def reasons(self) -> list[str]:
         """Why no joints are published."""
-        return [f"robot {self._name}: {self._fault}"] if self._fault else []
+        silent_s = time.monotonic() - self._last_s
+        silence = f"no measurement for {silent_s:.0f} s from {self._source.url}" if silent_s > SILENT_S else ""
+        fault = self._fault or silence
+        return [f"robot {self._name}: {fault}"] if fault else []
 
     def describe(self) -> dict[str, Any]:
         """The robot's entry in the health report."""
@@ -167,8 +184,11 @@ class Session:
         }
 
 
-def matched(joints: dict[str, float], wanted: tuple[str, ...], prefix: str) -> tuple[np.ndarray | None, str]:
-    """The angles (n,) of the cell's joints in order, None if one is missing or impossible; and the fault."""
+def matched(
+    joints: dict[str, float], wanted: tuple[str, ...], prefix: str, limits: Mapping[str, tuple[float, float]]
+) -> tuple[np.ndarray | None, str]:
+    """The angles (n,) of the cell's joints in order, None if one is missing or impossible; and the fault. limits: lower and upper
+    limit of each joint in the URDF [rad or m]."""
     named = {f"{prefix}{name}": angle for name, angle in joints.items()}
     if missing := [name for name in wanted if name not in named]:
         return None, (
@@ -178,4 +198,8 @@ def matched(joints: dict[str, float], wanted: tuple[str, ...], prefix: str) -> t
     q = np.array([named[name] for name in wanted], np.float64)
     if not np.abs(q).max() <= LARGEST:
         return None, f"expected joints of at most {LARGEST:g} rad, got {np.abs(q).max():g}: are these degrees?"
+    low, high = np.array([limits[name] for name in wanted]).T
+    if beyond := [i for i in range(len(q)) if not low[i] - BEYOND <= q[i] <= high[i] + BEYOND]:
+        got = ", ".join(f"{wanted[i]} {q[i]:g} ({low[i]:g} to {high[i]:g})" for i in beyond)
+        return None, f"expected joints within the limits of the URDF, got {got}: are these degrees, or millimetres?"
     return q, ""

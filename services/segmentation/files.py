@@ -36,7 +36,7 @@ class FileError(ValueError):
     + ", ".join(f"{label.value} {label.name.lower()}" for label in Label)
     + "), and NAME_overlay.png; for a film NAME.mp4: a mask a frame in NAME_masks/ and NAME_overlay.mp4.",
     flags.Argument("files", type=Path, nargs=-1, required=True, metavar="IMAGE|VIDEO...", help="what is looked at"),
-    flags.Option("--out", type=Path, default=Path("masks"), help="folder to write to"),
+    flags.Option("--out", type=flags.folder, default=Path("masks"), help="folder to write to"),
     flags.Option("--weights", type=Path, default=inference.WEIGHTS, show_default="the committed one", help="the network"),
     flags.Option("--sequence", is_flag=True, help="the pictures are frames of one film, in this order"),
     flags.Option(

@@ -136,6 +136,11 @@ def load_segmenter(path: Path = WEIGHTS, precision: Precision | None = None) -> 
     """A segmenter from a weights file and its card. Raises FileNotFoundError that says how to make one."""
     if not path.is_file():
         raise FileNotFoundError(f"no weights {path}: make them with `penumbra segmentation train --out {path}`")
+    card = path.with_suffix(".json")
+    if not card.is_file():
+        raise FileNotFoundError(
+            f"{path}: expected weights (.npz) with their card {card.name} beside them, got no card; copy both files"
+        )
     return _loaded(path, path.stat().st_mtime_ns, precision).twin()
 
 

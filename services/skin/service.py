@@ -62,6 +62,7 @@ def start(node: Node, options: flags.Options) -> None:
                 node.log.warning("no such device yet: it is waited for; is the board plugged in?", pad=pad, port=reader.port)
         session = Session(node, pad, readers, options.cycles)
         node.add_report(pad, session.describe)
+        node.add_reasons(session.reasons)
         node.every(BACKOFF_S[0], partial(Session.run, session), math.inf)
 
 
@@ -165,6 +166,10 @@ class Session:
         message = Voltages(stamp_ns=stamp_ns, period_ns=period_ns, volts=volts.astype("float32"))
         self._node.publish(VOLTAGES, message, pad=self._pad)
         self._failures = 0
+
+    def reasons(self) -> list[str]:
+        """Why no voltages are published."""
+        return [] if self._state in ("starting", "reading") else [f"pad {self._pad}: {self._state}"]
 
     def describe(self) -> dict[str, Any]:
         """The pad's entry in the health report: rate and skew, and each board's resonance and line statistics."""

@@ -1,7 +1,8 @@
 """Reader for a robot's URDF: its tree of links and joints, limits, masses and collision shapes (http://wiki.ros.org/urdf/XML).
 
 It uses the XML parser of the standard library. yourdfpy would import trimesh, 0.4 s of CPU in every process that needs only the
-kinematics, and it keeps no line numbers for errors. Visual shapes, materials, transmissions and mimics are not read.
+kinematics, and it keeps no line numbers for errors. Of visual shapes only
+the presence is read; materials, transmissions and mimics are not.
 """
 
 from __future__ import annotations
@@ -47,12 +48,14 @@ class Solid:
 
 @dataclass(frozen=True)
 class Link:
-    """A link. mass [kg]: None where the URDF has no `inertial`; centre (3,): of mass [m], in the link's frame."""
+    """A link. mass [kg]: None where the URDF has no `inertial`; centre (3,): of mass [m], in the link's frame; is_drawn: whether
+    it has a visual shape."""
 
     name: str
     solids: tuple[Solid, ...]
     mass: float | None
     centre: Array
+    is_drawn: bool
 
     def shapes(self) -> list[list[Any]]:
         """Collision shapes as JSON values, for comparisons. They do not depend on the location of the mesh files."""
@@ -148,7 +151,9 @@ class _Reader:
         links = {link.name: link for link in map(self._link, self._named("link"))}
         joints = {joint.child: joint for joint in map(self._joint, self._named("joint"))}
         if not links:
-            raise self._error(self._root, "expected at least one link, got none")
+            is_xacro = any(each.tag.startswith("xacro:") for each in self._root)
+            hint = "; convert it with `xacro FILE.xacro > FILE.urdf`" if is_xacro else ""
+            raise self._error(self._root, f"expected at least one link, got none{hint}")
         order, pending = [], [self._base(links, joints)]
         while pending:
             order.append(name := pending.pop())
@@ -196,7 +201,8 @@ class _Reader:
             centre = self._origin(inertial)[:3, 3]
             if mass < 0.0:
                 raise self._error(inertial, f"expected a mass of at least 0 kg, got {mass:g}")
-        return Link(element.attrib["name"], tuple(self._solid(each) for each in element.findall("collision")), mass, centre)
+        solids = tuple(self._solid(each) for each in element.findall("collision"))
+        return Link(element.attrib["name"], solids, mass, centre, element.find("visual") is not None)
 
     def _solid(self, collision: ElementTree.Element) -> Solid:
         geometries = list(self._child(collision, "geometry"))

@@ -29,6 +29,7 @@ SYNTAX = (
         r"did not find expected|expected <block end>|expected the node content",
         "expected the indentation of the keys before; indent the keys of a map equally, and close brackets and quotes",
     ),
+    (r"found another document", "expected one document, got another after a line `---`; remove that line"),
     (r"unexpected end of stream", "expected a closing quote, got the end of the file; close it"),
     (r"undefined alias|could not determine a constructor", "expected plain values; remove the * or ! or put the text in quotes"),
     (r"found unhashable key|unacceptable key", "expected a plain name as a key; remove the brackets or braces before the colon"),

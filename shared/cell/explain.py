@@ -73,7 +73,9 @@ def _reason(model: type[BaseModel], location: list[str], error: Any) -> str:
             return f"expected {f'at most {high}' if high is not None else f'at least {low}'}, got {actual}; add or remove some"
         case "model_type" | "model_attributes_type" | "dict_type" | "mapping_type":
             known = known_keys(model, location)
-            return f"expected a map{f' with {_listed(known)}' if known else ''}, got {got}"
+            text = error.get("input")
+            hint = f"; write {{{known[0]}: {text:.100}}}" if known and isinstance(text, str) else ""
+            return f"expected a map{f' with {_listed(known)}' if known else ''}, got {got}{hint}"
         case _:
             return f"expected something else ({error['msg']}), got {got}"
 

@@ -48,7 +48,9 @@ def one(cell: str, kind: str, known: Iterable[str], name: str | None) -> str:
     names = list(known)
     if name is None and names:
         return names[0]
-    if name is None or name not in names:
+    if name is None:
+        raise CellError(f"cell {cell} has no {kind}")
+    if name not in names:
         raise CellError(f"cell {cell} has no {kind} {name!r}: it has {', '.join(names) or 'none'}")
     return name
 

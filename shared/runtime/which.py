@@ -9,6 +9,7 @@ from penumbra.shared.cell.names import Names
 from penumbra.shared.contract import outline, topics
 from penumbra.shared.contract.messages import BadMessage
 from penumbra.shared.contract.outline import Outline
+from penumbra.shared.contract.processes import ROUTER
 from penumbra.shared.runtime import bus, running
 
 
@@ -49,7 +50,7 @@ def whats_there(session: zenoh.Session, cell: str, service: str) -> str:
     services = sorted({instance.service for instance in running.ask(session, cell)})
     if service in services:
         return f"{service} runs, and has nothing to answer yet: see `penumbra topics --hz`"
-    if services:
+    if services not in ([], [ROUTER.name]):  # a router serves all cells
         return f"its processes are {', '.join(services)}: start `penumbra {service}`"
     return elsewhere(session, cell)
 

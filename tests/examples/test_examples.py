@@ -20,7 +20,7 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
 from penumbra.sim.world.world import Sensors, World
 from penumbra.tests.support import numbered
-from penumbra.tests.support.live import PATIENCE_S, penumbra_up, wait_for
+from penumbra.tests.support.live import PATIENCE_S, free_port, penumbra_up, wait_for
 from penumbra.tests.support.small import small
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -161,6 +161,16 @@ def test_own_skin_reaches_the_haptics(own_cell):
         for pad in ("p0", "p7"):
             key = topics.VOLTAGES.at(cell="table", pad=pad)
             wait_for(partial(arrived, own_cell, "haptics", key), 120, f"voltages of {pad}", 0.2)
+
+
+@pytest.mark.parametrize("words", ["read_poses.py", "own_joints.py", "own_skin.py", "own_camera.py 0"])
+def test_an_example_without_a_router_is_one_line_that_says_what_to_start(words):
+    name, *arguments = words.split()
+    command = [sys.executable, str(EXAMPLES / name), *arguments]
+    environment = {**os.environ, "PENUMBRA_CONNECT": f"tcp/127.0.0.1:{free_port()}"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert done.returncode in (1, 2)
+    assert "start `penumbra router` or `penumbra up`" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_own_camera_says_what_it_expected_where_there_is_no_camera(router, tmp_path):

@@ -99,7 +99,7 @@ def refine(options: flags.Options) -> int:
     flags.Option("--images", type=Path, metavar="FOLDER", help="the images, of the same names; needed where there are no masks"),
     flags.Option("--occluders", type=Path, metavar="FOLDER", help="masks of what stands in front, of the same names"),
     flags.Option("--fps", type=flags.above_zero, default=30.0, help="frames a second of masks and video"),
-    flags.Option("--out", type=Path, default=Path("track"), metavar="FOLDER", help="for poses.csv and overlay.mp4"),
+    flags.Option("--out", type=flags.folder, default=Path("track"), metavar="FOLDER", help="for poses.csv and overlay.mp4"),
     example="penumbra search track --mesh cup.stl --camera camera.json --init start.json --masks masks --out track",
 )
 def track(options: flags.Options) -> int:
@@ -172,7 +172,9 @@ def _given(options: flags.Options) -> tuple[RigidObject, CameraFiles, Array]:
     """The inputs of both commands: object, reader of the camera's files, start."""
     metres, degrees = options.init_sigma
     if not (0 < metres < 10 and 0 < degrees < 360):
-        raise ObjectFileError(f"--init-sigma: expected metres and degrees above 0, got {metres:g} and {degrees:g}")
+        raise ObjectFileError(
+            f"--init-sigma: expected metres from 0 to 10 and degrees from 0 to 360, got {metres:g} and {degrees:g}"
+        )
     options.spread = metres, math.radians(degrees)
     files, T = CameraFiles(read_camera(options.camera)), read_pose(options.init)
     try:

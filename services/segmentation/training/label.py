@@ -318,6 +318,8 @@ def pictures(path: Path, every: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         yield 0, files.read(path)
         return
     film = cv2.VideoCapture(str(path))
+    if not film.isOpened():
+        raise files.FileError(f"{path}: expected a picture or a film, got a file of which OpenCV reads no frame")
     for number in itertools.count():
         if not film.grab():
             break
@@ -431,7 +433,7 @@ class Folder:
     "segmentation label",
     "Makes frames and masks for `penumbra segmentation train --data` from films of your own arms.\n\n" + (__doc__ or ""),
     flags.Argument("films", type=Path, nargs=-1, required=True, metavar="FILM...", help="films, or single pictures"),
-    flags.Option("--out", type=Path, default=Path("labels"), help="folder to write images/, masks/ and check/ to"),
+    flags.Option("--out", type=flags.folder, default=Path("labels"), help="folder to write images/, masks/ and check/ to"),
     flags.Option(
         "--every", type=flags.positive, metavar="N", show_default=f"{RATE_HZ:.0f} a second", help="label every Nth frame"
     ),

@@ -95,7 +95,9 @@ FOLDER = flags.Option(
     "segmentation models",
     "Fetches the models with which `penumbra segmentation label`, `photographs` and `train --encoder` work.\n\n"
     + (__doc__ or ""),
-    flags.Option("--out", type=Path, default=kept(), show_default="the user's cache folder", help="folder to keep the files in"),
+    flags.Option(
+        "--out", type=flags.folder, default=kept(), show_default="the user's cache folder", help="folder to keep the files in"
+    ),
     example="penumbra segmentation models",
 )
 def main(options: flags.Options) -> int:

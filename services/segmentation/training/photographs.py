@@ -245,7 +245,7 @@ def _empty(
     ),
     models.FOLDER,
     flags.Option("--tables", type=Path, default=Path("training/photographs"), help="the project's folder with tables and masks"),
-    flags.Option("--out", type=Path, default=Path("photographs"), help="folder to write street/, close/ and scenes/ to"),
+    flags.Option("--out", type=flags.folder, default=Path("photographs"), help="folder to write street/, close/ and scenes/ to"),
     example="penumbra segmentation photographs clones --get",
 )
 def main(options: flags.Options) -> int:

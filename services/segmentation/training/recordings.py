@@ -131,13 +131,21 @@ class Recordings:
         self.calibration: list[Recorded] = []
         self.held_out: list[Recorded] = []
         self._train: list[list[Recorded]] = []
+        classes: set[int] = set()
         for folder in folders:
-            pieces = _pieces(folder)
+            pieces, there = _pieces(folder)
+            classes |= there
             order = np.random.default_rng([seed, 4]).permutation(len(pieces))
             tenth = max(len(pieces) // 10, 1)
             self.calibration += [pieces[i] for i in order[:tenth]]
             self.held_out += [pieces[i] for i in order[tenth : 2 * tenth]]
             self._train.append([pieces[i] for i in order[2 * tenth :]])
+        if not classes - {Label.BACKGROUND, UNLABELLED}:
+            raise DataError(
+                f"{', '.join(map(str, folders))}: expected masks with classes ({CLASSES}), got only "
+                f"{' and '.join(map(str, sorted(classes)))}; of masks that are black and white, write the arm as "
+                f"{Label.FOREARM.value} and the hand as {Label.HAND.value}"
+            )
         self.count = len(folders) * max(len(pieces) for pieces in self._train)
         self.side = min(piece.side for piece in itertools.chain(self.calibration, self.held_out, *self._train))
         times = Counter(folders)
@@ -164,19 +172,21 @@ class Recordings:
         """Nothing to close."""
 
 
-def _pieces(folder: Path) -> list[Recorded]:
+def _pieces(folder: Path) -> tuple[list[Recorded], set[int]]:
+    """The pieces of a folder's sequences, and the classes in its masks."""
     found = find(folder)
     length = min(max(sum(map(len, found)) // 20, SHORTEST), PIECE)
-    pieces = []
+    pieces, classes = [], set()
     for sequence in found:
-        size = check(sequence)
+        size, there = check(sequence)
+        classes |= there
         pieces += [Recorded(sequence[i : i + length], size) for i in range(0, len(sequence), length)]
     if len(pieces) < 3:
         raise DataError(
             f"{folder}: expected at least 3 sequences, or pieces of {length} frames of them (to learn from, to calibrate and "
             f"to score with), got {len(pieces)}"
         )
-    return pieces
+    return pieces, classes
 
 
 def _sources(folder: Path) -> Any:
@@ -220,11 +230,14 @@ def in_sequences(root: Path, frames: Iterable[Frame]) -> list[list[Frame]]:
     return list(groups.values())
 
 
-def check(sequence: Sequence[Frame]) -> tuple[int, int]:
-    """Read every frame of a sequence; its height and width. Raises DataError."""
+def check(sequence: Sequence[Frame]) -> tuple[tuple[int, int], set[int]]:
+    """Read every frame of a sequence; its height and width, and the classes in its masks. Raises DataError."""
     sizes: dict[tuple[int, ...], Path] = {}
+    classes: set[int] = set()
     for frame in sequence:
-        sizes.setdefault(frame.read()[1].shape, frame.picture)
+        labels = frame.read()[1]
+        sizes.setdefault(labels.shape, frame.picture)
+        classes.update(np.unique(labels).tolist())
     if len(sizes) > 1:
         (a, first), (b, other) = list(sizes.items())[:2]
         raise DataError(
@@ -234,7 +247,7 @@ def check(sequence: Sequence[Frame]) -> tuple[int, int]:
     height, width = next(iter(sizes))
     if min(height, width) < SMALLEST:
         raise DataError(f"{sequence[0].picture}: expected at least {SMALLEST} x {SMALLEST} pixels, got {width} x {height}")
-    return height, width
+    return (height, width), classes
 
 
 def read_mask(path: Path) -> NDArray[np.uint8]:

@@ -393,7 +393,7 @@ def _device(text: str) -> torch.device:
     ),
     flags.Option(
         "--out",
-        type=Path,
+        type=flags.output,
         metavar="FILE",
         show_default="the committed ones; with --data segmentation.npz",
         help="the weights, their card beside them",

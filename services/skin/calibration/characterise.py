@@ -75,7 +75,7 @@ def _step(text: str) -> float:
     "skin characterise",
     "Measures a pad by distances, angles and plane scans, and writes tables and pictures.",
     flags.CELL,
-    flags.Option("--out", type=Path, required=True, metavar="FOLDER", help="tables, pictures and summary.json go there"),
+    flags.Option("--out", type=flags.folder, required=True, metavar="FOLDER", help="tables, pictures and summary.json go there"),
     flags.Option(
         "--data",
         type=Path,

@@ -208,7 +208,8 @@ def carriers(cell: cells.Cell, models: Mapping[str, RobotModel], wanted: Iterabl
     for name in wanted:
         full = [link for link in ("world", *known) if name in (link, link.partition("/")[2])]
         if len(full) != 1:
-            what = f"one of {', '.join(full)}" if full else f"world or one of {', '.join(solid)}"
+            others = f" or one of {', '.join(solid)}" if solid else ", as the cell has no robot"
+            what = f"one of {', '.join(full)}" if full else f"world{others}"
             raise cells.CellError(f"--links: expected {what}, got {name!r}{meant(name, [*known, 'world'])}")
         if full[0] != "world" and full[0] not in solid:
             raise cells.CellError(f"--links: expected links with a collision mesh ({', '.join(solid)}), got {name!r}")

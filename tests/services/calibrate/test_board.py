@@ -72,6 +72,7 @@ def test_a_board_that_does_not_fit_the_paper_is_refused_with_what_would(tmp_path
         (["--squares", "7"], "expected columns and rows of squares from 3 to 40, as in 7x5"),
         (["--squares", "2x50"], "expected columns and rows of squares from 3 to 40"),
         (["--marker", "39mm"], "expected 30 % to 95 % of a square of 40 mm, got 39 mm"),
+        (["-o", "board.png"], "--out: expected a name that ends with .pdf, got board.png"),
         (["--squares", "20x20", "--square", "8mm", "--page", "A3"], "expected at least 200 markers for this board, got 4X4_100"),
     ],
 )

@@ -1,5 +1,7 @@
 """Camera to robot: right within its own uncertainty, outliers found, motions that tell nothing refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,6 +96,16 @@ def test_poses_that_mostly_do_not_fit_are_refused(many):
     pairs = [moved(p, 0.05 * rng.standard_normal(6)) if i % 3 == 0 else p for i, p in enumerate(many[2])]
     with pytest.raises(CalibrationError, match=r"of 20 that do not .*is the board fixed to the link"):
         hand_eye.solve(pairs, resamples=10)
+
+
+def test_joints_that_belong_to_other_pictures_give_no_place(many):
+    pairs = many[1]
+    shuffled = [
+        replace(p, T_world_link=pairs[i].T_world_link)
+        for i, p in zip(np.random.default_rng(0).permutation(20), pairs, strict=True)
+    ]
+    with pytest.raises(CalibrationError, match="are the joints those of the pictures"):
+        hand_eye.solve(shuffled, resamples=40)
 
 
 def test_turns_about_one_axis_only_are_refused_and_small_ones_noted(photographer):

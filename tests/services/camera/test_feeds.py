@@ -254,6 +254,25 @@ def test_a_clock_that_is_set_back_does_not_stop_the_pictures(stopping, monkeypat
     assert numbered.number(play(found, stopping).image) == 2
 
 
+def test_a_picture_that_a_loop_brings_again_is_logged_once(stopping):
+    def shots():
+        for _ in range(3):
+            yield shot(1)
+            yield Shot(np.zeros((48, 64, 3), np.uint8), time.time_ns())
+
+    found, lines = reader(lambda: Given(shots()), stopping)
+    play(found, stopping)
+    assert found.describe()["refused"] == 3
+    assert len([line for line in lines if "got 64 x 48" in line]) == 1
+
+
+def test_two_pictures_at_once_do_not_make_a_camera_too_fast(stopping):
+    """A film that was held up while the process started catches up by one picture."""
+    with running(aged([0.0] * 2, period_s=1e-4), stopping, "playback") as found:
+        wait_for(lambda: found.describe()["received"] == 2, 10.0, "both pictures")
+        assert not [why for why in found.reasons() if "pictures a second" in why]
+
+
 def test_pictures_of_another_size_are_refused_and_not_scaled(stopping):
     found, lines = reader(lambda: Given([shot(1)]), stopping, width=640, height=480)
     assert play(found, stopping) is None

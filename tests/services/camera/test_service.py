@@ -204,7 +204,10 @@ def test_flags_change_the_sources_of_the_cell_file(tmp_path):
         ({}, "no camera of cell numbered has a source: give --source SOURCE, or `source:` of the camera in the cell file"),
         ({"camera": "front"}, "camera front of cell numbered has no source: give --source"),
         ({"source": "webcam"}, r"--source: expected v4l2:/dev/video0, rtsp://HOST/PATH, .*, got 'webcam'"),
-        ({"source": "file:nope.mp4"}, "--source: expected a film or a folder of pictures, got nothing at nope.mp4"),
+        (
+            {"source": "file:nope.mp4"},
+            "--source: expected a film or a folder of pictures, got nothing at .*/nope.mp4; correct it",
+        ),
         ({"source": "v4l2:/dev/video0", "loop": True}, "--loop: expected it with file: or folder: only, got it with v4l2:"),
         ({"source": "v4l2:/dev/video0", "rate": 3.0}, "--rate: expected it with file: or folder: only"),
         ({"source": "v4l2:/dev/video0", "latency": -1.0}, "--latency: expected a number of at least 0, got -1"),

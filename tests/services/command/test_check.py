@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -19,6 +20,10 @@ from penumbra.shared.cell import description as cells
 BUILT_IN = {name: (cells.BUILT_IN / f"{name}.yaml").read_text() for name in ("table", "arm")}
 LOOK = "    look_at: [0.05, 0.0, 0.15]\n"
 P3 = "  p3: {type: five, position: [0.12, -0.04, 0.0]}\n"
+_TABLE, _ARM = BUILT_IN["table"], BUILT_IN["arm"]
+NO_PADS = _TABLE[_TABLE.index("pad_types:") : _TABLE.index("    size: {")]
+MESH = "targets:\n  forearm:\n    mesh: {}.stl\n"
+BOUNDS = _ARM[_ARM.index("    joints:") : _ARM.index("  table: [")]
 DISC = "{disc: 0.0151, centre: [0.00018, 0.00001], "
 
 # (cell, what is replaced, by what, text on the line that is reported, words of the reason)
@@ -33,6 +38,7 @@ BROKEN = {
     "two colons": ("table", "name: table", "name: ta: ble", "name: ta", "put a text with a colon in quotes"),
     "an open bracket": ("table", "0.0, 0.15]", "0.0, 0.15", "pad_types:", "close the bracket"),
     "an indentation": ("table", "    height: 480", "   height: 480", "   height", "indentation of the keys before"),
+    "two documents": ("table", "frame: world", "---\nframe: world", "---", "another after a line `---`; remove that line"),
     "a number in words": ("table", "width: 640", "width: wide", "width:", "expected a whole number, got 'wide'"),
     "half a pixel": ("table", "width: 640", "width: 640.5", "width:", "expected a whole number, got 640.5"),
     "a boolean": ("table", "rate_hz: 20", "rate_hz: yes", "rate_hz:", "expected a number, got true"),
@@ -56,7 +62,7 @@ BROKEN = {
         "table", LOOK, LOOK + "    source: {url: 'http://192.0.2.1/film'}\n", "source:", "expected v4l2:/dev/video0, rtsp://HOST/PATH"
     ),
     "a source mistyped": ("table", LOOK, LOOK + "    source: {url: 'flie:a.mp4'}\n", "source:", "did you mean file"),
-    "a source in a word": ("table", LOOK, LOOK + "    source: file:a.mp4\n", "source:", "a map with url, loop, rate_hz, latency"),
+    "a source in a word": ("table", LOOK, LOOK + "    source: file:a.mp4\n", "source:", "'file:a.mp4'; write {url: file:a.mp4}"),
     "an adapter without a class": (
         "table", LOOK, LOOK + "    source: {url: 'adapter:my_camera'}\n", "source:", "as in adapter:my_camera:Camera"
     ),
@@ -87,6 +93,7 @@ BROKEN = {
     "no URDF": ("arm", "panda/panda.urdf", "ur5.urdf", "urdf:", "give a URDF beside the cell file"),
     "a cyclic URDF": ("arm", "panda/panda.urdf", "cyclic.urdf", "urdf:", "got a cycle"),
     "a URDF without meshes": ("arm", "panda/panda.urdf", "lone.urdf", "urdf:", "none.obj of a mesh"),
+    "a xacro": ("arm", "panda/panda.urdf", "arm.xacro", "urdf:", "convert it with `xacro"),
     "unknown joint": ("arm", "panda_joint7]", "elbow]", "joints:", "no moving joint elbow"),
     "few bounds": ("arm", "1.70, 0.485]", "1.70]", "joints_low:", "expected 7 values, one for each joint"),
     "a bound beyond the limits": ("arm", "2.10, 1.085]", "9.10, 1.085]", "joints_high:", "panda_joint6 within its limits"),
@@ -129,6 +136,18 @@ def folder(tmp_path_factory) -> Path:
     (out / "empty.obj").write_text("v 0 0 0\n")
     (out / "garbage.stl").write_text("no mesh")
     link = '<link name="{0}"><collision><geometry><mesh filename="none.obj"/></geometry></collision></link>'
+    turned = mesh.vertices[:, [1, 2, 0]]  # no mirror image: the surface stays outside
+    for name, vertices, faces in (
+        ("upright", turned, mesh.faces),
+        ("beside", mesh.vertices + np.array([0.0, 0.0, 0.5]), mesh.faces),
+        ("inverted", mesh.vertices, mesh.faces[:, ::-1]),
+    ):
+        trimesh.Trimesh(vertices, faces, process=False).export(out / f"{name}.stl")
+    drawn = (cells.BUILT_IN / "panda" / "panda.urdf").read_text().replace("meshes/", f"{cells.BUILT_IN}/panda/meshes/")
+    shape = "<visual><geometry><sphere radius='0.1'/></geometry></visual>"
+    (out / "drawn.urdf").write_text(drawn.replace("</robot>", f"<link name='tool'>{shape}</link><joint name='end' type='fixed'>"
+                                    "<parent link='panda_hand'/><child link='tool'/></joint></robot>"))  # fmt: skip
+    (out / "arm.xacro").write_text('<robot name="arm" xmlns:xacro="http://ros.org/wiki/xacro"><xacro:arm/></robot>')
     (out / "lone.urdf").write_text(f'<robot name="lone">{link.format("base")}</robot>')
     joint = '<joint name="{0}{1}" type="fixed"><parent link="{0}"/><child link="{1}"/></joint>'
     joints = "".join(joint.format(*pair) for pair in ("bc", "cb"))
@@ -204,6 +223,23 @@ WARNINGS = {
     "a pad far away": ("table", P3, P3.replace("0.12", "3.0"), "  p3:", "nothing can reach it"),
     "a pad turned over": ("table", P3, P3.replace("0.0]}", "0.0], rpy: [3.1416, 0, 0]}"), "  p3:", "points away from it"),
     "a home elsewhere": ("table", "position: [0.0, 0.0, 0.20]", "position: [0.0, 0.0, 2.0]", "home:", "in or near sim.motion"),
+    "a camera in mm": (
+        "table", "[0.35, -1.15, 0.90]", "[350, -1150, 900]", "position: [350", "0.17 px for forearm, 1.5e+03 m away; give metres",
+    ),
+    "an arm upright": ("table", NO_PADS, MESH.format("upright"), "mesh:", "x axis, got its longest side along z"),
+    "an arm beside its origin": ("table", NO_PADS, MESH.format("beside"), "mesh:", "got it 0.45 m beside it"),
+    "an arm inside out": ("table", NO_PADS, MESH.format("inverted"), "mesh:", "got a surface that is inside out"),
+    "a shoulder far away": ("table", "    labels:", "    shoulder: [0, 0, 3]\n    labels:", "shoulder:", "at home, got 2.8 m"),
+    "another arm in reach": (
+        "table", "\nsim:\n",
+        "\n  other:\n    mesh: body:forearm\n    labels: [hand]\n    home: {position: [0.0, 0.4, 0.25]}\nsim:\n",
+        "    home: {position: [0.0, 0.4", "at least 0.5 m apart, got 0.4 m from forearm; both may follow the same arm",
+    ),
+    "a link that hides nothing": ("arm", "panda/panda.urdf", "drawn.urdf", "urdf:", "got none of tool"),
+    "a joint that nobody measures": (
+        "arm", BOUNDS, BOUNDS.replace("panda_joint2, ", "").replace(", -0.20, -0.15", ", -0.15").replace(" 0.00, 0.15", " 0.15"),
+        "    joints:", "got none of panda_joint2; add them",
+    ),
 }  # fmt: skip
 
 

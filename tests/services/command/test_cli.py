@@ -198,6 +198,27 @@ def test_a_service_that_logs_json_logs_its_error_as_json_and_an_unknown_format_i
     assert (out.returncode, "--log-format: expected text or json, got 'xml'" in out.stderr) == (2, True)
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "segmentation infer arm.png --out {}",
+        "segmentation label film.mp4 --out {}",
+        "segmentation models --out {}/models",
+        "segmentation photographs clones --out {}",
+        "segmentation train --out {}/net.npz",
+        "search track --mesh cup.ply --camera camera.json --init pose.json --masks masks --out {}",
+        "skin characterise --out {}",
+        "calibrate camera --save {}",
+    ],
+)
+def test_a_file_where_a_folder_is_written_is_refused_before_the_work(command, tmp_path, capsys):
+    file = tmp_path / "results"
+    file.touch()
+    assert cli.main(command.format(file).split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"got {file}, which is a file; give another name" in line
+
+
 def test_a_bad_cell_file_is_reported_with_its_line(tmp_path, capsys):
     path = tmp_path / "cell.yaml"
     path.write_text("name: mine\ncolour: red\ntargets:\n  arm: {mesh: 'body:forearm', labels: [hand], home: {}}\n")
@@ -205,13 +226,26 @@ def test_a_bad_cell_file_is_reported_with_its_line(tmp_path, capsys):
     assert f"penumbra router: {path}:2: colour" in capsys.readouterr().err
 
 
-def test_no_router_is_one_line_that_says_how_to_start_one(capsys):
+def test_no_router_is_one_line_that_says_how_to_start_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))  # no cell of another test
     where = f"tcp/127.0.0.1:{free_port()}"
     assert cli.main(["pose", "--connect", where]) == 2
     assert capsys.readouterr().err == (
         f"penumbra pose: no router at {where}: nothing listens there: start `penumbra router` or `penumbra up`, or give "
         "another endpoint (--connect, in Python endpoint=)\n"
     )
+
+
+def test_without_a_router_the_cells_of_this_machine_are_named_with_their_endpoints(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    where = f"tcp/127.0.0.1:{free_port()}"
+    with runs.recorded("table", tmp_path / "table.yaml", ("tcp/127.0.0.1:7999",), None, None):
+        assert cli.main(["pose", "--connect", where]) == 2
+        error = capsys.readouterr().err
+        assert f"no router at {where}: nothing listens there" in error
+        assert "penumbra pose: cell table runs on this machine at another endpoint: give --connect tcp/127.0.0.1:7999\n" in error
+        assert cli.main(["pose", "--connect", "tcp/127.0.0.1:7999"]) == 2
+        assert "another endpoint: give" not in capsys.readouterr().err
 
 
 def test_a_missing_package_is_one_line_with_the_extra_that_installs_it():
@@ -427,6 +461,23 @@ def test_a_cell_that_does_not_run_where_another_does_is_named_with_what_to_give(
     assert [(each.text, each.mend) for each in found] == [
         ("no process of cell table runs there, where cells run: mine", "give --cell mine")
     ]
+
+
+def test_where_several_cells_run_at_a_router_they_are_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("PENUMBRA_CELL", raising=False)
+    found = []
+    for name in ("left", "right"):
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(cells.source("table").read_text().replace("name: table", f"name: {name}", 1))
+        found.append(cells.load(path))
+    where = f"tcp/127.0.0.1:{free_port()}"
+    left, right = (Node("fusion", cell, bus.Connection(connect=(where,))) for cell in found)
+    with Node("router", CELL, bus.Connection("router", listen=(where,))) as router, left, right:
+        session = router.session
+        assert session is not None
+        wait_for(lambda: running.cells_at_work(session) == ["left", "right"], 5, "both cells")
+        assert cli.main(["pose", "--connect", where]) == 2
+    assert "where cells run: left, right; give --cell FILE.yaml, the file of cell left" in capsys.readouterr().err
 
 
 def test_a_pose_that_no_process_answers_names_the_cells_and_processes_that_run(endpoint, capsys):

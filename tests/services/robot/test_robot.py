@@ -1,6 +1,7 @@
 """`penumbra robot`: joints by their names, stamps by the controller's clock, and what happens when a controller is lost."""
 
 import json
+import math
 import subprocess
 import sys
 import time
@@ -151,6 +152,28 @@ def test_an_adapter_of_ones_own_is_read_and_called_again_where_it_fails(tmp_path
         assert sys.modules["my_arm"].Robot.made >= 2
 
 
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [
+        (
+            "return [0.1, 0.2], None",
+            "Odd.read: expected (joints, clock_s), a dict of angles by name and a number or None, got tuple",
+        ),
+        ("return {'a': 'up', 'b': 0.2}, None", "Odd.read: ValueError: could not convert string to float: 'up'"),
+        ("raise RuntimeError('the SDK has ended')", "Odd.read: RuntimeError: the SDK has ended"),
+        ("threading.Event().wait(60)", " s from adapter:odd_arm:Odd"),
+    ],
+)
+def test_an_adapter_that_does_not_keep_to_the_form_is_a_reason_in_words(tmp_path, router, monkeypatch, body, why):
+    monkeypatch.delitem(sys.modules, "odd_arm", raising=False)
+    text = "import threading\n\n\nclass Odd:\n    def read(self):\n        {}\n\n    def close(self):\n        pass\n"
+    (tmp_path / "odd_arm.py").write_text(text.format(body))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with running(robot_cell(tmp_path, "adapter:odd_arm:Odd", ("a", "b")), router) as (node, heard):
+        wait_for(lambda: any(why in reason for reason in node.report().reasons), 10, "the reason")
+        assert not heard
+
+
 def test_a_franka_that_is_not_there_is_called_again_and_again(tmp_path, router):
     pytest.importorskip("panda_py", reason="pip install -e '.[panda]'")
     names = tuple(f"panda_joint{i}" for i in range(1, 8))
@@ -186,13 +209,18 @@ def test_a_robot_is_moved_by_the_emulator_or_has_a_source(tmp_path, capsys):
 
 
 def test_joints_that_are_missing_or_impossible_are_told_apart():
-    q, fault = service.matched({"b": 2.0, "a": 1.0, "c": 3.0}, ("a", "b"), "")
+    limits = {"a": (-math.inf, math.inf), "b": (-3.0, 3.0), "x_a": (-1.0, 1.0), "x_b": (-1.0, 1.0)}
+    q, fault = service.matched({"b": 2.0, "a": 1.0, "c": 3.0}, ("a", "b"), "", limits)
     assert q is not None and q.tolist() == [1.0, 2.0] and not fault
-    q, fault = service.matched({"a": 1.0}, ("x_a", "x_b"), "x_")
+    q, fault = service.matched({"a": 1.0}, ("x_a", "x_b"), "x_", limits)
     assert q is None and fault == "expected joints x_b, got x_a; correct `joints` in the cell file, or the prefix"
     for angle in (120.0, float("nan"), float("inf")):
-        q, fault = service.matched({"a": angle}, ("a",), "")
+        q, fault = service.matched({"a": angle}, ("a",), "", limits)
         assert q is None and "are these degrees?" in fault
+    q, fault = service.matched({"a": 45.0, "b": -45.0}, ("a", "b"), "", limits)
+    assert q is None and fault == (
+        "expected joints within the limits of the URDF, got b -45 (-3 to 3): are these degrees, or millimetres?"
+    )
 
 
 def test_stamps_are_those_of_the_quickest_messages_and_follow_a_clock_that_drifts_or_begins_anew():

@@ -152,6 +152,14 @@ def too_few(folder, scene):
     write_pairs(folder, scene, "a")
 
 
+def black_and_white(folder, scene):
+    for name in "abc":
+        write_pairs(folder, scene, name)
+    for path in folder.rglob("*_mask.png"):
+        arm = np.isin(recordings.read_mask(path), [Label.FOREARM, Label.HAND])
+        cv2.imwrite(str(path), 255 * arm.astype(np.uint8))
+
+
 def unknown_category(folder, scene):
     content = {"images": [], "categories": [{"id": 1, "name": "dog"}], "annotations": []}
     (folder / "labels.json").write_text(json.dumps(content))
@@ -172,6 +180,7 @@ def no_coco(folder, scene):
         (one_mask_missing, r"expected a mask for 0003, found none"),
         (sizes_in_a_sequence, r"got 96 x 96 in 0000.png and 96 x 64 in 0001.png"),
         (too_few, r"expected at least 3 sequences, .*, got 1"),
+        (black_and_white, r"got only 0 and 255; .* write the arm as 4 and the hand as 5"),
         (unknown_category, r"expected categories named background, .*, got 'dog'"),
         (no_coco, r"expected COCO format"),
     ],
@@ -289,6 +298,14 @@ def test_files_that_cannot_be_read_are_named(tmp_path, weights, capsys):
         assert cli.main(["segmentation", "infer", str(path), "--out", str(tmp_path), "--weights", str(weights)]) == 2
         error = capsys.readouterr().err
         assert says in error and str(path) in error
+
+
+def test_weights_without_their_card_are_missed_by_name(tmp_path, scene, weights, capsys):
+    cv2.imwrite(str(tmp_path / "a.png"), scene.images[0])
+    weights.with_suffix(".json").unlink()
+    command = ["segmentation", "infer", str(tmp_path / "a.png"), "--out", str(tmp_path), "--weights", str(weights)]
+    assert cli.main(command) == 2
+    assert f"{weights}: expected weights (.npz) with their card net.json beside them, got no card" in capsys.readouterr().err
 
 
 def test_contour_offsets_measure_what_a_mask_is_too_large_by():

@@ -203,6 +203,14 @@ def test_films_without_hands_are_told(finder, tmp_path, capsys):
     assert "found no hand" in capsys.readouterr().err
 
 
+def test_a_file_that_is_no_film_is_not_a_film_without_hands(tmp_path):
+    (tmp_path / "film.mp4").write_bytes(b"no film")
+    with pytest.raises(
+        files.FileError, match=r"film\.mp4: expected a picture or a film, got a file of which OpenCV reads no frame"
+    ):
+        list(label.pictures(tmp_path / "film.mp4", 1))
+
+
 def test_bare_skin_beyond_the_elbow_is_the_upper_arm():
     image, limb = np.full((240, 320, 3), (90, 110, 140), np.uint8), Limb(hand_at((160, 150), (0, 1), 30), np.array([160.0, 90.0]))
     for first in range(1, 21, 4):

@@ -370,6 +370,8 @@ def test_a_board_that_is_pulled_out_is_reported_and_read_again_when_it_is_back(h
         return node.health()["report"]["p3"]["state"]
 
     wait_for(lambda: "is the board plugged in?" in state(), 10, "the missing board to be reported")
+    report = node.report()
+    assert report.status == "degraded" and any(why.startswith(f"pad p3: no device {ports[0]}") for why in report.reasons)
     with served(emulated()) as (names, unplug):
         plug_in(names)
         wait_for(lambda: messages, 30, "the first message")
@@ -380,6 +382,7 @@ def test_a_board_that_is_pulled_out_is_reported_and_read_again_when_it_is_back(h
         plug_in(names)
         wait_for(lambda: messages, 30, "a message from the board that is back")
         assert state() == "reading"
+        assert not [why for why in node.report().reasons if why.startswith("pad p3")]
 
 
 @pytest.mark.parametrize(

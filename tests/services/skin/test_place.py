@@ -83,6 +83,7 @@ def test_a_robot_without_pads_gets_some_on_its_links_at_the_joints_that_are_give
 WRONG = {
     "no robot and no pads": (BARE, [], "expected a robot or a pad, got neither; add a robot"),
     "unknown link": (ARM, ["--links", "panda_link55"], "--links: expected world or one of panda/panda_link0"),
+    "a link of no robot": (TABLE, ["--links", "hand"], "--links: expected world, as the cell has no robot, got 'hand'"),
     "no pad on the world": (ARM, ["--links", "world"], "add a first one to the cell file"),
     "no room": (TABLE, ["--number", "400"], "--number: expected at most"),
     "three numbers": (TABLE, ["--workspace", "0", "0", "0"], "--workspace: expected 6 numbers"),
