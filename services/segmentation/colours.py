@@ -126,9 +126,9 @@ def _strays(target: NDArray[np.uint8], own: NDArray[np.uint8]) -> NDArray[np.boo
 def _bin(lab, index):
     for row in range(index.shape[0]):
         for column in range(index.shape[1]):
-            light = np.int64(lab[row, column, 0]) >> 4
-            a = min(max(np.int64(lab[row, column, 1]) >> 3, 8), 23) - 8
-            b = min(max(np.int64(lab[row, column, 2]) >> 3, 8), 23) - 8
+            light = int(lab[row, column, 0]) >> 4
+            a = min(max(int(lab[row, column, 1]) >> 3, 8), 23) - 8
+            b = min(max(int(lab[row, column, 2]) >> 3, 8), 23) - 8
             index[row, column] = (light << 8) | (a << 4) | b
 
 

@@ -477,7 +477,7 @@ def test_where_several_cells_run_at_a_router_they_are_named(tmp_path, monkeypatc
         assert session is not None
         wait_for(lambda: running.cells_at_work(session) == ["left", "right"], 5, "both cells")
         assert cli.main(["pose", "--connect", where]) == 2
-    assert "where cells run: left, right; give --cell FILE.yaml, the file of cell left" in capsys.readouterr().err
+    assert "where cells run: left, right; give --cell left" in capsys.readouterr().err
 
 
 def test_a_pose_that_no_process_answers_names_the_cells_and_processes_that_run(endpoint, capsys):
