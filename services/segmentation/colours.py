@@ -126,10 +126,10 @@ def _strays(target: NDArray[np.uint8], own: NDArray[np.uint8]) -> NDArray[np.boo
 def _bin(lab, index):
     for row in range(index.shape[0]):
         for column in range(index.shape[1]):
-            light = int(lab[row, column, 0]) >> 4
-            a = min(max(int(lab[row, column, 1]) >> 3, 8), 23) - 8
-            b = min(max(int(lab[row, column, 2]) >> 3, 8), 23) - 8
-            index[row, column] = (light << 8) | (a << 4) | b
+            a, b = lab[row, column, 1], lab[row, column, 2]
+            i = 0 if a < 64 else 15 if a > 191 else (a - 64) >> 3
+            j = 0 if b < 64 else 15 if b > 191 else (b - 64) >> 3
+            index[row, column] = ((np.int64(lab[row, column, 0]) >> 4) << 8) | (i << 4) | j
 
 
 @kernel("u2[h, w], f4[g, h, w], out f8[g, n]")
