@@ -7,7 +7,10 @@ its tilt. The evidence of the pictures about a rival is summed. A rival that the
 pose, and all rivals are compared anew. Until that is done, it keeps its place in the next pictures, in which a fit from the
 prediction, which has the turn before, would end at the previous pose again. A rival that is not refuted makes the pose as
 uncertain as the two are apart, until it is compared again; so does one that was not compared yet. The prediction counts because
-it knows the pictures before: a limb does not turn over because something hides its hand.
+it knows the pictures before: a limb does not turn over because something hides its hand. A turn whose fit ends at the pose is no
+other pose for now, and the evidence about it starts over: where a hand turns past the view in which both its turns look the same,
+the two poses meet and part again, and what was said before does not tell which of them is right. The mirror image meets the pose
+whenever the limb lies across the line of sight, and is held to what was said before.
 
 With a bent hand, a wrong rival may look right, as the mesh's stiff hand then points to where the bent one is. So if the hand is
 bent, only the forearms are compared.
@@ -39,8 +42,8 @@ uncertain as the forearm's (`mask_fit.Fit.hand`)."""
 TURNS = tuple(math.radians(degrees) for degrees in (180.0, 30.0, -30.0, 60.0, -60.0, 120.0, -120.0))
 """Turns of the rivals about the limb's axis [rad], spaced by the reach of `PASSES` steps of a fit, and by half of that next to
 the pose. Measured: a fit that starts 60 degrees from a pose that is off by 35 ends elsewhere."""
-RIVALS = len(TURNS) + 1
-"""Number of rivals: the turns, and the mirror image."""
+RIVALS, MIRROR = len(TURNS) + 1, 0
+"""Number of rivals: the turns, and the mirror image, which is the first."""
 PASSES = 8
 """Maximum number of steps of a rival's fit."""
 REFUTED = 9.0
@@ -111,7 +114,9 @@ class Rivals:
             other = _fitted(_start(best, which), best, shown)
             evidence = KEPT * (self._evidence[which] or 0.0) + min(_excess(other, best, shown), MOST)
             excess = evidence + unlikelier(other)
-            if excess < -PREFERRED:
+            if which != MIRROR and other.sharp and _is_same(other, best):
+                self._evidence[which], self._doubts[which] = 0.0, None
+            elif excess < -PREFERRED:
                 self._begin()
                 best = other
             else:
@@ -164,7 +169,7 @@ def against_mirror(
     if _angle(T, best.T_searched) < JUMPED_RAD:
         return best
     other = near(T)
-    if other.overlap < overlap or _angle(other.T, best.T) < APART_RAD:
+    if other.overlap < overlap or _is_same(other, best):
         return best
     excess = other.cost - best.cost + min(surprise(other), SURPRISING) - min(surprise(best), SURPRISING)
     if excess < 0.0:
@@ -185,7 +190,7 @@ def _added(best: Fit, T: Array, covariance: Array, excess: float, limits: Limits
 def _start(best: Fit, which: int) -> Array:
     """The pose from which a rival is fitted."""
     T = best.T_searched.copy()
-    if which == 0:
+    if which == MIRROR:
         return detect.mirrored(T)[0]
     T[:3, :3] = rigid.rotation(TURNS[which - 1] * T[:3, 0]) @ T[:3, :3]
     return T
@@ -204,12 +209,16 @@ def _excess(other: Fit, best: Fit, shown: Shown) -> float:
     """By how much a rival's cost exceeds that of the best pose; infinite if the two are the same pose, or the image does not
     confirm the rival. Costs are scaled to the longer of the two contours: a hand seen edge on has less contour than one that
     shows its fingers, and must not gain by that."""
-    if not other.sharp or _angle(other.T, best.T) < APART_RAD:
+    if not other.sharp or _is_same(other, best):
         return math.inf
     here = best if best.hand == other.hand else shown(best.T_searched, 1, other.hand)
     longer = max(other.points, here.points)
     excess = longer * (other.cost / other.points - here.cost / here.points)
     return excess / max(1.0, min(other.rms, here.rms) / TYPICAL) ** 2
+
+
+def _is_same(other: Fit, best: Fit) -> bool:
+    return _angle(other.T, best.T) < APART_RAD
 
 
 def _angle(a: Array, b: Array) -> float:

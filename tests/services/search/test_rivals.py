@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ import pytest
 from penumbra.services.search import detect
 from penumbra.services.search.image_fit import SHARP
 from penumbra.services.search.mask_fit import Fit, Limits
-from penumbra.services.search.rivals import RIVALS, TURNS, Rivals, against_mirror
+from penumbra.services.search.rivals import REST_NS, RIVALS, TURNS, Rivals, against_mirror
 from penumbra.shared.geometry import rigid
 
 PICTURE_NS = 50_000_000
@@ -71,6 +72,16 @@ def test_a_rival_that_took_the_place_keeps_it_where_fits_begin_from_the_turn_bef
     said = np.abs(taken(25.0, 4 * RIVALS))
     first = int(np.argmax(said > 0.1))
     assert (said[first:] > 0.1).all()
+
+
+def test_what_was_said_of_a_rival_before_it_was_one_with_the_pose_is_forgotten():
+    rivals, stamps = Rivals(Limits()), itertools.count(PICTURE_NS, PICTURE_NS)
+    for _ in range(10 * RIVALS):
+        rivals.contested(fitted(HERE, 100.0), next(stamps), lambda *_: fitted(HERE, 100.0), lambda fit: 0.0)
+    shown = costs(TURNS[3], 25.0)  # they part, and the first comparison tells which is right
+    every = -(-REST_NS // PICTURE_NS)
+    said = [roll(rivals.contested(fitted(HERE, 100.0), next(stamps), shown, lambda fit: 0.0)) for _ in range(RIVALS * every)]
+    assert max(np.abs(said)) == pytest.approx(TURNS[3], abs=0.01)
 
 
 TILTED = rigid.transform([0.0, 0.0, 1.5], [0.0, np.sin(0.25), 0.0, np.cos(0.25)])
