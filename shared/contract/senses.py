@@ -81,7 +81,7 @@ class Sense:
 
 SENSES = (
     # Measured in replays of both cells and in the paper's experiment: 27 to 39 % of the variance is new in every picture, the
-    # rest lasts for 0.3 to 3 s. The time constant is longer, because covariances are too large by four to ten times, and a bias
+    # rest lasts for 0.3 to 3 s. The time constant is longer, because covariances are too large by four to nine times, and a bias
     # that may change as fast as they say follows the limb's motion in the pose's place
     Sense("vision", topics.VISION, Measures.POSE, Errors(lasting=0.65, time_constant=4.0), usable="tracking", part="camera"),
     # windows of the skin share no samples and the noise of its voltages is white. Measured in replays: 5 % of the variance is
