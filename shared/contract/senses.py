@@ -81,10 +81,9 @@ class Sense:
 
 SENSES = (
     # Measured in replays of both cells and in the paper's experiment: 27 to 39 % of the variance is new in every picture, the
-    # rest lasts for 0.3 to 3 s. The time constant is longer, because covariances are too large by four to nine times, and a bias
-    # that may change as fast as they say follows the limb's motion in the pose's place
-    Sense("vision", topics.VISION, Measures.POSE, Errors(lasting=0.65, time_constant=4.0), usable="tracking", part="camera"),
-    # windows of the skin share no samples and the noise of its voltages is white. Measured in replays: 5 % of the variance is
-    # common to successive windows on `arm`, 30 % on `table`, and lasts for seconds; taken for so slow, it costs accuracy
-    Sense("haptic", topics.HAPTIC, Measures.POSE_INFORMATION, Errors(lasting=0.1, time_constant=0.3), usable="in_range"),
+    # rest lasts for 0.3 to 3 s
+    Sense("vision", topics.VISION, Measures.POSE, Errors(lasting=0.65, time_constant=2.0), usable="tracking", part="camera"),
+    # windows of the skin share no samples and the noise of its voltages is white. Measured on the emulator: a fifth of the
+    # variance comes from the response model and is common to successive windows
+    Sense("haptic", topics.HAPTIC, Measures.POSE_INFORMATION, Errors(lasting=0.2, time_constant=0.3), usable="in_range"),
 )

@@ -27,9 +27,12 @@ MAX_PIXELS = 224 * 224
 """Maximum number of pixels of a window around targets. A larger target is shown at a coarser scale."""
 MAX_PIXELS_WIDE = 320 * 240
 """Maximum number of pixels of a window of the whole frame, or around all targets' homes, while a target is lost."""
-SIGMAS = 2.0
-"""Distance, in standard deviations, from its prediction or its home, at which a target is still in the window. Chosen: a limb
-further from its home would not be taken for the target."""
+HOME_SIGMAS = 2.0
+"""Maximum distance from its home, in standard deviations, of the search for a lost target. A limb further away would not be taken
+for the target."""
+SIGMAS = 1.0
+"""Distance from its prediction, in standard deviations, at which a target that nothing measures is still in the window. Chosen:
+with 2, other things in a cluttered picture were taken for a hidden limb, which then was not found again."""
 ARM_M = 0.09
 """Width [m] of the belly of a forearm (circumference 0.28 to 0.31 m), and of a hand with adducted thumb (ANSUR II, Gordon et al.
 2014)."""
@@ -110,7 +113,7 @@ class Lookout:
         for name, target in cell.targets.items():
             corners = corners_of(anatomy.target_mesh(target, cell).vertices)
             home, spread = rigid.apply(target.home.transform, corners), target.home_spread
-            room = SIGMAS * np.hypot(spread.position, spread.rotation * np.abs(corners).max())
+            room = HOME_SIGMAS * np.hypot(spread.position, spread.rotation * np.abs(corners).max())
             region = corners_of(np.vstack([home - room, home + room]))
             if _is_in_picture(self._camera, region):
                 self._boxes[name], self._homes[name] = corners, (np.eye(4), region)
