@@ -113,30 +113,34 @@ def last_state(said) -> dict:
 
 
 def test_a_page_receives_pose_scene_picture_processes_and_rates(served: Served):
-    """Of each stream the first that is whole: the cell may have begun a moment ago."""
+    """Of each stream the first that is whole: the cell may have begun a moment ago, each pad by itself."""
+    measured = {topic.name for topic in topics.TOPICS} - {"joints"}
+    everything = {"dashboard", *SERVICES, "router"}
 
-    def is_whole(now) -> bool:
+    def is_whole(moment) -> bool:
+        now = moment["targets"]["forearm"]
         senses, sources = set(now.get("senses", ())), set(now.get("sources", ()))
         from_both = senses == {"vision front", "haptic"} and sources == {"vision", "haptic"}
-        return now["state"] == "tracking" and from_both and now["error"] is not None and now["ellipsoid"] is not None
+        is_tracked = now["state"] == "tracking" and now["error"] is not None and now["ellipsoid"] is not None
+        return from_both and is_tracked and moment["pads"].keys() == TABLE.pads.keys()
+
+    def is_told(slow) -> bool:
+        has_rates = {row["topic"] for row in slow["rates"]} == measured
+        return has_rates and everything <= running(slow) and bool(slow["timeline"]) and last_state(slow)["state"] == "tracking"
 
     async def look(browser: Browser):
         async with browser.page() as ws:
             hello = await until(ws, lambda said: True)
             assert hello["stream"] == "hello" and not hello["may_steer"], "without the key a page may look"
-            moment = await until(ws, of_stream("moment", lambda said: said["pads"] and is_whole(said["targets"]["forearm"])))
+            moment = await until(ws, of_stream("moment", is_whole))
             picture = await until(ws, of_stream("picture", lambda said: outlined(said["bytes"])))
-            everything = {"dashboard", *SERVICES, "router"}
-            slow = await until(ws, of_stream("slow", lambda said: everything <= running(said) and said["timeline"]))
-        return moment, picture["bytes"], slow
+            await until(ws, of_stream("slow", is_told))
+        return moment, picture["bytes"]
 
-    moment, picture, slow = browse(served.url, look)
+    moment, picture = browse(served.url, look)
     now = moment["targets"]["forearm"]
     assert now["error"]["position"] < 0.05 and len(now["ellipsoid"]["radii"]) == 3
-    assert set(moment["pads"]) == set(TABLE.pads)
     assert picture.rstrip().endswith(b"\xff\xd9")
-    assert {row["topic"] for row in slow["rates"]} == {topic.name for topic in topics.TOPICS} - {"joints"}
-    assert last_state(slow)["state"] == "tracking"
 
 
 def test_a_page_that_does_not_show_what_it_gets_gets_one_message_a_stream(served: Served):
