@@ -20,6 +20,7 @@ Voltages that no limb explains (a metal part, a block) are reported as an object
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -221,9 +222,9 @@ class Estimator:
 
     def _by_solve(self, reading: Reading, expected: Place | None, elapsed_s: float) -> tuple[HapticEstimate, Seen | None]:
         """The estimate, and the camera's prediction of the window. expected: the limb's place that a camera has just seen."""
-        before = self._track.place
+        before = copy(self._track)
         solution = self._solution(reading, expected is not None)
-        if self.identity.odds < 0.0 and before.is_apart(self._track.place, self.settings):
+        if self.identity.odds < 0.0 and before.place.is_apart(self._track.place, self.settings):
             self.identity.doubt()
         gap = self._limb.gap(reading, solution.T, solution.size)
         self._judge(solution)
@@ -233,6 +234,8 @@ class Estimator:
         information, gradient = self._track.mixed(information, gradient)
         T, information = self._peak(solution, information, gradient)
         is_felt = self._is_felt(information, gap)
+        if not is_felt:
+            self._track = before  # fits to noise would lead it away, and their covariances would call it sure
         state = self._identified(reading, solution, gap, expected, elapsed_s) if is_felt else self._absent(elapsed_s)
         self._pads.update(solution.residuals, np.isfinite(reading.variance))
         seen = None if expected is None or state == "object" else self._seen(solution, expected)

@@ -30,6 +30,11 @@ class Place:
         """The inverse (6, 6) of the covariance."""
         return np.asarray(np.linalg.inv(self.covariance), np.float64)
 
+    @functools.cached_property
+    def sigma(self) -> float:
+        """The standard deviation [m] of the position along its worst direction."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
     def is_apart(self, other: Place, settings: HapticSettings) -> bool:
         """Whether the distance between two places exceeds their covariances."""
         offset = self.T[:3, 3] - other.T[:3, 3]
@@ -98,13 +103,14 @@ class Track:
         self.rival = None if self.rival is None else self._home.decayed(self.rival, elapsed_s)
 
     def expect(self, T: Array, covariance: Array) -> bool:
-        """Move the track to a fused pose (4, 4) with covariance (6, 6) if that is known well enough; returns whether it was. The
-        track then has no rival."""
+        """Move the track to a fused pose (4, 4) with covariance (6, 6) if that is known well, or better than the track; the track
+        then has no rival. Returns whether it is known well."""
         settings = self._settings
-        known = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < settings.expected_sigma**2
-        if known:
-            self.place, self.rival = Place(T, settings.expected_inflation**2 * covariance + self._floor), None
-        return known
+        is_sure = Place(T, covariance).sigma < settings.expected_sigma
+        expected = Place(T, settings.expected_inflation**2 * covariance + self._floor)
+        if is_sure or expected.sigma < self.place.sigma:
+            self.place, self.rival = expected, None
+        return is_sure
 
     def contest(self, rival: Place, odds: float) -> None:
         """Keep a rival with these log odds of the track to it, if it is a distinct place and still possible."""

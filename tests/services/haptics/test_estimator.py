@@ -279,6 +279,18 @@ def test_a_limb_out_of_reach_gives_no_information(skin: Skin, response: Response
     assert all((e.information == 0).all() and np.isfinite(e.gap) for e in estimates)
 
 
+def test_windows_in_which_nothing_is_felt_only_make_the_place_less_certain(
+    skin: Skin, response: Response, forearm: Surface
+) -> None:
+    which = estimator(skin, response, forearm, rigid.transform([0, 0, 0.2]))
+    windows(which, skin, signal(skin, response, rigid.transform([0.05, -0.05, 0.10])), 20, seed=4)
+    last = which.pose.copy()
+    away = windows(which, skin, signal(skin, response, rigid.transform([0, 0, 0.60])), 25, seed=5, begin=20)
+    assert not any(e.may_be_limb for e in away)
+    decay = 0.05 * np.abs(last[:3, 3] - [0, 0, 0.2])  # half a second of ten
+    assert (np.abs(which.pose[:3, 3] - last[:3, 3]) <= decay + 1e-9).all()
+
+
 def test_a_limb_that_comes_back_elsewhere_is_found_at_once(skin: Skin, response: Response, forearm: Surface) -> None:
     here, there = rigid.transform([0.05, -0.05, 0.10]), rigid.from_rpy((-0.05, 0.05, 0.12), (0, 0, 0.3))
     which = estimator(skin, response, forearm, rigid.transform([0, 0, 0.2]))

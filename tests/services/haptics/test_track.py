@@ -96,6 +96,15 @@ def test_a_sure_fused_pose_moves_the_track_and_leaves_no_rival():
     assert np.sqrt(track.place.covariance[0, 0]) == pytest.approx(np.hypot(0.02, 0.01))
 
 
+def test_a_fused_pose_that_is_known_better_than_the_track_moves_it_without_being_sure():
+    track, T = Track(HOME, SETTINGS), rigid.transform([0.05, 0.0, 0.1])
+    assert not track.expect(T, np.diag(np.repeat([0.03, 0.1], 3) ** 2))
+    np.testing.assert_array_equal(track.place.T, T)
+    assert track.place.sigma == pytest.approx(np.hypot(0.06, 0.01))
+    assert not track.expect(rigid.transform([0.1, 0.0, 0.1]), np.diag(np.repeat([0.04, 0.1], 3) ** 2))
+    np.testing.assert_array_equal(track.place.T, T, "this one is known worse")
+
+
 # ---- what is forgotten
 
 
