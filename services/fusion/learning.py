@@ -30,6 +30,10 @@ LEAST = 50
 STEPS = 400
 """Maximum number of likelihoods that are computed. Chosen: five numbers settle to a hundredth within two hundred."""
 
+MOST_DAMPED = 0.99
+"""Maximum damping ratio that is learned: at one, where a limb at rest would lead, the motion is no oscillation any more and
+`motion.py` has no solution."""
+
 
 @dataclass(frozen=True)
 class Learned:
@@ -88,11 +92,11 @@ def log_likelihood(filter: Filter, measurements: NDArray[np.void]) -> float:
 
 def _numbers(settings: FusionSettings) -> Array:
     """The learned fields as unbounded numbers (5,)."""
-    damping = settings.damping
-    return np.append(np.log([*settings.jerk, *settings.motion_time]), math.log(damping / (1.0 - damping)))
+    share = settings.damping / MOST_DAMPED
+    return np.append(np.log([*settings.jerk, *settings.motion_time]), math.log(share / (1.0 - share)))
 
 
 def _settings(settings: FusionSettings, x: Array) -> FusionSettings:
     """The inverse of `_numbers`."""
     a, b, c, d = np.exp(x[:4]).tolist()
-    return replace(settings, jerk=(a, b), motion_time=(c, d), damping=1.0 / (1.0 + math.exp(-float(x[4]))))
+    return replace(settings, jerk=(a, b), motion_time=(c, d), damping=MOST_DAMPED / (1.0 + math.exp(-float(x[4]))))

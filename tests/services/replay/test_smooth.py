@@ -162,6 +162,6 @@ def test_the_motion_of_a_recording_is_learned_into_a_file_that_fusion_reads(path
     found = smoothed(path, capsys, "--motion", str(out))
     assert found["motion"] == json.loads(out.read_text())
     assert found["motion"]["gain"] >= 0.0
-    assert with_motion(str(out)).damping == found["motion"]["damping"]
+    assert with_motion(str(out)).damping == found["motion"]["damping"] < 0.999, "the limb rests"
     assert cli.main(["replay", str(path), "--motion", str(out)]) == 2
     assert "expected --smooth beside --motion" in capsys.readouterr().err
