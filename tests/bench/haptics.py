@@ -198,17 +198,20 @@ Scene = tuple[Array, Array, dict[float, Array], np.random.Generator]
 
 
 def _scene(rig: Rig, seed: int, count: int, gap: float, k: int) -> Scene:
-    """A random pose and size, the window's mean signals (n,) by speed, and the random generator for the rest."""
+    """A random pose and size, the window's mean signals (n,) by speed, and the random generator for the rest. Limbs that run into
+    a pad's link, whose field has no solution, are drawn again."""
     rng = np.random.default_rng([seed, count, int(1e4 * gap), k])
-    T, size = rig.place(rng, gap, count)
-    body = field.limb(rig.mesh, *np.exp(size))
-    direction = rng.standard_normal(3)
-    step = 0.5 * (WINDOW_NS - PERIOD_NS) * 1e-9 * direction / np.linalg.norm(direction)
-    signals = {0.0: rig.signal(body, T, count)}
-    for speed in SPEEDS[1:]:  # the mean over the window's way, by Simpson's rule
-        ends = [rig.signal(body, rigid.perturb(T, np.append(s * speed * step, np.zeros(3))), count) for s in (-1, 1)]
-        signals[speed] = (4.0 * signals[0.0] + ends[0] + ends[1]) / 6.0
-    return T, size, signals, rng
+    while True:
+        T, size = rig.place(rng, gap, count)
+        body = field.limb(rig.mesh, *np.exp(size))
+        direction = rng.standard_normal(3)
+        step = 0.5 * (WINDOW_NS - PERIOD_NS) * 1e-9 * direction / np.linalg.norm(direction)
+        signals = {0.0: rig.signal(body, T, count)}
+        for speed in SPEEDS[1:]:  # the mean over the window's way, by Simpson's rule
+            ends = [rig.signal(body, rigid.perturb(T, np.append(s * speed * step, np.zeros(3))), count) for s in (-1, 1)]
+            signals[speed] = (4.0 * signals[0.0] + ends[0] + ends[1]) / 6.0
+        if all((np.abs(each) < rig.skin.full_scale).all() for each in signals.values()):
+            return T, size, signals, rng
 
 
 def single_windows(
