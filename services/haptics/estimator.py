@@ -3,8 +3,8 @@
 Each window is estimated from its own samples, and its likelihood is published. Earlier windows only set where the solve starts
 and its prior, and the slowly changing states (`size.py`, `drift.py`). The steps of a window:
 
-1. predict: the track decays to its home (`track.py`), or moves to the fused pose if that is known well enough
-2. solve from there (`solve.py`), with the learned size of the limb as a prior
+1. predict: the track decays to its home (`track.py`), or moves to the fused pose if that is known well, or better
+2. solve from there (`solve.py`), with the learned size of the limb as a prior; where nothing is felt, the track stays
 3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from all of `starts.py`
 4. far from the pads, thick and thin parts of a limb feel alike: another possible place, from scratch or found beside the
    track, is kept as its rival and solved as well, until the windows have decided between the two
@@ -240,7 +240,7 @@ class Estimator:
         self._pads.update(solution.residuals, np.isfinite(reading.variance))
         seen = None if expected is None or state == "object" else self._seen(solution, expected)
         step = pose_error(T, solution.T)
-        return self._estimate(T, information, step, gap, state, solution.residuals), seen
+        return self._estimate(T, self.settings.trusted * information, step, gap, state, solution.residuals), seen
 
     def _watch_absence(self, in_range: bool, elapsed_s: float) -> None:
         """Forget the size of a limb that has been away: the next one may be another person's."""
