@@ -41,8 +41,9 @@ ARM_M = 0.085
 class Variety:
     """The variety of the sequences. frames: per sequence; size [px] of the window; scale: bounds of the focal length relative to
     the cell's camera; speed [m/s] and turn [rad/s]: maximum of the target's; jitter [m]: maximum offset of the window's middle
-    from the target's along each axis; real: share of sequences with the looks, hands, sizes and cameras of `sim.picture.looks`,
-    `sim.picture.limb` and ARM_PX."""
+    from the target's along each axis; away: bounds of the camera's distance relative to the cell's camera's, its focal length
+    growing with it; real: share of sequences with the looks, hands, sizes and cameras of `sim.picture.looks`, `sim.picture.limb`
+    and ARM_PX."""
 
     frames: int = 8
     size: int = 192
@@ -50,6 +51,7 @@ class Variety:
     speed: float = 0.5
     turn: float = 1.2
     jitter: float = 0.06
+    away: tuple[float, float] = (1.0, 1.0)
     real: float = 0.0
 
 
@@ -232,12 +234,16 @@ def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.rando
     scale = rng.uniform(0.85, 1.15) if choice < 0.7 else rng.uniform(0.45, 0.6) if choice < 0.9 else rng.uniform(low, high)
     scale = float(np.clip(scale, low, high))
     width, height = (max(round(scale * n), variety.size) for n in (camera.width, camera.height))
+    factor = 1.0
+    if variety.away != (1.0, 1.0):
+        factor = float(np.exp(rng.uniform(*np.log(variety.away))))
+        position = target + factor * (position - target)
     return camera.model_copy(
         update={
             "width": width,
             "height": height,
-            "fx": camera.fx * scale,
-            "fy": camera.fy * scale,
+            "fx": camera.fx * scale * factor,
+            "fy": camera.fy * scale * factor,
             "cx": (width - 1) / 2.0,
             "cy": (height - 1) / 2.0,
             "position": tuple(position),

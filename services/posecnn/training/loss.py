@@ -41,7 +41,8 @@ def dense(out: Dense, labels: Tensor, centre: Tensor, length: Tensor) -> dict[st
     pixels, length (batch,): log of the apparent length over the reference.
 
     labels: cross entropy; target: 1 - Dice of the target's classes as one, a picture with few of its pixels weighing as much as
-    another; direction and length: smooth L1 on the target's visible pixels, every picture weighing the same.
+    another; direction and length: smooth L1 on the target's visible pixels, every picture weighing the same; distance: that of
+    the mean of their lengths, which the estimator takes.
     """
     h, w = labels.shape[1:]
     target = torch.isin(labels, torch.tensor(TARGET_LABELS))
@@ -51,6 +52,7 @@ def dense(out: Dense, labels: Tensor, centre: Tensor, length: Tensor) -> dict[st
     direction = F.normalize(centre[:, :, None, None] - torch.stack([columns, rows])[None], dim=1)
     missed = F.smooth_l1_loss(out.direction, direction, reduction="none", beta=0.1).sum(1)
     probability = out.logits.softmax(1)[:, list(TARGET_LABELS)].sum(1)
+    mean = (target * out.length).sum((1, 2)) / target.sum((1, 2)).clamp_min(1)
     both, total = (probability * target).sum((1, 2)), probability.sum((1, 2)) + target.sum((1, 2))
     return {
         "labels": F.cross_entropy(out.logits, labels),
@@ -59,4 +61,5 @@ def dense(out: Dense, labels: Tensor, centre: Tensor, length: Tensor) -> dict[st
         "length": (
             share * F.smooth_l1_loss(out.length, length[:, None, None].expand_as(out.length), reduction="none", beta=0.02)
         ).sum(),
+        "distance": (shown * F.smooth_l1_loss(mean, length, reduction="none", beta=0.01)).sum() / shown.sum().clamp_min(1),
     }

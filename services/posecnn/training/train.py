@@ -1,9 +1,9 @@
 """Makes weights/ again: `penumbra posecnn train`.
 
-Simulated pictures, those that PredNet's sequences begin with, are rendered by a second process into a growing data set on disk
-while the network learns from those there. Step n takes its pictures, patches and colours from a generator seeded by (seed, n),
-and the schedule is a function of the progress, so that a run of --steps interrupted and resumed ends with the same weights as one
-that was not.
+Simulated pictures, such as PredNet's sequences begin with, but also from further away, are rendered by a second process into a
+growing data set on disk while the network learns from those there. Step n takes its pictures, patches and colours from a
+generator seeded by (seed, n), and the schedule is a function of the progress, so that a run of --steps interrupted and resumed
+ends with the same weights as one that was not.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import multiprocessing
 import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,10 +50,12 @@ DIFFERS = (
     "loss of the rotation: SLoss on the forearm and PLoss on the hand, distances not squared",
     "the centre is refined by least squares over the rays that agree",
     "covariance: learned from held-out pictures; the original has none; no refinement by depth images",
-    "data: the first frames of PredNet's simulated sequences, 40 960 of them, in place of YCB-Video and its synthetic images",
+    "data: first frames of simulated sequences as PredNet's, 28 672 of them, by cameras up to 6 times as far away, in place of "
+    "YCB-Video and its synthetic images",
 )
-VARIETY = sequences.Variety(frames=1)
-"""A network without memory learns most from pictures of many scenes."""
+VARIETY = sequences.Variety(frames=1, size=256, away=(0.7, 6.0))
+"""A network without memory learns most from pictures of many scenes. They are large, for patches to lie within them, and from as
+far away as the cameras of the paper."""
 CHUNK = 256
 """Pictures in a file of the data set."""
 
@@ -64,6 +66,11 @@ class Schedule:
     visited on average while the data set grows up to `most`; `weights`: of the loss's parts; `averaging`: of the weights that are
     exported.
 
+    Pictures: `cropped`: share of those that are cut off around the target, up to `margin` extents beside it; `coarse`: share of
+    those seen by a sensor of fewer pixels, at least the share `coarsest`; `soft`: share of the patches that are blurred, by up to
+    `softest` [px]; `noise`: largest standard deviation of what is added to half of them. How sharp a patch is and where its
+    picture ends must not tell how far it was zoomed.
+
     Patches: `room`: bounds of their side, in extents of the target's picture, and with a share `wide` up to `widest`; `off`: how
     far at most their middle is off the target's, in extents; `most_of_window`: their largest side and `cut`: their middle's least
     distance from the picture's border, in sides of picture and patch, for beyond it is black; `turn` [rad]: standard deviation of
@@ -71,21 +78,29 @@ class Schedule:
     apparent lengths, and of its size.
     """
 
-    peak_rate: float = 2e-3
+    peak_rate: float = 1e-3
     decay: float = 1e-3
     batch: int = 16
     reuse: int = 5
-    most: int = 40_960
+    most: int = 28_672
     weights: tuple[tuple[str, float], ...] = (
         ("labels", 1.0),
         ("target", 1.0),
         ("direction", 2.0),
-        ("length", 10.0),
+        ("length", 5.0),
+        ("distance", 10.0),
         ("rotation", 4.0),
     )
     averaging: float = 0.998
-    room: tuple[float, float] = (1.05, 2.2)
-    wide: float = 0.2
+    cropped: float = 0.3
+    margin: float = 0.3
+    coarse: float = 0.3
+    coarsest: float = 0.4
+    soft: float = 0.4
+    softest: float = 1.0
+    noise: float = 0.03
+    room: tuple[float, float] = (1.1, 1.8)
+    wide: float = 0.12
     widest: float = 5.0
     off: float = 0.2
     most_of_window: float = 1.05
@@ -187,35 +202,68 @@ class Batch:
 
 
 def draw_batch(chosen: list[tuple[NDArray[np.uint8], Truth]], schedule: Schedule, rng: np.random.Generator) -> Batch:
-    """Patches around the targets of pictures, turned, scaled and coloured anew at random."""
+    """Patches around the targets of pictures, drawn anew at random."""
     columns: dict[str, list[Any]] = {name: [] for name in Batch.__dataclass_fields__}
     for pixels, truth in chosen:
-        k = truth.intrinsics
-        points = rigid.apply(truth.T, truth.vertices)
-        shown = points[:, :2] / points[:, 2:] * k[:2] + k[2:]
-        low, high = shown.min(axis=0), shown.max(axis=0)
+        if rng.random() < schedule.cropped:
+            pixels, truth = _cropped(pixels, truth, schedule.margin, rng)
+        low, high = _box(truth)
         extent = float((high - low).max())
         room = schedule.room if rng.random() >= schedule.wide else (schedule.room[1], schedule.widest)
-        side = min(extent * float(np.exp(rng.uniform(*np.log(room)))), schedule.most_of_window * len(pixels))
-        inside = np.clip((low + high) / 2.0, schedule.cut * side, len(pixels) - schedule.cut * side)
+        size = np.array(pixels.shape[1::-1])
+        side = min(extent * float(np.exp(rng.uniform(*np.log(room)))), schedule.most_of_window * size.max())
+        inside = np.clip((low + high) / 2.0, schedule.cut * side, np.maximum(size - schedule.cut * side, schedule.cut * side))
         middle = inside + rng.uniform(-1.0, 1.0, 2) * schedule.off * min(extent, side)
         angle = rng.normal(0.0, schedule.turn)
-        M, focal, principal = patch.square(k, middle, side, angle)
+        M, focal, principal = patch.square(truth.intrinsics, middle, side, angle)
         T = rigid.from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, angle)) @ truth.T
-        size = float(np.ptp(truth.vertices[:, 0]))
+        length = float(np.ptp(truth.vertices[:, 0]))
         halved = np.column_stack([M[:, :2], M[:, 2] - (STRIDE - 1) / 2.0]) / STRIDE
         side_out = patch.SIDE // STRIDE
-        warped = patch.warp(pixels[..., :3], M).astype(np.float32) / np.float32(255.0)
-        columns["images"].append(training.recoloured(warped, rng, schedule.jitter))
+        columns["images"].append(training.recoloured(_seen(pixels[..., :3], M, schedule, rng), rng, schedule.jitter))
         columns["labels"].append(cv2.warpAffine(pixels[..., 3], halved, (side_out, side_out), flags=cv2.INTER_NEAREST))
         columns["centre"].append(focal * T[:2, 3] / T[2, 3] + principal)
-        columns["length"].append(focal * size / T[2, 3])
+        columns["length"].append(focal * length / T[2, 3])
         columns["rotation"].append(patch.facing(T[:3, 3]).T @ T[:3, :3])
-        columns["points"].append(truth.vertices / size)
+        columns["points"].append(truth.vertices / length)
         columns["shape"].append(proportions(truth.vertices))
     stacked = {name: torch.from_numpy(np.stack(values)) for name, values in columns.items()}
     as_float = {name: stacked[name].float() for name in ("centre", "length", "rotation", "points", "shape")}
     return Batch(stacked["images"].movedim(-1, 1), stacked["labels"].long(), **as_float)
+
+
+def _box(truth: Truth) -> tuple[Array, Array]:
+    """The first and the last column and row (2,) [px] of a target's picture, were it not hidden."""
+    points = rigid.apply(truth.T, truth.vertices)
+    shown = points[:, :2] / points[:, 2:] * truth.intrinsics[:2] + truth.intrinsics[2:]
+    return shown.min(axis=0), shown.max(axis=0)
+
+
+def _cropped(pixels: NDArray[np.uint8], truth: Truth, margin: float, rng: np.random.Generator) -> tuple[NDArray[np.uint8], Truth]:
+    """A picture (h, w, 4) cut off around its target at random, leaving up to `margin` extents beside it."""
+    low, high = _box(truth)
+    room = margin * float((high - low).max()) * rng.random((2, 2))
+    size = np.array(pixels.shape[1::-1])
+    first = np.clip(np.floor(low - room[0]), 0, size - 16).astype(int)
+    last = np.clip(np.ceil(high + room[1]), first + 16, size).astype(int)
+    moved = replace(truth, intrinsics=truth.intrinsics - [0.0, 0.0, *first])
+    return pixels[first[1] : last[1], first[0] : last[0]], moved
+
+
+def _seen(image: NDArray[np.uint8], M: Array, schedule: Schedule, rng: np.random.Generator) -> NDArray[np.float32]:
+    """The patch (SIDE, SIDE, 3) in [0, 1] of a picture by a map M (2, 3), as a sensor of any resolution and noise sees it."""
+    if rng.random() < schedule.coarse:
+        before = np.array(image.shape[1::-1])
+        after = np.maximum(np.round(before * rng.uniform(schedule.coarsest, 1.0)), 8.0)
+        image = np.asarray(cv2.resize(image, after.astype(int).tolist(), interpolation=cv2.INTER_AREA), np.uint8)
+        larger = before / after
+        M = np.column_stack([M[:, :2] * larger, M[:, 2] + M[:, :2] @ ((larger - 1.0) / 2.0)])
+    found = patch.warp(image, M).astype(np.float32) / np.float32(255.0)
+    if rng.random() < schedule.soft:
+        found = np.asarray(cv2.GaussianBlur(found, (0, 0), rng.uniform(0.2, schedule.softest)), np.float32)
+    if rng.random() < 0.5:
+        found += np.float32(rng.uniform(0.0, schedule.noise)) * rng.standard_normal(found.shape, np.float32)
+    return found
 
 
 class Trainer(training.Trainer[Network, RenderedPictures]):
@@ -234,6 +282,16 @@ class Trainer(training.Trainer[Network, RenderedPictures]):
         self._hand = torch.from_numpy(hand)
         self._forearm = torch.from_numpy(np.setdiff1d(np.arange(len(mesh.vertices)), hand))
         self._half = processor.has_bfloat16()
+
+    @classmethod
+    def begin(cls, path: Path, schedule: Schedule, seed: int) -> Trainer:
+        """A trainer that starts from weights with a card; the card that it writes names them."""
+        net, card = network.load(path)
+        trainer = cls(net.settings, schedule, seed)
+        trainer.net.load_state_dict(net.state_dict())
+        trainer.average.load_state_dict(net.state_dict())
+        trainer.started_from = {name: card[name] for name in ("seed", "date", "started_from") if name in card}
+        return trainer
 
     def train_step(self, data: RenderedPictures, progress: float) -> dict[str, float]:
         """One step of gradient descent; returns the parts of the loss."""
@@ -285,6 +343,7 @@ def export(trainer: Trainer, out: Path, each: int) -> dict[str, Any]:
         "seed": trainer.seed,
         "date": datetime.date.today().isoformat(),
         "settings": {"schedule": asdict(trainer.schedule), "steps": trainer.step, "minutes": round(trainer.minutes, 1)},
+        **({"started_from": trainer.started_from} if trainer.started_from else {}),
         "parameters": sum(p.numel() for p in net.parameters()),
         "differs": DIFFERS,
         "calibration": {"seed": seeds[0], "count": each, "coefficients": uncertainty.coefficients},
@@ -299,7 +358,8 @@ def export(trainer: Trainer, out: Path, each: int) -> dict[str, Any]:
     "posecnn train",
     "Trains PoseCNN on simulated pictures, and writes weights and card.",
     *flags.training("posecnn", 75.0),
-    flags.Option("--cache", type=Path, default=Path("posecnn-data"), help="folder of rendered pictures (6 GB)"),
+    flags.Option("--start", type=Path, metavar="FILE", help="start from these weights instead of random ones"),
+    flags.Option("--cache", type=Path, default=Path("posecnn-data"), help="folder of rendered pictures (8 GB)"),
     flags.Option(
         "--out", type=Path, default=WEIGHTS, show_default="the committed ones", help="the weights, their card beside them"
     ),
@@ -311,6 +371,8 @@ def main(options: flags.Options) -> int:
     schedule = Schedule()
     if checkpoint := training.begun(options):
         trainer = Trainer.restore(checkpoint, schedule)
+    elif options.start is not None:
+        trainer = Trainer.begin(options.start, schedule, options.seed)
     else:
         trainer = Trainer(PoseCnnSettings(), schedule, options.seed)
     data = RenderedPictures(options.cache, trainer.seed, schedule.most)

@@ -145,6 +145,29 @@ def test_facing_turns_straight_ahead_to_the_point_without_roll():
     assert axis[2] == pytest.approx(0.0, abs=1e-12)
 
 
+def test_errors_of_a_length_that_cancel_cost_its_pixels_but_not_the_distance():
+    labels = torch.full((1, 4, 4), int(Label.BACKGROUND))
+    labels[0, 1, :2] = int(Label.FOREARM)
+    length = torch.zeros(1, 4, 4)
+    length[0, 1, 0], length[0, 1, 1] = 0.3, -0.1
+    out = network.Dense(torch.zeros(1, len(Label), 4, 4), torch.zeros(1, 2, 4, 4), length, torch.zeros(1))
+    costs = {true: loss.dense(out, labels, torch.zeros(1, 2), torch.tensor([true])) for true in (0.1, -0.1)}
+    assert costs[0.1]["distance"] == pytest.approx(0.0, abs=1e-6)
+    assert costs[-0.1]["distance"] == pytest.approx(0.2, abs=0.01)
+    assert costs[0.1]["length"] == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_camera_further_away_shows_the_target_as_large():
+    (near, things), (far, _) = (
+        sequences.scene(np.random.default_rng(6), sequences.Variety(frames=1, away=away)) for away in ((1.0, 1.0), (5.0, 5.0))
+    )
+    target = things[0].T[0, :3, 3]
+    nearer, further = (np.asarray(camera.position) - target for camera in (near, far))
+    assert further == pytest.approx(5.0 * nearer)
+    assert [far.fx, far.fy] == pytest.approx([5.0 * near.fx, 5.0 * near.fy])
+    assert (far.width, far.height) == (near.width, near.height)
+
+
 def test_sequences_say_where_their_target_is():
     faces = anatomy.forearm_mesh(cells.Body()).faces
     overlaps = []
@@ -191,9 +214,9 @@ def test_training_that_was_interrupted_ends_with_the_same_weights(data, tmp_path
 @pytest.mark.slow
 def test_training_lowers_the_loss(data):
     trainer = train.Trainer(SMALL, train.Schedule(batch=8, peak_rate=4e-3), seed=1)
-    parts = [trainer.train_step(data, 0.1) for _ in range(50)]
+    parts = [trainer.train_step(data, 0.1) for _ in range(100)]
     before, after = ({name: np.mean([part[name] for part in some]) for name in parts[0]} for some in (parts[:6], parts[-12:]))
-    assert after["total"] < 0.8 * before["total"]
+    assert after["total"] < 0.75 * before["total"]
     for name in ("labels", "length", "rotation"):
         assert after[name] < 0.85 * before[name], name
 
@@ -210,6 +233,38 @@ def test_a_batch_contains_the_target_s_place_in_every_patch(data):
             away = np.hypot(columns * network.STRIDE - float(centre[0]), rows * network.STRIDE - float(centre[1]))
             assert away.min() < 0.5 * float(length)
             assert away.max() < network.REACH * float(length) + 4.0
+
+
+@pytest.mark.parametrize("spoilt", [{}, {"cropped": 1.0}, {"coarse": 1.0}, {"soft": 1.0}])
+def test_a_spoilt_picture_shows_the_target_where_its_batch_says(spoilt):
+    plain: dict[str, float] = {"cropped": 0.0, "coarse": 0.0, "soft": 0.0, "noise": 0.0, "jitter": 0.0}
+    schedule = train.Schedule(**{**plain, **spoilt, "off": 0.0, "wide": 0.0})
+    vertices = anatomy.forearm_mesh(cells.Body()).vertices
+    truth = train.Truth(
+        rigid.from_rpy((0.02, -0.03, 1.5), (0.0, 0.0, 0.6)), np.array([500.0, 500.0, 130.0, 120.0]), 0.0, vertices
+    )
+    pixels = np.zeros((256, 256, 4), np.uint8)
+    x, y = truth.intrinsics[:2] * truth.T[:2, 3] / truth.T[2, 3] + truth.intrinsics[2:]
+    rows, columns = np.indices((256, 256))
+    blob = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2.0 * 5.0**2))
+    pixels[..., :3] = np.round(255.0 * blob)[..., None]
+    batch = train.draw_batch([(pixels, truth)] * 8, schedule, np.random.default_rng(5))
+    bright = batch.images.mean(1)
+    places = torch.from_numpy(np.indices((patch.SIDE, patch.SIDE), np.float32))
+    for picture, centre in zip(bright, batch.centre, strict=True):
+        found = [float((picture * place).sum() / picture.sum()) for place in reversed(places)]
+        assert found == pytest.approx(centre.tolist(), abs=0.4)
+
+
+def test_a_training_starts_from_weights_and_its_checkpoint_names_them(tmp_path):
+    first = network.Network(SMALL)
+    network.save(tmp_path / "w.npz", first, {"seed": 3, "date": "2026-01-02"})
+    trainer = train.Trainer.begin(tmp_path / "w.npz", train.Schedule(), seed=1)
+    for net in (trainer.net, trainer.average):
+        for ours, theirs in zip(net.parameters(), first.parameters(), strict=True):
+            assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4)
+    trainer.save(tmp_path / "checkpoint")
+    assert train.Trainer.restore(tmp_path / "checkpoint", train.Schedule()).started_from == {"seed": 3, "date": "2026-01-02"}
 
 
 def test_the_calibration_finds_the_deviations_that_errors_were_drawn_with():
