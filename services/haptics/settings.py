@@ -25,8 +25,8 @@ class HapticSettings:
     # ---- What the fused pose tells
 
     expected_sigma: float = 0.02
-    """Maximum standard deviation [m] of the fused position, along its worst direction, with which the limb is searched for nowhere
-    else. Chosen: a camera's recent position to 2 cm separates places that feel alike."""
+    """Maximum standard deviation [m] of the fused position, along its worst direction, with which the limb is searched for
+    nowhere else. Chosen: a camera's recent position to 2 cm separates places that feel alike."""
     expected_inflation: float = 2.0
     """Factor on the fused pose's standard deviations in the solve's prior. Chosen: the fused pose says where to look, and must
     not count as a measurement of the skin."""

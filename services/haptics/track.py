@@ -103,8 +103,8 @@ class Track:
         self.rival = None if self.rival is None else self._home.decayed(self.rival, elapsed_s)
 
     def expect(self, T: Array, covariance: Array) -> bool:
-        """Move the track to a fused pose (4, 4) with covariance (6, 6) if that is known well (`expected_sigma`), or better than the
-        track; the track then has no rival. Returns whether it is known well."""
+        """Move the track to a fused pose (4, 4) with covariance (6, 6) if that is known well (`expected_sigma`), or better than
+        the track; the track then has no rival. Returns whether it is known well."""
         settings = self._settings
         is_sure = Place(T, covariance).sigma < settings.expected_sigma
         expected = Place(T, settings.expected_inflation**2 * covariance + self._floor)
