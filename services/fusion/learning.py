@@ -29,7 +29,6 @@ LEAST = 50
 """Minimum number of measurements to learn from: some seconds of vision. Chosen, not measured; a minute or more is better."""
 STEPS = 400
 """Maximum number of likelihoods that are computed. Chosen: five numbers settle to a hundredth within two hundred."""
-
 MOST_DAMPED = 0.99
 """Maximum damping ratio that is learned: at one, where a limb at rest would lead, the motion is no oscillation any more and
 `motion.py` has no solution."""

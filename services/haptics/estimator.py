@@ -3,7 +3,7 @@
 Each window is estimated from its own samples, and its likelihood is published. Earlier windows only set where the solve starts
 and its prior, and the slowly changing states (`size.py`, `drift.py`). The steps of a window:
 
-1. predict: the track decays to its home (`track.py`), or moves to the fused pose if that is known well, or better
+1. predict: the track decays to its home (`track.py`), or moves to a fused pose that is known well, or better than the track
 2. solve from there (`solve.py`), with the learned size of the limb as a prior; where nothing is felt, the track stays
 3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from all of `starts.py`
 4. far from the pads, thick and thin parts of a limb feel alike: another possible place, from scratch or found beside the

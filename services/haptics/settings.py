@@ -111,9 +111,9 @@ class HapticSettings:
     # ---- What is published
 
     trusted: float = 0.7
-    """Share of a window's information that is published: farther than a few centimetres from the pads, voltages are less linear
-    in the pose than a covariance says. Chosen on twelve replays of `arm`: of the fused poses of hidden limbs 0.6 instead of 1.0 %
-    are beyond three sigma, and they are called tracking for 65 instead of 73 % of the time; a half would make that 60 %."""
+    """Share of a window's information that is published. Chosen on replays of `arm`, in twelve of which 0.6 instead of 1.0 % of
+    the fused poses of hidden limbs are beyond three sigma; they are called tracking for 65 instead of 73 % of the time, and with
+    a half for 60 %."""
     error_lasts: float = 5.0
     """Number of successive windows in which field model and drift make about the same error. Its variance is multiplied by this
     number, because fusion assumes that the windows' errors are independent. Chosen by the NEES of `penumbra bench haptics`."""

@@ -216,9 +216,9 @@ def test_training_lowers_the_loss(data):
     trainer = train.Trainer(SMALL, train.Schedule(batch=8, peak_rate=4e-3), seed=1)
     parts = [trainer.train_step(data, 0.1) for _ in range(100)]
     before, after = ({name: np.mean([part[name] for part in some]) for name in parts[0]} for some in (parts[:6], parts[-12:]))
-    assert after["total"] < 0.75 * before["total"]
+    assert after["total"] < 0.72 * before["total"]
     for name in ("labels", "length", "rotation"):
-        assert after[name] < 0.85 * before[name], name
+        assert after[name] < 0.75 * before[name], name
 
 
 def test_a_batch_contains_the_target_s_place_in_every_patch(data):
