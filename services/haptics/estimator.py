@@ -5,7 +5,7 @@ and its prior, and the slowly changing states (`size.py`, `drift.py`). The steps
 
 1. predict: the track decays to its home (`track.py`), or moves to a fused pose that is known well, or better than the track
 2. solve from there (`solve.py`), with the learned size of the limb as a prior; where nothing is felt, the track stays
-3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from all of `starts.py`
+3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from the likeliest of `starts.py`
 4. far from the pads, thick and thin parts of a limb feel alike: another possible place, from scratch or found beside the
    track, is kept as its rival and solved as well, until the windows have decided between the two
 5. learn the trust in each pad (`trust.py`), the limb's size close to the pads, and the drift of the electrodes while nothing is
@@ -288,10 +288,13 @@ class Estimator:
             self._track.contest(rival, self.settings.beside_odds + self._track.limited(other.cost - same.cost))
 
     def _from_scratch(self, reading: Reading) -> Solution:
-        """The best solution from all starts and from the track; the second best at another place becomes the rival."""
+        """The best solution from the track and all starts, of which the most probable ones are solved; the second best at another
+        place becomes the rival."""
         home, track = self._prior(self._home.place), self._track
         starts = [self.pose, *(self._starts.at(which, reading, self.size.mean) for which in range(len(self._starts)))]
-        best, *others = sorted((self._solve(reading, home, start) for start in starts), key=lambda solution: solution.cost)
+        cost = [self._solver.solve(reading, home, start, self.size.mean, coarse=0, fine=0).cost for start in starts]
+        likely = [starts[which] for which in np.argsort(cost)[: self.settings.scratch_solves]]
+        best, *others = sorted((self._solve(reading, home, start) for start in likely), key=lambda solution: solution.cost)
         track.place, track.rival = self._place(reading, best, home), None
         self._track_misfit.value = best.misfit
         for other in others:
