@@ -150,7 +150,8 @@ def _of_vision(said: messages.VisionPose) -> str:
         return f"{where}: too little to see, {said.hidden:.0%} hidden"
     if said.state == "lost":
         return f"{where}: the target is not found, {said.hidden:.0%} hidden"
-    return f"{where}: tracks, {said.hidden:.0%} hidden, overlap {said.overlap:.0%}"
+    confidence = "" if said.confidence is None else f", confidence {said.confidence:.0%}"
+    return f"{where}: tracks, {said.hidden:.0%} hidden, overlap {said.overlap:.0%}{confidence}"
 
 
 def _of_haptic(said: messages.HapticPose) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -31,9 +32,11 @@ METHODS = ("default", "paper")
 
 @dataclass(frozen=True)
 class Searched(VisionEstimate):
-    """`T_searched`: the most probable pose, given the measurement and the prediction."""
+    """`T_searched`: the most probable pose, given the measurement and the prediction; `findings`: by which the pose was judged,
+    None where none was found."""
 
     T_searched: Array
+    findings: Findings | None = None
 
 
 class Search:
@@ -369,32 +372,32 @@ class Search:
         self, seen: Evidence, best: Fit, with_image: bool, T_prior: Array | None, prior_covariance: Array | None
     ) -> Searched:
         """The estimate from a fit; `with_image`: whether there was an image to confirm it; T_prior: predicted T_camera_target,
-        None if unknown."""
+        None if unknown: the target is then expected at home."""
+        covariance, floor = self._predicted(prior_covariance)
+        if T_prior is None:
+            T_expected, regular = self._T_camera_world @ self._target.home.transform, self._home_information
+            expected = np.asarray(np.linalg.inv(regular), np.float64)
+        else:
+            T_expected, regular, expected = T_prior, self._regularising(prior_covariance), covariance + floor
         may_differ = self._sharp < self.settings.shape_known[0] and seen.seen_px >= detect.SMALLEST_PX
         if may_differ and best.shape is None and not best.sharp and best.misfit > MISFIT:
-            if T_prior is None:
-                T_home = self._T_camera_world @ self._target.home.transform
-                best = self._shaped(seen, best, T_home, self._home_information)
-            else:
-                best = self._shaped(seen, best, T_prior, self._regularising(prior_covariance))
-        is_expected, T_probable = False, best.T_searched
-        if T_prior is not None:
-            is_known = best.shape is None or self._has_other_shape
-            is_expected = is_known and self._is_expected(best, T_prior, prior_covariance)
-            if prior_covariance is not None:
-                information = np.asarray(np.linalg.inv(self._predicted(prior_covariance)[0]), np.float64)
-                T_probable = with_prior(best.T, best.covariance, T_prior, information)
-        found = self._findings(seen, best, with_image, is_expected)
+            best = self._shaped(seen, best, T_expected, regular)
+        is_known = best.shape is None or self._has_other_shape
+        is_expected = T_prior is not None and is_known and self._is_expected(best, T_prior, prior_covariance)
+        found = self._findings(seen, best, with_image, is_expected, T_expected, expected)
         state = verdict(found, self.settings).state
         self._sharp = min(self._sharp + best.sharp, self.settings.shape_known[1]) if state != "lost" else max(self._sharp - 1, 0)
-        if state == "tracking":
-            self._has_other_shape = best.shape is not None
-            covariance = best.covariance.copy()
-            if found.hidden > self.settings.turning[0]:
-                axis = best.T[:3, 0]
-                covariance[3:, 3:] += self.settings.turning[1] ** 2 * np.outer(axis, axis)
-            return self._estimate(best.T, covariance, best.overlap, found.hidden, state, T_probable)
-        return self._estimate(best.T_searched, self._limits.covariance, best.overlap, found.hidden, state, best.T_searched)
+        if state != "tracking":
+            T, covariance = best.T_searched, self._limits.covariance
+            return self._estimate(T, covariance, best.overlap, found.hidden, state, T, found)
+        self._has_other_shape = best.shape is not None
+        T_probable, turning = best.T_searched, np.zeros((6, 6))
+        if T_prior is not None and prior_covariance is not None:
+            T_probable = with_prior(best.T, best.covariance, T_prior, np.asarray(np.linalg.inv(covariance), np.float64))
+        if found.hidden > self.settings.turning[0]:
+            axis = best.T[:3, 0]
+            turning[3:, 3:] = self.settings.turning[1] ** 2 * np.outer(axis, axis)
+        return self._estimate(best.T, best.covariance + turning, best.overlap, found.hidden, state, T_probable, found)
 
     def _shaped(self, seen: Evidence, found: Fit, T_prior: Array, prior: Array) -> Fit:
         """Fits a limb whose shape is not quite the mesh's."""
@@ -408,8 +411,12 @@ class Search:
         surprise = _surprise(T_prior, prior)
         return against_mirror(best, lambda T: near(T, T, none), surprise, self.settings.fits_shaped, self._limits)
 
-    def _findings(self, seen: Evidence, best: Fit, with_image: bool, is_expected: bool) -> Findings:
+    def _findings(
+        self, seen: Evidence, best: Fit, with_image: bool, is_expected: bool, T_expected: Array, expected: Array
+    ) -> Findings:
+        """The properties of a fit; expected: covariance (6, 6) of the prediction T_expected (4 x 4)."""
         amodal = max(self._amodal_px(best.T_searched, seen.intrinsics), 1)
+        away = rigid.pose_error(best.T, T_expected)
         return Findings(
             overlap=best.overlap,
             misfit=best.misfit,
@@ -420,6 +427,9 @@ class Search:
             covered=1.0 - (best.both + best.free) / amodal,
             has_image=with_image,
             is_expected=is_expected,
+            sigma=_worst(best.covariance),
+            surprise=float(away @ np.linalg.solve(expected, away)),
+            expected_sigma=_worst(expected),
         )
 
     def _amodal_px(self, T: Array, k: Intrinsics) -> int:
@@ -455,10 +465,27 @@ class Search:
         self._has_other_shape = False
         return self._estimate(T, self._limits.covariance, 0.0, 1.0, "lost", T)
 
-    def _estimate(self, T: Array, covariance: Array, share: float, hidden: float, state: State, T_searched: Array) -> Searched:
+    def _estimate(
+        self,
+        T: Array,
+        covariance: Array,
+        share: float,
+        hidden: float,
+        state: State,
+        T_searched: Array,
+        found: Findings | None = None,
+    ) -> Searched:
         T_world_camera = self._camera.T_world_camera
         covariance = self._axes @ covariance @ self._axes.T
-        return Searched(T_world_camera @ T, (covariance + covariance.T) / 2.0, share, hidden, state, T_world_camera @ T_searched)
+        covariance = (covariance + covariance.T) / 2.0
+        confidence = found.confidence if found is not None else 0.0 if state == "lost" else None
+        T, T_searched = T_world_camera @ T, T_world_camera @ T_searched
+        return Searched(T, covariance, share, hidden, state, T_searched, found, confidence=confidence)
+
+
+def _worst(covariance: Array) -> float:
+    """The standard deviation [m] of a position along its worst direction, from the covariance (6, 6) of its pose."""
+    return math.sqrt(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
 
 
 def _surprise(T_prior: Array, prior: Array) -> Callable[[Fit], float]:

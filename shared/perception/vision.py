@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -17,13 +17,14 @@ State = Literal["tracking", "occluded", "lost"]
 @dataclass(frozen=True)
 class VisionEstimate:
     """T_world_target, covariance (6, 6) along the world's axes, overlap and hidden share in [0, 1], state. The pose is based on
-    the measurement alone."""
+    the measurement alone. confidence: probability in [0, 1] that the pose is right, None if unknown."""
 
     T: NDArray[np.float64]
     covariance: NDArray[np.float64]
     overlap: float
     hidden: float
     state: State
+    confidence: float | None = field(default=None, kw_only=True)
 
     def message(self, stamp_ns: int, target: str, camera: str, frame: str) -> VisionPose:
         """Message of the estimate for a frame exposed at a stamp."""
@@ -39,4 +40,5 @@ class VisionEstimate:
             overlap=self.overlap,
             hidden=self.hidden,
             state=self.state,
+            confidence=self.confidence,
         )

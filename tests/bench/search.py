@@ -9,8 +9,9 @@ it out.
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +25,7 @@ from scipy.stats import chi2, rankdata
 from penumbra.services import flags
 from penumbra.services.search.mask_fit import Noise
 from penumbra.services.search.tracker import Search, Searched
+from penumbra.services.search.verdict import WRONG
 from penumbra.services.segmentation.inference import Segmenter, load_segmenter
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.contract.messages import Mask
@@ -46,8 +48,6 @@ PRIOR = np.diag(np.repeat(np.square(START) / 3.0, 3))
 """Covariance of the starts, the same along any axes."""
 EXACT = Noise(edge=0.29, correlation=2.0, dilation=0.02)
 """Noise of an exact mask, for the search: uniform in a pixel, and the stairs of a slanted edge repeat it."""
-LOST = (0.05, np.radians(20.0))
-"""An error in position [m] or of the limb's axis [rad] beyond which a pose is wrong."""
 GONE = 0.95
 """Hidden share above which nothing is left to track."""
 GOALS = {0.0: (0.25, 0.4), 0.3: (0.3, 0.5), 0.6: (0.6, 1.2), 0.85: (1.5, 2.5)}
@@ -114,7 +114,7 @@ class Result:
 
     @property
     def is_wrong(self) -> bool:
-        return bool(self.position > LOST[0] or self.axis > LOST[1])
+        return bool(self.position > WRONG[0] or self.axis > WRONG[1])
 
 
 def perturbed(rng: np.random.Generator) -> Array:
@@ -279,17 +279,6 @@ def nees(results: list[Result]) -> dict[str, Any]:
     }
 
 
-def doubt(estimate: Searched) -> float:
-    """An estimate's doubt in itself, as a score for ranking: infinite where it is not tracking."""
-    if estimate.state != "tracking":
-        return np.inf
-    confidence = getattr(estimate, "confidence", None)
-    if confidence is not None:
-        return 1.0 - float(confidence)
-    sigma = [np.sqrt(np.linalg.eigvalsh(estimate.covariance[i : i + 3, i : i + 3])[-1]) for i in (0, 3)]
-    return float(max(sigma[0] / LOST[0], (1.0 - estimate.overlap) / 0.2))
-
-
 def auc(scores: Array, positive: np.ndarray) -> float | None:
     """Area under the ROC curve: the probability that a positive scores above a negative, ties counted half."""
     n, p = int((~positive).sum()), int(positive.sum())
@@ -298,43 +287,63 @@ def auc(scores: Array, positive: np.ndarray) -> float | None:
     return float((rankdata(scores)[positive].sum() - p * (p + 1) / 2.0) / (n * p))
 
 
+CONFIDENCES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)
+"""Bounds of the confidences that are compared with the share of right poses."""
 KINDS = ("good start", "bad start", "wrong mask", "no prior", "absent")
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A frame of one of KINDS: how much the estimate doubts itself, whether its pose is wrong, whether the mask shows the target.
+    """A frame of one of KINDS: the estimate, whether its pose is wrong, whether the mask shows the target.
 
     Where the search gives up, it reports the start's pose. With a good start and a mask that shows something else this pose is
     right by chance: such a frame counts as one that should be doubted.
     """
 
     kind: str
-    doubt: float
+    estimate: Searched
     is_wrong: bool
     is_shown: bool
 
     @property
     def is_told(self) -> bool:
-        return bool(np.isfinite(self.doubt))
+        return self.estimate.state == "tracking"
+
+    @property
+    def confidence(self) -> float:
+        """0 where the search did not say."""
+        return self.estimate.confidence or 0.0
 
     @property
     def should_be_doubted(self) -> bool:
         return self.is_wrong or not (self.is_shown or self.is_told)
 
 
-def lost_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domain) -> Iterator[Judgement]:
-    """Frames of all KINDS."""
-
-    def judgement(kind: str, shot: Shot, mask: Mask, T_prior: Array | None) -> Judgement:
-        found = searched(shot, search_of(shot, "default", False), mask, T_prior)
-        return Judgement(kind, doubt(found.estimate), found.is_wrong or kind == "absent", shows_target(mask, shot))
-
+def lost_frames(
+    seed: int,
+    count: int,
+    segmenter: Segmenter,
+    domain: shots.Domain,
+    view: tuple[int, int, float] = NEES_VIEW,
+    hands: shots.Hands = "stiff",
+    has_image: bool = True,
+    spreads: tuple[float, ...] = (1.0,),
+) -> Iterator[Judgement]:
+    """Frames of all KINDS. has_image: whether the search gets the image as well; spreads: factors, in turn, on the standard
+    deviations of the starts, which the search knows; bad starts are not as near as it is told."""
     for index in range(count):
         rng = np.random.default_rng([seed, index, 2])
-        film = shots.clip(seed, index, *NEES_VIEW, HIDDEN[index % len(HIDDEN)], domain, 3)
+        spread = spreads[index % len(spreads)]
+
+        def judgement(kind: str, shot: Shot, mask: Mask, T_prior: Array | None, spread: float = spread) -> Judgement:
+            search, covariance = search_of(shot, "default", False), None if T_prior is None else spread**2 * PRIOR
+            estimate = search.update(mask, T_prior, covariance, shot.joints, shot.image if has_image else None)
+            is_wrong = Result(estimate, shot, 0.0).is_wrong or kind == "absent"
+            return Judgement(kind, estimate, is_wrong, shows_target(mask, shot))
+
+        film = shots.clip(seed, index, *view, HIDDEN[index % len(HIDDEN)], domain, 3, hands=hands)
         last = film[-1]
-        near, far = perturbed(rng), np.concatenate([_length(rng, 0.08, 0.4), _length(rng, 0.3, 1.5)])
+        near, far = spread * perturbed(rng), np.concatenate([_length(rng, 0.08, 0.4), _length(rng, 0.3, 1.5)])
         T_near, T_far = (rigid.perturb(last.T_world_target, error) for error in (near, far))
         *_, mask = network_masks(segmenter, film, around(near))
         yield judgement("good start", last, mask, T_near)
@@ -343,7 +352,7 @@ def lost_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domai
         yield judgement("bad start", last, mask, T_far)
         *_, mask = network_masks(segmenter, film, lambda shot, previous: whole_frame(shot.camera))
         yield judgement("no prior", last, mask, None)
-        empty = shots.clip(seed, index, *NEES_VIEW, 0.0, domain, 3, present=False)
+        empty = shots.clip(seed, index, *view, 0.0, domain, 3, present=False)
         T_prior = rigid.perturb(empty[-1].T_world_target, near) if index % 2 else None
         *_, mask = network_masks(segmenter, empty, around(near))
         yield judgement("absent", empty[-1], mask, T_prior)
@@ -384,8 +393,8 @@ def spoiled(mask: Mask, rng: np.random.Generator) -> Mask:
     return Mask(stamp_ns=mask.stamp_ns, labels=np.ascontiguousarray(labels), x0=mask.x0, y0=mask.y0, scale=mask.scale)
 
 
-def gone_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domain) -> Iterator[tuple[float, str]]:
-    """Frames in which more than GONE of the target is hidden: the share hidden and the search's state."""
+def gone_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domain) -> Iterator[Searched]:
+    """Estimates from frames in which more than GONE of the target is hidden."""
     for index in range(count):
         film = shots.clip(seed, index, *NEES_VIEW, (0.975, 0.99, 1.0)[index % 3], domain, 5)
         error = perturbed(np.random.default_rng([seed, index, 3]))
@@ -393,7 +402,7 @@ def gone_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domai
         for shot, mask in zip(film, network_masks(segmenter, film, around(error)), strict=True):
             found = searched(shot, search, mask, rigid.perturb(shot.T_world_target, error))
             if shot.hidden > GONE:
-                yield shot.hidden, found.estimate.state
+                yield found.estimate
 
 
 def rows_of(seed: int, plan: Plan, masks: tuple[str, ...]) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
@@ -433,7 +442,7 @@ def judged(seed: int, plan: Plan) -> dict[str, Any]:
     """The search's own judgement: as a detector of wrong poses, and where nothing is left to see."""
     segmenter = load_segmenter()
     frames = list(lost_frames(seed, plan.lost, segmenter, plan.domain))
-    doubts = np.array([frame.doubt for frame in frames])
+    doubts = np.array([1.0 - frame.confidence for frame in frames])
     area = auc(doubts, np.array([frame.should_be_doubted for frame in frames]))
     by_error = auc(doubts, np.array([frame.is_wrong for frame in frames]))
     kinds = {}
@@ -451,9 +460,22 @@ def judged(seed: int, plan: Plan) -> dict[str, Any]:
         "lost_auc": None if by_error is None else round(by_error, 4),
         "lost_auc_giving_up_right": None if area is None else round(area, 4),
         "lost": kinds,
-        "false_tracking": sum(state == "tracking" for _, state in gone),
+        "reliability": reliability(frames),
+        "false_tracking": sum(estimate.state == "tracking" for estimate in gone),
         "hidden_frames": len(gone),
     }
+
+
+def reliability(frames: Sequence[Judgement]) -> list[dict[str, Any]]:
+    """By bounds of the confidence: the number of frames, their mean confidence, and the share that should not be doubted."""
+    rows = []
+    for low, high in itertools.pairwise(CONFIDENCES):
+        chosen = [frame for frame in frames if low <= frame.confidence < high]
+        if chosen:
+            mean = float(np.mean([frame.confidence for frame in chosen]))
+            right = float(np.mean([not frame.should_be_doubted for frame in chosen]))
+            rows.append({"low": low, "high": high, "frames": len(chosen), "confidence": round(mean, 3), "right": round(right, 3)})
+    return rows
 
 
 def measure(seed: int, plan: Plan, parts: tuple[str, ...]) -> dict[str, Any]:
@@ -522,8 +544,14 @@ def _judged(result: dict[str, Any]) -> list[Part]:
     area = result["lost_auc"]
     told = "-" if area is None else marked(f"{area:.3f}", area >= AUC_GOAL)
     false = marked(f"{result['false_tracking']} of {result['hidden_frames']}", result["false_tracking"] == 0)
+    reliable = Table("confidence", "frames", "mean confidence", "right", title="How often a pose is right, by its confidence")
+    for row in result["reliability"]:
+        reliable.add_row(
+            f"{row['low']:g} to {min(row['high'], 1.0):g}", str(row["frames"]), f"{row['confidence']:.2f}", f"{row['right']:.2f}"
+        )
     return [
         kinds,
+        reliable,
         f"Wrong poses doubted: area under the ROC curve {told} (goal {AUC_GOAL}); {result['lost_auc_giving_up_right']} if giving "
         "up on a mask of something else is right, whatever the start.",
         f"More than {GONE:.0%} hidden and tracking: {false} (goal 0).",

@@ -19,6 +19,7 @@ from rich.table import Table
 
 from penumbra.services import flags
 from penumbra.services.replay.chain import Replay
+from penumbra.services.search.verdict import WRONG
 from penumbra.shared.contract import topics
 from penumbra.shared.contract.messages import Frame, FusedPose, Message, VisionPose
 from penumbra.shared.contract.topics import Topic
@@ -28,7 +29,7 @@ from penumbra.sim.sets import shots
 from penumbra.sim.sets.shots import Domain, Shot
 from penumbra.tests.bench.lib import results
 from penumbra.tests.bench.lib.results import Part, Result, marked
-from penumbra.tests.bench.search import GONE, LOST
+from penumbra.tests.bench.search import GONE
 
 BACKGROUNDS: dict[str, Domain] = {"plain": "easy", "cluttered": "wide"}
 SERVICES = ("segmentation", "search", "fusion")
@@ -75,7 +76,7 @@ class Film:
     def is_right(self, truth: Truth) -> bool:
         """Whether the camera's pose is tracked and not wrong."""
         pose = self.vision.get(truth.stamp_ns)
-        return pose is not None and pose.state == "tracking" and bool(np.less(self.errors(pose, truth), LOST).all())
+        return pose is not None and pose.state == "tracking" and bool(np.less(self.errors(pose, truth), WRONG).all())
 
 
 def played(film: Iterator[Shot], arguments: dict[str, list[str]] | None = None) -> Film:

@@ -125,12 +125,23 @@ def test_a_mask_shows_the_target_where_it_agrees_with_the_truth_at_any_scale():
 
 
 def test_giving_up_is_right_where_a_mask_shows_something_else_and_the_start_was_right_by_luck():
-    def told(doubt: float, wrong: bool, shown: bool) -> bool:
-        return search.Judgement("wrong mask", doubt, wrong, shown).should_be_doubted
+    def told(state: Any, wrong: bool, shown: bool) -> bool:
+        T = np.eye(4)
+        return search.Judgement("wrong mask", Searched(T, np.eye(6), 1.0, 0.0, state, T), wrong, shown).should_be_doubted
 
-    assert told(np.inf, False, False) and told(np.inf, True, True) and told(0.1, True, True)
-    assert not told(np.inf, False, True)  # it could have been measured
-    assert not told(0.1, False, False)  # right all the same
+    assert told("lost", False, False) and told("lost", True, True) and told("tracking", True, True)
+    assert not told("lost", False, True)  # it could have been measured
+    assert not told("tracking", False, False)  # right all the same
+
+
+def test_the_share_of_right_poses_is_told_by_their_confidence():
+    T = np.eye(4)
+
+    def frame(confidence: float, wrong: bool) -> search.Judgement:
+        return search.Judgement("good start", Searched(T, np.eye(6), 1.0, 0.0, "tracking", T, confidence=confidence), wrong, True)
+
+    rows = search.reliability([frame(0.95, False), frame(0.97, True), frame(1.0, False), frame(0.2, True)])
+    assert [(row["frames"], row["confidence"], row["right"]) for row in rows] == [(1, 0.2, 0.0), (3, 0.973, 0.667)]
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The cases of the judgement of a fitted pose, one by one."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from penumbra.services.search.settings import ONE_IN_10, ONE_IN_10_000, ONE_IN_100, SearchSettings
-from penumbra.services.search.verdict import Findings, Verdict, explains_mask, is_of_other_shape, verdict
+from penumbra.services.search.verdict import WEIGHTS, Findings, Verdict, explains_mask, is_of_other_shape, verdict
 
 SETTINGS = SearchSettings()
 GOOD = Findings(
@@ -20,6 +21,9 @@ GOOD = Findings(
     covered=0.05,
     has_image=True,
     is_expected=False,
+    sigma=0.01,
+    surprise=5.0,
+    expected_sigma=0.03,
 )
 
 
@@ -73,6 +77,41 @@ def test_what_shows_too_little_is_occluded_where_something_covers_it_and_lost_wh
     assert judged(hidden=0.99, covered=0.5) is Verdict.TOO_LITTLE
     assert {case.state for case in Verdict} == {"tracking", "occluded", "lost"}
     assert Verdict.COVERED.state == "occluded" and Verdict.TOO_LITTLE.state == "lost"
+
+
+WORSE = ({"overlap": 0.7}, {"is_sharp": False}, {"points": 4.0}, {"hidden": 0.9}, {"sigma": 0.2}, {"surprise": 1e2},
+         {"expected_sigma": 0.3})  # fmt: skip
+
+
+def confidence(**changes: object) -> float:
+    return replace(GOOD, **changes).confidence  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("worse", WORSE)
+def test_whatever_speaks_against_a_pose_makes_it_less_probable(worse):
+    assert GOOD.confidence > 0.95
+    assert confidence(**worse) < GOOD.confidence
+
+
+def test_several_findings_together_make_a_pose_improbable():
+    assert confidence(is_sharp=False) < confidence(is_sharp=False, has_image=False) < GOOD.confidence
+    assert confidence(is_sharp=False, overlap=0.4, surprise=400.0) < 0.1
+    assert confidence(points=3.0, sigma=0.2, hidden=0.9, expected_sigma=0.3) < 0.3  # a small piece may be anything
+
+
+def test_a_pose_that_nothing_refutes_is_not_tracked_if_it_is_improbable_all_the_same():
+    odd = {"overlap": 0.81, "sigma": 0.3, "surprise": 300.0, "points": 9.0, "hidden": 0.4}
+    assert judged(**(odd | {"surprise": 3.0})) is Verdict.RIGHT
+    assert judged(**odd) is Verdict.IMPROBABLE
+    assert judged(**odd, shape=0.005, is_sharp=False) is Verdict.IMPROBABLE
+
+
+def test_the_log_odds_are_the_weighted_sum_of_the_features():
+    assert GOOD.features.keys() == WEIGHTS.keys()
+    odds = sum(WEIGHTS[name] * value for name, value in GOOD.features.items())
+    assert math.log(GOOD.confidence / (1.0 - GOOD.confidence)) == pytest.approx(odds)
+    surer = confidence(overlap=1.0)
+    assert math.log(surer / (1.0 - surer)) - odds == pytest.approx(0.05 * WEIGHTS["overlap"])
 
 
 def test_a_pose_explains_a_mask_by_overlap_and_boundary_together():
