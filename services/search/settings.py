@@ -81,6 +81,9 @@ class SearchSettings:
     the fit from diverging."""
     prior_floor: tuple[float, float] = (0.02, 0.09)
     """Standard deviations [m, rad] added to the prediction's for the same reason. Chosen."""
+    beside: tuple[float, float] = (0.05, 0.3)
+    """Standard deviations [m, rad] about a rival of the pose, with which it is fitted to the mask where the image does not
+    confirm it as it is: a turned limb of which only a piece shows lies elsewhere. Chosen: half of the turns' spacing."""
     joint_margin: float = 0.02
     """Length [m] beyond the limb's predicted near end in which the mask is still used. Chosen: the prediction may be off."""
 

@@ -65,6 +65,7 @@ class Search:
         self._detected_ns: int | None = None
         self._last: tuple[int, Array] | None = None  # stamp and T_camera_target of the last picture in which it was tracked
         self._rivals = Rivals(self._limits)
+        self._beside = np.diag(np.repeat(np.square(self.settings.beside), 3) ** -1.0)
         self._has_other_shape = False  # than the mesh, in the last picture in which it was tracked
         self._sharp = 0  # pictures that showed the mesh, less those in which the target was lost since
 
@@ -191,8 +192,14 @@ class Search:
             return best
 
         def shown(T: Array, passes: int, hand: float) -> Fit:
-            start = replace(best, T=T, T_searched=T, hand=hand)
-            return fit_image(self._model, start, image, seen, T, np.zeros((6, 6)), ImageSettings(passes=passes))
+            def near(start: Fit) -> Fit:
+                start = replace(start, hand=hand)
+                return fit_image(
+                    self._model, start, image, seen, start.T_searched, np.zeros((6, 6)), ImageSettings(passes=passes)
+                )
+
+            found = near(replace(best, T=T, T_searched=T))
+            return found if found.sharp else near(self._fit(seen, T, T, self._beside, ROUGH))
 
         return self._rivals.contested(best, stamp_ns, shown, _surprise(T_prior, prior))
 
