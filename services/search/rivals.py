@@ -3,7 +3,8 @@ limb lies in the image plane.
 
 A forearm is nearly round. Without its hand, a limb that is turned over has almost the same contour, and every fit keeps the roll
 that it started from, right or wrong. So rivals are fitted to the picture: turns about the limb's axis, and the mirror image of
-its tilt. The evidence of the pictures about a rival is summed. A rival that the pictures and the prediction prefer replaces the
+its tilt. One that the image does not confirm there is fitted to the mask first: a turned limb of which only a piece shows lies
+elsewhere. The evidence of the pictures about a rival is summed. A rival that the pictures and the prediction prefer replaces the
 pose, and all rivals are compared anew. Until that is done, it keeps its place in the next pictures, in which a fit from the
 prediction, which has the turn before, would end at the previous pose again. A rival that is not refuted makes the pose as
 uncertain as the two are apart, until it is compared again; so does one that was not compared yet. The prediction counts because

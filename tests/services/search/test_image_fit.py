@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from penumbra.services.search import contour, tracker
 from penumbra.services.search.contour import MEASURED, POINT
-from penumbra.services.search.image_fit import UNKNOWNS, ImageSettings, offsets, unfitted
+from penumbra.services.search.image_fit import UNKNOWNS, ImageSettings, fit_image, offsets, unfitted
 from penumbra.services.search.mask_fit import Limits, marginal
-from penumbra.services.search.rivals import RIVALS
+from penumbra.services.search.rivals import PASSES, RIVALS
 from penumbra.services.search.tracker import Search, Searched
-from penumbra.shared.contract.labels import Label
+from penumbra.shared.contract.labels import TARGET_LABELS, Label
 from penumbra.shared.contract.messages import Mask
 from penumbra.shared.geometry import rigid
+from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.shared.perception.lookout import corners_of, window_around
 from penumbra.sim.sets import shots
 from penumbra.sim.sets.shots import Shot
@@ -267,3 +271,33 @@ def test_how_far_away_a_distant_limb_is_need_not_be_known_to_expect_it(across):
         T = start(shot, index)
         states.append(Search(shot.cell).update(mask(shot, T), T, prior, shot.joints, shot.image).state)
     assert "tracking" not in states if across else np.mean([state == "tracking" for state in states]) > 0.7
+
+
+def test_a_rival_that_the_image_refuses_is_fitted_to_the_mask_before_it_is_tried_again(monkeypatch):
+    """A turned limb of which only a piece shows lies elsewhere than the pose."""
+    shot = shots.shot(7400, 1, hidden=0.6, domain="easy")
+    shown, search = mask(shot, shot.T_world_target), Search(shot.cell)
+    model = contour.Model(shot.mesh)
+    k = Intrinsics.of_window(shot.camera, shown.x0, shown.y0, shown.scale)
+    is_target = np.isin(shown.labels, TARGET_LABELS)
+    fitted: list[tuple[np.ndarray, int, bool]] = []
+
+    def overlap(T: np.ndarray) -> float:
+        is_shown = model.silhouette(T, k, (0, 0, *is_target.shape[::-1]))
+        covered = np.isin(shown.labels, (Label.FOREARM, Label.HAND, Label.BACKGROUND))  # what may show the target
+        return float((is_shown & is_target).sum() / ((is_shown & covered) | is_target).sum())
+
+    def recorded(model, first, image, evidence, T_prior, prior, settings=None):
+        found = fit_image(model, first, image, evidence, T_prior, prior, settings or ImageSettings())
+        fitted.append((first.T_searched, settings.passes if settings else 0, found.sharp))
+        return found
+
+    monkeypatch.setattr(tracker, "fit_image", recorded)
+    for i in range(1, RIVALS + 1):
+        found = search.update(replace(shown, stamp_ns=50_000_000 * i), shot.T_world_target, PRIOR, shot.joints, shot.image)
+        assert found.state == "tracking"
+    tried = [(T, sharp) for T, passes, sharp in fitted if passes == PASSES]
+    refused = [(T, again) for (T, sharp), (again, _) in itertools.pairwise(tried) if not sharp]
+    assert len(tried) > RIVALS and len(refused) >= 2
+    nearer = [overlap(again) > overlap(T) for T, again in refused]
+    assert np.mean(nearer) > 0.7
