@@ -13,7 +13,7 @@ from penumbra.services.search import contour, detect, evidence, paper_search
 from penumbra.services.search.evidence import TARGET, Evidence
 from penumbra.services.search.image_fit import ImageSettings, fit_image, straightest
 from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
-from penumbra.services.search.rivals import Rivals, against_mirror
+from penumbra.services.search.rivals import PASSES, Rivals, against_mirror
 from penumbra.services.search.settings import SearchSettings
 from penumbra.services.search.shape_fit import fit_shape
 from penumbra.services.search.verdict import Findings, explains_mask, is_of_other_shape, least_overlap, verdict
@@ -199,7 +199,9 @@ class Search:
                 )
 
             found = near(replace(best, T=T, T_searched=T))
-            return found if found.sharp else near(self._fit(seen, T, T, self._beside, ROUGH))
+            if found.sharp or passes < PASSES:  # the latter: not a rival, but the pose itself
+                return found
+            return near(self._fit(seen, T, T, self._beside, ROUGH))
 
         return self._rivals.contested(best, stamp_ns, shown, _surprise(T_prior, prior))
 

@@ -18,7 +18,7 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.sim.sets import shots
 from penumbra.tests.bench import lost, search, tracking
-from penumbra.tests.bench.lib import bound
+from penumbra.tests.bench.lib import bound, verdicts
 
 
 def rms_cm(information: np.ndarray) -> float:
@@ -142,6 +142,14 @@ def test_the_share_of_right_poses_is_told_by_their_confidence():
 
     rows = search.reliability([frame(0.95, False), frame(0.97, True), frame(1.0, False), frame(0.2, True)])
     assert [(row["frames"], row["confidence"], row["right"]) for row in rows] == [(1, 0.2, 0.0), (3, 0.973, 0.667)]
+
+
+def test_the_weights_of_the_verdict_are_those_by_which_poses_were_drawn():
+    rng = np.random.default_rng(6)
+    features = np.column_stack([np.ones(20_000), rng.normal(0.8, 0.1, 20_000), rng.normal(2.0, 1.0, 20_000)])
+    weights = np.array([-7.0, 10.0, -0.5])
+    is_right = (rng.random(20_000) < 1.0 / (1.0 + np.exp(-features @ weights))).astype(float)
+    np.testing.assert_allclose(verdicts.fitted(features, is_right), weights, rtol=0.05, atol=0.02)
 
 
 @pytest.mark.slow
