@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import importlib.util
 import inspect
+import json
 import re
 import runpy
 import shlex
@@ -29,6 +30,32 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+
+
+def test_the_readme_s_accuracy_is_that_of_the_results():
+    readme = (ROOT / "README.md").read_text()
+    table, fusion, haptics = (
+        json.loads((published.DATA / f"{name}.json").read_text()) for name in ("table1", "fusion", "haptics")
+    )
+    multimodal = table["columns"].index("multimodal_procnet")
+
+    def of_run(reach: str, hidden: str) -> str:
+        return f"{table[f'haptic_range_{reach}']['short_0_3m'][hidden]['ours'][multimodal]:.2f} cm"
+
+    def by_direction(values: dict[str, float]) -> str:
+        return " / ".join(f"{values[name]:.1f}" for name in ("lateral", "height", "axial")) + " mm"
+
+    visible = fusion["situations"]["visible"]
+    skin = {"array": "bare", "gap_m": 0.05, "pads": 8, "prior": True, "speed": 0.0}
+    (felt,) = (row for row in haptics["rows"] if skin.items() <= row.items())
+    for row in (
+        f"skin in range, mean error | {of_run('inside', 'light')} |",
+        f"the same, heavily occluded | {of_run('inside', 'heavy')} |",
+        f"heavily occluded, skin out of range | {of_run('outside', 'heavy')} |",
+        f"visible, mean error | {visible['error_cm']:.2f} cm | gtsam's smoother {visible['baselines_cm']['gtsam']:.2f} cm |",
+        f"| {by_direction(felt['rmse_mm'])} | Cramér-Rao bound {by_direction(felt['bound_mm'])} |",
+    ):
+        assert row in readme
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

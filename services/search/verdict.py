@@ -3,7 +3,8 @@
 A pose is right if its position is within WRONG[0] and its axis within WRONG[1] of the truth, and the mask shows the target. Its
 log odds are a weighted sum of what the fit found (logistic regression). `python -m penumbra.tests.bench.lib.verdicts` fits the
 weights to simulated pictures with the network's masks: with right and wrong predictions, masks of something else, and targets
-that are absent or hidden; `penumbra bench search` measures on others how true the probability is.
+that are absent or hidden; `penumbra bench search` measures on others how true the probability is. All limbs there are the mesh:
+for a limb of another shape the probability is too low, so the verdict does not depend on it.
 """
 
 from __future__ import annotations
@@ -40,7 +41,6 @@ class Verdict(Enum):
     ELSEWHERE = "lost", "mask and silhouette overlap too little"
     UNCONFIRMED = "lost", "the image shows no edges along the contour"
     MISSHAPEN = "lost", "the mask's boundary is not the contour's"
-    IMPROBABLE = "lost", "nothing refutes the pose, but all that was found together makes it improbable"
 
     def __init__(self, state: State, reason: str):
         self.state, self.reason = state, reason
@@ -99,15 +99,14 @@ def verdict(found: Findings, settings: SearchSettings) -> Verdict:
     if found.shape is not None:
         if found.overlap < settings.fits_shaped:
             return Verdict.ELSEWHERE
-        if found.shape >= settings.other_shape[1]:
-            return Verdict.MISSHAPEN
-    elif found.overlap < least_overlap(found.is_expected and found.is_sharp, settings):
+        return Verdict.RIGHT if found.shape < settings.other_shape[1] else Verdict.MISSHAPEN
+    if found.overlap < least_overlap(found.is_expected and found.is_sharp, settings):
         return Verdict.ELSEWHERE
-    elif found.has_image and not found.is_sharp:
+    if found.has_image and not found.is_sharp:
         return Verdict.UNCONFIRMED
-    elif not found.has_image and found.misfit >= settings.wrong_misfit:
+    if not found.has_image and found.misfit >= settings.wrong_misfit:
         return Verdict.MISSHAPEN
-    return Verdict.RIGHT if found.confidence >= settings.least_confidence else Verdict.IMPROBABLE
+    return Verdict.RIGHT
 
 
 def least_overlap(is_confirmed: bool, settings: SearchSettings) -> float:
