@@ -4,7 +4,7 @@ A pose is right if its position is within WRONG[0] and its axis within WRONG[1] 
 log odds are a weighted sum of what the fit found (logistic regression). `python -m penumbra.tests.bench.lib.verdicts` fits the
 weights to simulated pictures with the network's masks: with right and wrong predictions, masks of something else, and targets
 that are absent or hidden; `penumbra bench search` measures on others how true the probability is. All limbs there are the mesh:
-for a limb of another shape the probability is too low, so the verdict does not depend on it.
+for a limb of another shape the probability is too low, and its verdict does not depend on it.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ class Verdict(Enum):
     ELSEWHERE = "lost", "mask and silhouette overlap too little"
     UNCONFIRMED = "lost", "the image shows no edges along the contour"
     MISSHAPEN = "lost", "the mask's boundary is not the contour's"
+    IMPROBABLE = "lost", "nothing refutes the pose, but all that was found together makes it improbable"
 
     def __init__(self, state: State, reason: str):
         self.state, self.reason = state, reason
@@ -106,7 +107,7 @@ def verdict(found: Findings, settings: SearchSettings) -> Verdict:
         return Verdict.UNCONFIRMED
     if not found.has_image and found.misfit >= settings.wrong_misfit:
         return Verdict.MISSHAPEN
-    return Verdict.RIGHT
+    return Verdict.RIGHT if found.confidence >= settings.least_confidence else Verdict.IMPROBABLE
 
 
 def least_overlap(is_confirmed: bool, settings: SearchSettings) -> float:

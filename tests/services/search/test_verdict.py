@@ -99,6 +99,13 @@ def test_several_findings_together_make_a_pose_improbable():
     assert confidence(points=3.0, sigma=0.2, hidden=0.9, expected_sigma=0.3) < 0.3  # a small piece may be anything
 
 
+def test_a_pose_that_nothing_refutes_is_not_tracked_if_it_is_improbable_all_the_same():
+    odd = {"overlap": 0.81, "sigma": 0.3, "surprise": 300.0, "points": 9.0, "hidden": 0.4}
+    assert judged(**(odd | {"surprise": 3.0})) is Verdict.RIGHT
+    assert judged(**odd) is Verdict.IMPROBABLE
+    assert judged(**odd, shape=0.005, is_sharp=False) is Verdict.RIGHT  # the probability is that of limbs that are the mesh
+
+
 def test_the_log_odds_are_the_weighted_sum_of_the_features():
     assert GOOD.features.keys() == WEIGHTS.keys()
     odds = sum(WEIGHTS[name] * value for name, value in GOOD.features.items())
