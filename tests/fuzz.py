@@ -64,7 +64,7 @@ def _good(kind: type[messages.Message]) -> bytes:
         "labels": np.zeros((2, 3), np.uint8),
         "volts": np.ones((2, 5), np.float32),
     }
-    fields |= {"x0": 0, "y0": 0, "scale": 1, "period_ns": 10**6, "overlap": 0.9, "hidden": 0.1, "gap": 0.05}
+    fields |= {"x0": 0, "y0": 0, "scale": 1, "period_ns": 10**6, "overlap": 0.9, "hidden": 0.1, "gap": 0.05, "confidence": 0.9}
     point = messages.SurfacePoint("arm/link5", (0.0, 0.0, 0.1), distance=0.05, along=0.005, across=0.02, gap=0.05)
     fields |= {"surface": {"pad": point}, "contact": "touch", "touched": ("pad",), "step": np.zeros(6)}
     if kind is messages.Joints:
