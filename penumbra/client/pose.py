@@ -15,8 +15,8 @@ from penumbra.shared.geometry.rigid import Array
 
 State = Literal["tracking", "coasting", "lost"]
 """`tracking`: a sense measures the target, and three standard deviations of its position are within the `tracking_bound` of the
-cell file. `coasting`: no sense measures the target now, the newest measurement contradicts the pose, or the pose is less certain
-than that bound. `lost`: the pose is unknown."""
+cell file. `coasting`: no sense measures the target now, the newest measurement contradicts the pose, a camera that saw the
+target until recently does not see it there, or the pose is less certain than that bound. `lost`: the pose is unknown."""
 
 
 @dataclass(frozen=True, eq=False)

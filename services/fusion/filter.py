@@ -57,6 +57,9 @@ SWIFT, REMEMBERED = 100.0, 0.3
 """Agility above which a limb is fast, and factor on the rate at which its agility then decreases: a fast hand that rests will set
 out as before, and no picture shows it in time. Slow limbs have agilities up to 20. With 0.3 instead of 1, 0.05 % instead of 1.0 %
 of the poses of a fast hand are beyond three sigma (12 runs of seed 8401)."""
+TOLD_APART = 9.0
+"""Squared Mahalanobis distance between two poses, by the covariance of one measurement, above which that measurement tells them
+apart: three standard deviations."""
 SURPRISING = 2.0
 """Squared Mahalanobis distance per direction (1 expected) above which a measurement does not change the process noise while
 another sense agrees better with the state: otherwise the state would follow a sense with a small bias. Chosen, not measured."""
@@ -91,7 +94,7 @@ def forget(state):  # type: ignore[no-untyped-def]
     for s in range(len(state.senses)):
         sense = state.senses[s]
         sense.measured_ns = sense.learned_ns = sense.accepted_ns = sense.refused_ns = NEVER
-        sense.refused = sense.has_innovation = sense.unsteady = 0
+        sense.refused = sense.contradicted = sense.has_innovation = sense.unsteady = 0
         sense.gain, sense.doubt = 0.0, 1.0
         for i in range(POSE):
             sense.bias[i] = 0.0
@@ -116,7 +119,9 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
         now.distance, now.rank = distance, m.rank
         sense.surprise, sense.measured_ns, sense.rank = distance / m.rank, m.stamp_ns, m.rank
         so3.copy(m.directions, sense.directions)
-        contradicted = _is_contradicted(one, state, m, innovation)
+        for k in range(m.rank):
+            sense.sigma[k] = m.sigma[k]
+        contradicted = _is_contradicted(one, state, m, z)
         gate = 0 if not contradicted else 1 if sense.refused < one.refusals else 2
         passes = distance <= model.senses[m.source].threshold[gate, m.rank]
         if now.wrong != NOBODY and now.wrong != m.source and distance > model.senses[m.source].threshold[1, m.rank]:
@@ -135,6 +140,7 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
         if sense.refused == 0:
             sense.refused_ns = m.stamp_ns
         sense.refused += 1
+        sense.contradicted = 1 if contradicted else 0
         now.passed = 0
         if _is_blind(one, state) and not contradicted:
             _start_where_it_is(one, state, m)
@@ -208,29 +214,34 @@ def trust(state):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _is_contradicted(one, state, m, innovation):  # type: ignore[no-untyped-def]
+def _is_contradicted(one, state, m, z):  # type: ignore[no-untyped-def]
     """Whether another sense with a recent measurement, accepted or not, agrees better with the state: then the measurement is
-    wrong rather than the state. To adapt to it would raise the process noise until it passes the gate. A sense that does not
-    observe what is surprising, as the skin does not the roll of a limb, cannot agree with it. innovation: (6,)."""
+    wrong rather than the state. To adapt to it would raise the process noise until it passes the gate. A sense that cannot tell
+    the measured pose from the state's agrees with either: the skin does not feel a roll, and from afar not where along itself a
+    limb is. z: the innovation (k,)."""
     surprise = state.senses[m.source].surprise
     for s in range(len(state.senses)):
         other = state.senses[s]
         if m.stamp_ns - other.measured_ns < one.agreement_time * 1e9 and other.surprise < surprise:
-            seen = 0.0
+            apart = 0.0
             for k in range(other.rank):
-                seen += so3.dot(other.directions[k], innovation) ** 2
-            if seen > 0.5 * so3.dot(innovation, innovation):
+                along = 0.0
+                for i in range(m.rank):
+                    along += z[i] * so3.dot(m.directions[i], other.directions[k])
+                apart += (along / other.sigma[k]) ** 2
+            if apart > TOLD_APART:
                 return True
     return False
 
 
 @inner
 def is_contested(state):  # type: ignore[no-untyped-def]
-    """Whether a sense contradicts the state and nothing newer has confirmed it: the limb may be elsewhere. A sense that is wrong
-    for long is answered by the next measurement of another one that is accepted."""
+    """Whether a sense contradicts the state, and no other one contradicts that sense, or nothing newer has confirmed the state:
+    the limb may be elsewhere. A sense that is wrong for long is answered by the next measurement that is accepted of another one
+    which can tell the two poses apart."""
     for s in range(len(state.senses)):
         sense = state.senses[s]
-        if sense.refused and sense.refused_ns >= state.now.accepted_ns:
+        if sense.refused and (not sense.contradicted or sense.refused_ns >= state.now.accepted_ns):
             return True
     return False
 

@@ -234,9 +234,20 @@ def measure_all(
             fates[r] = insert(model, history, m, PHt) if m.rank else NOTHING
 
 
+@inner
+def _is_denied(one, senses, denied_ns, stamp_ns):  # type: ignore[no-untyped-def]
+    """Whether a sense that saw the target until recently looks where the target is expected, and does not find it there."""
+    for s in range(len(senses)):
+        seen_ns, said_ns = senses[s].accepted_ns, denied_ns[s]
+        has_seen = seen_ns != NEVER and stamp_ns - seen_ns < one.lost_age * 1e9
+        if has_seen and said_ns - seen_ns > one.denial[0] * 1e9 and 0 <= stamp_ns - said_ns < one.denial[1] * 1e9:
+            return True
+    return False
+
+
 @kernel(
-    "MODEL[t], SENSE_MODEL[n], MEASUREMENT[t, c], STATE[t, c], SENSE_STATE[t, c, n], f8[t, c, size, size], i8[t, 2], i8, "
-    "out ESTIMATE[t], out SENSE_ESTIMATE[t, n]",
+    "MODEL[t], SENSE_MODEL[n], MEASUREMENT[t, c], STATE[t, c], SENSE_STATE[t, c, n], f8[t, c, size, size], i8[t, 2], i8[t, n], "
+    "i8, out ESTIMATE[t], out SENSE_ESTIMATE[t, n]",
     MODEL=MODEL,
     SENSE_MODEL=SENSE_MODEL,
     MEASUREMENT=MEASUREMENT,
@@ -245,8 +256,10 @@ def measure_all(
     ESTIMATE=ESTIMATE,
     SENSE_ESTIMATE=SENSE_ESTIMATE,
 )
-def estimate_all(models, sense_models, measurements, states, senses, P, rings, stamp_ns, out, shares):  # type: ignore[no-untyped-def]
-    """`Bank.estimate`, one after the other."""
+def estimate_all(
+    models, sense_models, measurements, states, senses, P, rings, denied_ns, stamp_ns, out, shares
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """`Bank.estimate`, one after the other. denied_ns (t, n) : stamps at which senses last denied the targets."""
     p, R, covariance = np.empty(3), np.empty((3, 3)), np.empty((MOTION, MOTION))
     velocity, acceleration = np.empty(POSE), np.empty(POSE)
     for n in range(len(out)):
@@ -283,7 +296,9 @@ def estimate_all(models, sense_models, measurements, states, senses, P, rings, s
             if stamp_ns > now.accepted_ns:  # a guess; what is measured is believed
                 within_reach(one, p, R)
             found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)
-            if found.state == TRACKING and is_contested(State(now, of_senses, P[n, slot])):
+            if found.state == TRACKING and (
+                is_contested(State(now, of_senses, P[n, slot])) or _is_denied(one, of_senses, denied_ns[n], stamp_ns)
+            ):
                 found.state = COASTING
         for i in range(3):
             for j in range(3):

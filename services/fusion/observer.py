@@ -38,6 +38,7 @@ class Bank:
         self._sense_models = sense_models(senses)
         self._history = History.empty(len(subjects), self.settings.capacity * len(senses), len(senses))
         self._room = np.empty(1, MEASUREMENT), np.empty((size(len(senses)), POSE))
+        self._denied_ns = np.full((len(subjects), len(senses)), NEVER)
         history.clear_all(*self._history)
 
     def __len__(self) -> int:
@@ -46,6 +47,7 @@ class Bank:
     def forget(self, targets: slice = slice(None)) -> None:
         """Starts over for all targets, or for some of them; their counts continue."""
         history.clear_all(*self._history.of(targets))
+        self._denied_ns[targets] = NEVER
         for log in self.logs[targets]:
             log.first_ns.clear()
 
@@ -76,6 +78,13 @@ class Bank:
             self.logs[target].record(self.names[source], stamp_ns, fate)
         return fates
 
+    def deny(self, target: int, source: str, stamp_ns: int, now_ns: int | None = None) -> None:
+        """As `ErrorStateObserver.deny`, for one target."""
+        self.logs[target].received(source, stamp_ns)
+        which = self.names.index(source)
+        if stamp_ns <= latest(now_ns):
+            self._denied_ns[target, which] = max(self._denied_ns[target, which], stamp_ns)
+
     def adopt(self, target: int, message: FusedPose) -> None:
         """As `ErrorStateObserver.adopt`, for one target."""
         known = np.array([(NEVER, 0.0)] * len(self.names), SENSE_ESTIMATE)
@@ -94,7 +103,8 @@ class Bank:
         otherwise as `ErrorStateObserver.estimate`."""
         models = self._models[targets]
         out, senses = np.empty(len(models), ESTIMATE), np.empty((len(models), len(self.names)), SENSE_ESTIMATE)
-        history.estimate_all(models, self._sense_models, *self._history.of(targets), stamp_ns, out, senses)
+        denied_ns = self._denied_ns[targets]
+        history.estimate_all(models, self._sense_models, *self._history.of(targets), denied_ns, stamp_ns, out, senses)
         return out, senses
 
     def earliest_ns(self, target: int) -> int:
@@ -183,6 +193,13 @@ class ErrorStateObserver:
         if fate >= FUTURE:
             raise refusal(fate, stamp_ns, T, information, now_ns)
         return fate == ACCEPTED
+
+    def deny(self, source: str, stamp_ns: int, now_ns: int | None = None) -> None:
+        """Takes the word of a sense that the target is not where it is expected. A pose that this sense measured until recently
+        is then not called tracking for some time (`FusionSettings.denial`), whatever other senses say; the pose itself stays as
+        it is. A stamp ahead of the reader's clock `now_ns` (if given) denies nothing. Raises ValueError for an unknown source.
+        """
+        self._bank.deny(self._target, source, stamp_ns, now_ns)
 
     def adopt(self, message: FusedPose) -> None:
         """Continues from a pose that another observer of this target has published, and forgets its own state. Measurements

@@ -166,6 +166,10 @@ class PaperObserver:
         self.log.counts[source].accepted += 1
         return True
 
+    def deny(self, source: str, stamp_ns: int, now_ns: int | None = None) -> None:
+        """Notes that the sense runs: to the paper's observer, a sense that does not see the target says nothing."""
+        self.log.received(source, stamp_ns)
+
     def adopt(self, message: FusedPose) -> None:
         """Does nothing: the paper's state is bound to the measurements in use, so that it waits for its own."""
 

@@ -33,7 +33,7 @@ MODEL = np.dtype(
         *((name, "f8", 2) for name in ("jerk", "motion_time", "velocity_spread", "agility", "learning")),  # as in FusionSettings
         *((name, "f8") for name in ("damping", "doubt", "patience", "source_patience", "refusals")),
         *((name, "f8") for name in ("unobserved", "agreement_time", "horizon", "weight_time", "lost_age")),
-        *((name, "f8", 2) for name in ("offset_spread", "offset_drift")),
+        *((name, "f8", 2) for name in ("offset_spread", "offset_drift", "denial")),
         *((name, "f8") for name in ("offset_trial", "offset_wander", "offset_learning")),
         ("limits", "f8", 4),  # as in Limits
         ("shoulder", "f8", 3),  # as in Arm
@@ -94,12 +94,14 @@ SENSE_STATE = np.dtype(
     [
         ("measured_ns", "i8"),  # stamp of the last measurement
         ("surprise", "f8"),  # its squared Mahalanobis distance per direction
-        ("rank", "i8"),  # and the directions that it observed, as in a MEASUREMENT
+        ("rank", "i8"),  # and the directions that it observed, with their standard deviations, as in a MEASUREMENT
         ("directions", "f8", (POSE, POSE)),
+        ("sigma", "f8", POSE),
         ("learned_ns", "i8"),  # stamp of the last measurement to which agility and doubt were adapted
         ("accepted_ns", "i8"),  # stamp of the last accepted measurement
         ("refused", "i8"),  # number of measurements refused since
         ("refused_ns", "i8"),  # stamp of the first of them
+        ("contradicted", "i8"),  # whether another sense contradicted the last of them
         ("unsteady", "i8"),  # whether their offset is not constant
         # information [nats] that it contributed, with decay: decrease of the logarithm of the volume of the pose's uncertainty.
         # Only what is new counts: the hundredth measurement with the same error contributes almost nothing

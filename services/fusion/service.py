@@ -159,8 +159,8 @@ class Fusion:
         node.add_report(target, self.describe)
 
     def on_measurement(self, sense: Sense, message: Any, names: dict[str, str]) -> None:
-        """Passes a measurement to the observer, or the fact that a sense runs but observes nothing. Refused measurements are
-        counted, and the first of each kind is logged."""
+        """Passes a measurement to the observer, or that a sense denies that the target is where it is expected, or that it runs
+        but observes nothing. Refused measurements are counted, and the first of each kind is logged."""
         log = self.observer.log
         try:
             self._check_origin(sense, message, names["publisher"])
@@ -173,7 +173,10 @@ class Fusion:
         with self.group.lock:
             now_ns = self.group.now_ns()
             if found is None:
-                log.received(sense.name, message.stamp_ns)
+                if message.state == sense.denies:
+                    self.observer.deny(sense.name, message.stamp_ns, now_ns)
+                else:
+                    log.received(sense.name, message.stamp_ns)
                 return
             hidden = getattr(message, "hidden", None)  # the share with which the paper's observer weights the camera
             try:

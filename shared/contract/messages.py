@@ -288,8 +288,9 @@ FusedState = Literal["tracking", "coasting", "lost"]
 class FusedPose(Message, frozen=True, kw_only=True):
     """The fused pose. `velocity`: linear [m/s] and angular [rad/s] along the frame's axes. `state`: tracking (a sense measures
     the target, and three standard deviations of the position are within the target's `tracking_bound`), coasting (no sense does,
-    the newest measurement contradicts the pose, or the pose is less certain: do not rely on it within the bound) or lost.
-    `sources`: by name (see the table of senses), without senses that have sent nothing."""
+    the newest measurement contradicts the pose, a camera that saw the target until recently does not see it there, or the pose is
+    less certain: do not rely on it within the bound) or lost. `sources`: by name (see the table of senses), without senses that
+    have sent nothing."""
 
     target: Name
     frame: Name

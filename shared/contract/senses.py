@@ -54,6 +54,8 @@ class Sense:
     errors : error model that the filter assumes.
     usable : value of the message's `state` with which a measurement is used; with any other value the sense only counts as
         present. None for a message without a state.
+    denies : value of `state` with which a sense says that it looks where the target is expected, and that the target is not
+        there. None where it never says that.
     part : message field that names the part of the cell which measured ("camera"). Each part is a separate stream with one
         publisher at a time. None where a target has one stream.
 
@@ -65,13 +67,15 @@ class Sense:
     measures: Measures
     errors: Errors = Errors()
     usable: str | None = None
+    denies: str | None = None
     part: str | None = None
 
     def __post_init__(self) -> None:
         if "{target}" not in self.topic.key:
             raise TypeError(f"sense {self.name}: expected a topic with {{target}} in its key, got {self.topic.key}")
         known = set(self.topic.message.__struct_fields__)
-        wanted = {"target", "frame", *self.measures.value, *({"state"} if self.usable else ()), *({self.part} - {None})}
+        has_state = self.usable is not None or self.denies is not None
+        wanted = {"target", "frame", *self.measures.value, *({"state"} if has_state else ()), *({self.part} - {None})}
         if missing := sorted(wanted - known):
             raise TypeError(
                 f"sense {self.name}: expected the fields {', '.join(sorted(wanted))}, "
@@ -82,7 +86,15 @@ class Sense:
 SENSES = (
     # Measured in replays of both cells and in the paper's experiment: 27 to 39 % of the variance is new in every picture, the
     # rest lasts for 0.3 to 3 s
-    Sense("vision", topics.VISION, Measures.POSE, Errors(lasting=0.65, time_constant=2.0), usable="tracking", part="camera"),
+    Sense(
+        "vision",
+        topics.VISION,
+        Measures.POSE,
+        Errors(lasting=0.65, time_constant=2.0),
+        usable="tracking",
+        denies="lost",
+        part="camera",
+    ),
     # windows of the skin share no samples and the noise of its voltages is white. Measured on the emulator: a fifth of the
     # variance comes from the response model and is common to successive windows
     Sense("haptic", topics.HAPTIC, Measures.POSE_INFORMATION, Errors(lasting=0.2, time_constant=0.3), usable="in_range"),
