@@ -17,10 +17,11 @@ With a bent hand, a wrong rival may look right, as the mesh's stiff hand then po
 bent, only the forearms are compared.
 
 One rival is compared per picture: all eight at once would delay the first pictures of a limb that was just found, and it would
-have moved by then. The mirror image comes first, as it is the farthest away: a limb found again with the wrong tilt is 10 cm off.
-Once all were compared, every second comparison is of a rival that the pictures clearly prefer to the pose, if there is one, so
-that a right one wins within a few pictures. If all are refuted, pictures are skipped: a comparison costs as much as the pose
-itself. A limb that is not quite the mesh has its mirror image as a rival in each picture (`against_mirror`).
+have moved by then. The mirror image comes first, also when another rival has won, as it is the farthest away: a limb found again
+with the wrong tilt is 10 cm off. Once all were compared, every second comparison is of a rival that the pictures clearly prefer
+to the pose, if there is one, so that a right one wins within a few pictures. If all are refuted, pictures are skipped: a
+comparison costs as much as the pose itself. A limb that is not quite the mesh has its mirror image as a rival in each picture
+(`against_mirror`).
 """
 
 from __future__ import annotations
@@ -83,12 +84,13 @@ class Rivals:
 
     def forget(self) -> None:
         """Start over, as with another limb."""
-        self._next = 0
         self._is_repeat_due = False
         self._begin()
 
-    def _begin(self) -> None:
-        """Compare all rivals again, with another pose of the same limb."""
+    def _begin(self, won: int | None = None) -> None:
+        """Compare all rivals again, with another pose of the same limb: the rival that won, if one did. The mirror image of a
+        mirror image is the pose before, which has just lost."""
+        self._next = MIRROR + 1 if won == MIRROR else MIRROR
         self._evidence: list[float | None] = [None] * RIVALS
         self._doubts: list[Array | None] = [None] * RIVALS
         self._before: Array | None = None
@@ -118,7 +120,7 @@ class Rivals:
             if which != MIRROR and other.sharp and _is_same(other, best):
                 self._evidence[which], self._doubts[which] = 0.0, None
             elif excess < -PREFERRED:
-                self._begin()
+                self._begin(which)
                 best = other
             else:
                 self._evidence[which] = evidence

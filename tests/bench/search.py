@@ -9,9 +9,8 @@ it out.
 
 from __future__ import annotations
 
-import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,37 +18,31 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, rankdata
+from scipy.stats import chi2
 
 from penumbra.services import flags
-from penumbra.services.search.mask_fit import Noise
-from penumbra.services.search.tracker import Search, Searched
-from penumbra.services.search.verdict import WRONG
 from penumbra.services.segmentation.inference import Segmenter, load_segmenter
-from penumbra.shared.contract.labels import Label
-from penumbra.shared.contract.messages import Mask
 from penumbra.shared.geometry import rigid
-from penumbra.shared.geometry.rigid import Array
-from penumbra.shared.perception.lookout import Window, corners_of, whole_frame, window_around
 from penumbra.sim.sets import shots
 from penumbra.sim.sets.shots import Shot
 from penumbra.tests.bench.lib import bound, results
+from penumbra.tests.bench.lib.judgements import GONE, KINDS, auc, gone_frames, lost_frames, reliability
 from penumbra.tests.bench.lib.results import Part, marked
+from penumbra.tests.bench.lib.searches import (
+    HIDDEN,
+    NEES_VIEW,
+    PRIOR,
+    VIEWS,
+    Result,
+    around,
+    exact_mask,
+    network_masks,
+    perturbed,
+    search_of,
+    searched,
+    window_of,
+)
 
-HIDDEN = (0.0, 0.3, 0.6, 0.85)
-VIEWS = ((320, 240, 1.5), (640, 480, 1.5), (1280, 960, 4.5), (1280, 960, 8.0))
-"""Width and height of the pictures [px], distance [m]."""
-NEES_VIEW = VIEWS[1]
-"""View of the NEES, of the goals for the whole chain, and of the frames for the other numbers."""
-START = (0.02, np.radians(4.0))
-"""Root mean square length of the starts' errors: position [m], rotation [rad]."""
-PRIOR = np.diag(np.repeat(np.square(START) / 3.0, 3))
-"""Covariance of the starts, the same along any axes."""
-EXACT = Noise(edge=0.29, correlation=2.0, dilation=0.02)
-"""Noise of an exact mask, for the search: uniform in a pixel, and the stairs of a slanted edge repeat it."""
-GONE = 0.95
-"""Hidden share above which nothing is left to track."""
 GOALS = {0.0: (0.25, 0.4), 0.3: (0.3, 0.5), 0.6: (0.6, 1.2), 0.85: (1.5, 2.5)}
 """Goals for the position error of the whole chain at NEES_VIEW, median and mean [cm], by hidden share."""
 BOUND_GOAL, FASTER_GOAL, BETTER_GOAL, AUC_GOAL = 1.2, 10.0, 5.0, 0.97
@@ -69,95 +62,6 @@ class Plan:
 
 
 FULL, QUICK = Plan(40, 200, 50, 110), Plan(2, 3, 2, 2)
-
-
-@dataclass(frozen=True)
-class Result:
-    """One search of one frame, its time [ms], and its errors: position, depth (along the line of sight) and lateral [m], axis and
-    roll [rad]."""
-
-    estimate: Searched
-    shot: Shot
-    ms: float
-
-    @property
-    def error(self) -> Array:
-        return rigid.pose_error(self.shot.T_world_target, self.estimate.T)
-
-    @property
-    def position(self) -> float:
-        return float(np.linalg.norm(self.error[:3]))
-
-    @property
-    def with_prior(self) -> float:
-        """Position error [m] of the pose that is most probable given the start as a prior."""
-        return float(np.linalg.norm(self.shot.T_world_target[:3, 3] - self.estimate.T_searched[:3, 3]))
-
-    @property
-    def depth(self) -> float:
-        sight = self.shot.T_world_target[:3, 3] - self.shot.camera.T_world_camera[:3, 3]
-        return float(abs(self.error[:3] @ sight) / np.linalg.norm(sight))
-
-    @property
-    def lateral(self) -> float:
-        return float(np.sqrt(max(self.position**2 - self.depth**2, 0.0)))
-
-    @property
-    def axis(self) -> float:
-        return rigid.axis_angle_error(self.shot.T_world_target, self.estimate.T)
-
-    @property
-    def roll(self) -> float:
-        """Twist about the limb's axis of the rotation between the two poses."""
-        x, _, _, w = Rotation.from_matrix(self.shot.T_world_target[:3, :3].T @ self.estimate.T[:3, :3]).as_quat()
-        return float(abs((2.0 * np.arctan2(x, w) + np.pi) % (2.0 * np.pi) - np.pi))
-
-    @property
-    def is_wrong(self) -> bool:
-        return bool(self.position > WRONG[0] or self.axis > WRONG[1])
-
-
-def perturbed(rng: np.random.Generator) -> Array:
-    """A random pose error (6,) of a start."""
-    return rng.normal(size=6) * np.sqrt(np.diag(PRIOR))
-
-
-def search_of(shot: Shot, method: str, exact: bool) -> Search:
-    return Search(shot.cell, method=method, noise=EXACT if exact else None)
-
-
-def searched(shot: Shot, search: Search, mask: Mask, T_prior: Array | None) -> Result:
-    """One update and its processor time, which excludes other processes."""
-    begin = time.process_time()
-    estimate = search.update(mask, T_prior, None if T_prior is None else PRIOR, shot.joints, shot.image)
-    return Result(estimate, shot, 1e3 * (time.process_time() - begin))
-
-
-def window_of(shot: Shot, T: Array, previous: Window | None = None) -> Window:
-    """The window that the segmentation service would cut around a pose."""
-    around = window_around(shot.camera, [(T, corners_of(shot.mesh.vertices))], previous)
-    return around or whole_frame(shot.camera)
-
-
-def around(error: Array) -> Callable[[Shot, Window | None], Window]:
-    """The window around the true pose moved by an error (6,), for a frame and the window before."""
-    return lambda shot, previous: window_of(shot, rigid.perturb(shot.T_world_target, error), previous)
-
-
-def exact_mask(shot: Shot, window: Window) -> Mask:
-    """The labels of a window at the picture's own resolution."""
-    labels = np.ascontiguousarray(shot.labels[window.y0 : window.bottom, window.x0 : window.right])
-    return Mask(stamp_ns=shot.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=1)
-
-
-def network_masks(segmenter: Segmenter, film: list[Shot], window_at: Callable[[Shot, Window | None], Window]) -> Iterator[Mask]:
-    """The masks of a film, in the window that `window_at` gives for each frame and the window before."""
-    window = None
-    for shot in film:
-        window = window_at(shot, window)
-        assert shot.image is not None
-        labels = segmenter(shot.image, window, shot.stamp_ns)
-        yield Mask(stamp_ns=shot.stamp_ns, labels=labels, x0=window.x0, y0=window.y0, scale=window.scale)
 
 
 def exact_results(
@@ -279,132 +183,6 @@ def nees(results: list[Result]) -> dict[str, Any]:
     }
 
 
-def auc(scores: Array, positive: np.ndarray) -> float | None:
-    """Area under the ROC curve: the probability that a positive scores above a negative, ties counted half."""
-    n, p = int((~positive).sum()), int(positive.sum())
-    if not n or not p:
-        return None
-    return float((rankdata(scores)[positive].sum() - p * (p + 1) / 2.0) / (n * p))
-
-
-CONFIDENCES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.01)
-"""Bounds of the confidences that are compared with the share of right poses."""
-KINDS = ("good start", "bad start", "wrong mask", "no prior", "absent")
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """A frame of one of KINDS: the estimate, whether its pose is wrong, whether the mask shows the target.
-
-    Where the search gives up, it reports the start's pose. With a good start and a mask that shows something else this pose is
-    right by chance: such a frame counts as one that should be doubted.
-    """
-
-    kind: str
-    estimate: Searched
-    is_wrong: bool
-    is_shown: bool
-
-    @property
-    def is_told(self) -> bool:
-        return self.estimate.state == "tracking"
-
-    @property
-    def confidence(self) -> float:
-        """0 where the search did not say."""
-        return self.estimate.confidence or 0.0
-
-    @property
-    def should_be_doubted(self) -> bool:
-        return self.is_wrong or not (self.is_shown or self.is_told)
-
-
-def lost_frames(
-    seed: int,
-    count: int,
-    segmenter: Segmenter,
-    domain: shots.Domain,
-    view: tuple[int, int, float] = NEES_VIEW,
-    hands: shots.Hands = "stiff",
-    has_image: bool = True,
-    spreads: tuple[float, ...] = (1.0,),
-) -> Iterator[Judgement]:
-    """Frames of all KINDS. has_image: whether the search gets the image as well; spreads: factors, in turn, on the standard
-    deviations of the starts, which the search knows; bad starts are not as near as it is told."""
-    for index in range(count):
-        rng = np.random.default_rng([seed, index, 2])
-        spread = spreads[index % len(spreads)]
-
-        def judgement(kind: str, shot: Shot, mask: Mask, T_prior: Array | None, spread: float = spread) -> Judgement:
-            search, covariance = search_of(shot, "default", False), None if T_prior is None else spread**2 * PRIOR
-            estimate = search.update(mask, T_prior, covariance, shot.joints, shot.image if has_image else None)
-            is_wrong = Result(estimate, shot, 0.0).is_wrong or kind == "absent"
-            return Judgement(kind, estimate, is_wrong, shows_target(mask, shot))
-
-        film = shots.clip(seed, index, *view, HIDDEN[index % len(HIDDEN)], domain, 3, hands=hands)
-        last = film[-1]
-        near, far = spread * perturbed(rng), np.concatenate([_length(rng, 0.08, 0.4), _length(rng, 0.3, 1.5)])
-        T_near, T_far = (rigid.perturb(last.T_world_target, error) for error in (near, far))
-        *_, mask = network_masks(segmenter, film, around(near))
-        yield judgement("good start", last, mask, T_near)
-        yield judgement("wrong mask", last, spoiled(mask, rng), T_near)
-        *_, mask = network_masks(segmenter, film, around(far))
-        yield judgement("bad start", last, mask, T_far)
-        *_, mask = network_masks(segmenter, film, lambda shot, previous: whole_frame(shot.camera))
-        yield judgement("no prior", last, mask, None)
-        empty = shots.clip(seed, index, *view, 0.0, domain, 3, present=False)
-        T_prior = rigid.perturb(empty[-1].T_world_target, near) if index % 2 else None
-        *_, mask = network_masks(segmenter, empty, around(near))
-        yield judgement("absent", empty[-1], mask, T_prior)
-
-
-def shows_target(mask: Mask, shot: Shot) -> bool:
-    """Whether the IoU of the target's pixels in the mask and in the truth is at least a half."""
-    target = (Label.FOREARM, Label.HAND)
-    ours = np.zeros(shot.labels.shape, bool)
-    h, w = (n * mask.scale for n in mask.labels.shape)
-    ours[mask.y0 : mask.y0 + h, mask.x0 : mask.x0 + w] = np.kron(
-        np.isin(mask.labels, target), np.ones((mask.scale, mask.scale), bool)
-    )
-    theirs = np.isin(shot.labels, target)
-    return bool((ours & theirs).sum() >= 0.5 * max((ours | theirs).sum(), 1))
-
-
-def _length(rng: np.random.Generator, low: float, high: float) -> Array:
-    v = rng.normal(size=3)
-    return rng.uniform(low, high) * v / np.linalg.norm(v)
-
-
-def spoiled(mask: Mask, rng: np.random.Generator) -> Mask:
-    """A mask that is wrong about where the target is: mirrored, turned by 180 degrees, moved away, or with the upper arm's region
-    called the target and the target background."""
-    labels = mask.labels
-    kind = rng.integers(4)
-    if kind == 0:
-        labels = labels[:, ::-1]
-    elif kind == 1:
-        labels = labels[::-1, ::-1]
-    elif kind == 2:
-        labels = np.roll(labels, rng.choice([-1, 1], 2) * np.array(labels.shape) // 4, axis=(0, 1))
-    else:
-        table = np.arange(256, dtype=np.uint8)
-        table[[Label.FOREARM, Label.HAND, Label.UPPER_ARM]] = Label.BACKGROUND, Label.BACKGROUND, Label.FOREARM
-        labels = table[labels]
-    return Mask(stamp_ns=mask.stamp_ns, labels=np.ascontiguousarray(labels), x0=mask.x0, y0=mask.y0, scale=mask.scale)
-
-
-def gone_frames(seed: int, count: int, segmenter: Segmenter, domain: shots.Domain) -> Iterator[Searched]:
-    """Estimates from frames in which more than GONE of the target is hidden."""
-    for index in range(count):
-        film = shots.clip(seed, index, *NEES_VIEW, (0.975, 0.99, 1.0)[index % 3], domain, 5)
-        error = perturbed(np.random.default_rng([seed, index, 3]))
-        search = search_of(film[-1], "default", False)
-        for shot, mask in zip(film, network_masks(segmenter, film, around(error)), strict=True):
-            found = searched(shot, search, mask, rigid.perturb(shot.T_world_target, error))
-            if shot.hidden > GONE:
-                yield found.estimate
-
-
 def rows_of(seed: int, plan: Plan, masks: tuple[str, ...]) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
     """All rows of the table, and the NEES at NEES_VIEW by kind of mask and share hidden."""
     segmenter = load_segmenter() if "network" in masks else None
@@ -464,18 +242,6 @@ def judged(seed: int, plan: Plan) -> dict[str, Any]:
         "false_tracking": sum(estimate.state == "tracking" for estimate in gone),
         "hidden_frames": len(gone),
     }
-
-
-def reliability(frames: Sequence[Judgement]) -> list[dict[str, Any]]:
-    """By bounds of the confidence: the number of frames, their mean confidence, and the share that should not be doubted."""
-    rows = []
-    for low, high in itertools.pairwise(CONFIDENCES):
-        chosen = [frame for frame in frames if low <= frame.confidence < high]
-        if chosen:
-            mean = float(np.mean([frame.confidence for frame in chosen]))
-            right = float(np.mean([not frame.should_be_doubted for frame in chosen]))
-            rows.append({"low": low, "high": high, "frames": len(chosen), "confidence": round(mean, 3), "right": round(right, 3)})
-    return rows
 
 
 def measure(seed: int, plan: Plan, parts: tuple[str, ...]) -> dict[str, Any]:

@@ -28,8 +28,8 @@ from penumbra.shared.geometry.rigid import Array
 from penumbra.sim.sets import shots
 from penumbra.sim.sets.shots import Domain, Shot
 from penumbra.tests.bench.lib import results
+from penumbra.tests.bench.lib.judgements import GONE
 from penumbra.tests.bench.lib.results import Part, Result, marked
-from penumbra.tests.bench.search import GONE
 
 BACKGROUNDS: dict[str, Domain] = {"plain": "easy", "cluttered": "wide"}
 SERVICES = ("segmentation", "search", "fusion")

@@ -19,7 +19,8 @@ from penumbra.services.search.verdict import WEIGHTS, Findings
 from penumbra.services.segmentation.inference import load_segmenter
 from penumbra.shared.geometry.rigid import Array
 from penumbra.sim.sets import shots
-from penumbra.tests.bench import search
+from penumbra.tests.bench.lib.judgements import gone_frames, lost_frames
+from penumbra.tests.bench.lib.searches import VIEWS
 
 CONDITIONS: tuple[tuple[shots.Hands, bool, float], ...] = (("stiff", True, 1.0), ("posed", True, 0.5), ("stiff", False, 0.33))
 """Hands, whether there is an image, and the number of scenes relative to the first."""
@@ -33,14 +34,14 @@ def frames(seed: int, count: int) -> Iterator[tuple[Findings, bool]]:
     """What the search found in frames of all conditions, and whether the pose is right. count: of scenes of each view in the
     first condition."""
     segmenter = load_segmenter()
-    for view in search.VIEWS:
+    for view in VIEWS:
         for hands, has_image, share in CONDITIONS:
             seed += 1
-            drawn = search.lost_frames(seed, math.ceil(share * count), segmenter, "wide", view, hands, has_image, SPREADS)
+            drawn = lost_frames(seed, math.ceil(share * count), segmenter, "wide", view, hands, has_image, SPREADS)
             for frame in drawn:
                 if frame.estimate.findings is not None:
                     yield frame.estimate.findings, frame.is_shown and not frame.is_wrong
-    for estimate in search.gone_frames(seed + 1, count, segmenter, "wide"):
+    for estimate in gone_frames(seed + 1, count, segmenter, "wide"):
         if estimate.findings is not None:
             yield estimate.findings, False
 

@@ -18,7 +18,7 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.perception.intrinsics import Intrinsics
 from penumbra.sim.sets import shots
 from penumbra.tests.bench import lost, search, tracking
-from penumbra.tests.bench.lib import bound, verdicts
+from penumbra.tests.bench.lib import bound, judgements, searches, verdicts
 
 
 def rms_cm(information: np.ndarray) -> float:
@@ -58,7 +58,7 @@ def test_the_less_is_seen_and_the_coarser_the_picture_the_larger_is_the_bound():
         pictures = [shots.shot(43, i, width, width * 3 // 4, 1.5, hidden, images=False) for i in range(8)]
         return float(np.median(bound.position_errors([bound.information(shot) for shot in pictures])))
 
-    by_hidden = [median(hidden, 640) for hidden in search.HIDDEN]
+    by_hidden = [median(hidden, 640) for hidden in searches.HIDDEN]
     assert all(a < b for a, b in itertools.pairwise(by_hidden))
     assert median(0.0, 320) > 1.5 * by_hidden[0]
 
@@ -70,7 +70,7 @@ def test_an_efficient_estimator_has_the_errors_of_its_information():
 
 
 @pytest.fixture(scope="module")
-def drawn() -> list[search.Result]:
+def drawn() -> list[searches.Result]:
     """Estimates whose errors are drawn from their own covariances, except for the roll."""
     rng = np.random.default_rng(5)
     shot = shots.shot(44, 0, 320, 240, images=False)
@@ -80,7 +80,7 @@ def drawn() -> list[search.Result]:
         error = root @ rng.normal(size=6)
         error[3:] += rng.normal() * shot.T_world_target[:3, 0]  # a roll that no covariance contains
         T = rigid.perturb(shot.T_world_target, -error)
-        results.append(search.Result(Searched(T, root @ root.T, 0.95, 0.0, "tracking", T), shot, 1.0))
+        results.append(searches.Result(Searched(T, root @ root.T, 0.95, 0.0, "tracking", T), shot, 1.0))
     return results
 
 
@@ -99,7 +99,7 @@ def test_errors_are_told_apart_along_and_across_the_line_of_sight_and_about_the_
     sight /= np.linalg.norm(sight)
     roll = 0.3 * shot.T_world_target[:3, 0]
     T = rigid.perturb(shot.T_world_target, [*(0.02 * sight), *roll])
-    result = search.Result(Searched(T, np.eye(6), 1.0, 0.0, "tracking", T), shot, 1.0)
+    result = searches.Result(Searched(T, np.eye(6), 1.0, 0.0, "tracking", T), shot, 1.0)
     assert (result.depth, result.lateral) == pytest.approx((0.02, 0.0), abs=1e-9)
     assert (result.roll, result.axis) == pytest.approx((0.3, 0.0), abs=1e-6)
     assert not result.is_wrong
@@ -107,27 +107,27 @@ def test_errors_are_told_apart_along_and_across_the_line_of_sight_and_about_the_
 
 def test_the_area_under_the_curve_counts_pairs_in_order():
     positive = np.array([True, True, False, False])
-    assert search.auc(np.array([3.0, 2.0, 1.0, 0.0]), positive) == 1.0
-    assert search.auc(np.array([np.inf, 1.0, 2.0, 0.0]), positive) == 0.75
-    assert search.auc(np.ones(4), positive) == 0.5
-    assert search.auc(np.ones(4), np.zeros(4, bool)) is None
+    assert judgements.auc(np.array([3.0, 2.0, 1.0, 0.0]), positive) == 1.0
+    assert judgements.auc(np.array([np.inf, 1.0, 2.0, 0.0]), positive) == 0.75
+    assert judgements.auc(np.ones(4), positive) == 0.5
+    assert judgements.auc(np.ones(4), np.zeros(4, bool)) is None
 
 
 def test_a_mask_shows_the_target_where_it_agrees_with_the_truth_at_any_scale():
     shot = shots.shot(48, 0, 320, 240, hidden=0.3, images=False)
-    window = search.window_of(shot, shot.T_world_target)
-    mask = search.exact_mask(shot, window)
-    assert search.shows_target(mask, shot)
+    window = searches.window_of(shot, shot.T_world_target)
+    mask = searches.exact_mask(shot, window)
+    assert judgements.shows_target(mask, shot)
     coarse = msgspec.structs.replace(mask, labels=np.ascontiguousarray(mask.labels[::2, ::2]), scale=2)
-    assert search.shows_target(coarse, shot)
-    assert not search.shows_target(msgspec.structs.replace(mask, labels=np.zeros_like(mask.labels)), shot)
-    assert not search.shows_target(msgspec.structs.replace(mask, x0=mask.x0 // 2, y0=mask.y0 // 2 + 40), shot)
+    assert judgements.shows_target(coarse, shot)
+    assert not judgements.shows_target(msgspec.structs.replace(mask, labels=np.zeros_like(mask.labels)), shot)
+    assert not judgements.shows_target(msgspec.structs.replace(mask, x0=mask.x0 // 2, y0=mask.y0 // 2 + 40), shot)
 
 
 def test_giving_up_is_right_where_a_mask_shows_something_else_and_the_start_was_right_by_luck():
     def told(state: Any, wrong: bool, shown: bool) -> bool:
         T = np.eye(4)
-        return search.Judgement("wrong mask", Searched(T, np.eye(6), 1.0, 0.0, state, T), wrong, shown).should_be_doubted
+        return judgements.Judgement("wrong mask", Searched(T, np.eye(6), 1.0, 0.0, state, T), wrong, shown).should_be_doubted
 
     assert told("lost", False, False) and told("lost", True, True) and told("tracking", True, True)
     assert not told("lost", False, True)  # it could have been measured
@@ -137,10 +137,12 @@ def test_giving_up_is_right_where_a_mask_shows_something_else_and_the_start_was_
 def test_the_share_of_right_poses_is_told_by_their_confidence():
     T = np.eye(4)
 
-    def frame(confidence: float, wrong: bool) -> search.Judgement:
-        return search.Judgement("good start", Searched(T, np.eye(6), 1.0, 0.0, "tracking", T, confidence=confidence), wrong, True)
+    def frame(confidence: float, wrong: bool) -> judgements.Judgement:
+        return judgements.Judgement(
+            "good start", Searched(T, np.eye(6), 1.0, 0.0, "tracking", T, confidence=confidence), wrong, True
+        )
 
-    rows = search.reliability([frame(0.95, False), frame(0.97, True), frame(1.0, False), frame(0.2, True)])
+    rows = judgements.reliability([frame(0.95, False), frame(0.97, True), frame(1.0, False), frame(0.2, True)])
     assert [(row["frames"], row["confidence"], row["right"]) for row in rows] == [(1, 0.2, 0.0), (3, 0.973, 0.667)]
 
 
@@ -158,7 +160,7 @@ def test_the_search_s_benchmark_runs_and_tells_all_rows(tmp_path):
     assert search.main(["--seed", "46", "--quick", "--json", str(out)]) == 0
     result = json.loads(out.read_text())
     rows = {(r["masks"], r["width"], r["distance_m"], r["occlusion"], r["method"]) for r in result["rows"]}
-    assert len(rows) == 2 * len(search.VIEWS) * len(search.HIDDEN) * 2
+    assert len(rows) == 2 * len(searches.VIEWS) * len(searches.HIDDEN) * 2
     exact = [r for r in result["rows"] if r["masks"] == "exact" and r["width"] == 640 and r["method"] == "contour"]
     assert exact[0]["position_cm"]["median"] < 1.0  # centimetres where nothing is hidden
     assert {"mean", "band"} <= result["nees"].keys()

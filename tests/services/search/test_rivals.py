@@ -100,6 +100,22 @@ def test_a_limb_found_with_the_wrong_tilt_has_the_right_one_at_once():
     assert apart(TILTED, MIRROR) > 0.5 and apart(found.T, MIRROR) < 0.1
 
 
+def test_the_mirror_image_of_a_turn_that_wins_is_compared_next():
+    rivals, starts = Rivals(Limits()), []
+    mirrored = detect.mirrored(TILTED)[0]
+
+    def shown(T: np.ndarray, passes: int, hand: float) -> Fit:
+        starts.append(T)
+        return fitted(T, 100.0 if apart(T, mirrored) > 0.1 and apart(T, TILTED) > 0.1 else 160.0)
+
+    for i in range(1, 4):  # the mirror image costs as much, the first turn less, then the turn's mirror image is looked at
+        best = fitted(TILTED, 160.0) if i < 3 else fitted(starts[-1], 100.0)
+        rivals.contested(best, PICTURE_NS * i, shown, lambda fit: 0.0)
+    assert apart(starts[0], mirrored) < 0.01
+    assert apart(starts[1], TILTED) > 1.0
+    assert apart(starts[2], detect.mirrored(starts[1])[0]) < 0.01
+
+
 @pytest.mark.parametrize(("straight_px", "is_taken"), [(0.35, True), (0.1, False)])
 def test_where_the_hand_is_bent_the_forearm_tells_the_tilt_unless_a_straight_hand_fits(straight_px, is_taken):
     def shown(T: np.ndarray, passes: int, hand: float) -> Fit:

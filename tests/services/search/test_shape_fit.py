@@ -14,7 +14,7 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.sim.sets import shots
 from penumbra.sim.sets.shots import Shot
-from penumbra.tests.bench.search import PRIOR, exact_mask, perturbed, window_of
+from penumbra.tests.bench.lib.searches import PRIOR, exact_mask, perturbed, window_of
 
 PEOPLE = 12
 THREE_SIGMA = 14.2
