@@ -235,13 +235,14 @@ def _is_contradicted(one, state, m, z):  # type: ignore[no-untyped-def]
 
 
 @inner
-def is_contested(state):  # type: ignore[no-untyped-def]
-    """Whether a sense contradicts the state, and no other one contradicts that sense, or nothing newer has confirmed the state:
-    the limb may be elsewhere. A sense that is wrong for long is answered by the next measurement that is accepted of another one
-    which can tell the two poses apart."""
+def is_contested(one, state, stamp_ns):  # type: ignore[no-untyped-def]
+    """Whether a sense contradicts the state at a stamp, and no other one contradicts that sense, or nothing newer has confirmed
+    the state: the limb may be elsewhere. A sense that is wrong for long is answered by the next measurement that is accepted of
+    another one which can tell the two poses apart, and one that falls silent, by time."""
     for s in range(len(state.senses)):
         sense = state.senses[s]
-        if sense.refused and (not sense.contradicted or sense.refused_ns >= state.now.accepted_ns):
+        is_answered = sense.contradicted or stamp_ns - sense.measured_ns >= one.denial[1] * 1e9
+        if sense.refused and (not is_answered or sense.refused_ns >= state.now.accepted_ns):
             return True
     return False
 

@@ -297,7 +297,8 @@ def estimate_all(
                 within_reach(one, p, R)
             found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)
             if found.state == TRACKING and (
-                is_contested(State(now, of_senses, P[n, slot])) or _is_denied(one, of_senses, denied_ns[n], stamp_ns)
+                is_contested(one, State(now, of_senses, P[n, slot]), stamp_ns)
+                or _is_denied(one, of_senses, denied_ns[n], stamp_ns)
             ):
                 found.state = COASTING
         for i in range(3):

@@ -67,8 +67,8 @@ class FusionSettings:
     not measured."""
     denial: tuple[float, float] = (0.1, 0.5)
     """Age [s] of the last accepted measurement of a sense from which its word counts that the target is not where it is expected,
-    and the time [s] for which it counts. Chosen: two periods of a camera at 20 Hz, so that one camera does not deny what another
-    one sees, and `patience`."""
+    and the time [s] for which it counts, as does a refused measurement that nothing contradicts. Chosen: two periods of a camera
+    at 20 Hz, so that one camera does not deny what another one sees, and `patience`."""
     refusals: int = 5
     """Minimum number of refused measurements in both cases, so that two outliers after a pause do not suffice. Chosen, not
     measured."""

@@ -163,6 +163,22 @@ def test_a_jump_that_the_skin_cannot_feel_is_noticed_at_once_and_followed() -> N
     assert states[-1] == "tracking"
 
 
+def test_a_camera_that_falls_silent_after_a_refused_picture_does_not_end_what_the_skin_tracks() -> None:
+    spread = np.diag([0.02**2] * 3 + [0.2**2] * 3)
+    spread[:3, :3] += 0.15**2 * np.outer(HOME[:3, 0], HOME[:3, 0])
+    observer = ErrorStateObserver(HOME, SPREAD)
+    states = {}
+    for k in range(250):
+        observer.measure("haptic", ns(k * 0.01), HOME, np.linalg.inv(spread))
+        if k <= 100 and k % 5 == 0:
+            away = 0.12 * HOME[:3, 0] if k == 100 else np.zeros(3)
+            accepted = observer.measure("vision", ns(k * 0.01), perturb(HOME, [*away, 0.0, 0.0, 0.0]), VISION)
+            assert accepted == (k < 100)
+        states[k] = observer.estimate(ns(k * 0.01)).state
+    assert {states[k] for k in range(100, 150)} == {"coasting"}
+    assert {states[k] for k in range(150, 170)} == {"tracking"}
+
+
 def seen_until_one_second_and_felt(until: float) -> ErrorStateObserver:
     """A limb that vision sees for a second, and that the skin feels until a time [s]."""
     observer = ErrorStateObserver(HOME, SPREAD)
