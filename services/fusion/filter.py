@@ -57,6 +57,10 @@ SWIFT, REMEMBERED = 100.0, 0.3
 """Agility above which a limb is fast, and factor on the rate at which its agility then decreases: a fast hand that rests will set
 out as before, and no picture shows it in time. Slow limbs have agilities up to 20. With 0.3 instead of 1, 0.05 % instead of 1.0 %
 of the poses of a fast hand are beyond three sigma (12 runs of seed 8401)."""
+FAST, RESTED_S, FORGOTTEN = 2.0, 3.0, 0.4
+"""A limb whose speed has not been above that many times `velocity_spread` (0.8 m/s, 2 rad/s) for that time [s] is not fast any
+more: its agility then decreases down to SWIFT at that share of the learning rate, by a factor of 7 a second. Fast hands reach that
+speed every 2.6 s at least (12 runs of seed 8821)."""
 TOLD_APART = 9.0
 """Squared Mahalanobis distance between two poses, by the covariance of one measurement, above which that measurement tells them
 apart: three standard deviations."""
@@ -88,6 +92,7 @@ def forget(state):  # type: ignore[no-untyped-def]
     now.passed = now.rank = 0
     now.distance = 0.0
     now.agility[0] = now.agility[1] = now.wander[0] = now.wander[1] = 1.0
+    now.fast_ns[0] = now.fast_ns[1] = NEVER
     now.wrong = NOBODY
     for i in range(POSE):
         now.velocity[i] = now.acceleration[i] = now.offset[i] = 0.0
@@ -453,12 +458,23 @@ def learn(model, state, m, innovation, factor):  # type: ignore[no-untyped-def]
         unlike = scale * scale * so3.dot(innovation, innovation) / m.rank - alike  # 1 expected
         for half in range(2):
             change = factor * rate * scale * _resemblance(m, innovation, sense.innovation, half)
-            if change < 0.0 and now.agility[half] > SWIFT:
+            if now.agility[half] <= SWIFT or _is_fast(model.one, now, half):
+                now.fast_ns[half] = m.stamp_ns
+            if m.stamp_ns - now.fast_ns[half] > RESTED_S * 1e9:
+                change -= FORGOTTEN * rate
+            elif change < 0.0 and now.agility[half] > SWIFT:
                 change *= REMEMBERED  # it may set out again as it did before
             now.agility[half] = min(max(now.agility[half] * math.exp(change), bounds[0]), bounds[1])
         sense.doubt = min(max(sense.doubt * math.exp(0.5 * rate * (unlike - 1.25)), 1.0), model.one.doubt)
     sense.learned_ns = m.stamp_ns
     _keep(sense, innovation, scale)
+
+
+@inner
+def _is_fast(one, now, half):  # type: ignore[no-untyped-def]
+    """Whether a limb moves (half 0) or turns (1) as slow limbs never do."""
+    velocity = now.velocity[3 * half : 3 * half + 3]
+    return so3.dot(velocity, velocity) > (FAST * one.velocity_spread[half]) ** 2
 
 
 @inner

@@ -83,6 +83,7 @@ STATE = np.dtype(
         ("velocity", "f8", POSE),
         ("acceleration", "f8", POSE),
         ("agility", "f8", 2),  # learned factors on the process noise, linear and angular
+        ("fast_ns", "i8", 2),  # stamps at which the limb last moved and turned fast, or was not expected to
         ("wrong", "i8"),  # row of the sense that counts as wrong by an offset, or NOBODY
         ("wander", "f8", 2),  # learned factors on the variance of the offset's random walk, in position and rotation
         ("offset", "f8", POSE),  # of that sense, in units of its prior standard deviation
