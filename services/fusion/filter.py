@@ -59,8 +59,8 @@ out as before, and no picture shows it in time. Slow limbs have agilities up to 
 of the poses of a fast hand are beyond three sigma (12 runs of seed 8401)."""
 FAST, RESTED_S, FORGOTTEN = 2.0, 3.0, 0.4
 """A limb whose speed has not been above that many times `velocity_spread` (0.8 m/s, 2 rad/s) for that time [s] is not fast any
-more: its agility then decreases down to SWIFT at that share of the learning rate, by a factor of 7 a second. Fast hands reach that
-speed every 2.6 s at least (12 runs of seed 8821)."""
+more: its agility then decreases down to SWIFT at that share of the learning rate, by a factor of 7 a second for each sense. Fast
+hands reach that speed every 2.6 s at least (12 runs of seed 8821)."""
 TOLD_APART = 9.0
 """Squared Mahalanobis distance between two poses, by the covariance of one measurement, above which that measurement tells them
 apart: three standard deviations."""
