@@ -201,6 +201,20 @@ def test_a_fast_hand_that_rests_is_expected_to_set_out_as_it_did_before() -> Non
     assert 3.0 * sigma["fast"] > 0.05 > 3.0 * sigma["slow"]
 
 
+def test_after_a_rest_of_seconds_a_fast_limb_is_no_longer_followed_wherever_one_sense_says() -> None:
+    """A state that expects a fast hand is so uncertain between two pictures that a wrong skin passes the gate."""
+    rng, observer, errors = np.random.default_rng(1), ErrorStateObserver(HOME, SPREAD), []
+    sigma = 0.5 * np.sqrt(np.diag(np.linalg.inv(VISION)))
+    for k in range(1200):  # it swings for two seconds, rests for eight, and then the skin is off by 10 cm
+        T = perturb(HOME, [0.3 * np.sin(0.02 * np.pi * k) if 100 <= k < 300 else 0.0, *np.zeros(5)])
+        off = np.array([0.0, 0.1 if k >= 1100 else 0.0, *np.zeros(4)])
+        observer.measure("haptic", ns(k * 0.01), perturb(T, off + sigma * rng.normal(size=6)), VISION)
+        if k % 5 == 0:
+            observer.measure("vision", ns(k * 0.01), perturb(T, sigma * rng.normal(size=6)), VISION)
+        errors.append(float(np.linalg.norm(observer.estimate(ns(k * 0.01)).T[:3, 3] - T[:3, 3])))
+    assert max(errors[1100:]) < 0.03
+
+
 def test_a_sense_that_is_noisier_than_it_says_is_doubted_and_not_refused() -> None:
     rng = np.random.default_rng(0)
     observer = ErrorStateObserver(HOME, SPREAD)
