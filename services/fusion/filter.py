@@ -21,7 +21,8 @@ one is surprising: then the sense is not used until it is right again.
 Three factors adapt to the innovations, by whether each innovation resembles the one before of the same sense:
 - If those of a wrong sense, relative to its offset, resemble each other, the offset runs away: its walk grows.
 - If those of other senses resemble each other, the filter lags behind the limb: the process noise grows, separately for linear
-  and angular motion, because otherwise a limb that turns would let a sense with a wrong position pass.
+  and angular motion, because otherwise a limb that turns would let a sense with a wrong position pass. It stays large while the
+  limb moves fast, and for seconds afterwards.
 - If innovations are too large and do not resemble each other, the sense is noisier than it says: its covariance grows, and is
   never smaller than the sense says.
 
@@ -60,7 +61,7 @@ of the poses of a fast hand are beyond three sigma (12 runs of seed 8401)."""
 FAST, RESTED_S, FORGOTTEN = 2.0, 3.0, 0.4
 """A limb whose speed has not been above that many times `velocity_spread` (0.8 m/s, 2 rad/s) for that time [s] is not fast any
 more: its agility then decreases down to SWIFT at that share of the learning rate, by a factor of 7 a second for each sense. Fast
-hands reach that speed every 2.6 s at least (12 runs of seed 8821)."""
+hands reach that speed at least every 2.6 s (12 runs of seed 8821)."""
 TOLD_APART = 9.0
 """Squared Mahalanobis distance between two poses, by the covariance of one measurement, above which that measurement tells them
 apart: three standard deviations."""
