@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import expm
 
+from penumbra.services.fusion.observer import ErrorStateObserver
+from penumbra.services.fusion.paper import PaperObserver
 from penumbra.services.fusion.records import UNITS
 from penumbra.services.fusion.settings import FusionSettings
 from penumbra.shared.contract import senses
@@ -18,12 +20,20 @@ VISION = np.diag(1.0 / np.square([0.01, 0.01, 0.01, 0.03, 0.03, 0.03]))
 """Information (6, 6) of a camera's pose."""
 SKIN = [0.006, 0.003, 0.002, 1.0, 0.02, 0.03]
 """Standard deviations [m, rad] of a haptic pose along and about the limb's axes."""
+STEP = np.array([0.02, -0.01, 0.03, 0.0, 0.2, -0.6])
+"""Pose error (6,) from where a likelihood was linearised to its peak."""
 NO_ROLL = np.diag([1.0, 1.0, 1.0, 0.0, 1.0, 1.0])
 
 
 def ns(seconds: float) -> int:
     """The stamp [ns] of a time [s]."""
     return T0_NS + round(seconds * 1e9)
+
+
+def still(observer: ErrorStateObserver | PaperObserver, T: Array, begin: float, end: float, information: Array = VISION) -> None:
+    """Perfect vision of a limb that rests at T, at 20 Hz."""
+    for t in np.arange(begin, end, 0.05):
+        observer.measure("vision", ns(t), T, information, 0.0)
 
 
 class Errors:

@@ -8,7 +8,7 @@ import pytest
 from penumbra.services.fusion.observer import ErrorStateObserver
 from penumbra.shared.contract.messages import MAX_FUTURE_S
 from penumbra.shared.geometry.rigid import perturb
-from penumbra.tests.support.fusion_data import HOME, SPREAD, VISION, ns
+from penumbra.tests.support.fusion_data import HOME, SPREAD, VISION, ns, still
 
 
 def test_a_jump_that_the_skin_cannot_feel_is_noticed_at_once_and_followed() -> None:
@@ -92,8 +92,7 @@ def test_a_denial_from_the_future_counts_for_nothing_and_one_is_forgotten_with_a
     assert observer.estimate(ns(1.35)).state == "tracking"
     observer.deny("vision", ns(1.3))
     observer.forget()
-    for t in np.arange(1.0, 1.4, 0.05):
-        observer.measure("vision", ns(t), HOME, VISION)
+    still(observer, HOME, 1.0, 1.4)
     assert observer.estimate(ns(1.4)).state == "tracking"
     with pytest.raises(ValueError, match="expected one of vision, haptic, got 'lidar'"):
         observer.deny("lidar", ns(1.0))
