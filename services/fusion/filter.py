@@ -9,7 +9,9 @@ too near for as long as nobody moves. A filter that treats 100 such measurements
 error, and then ignores the other sense. So the error of every measurement is split: a share `lasting` of its variance belongs to
 the sense's bias, a first-order Gauss-Markov process that the filter estimates, and the rest is white. The bias is in units of the
 measurement's own standard deviation, which changes with distance and occlusion: a measurement of covariance L L' reads
-pose + sqrt(lasting) L bias + white noise.
+pose + sqrt(lasting) L bias + white noise. Where a stated covariance allows for rare large errors, L L' is the `typical` share of
+it: a filter that weighs by more takes a limb's motion for a change of the bias, and lags behind. What the bias may be larger by
+is considered and not estimated: `history.consider` adds it to the covariance that is published.
 
 A measurement that the gate refuses and another sense contradicts is wrong, but its changes may be right. From then on its sense
 reads pose + offset + bias + white noise. The offset is unknown at first, and constant except for a slow random walk. While the
@@ -115,6 +117,10 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
         _start_at_home(one, state, m)
     else:
         predict(model, state, m.stamp_ns)
+    sense.rank = m.rank
+    so3.copy(m.directions, sense.directions)
+    for k in range(m.rank):
+        sense.sigma[k], sense.rest[k] = m.sigma[k], m.rest[k]
     z, H, S_inverse, innovation = np.empty(POSE), np.zeros((POSE, 3 * POSE)), np.empty((POSE, POSE)), np.empty(POSE)
     while True:
         linearised(model, state, m, z, H)
@@ -123,10 +129,7 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
             break
         distance = so3.dot(innovation, innovation)
         now.distance, now.rank = distance, m.rank
-        sense.surprise, sense.measured_ns, sense.rank = distance / m.rank, m.stamp_ns, m.rank
-        so3.copy(m.directions, sense.directions)
-        for k in range(m.rank):
-            sense.sigma[k] = m.sigma[k]
+        sense.surprise, sense.measured_ns = distance / m.rank, m.stamp_ns
         contradicted = _is_contradicted(one, state, m, z)
         gate = 0 if not contradicted else 1 if sense.refused < one.refusals else 2
         passes = distance <= model.senses[m.source].threshold[gate, m.rank]
@@ -353,22 +356,30 @@ def predict(model, state, stamp_ns):  # type: ignore[no-untyped-def]
     one, now, P = model.one, state.now, state.P
     dt = (stamp_ns - now.stamp_ns) * 1e-9
     move(one, dt, now.p, now.R, now.velocity, now.acceleration, P, now.agility)
+    fade(model.senses, dt, P)
     for s in range(len(state.senses)):
-        sense, first = state.senses[s], MOTION + POSE * s
-        keep = math.exp(-dt / model.senses[s].time_constant)
+        sense = state.senses[s]
         for i in range(POSE):
-            sense.bias[i] *= keep
-            for j in range(len(P)):
-                P[first + i, j] *= keep
-            for j in range(len(P)):
-                P[j, first + i] *= keep
-            P[first + i, first + i] += 1.0 - keep**2
+            sense.bias[i] *= math.exp(-dt / model.senses[s].time_constant)
         sense.gain *= math.exp(-dt / one.weight_time)
     if now.wrong != NOBODY:
         for i in range(POSE):
             walk = one.offset_drift[i // 3] / one.offset_spread[i // 3]
             P[len(P) - POSE + i, len(P) - POSE + i] += dt * now.wander[i // 3] * walk**2
     now.stamp_ns = stamp_ns
+
+
+@inner
+def fade(sense_models, dt, P):  # type: ignore[no-untyped-def]
+    """Takes the covariance of all errors on by dt [s], as far as the biases of the senses change."""
+    for s in range(len(sense_models)):
+        keep, first = math.exp(-dt / sense_models[s].time_constant), MOTION + POSE * s
+        for i in range(first, first + POSE):
+            for j in range(len(P)):
+                P[i, j] *= keep
+            for j in range(len(P)):
+                P[j, i] *= keep
+            P[i, i] += 1.0 - keep**2
 
 
 @inner

@@ -13,6 +13,7 @@ the number of entries.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +30,7 @@ from penumbra.services.fusion.estimate import (
     fault,
     state_of,
 )
-from penumbra.services.fusion.filter import Model, State, forget, is_contested, spread, step
+from penumbra.services.fusion.filter import Model, State, fade, forget, is_contested, spread, step
 from penumbra.services.fusion.measurement import reduce, undo
 from penumbra.services.fusion.motion import move, within_reach
 from penumbra.services.fusion.records import (
@@ -165,6 +166,40 @@ def _calibration(sense_models, shares):  # type: ignore[no-untyped-def]
     return variance / total if total > 0.0 else 0.0
 
 
+@kernel("SENSE_MODEL[n], SENSE_STATE[n], f8[size, size], out f8[6, 6]", SENSE_MODEL=SENSE_MODEL, SENSE_STATE=SENSE_STATE)
+def consider(sense_models, senses, P, covariance):  # type: ignore[no-untyped-def]
+    """Adds to a pose's covariance what the pose is off by where the senses' common errors are larger than the filter assumes.
+
+    It depends on a bias by P_pb P_bb^-1: not at all, where another sense has told what the bias is.
+    """
+    variances, vectors, along = np.empty((POSE, POSE)), np.empty((POSE, POSE)), np.empty((POSE, POSE))
+    larger, gain, product = np.empty((POSE, POSE)), np.empty((POSE, POSE)), np.empty((POSE, POSE))
+    for s in range(len(senses)):
+        of, sense, first = sense_models[s], senses[s], MOTION + POSE * s
+        if of.typical == 1.0:
+            continue
+        for i in range(POSE):
+            for j in range(POSE):
+                variances[i, j] = P[first + i, first + j]
+                larger[i, j] = 0.0
+                for k in range(sense.rank):
+                    share = sense.rest[k] / (of.lasting * sense.sigma[k] ** 2 + of.floor**2)
+                    larger[i, j] += math.sqrt(share) * sense.directions[k, i] * sense.directions[k, j]
+        so3.eigen(variances, POSE, vectors)
+        for i in range(POSE):
+            for e in range(POSE):
+                along[i, e] = 0.0
+                for j in range(POSE):
+                    along[i, e] += P[i, first + j] * vectors[j, e] / variances[e, e]
+        so3.product_transposed(along, vectors, product)
+        so3.product(product, larger, gain)
+        so3.product(gain, vectors, along)
+        for i in range(POSE):
+            for j in range(POSE):
+                for e in range(POSE):
+                    covariance[i, j] += along[i, e] * variances[e, e] * along[j, e]
+
+
 @kernel(
     "MODEL[t], SENSE_MODEL[n], out MEASUREMENT[t, c], out STATE[t, c], out SENSE_STATE[t, c, n], out f8[t, c, size, size], "
     "out i8[t, 2], i8, i8, f8[4, 4], f8[6], f8[6, 6], SENSE_ESTIMATE[n]",
@@ -260,7 +295,7 @@ def estimate_all(
     models, sense_models, measurements, states, senses, P, rings, denied_ns, stamp_ns, out, shares
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """`Bank.estimate`, one after the other. denied_ns (t, n) : stamps at which senses last denied the targets."""
-    p, R, covariance = np.empty(3), np.empty((3, 3)), np.empty((MOTION, MOTION))
+    p, R, ahead = np.empty(3), np.empty((3, 3)), np.empty_like(P[0, 0])
     velocity, acceleration = np.empty(POSE), np.empty(POSE)
     for n in range(len(out)):
         history = Entries(measurements[n], states[n], senses[n], P[n], rings[n])
@@ -279,23 +314,25 @@ def estimate_all(
             so3.copy(one.home, R)
             for i in range(POSE):
                 velocity[i] = 0.0
-                for j in range(POSE):
-                    covariance[i, j] = one.home_covariance[i, j]
+            so3.copy(one.home_covariance, found.covariance)
             found.state = LOST
         else:
             for i in range(3):
                 p[i] = now.p[i]
             so3.copy(now.R, R)
-            so3.copy(P[n, slot], covariance)
+            so3.copy(P[n, slot], ahead)
             for i in range(POSE):
                 velocity[i], acceleration[i] = now.velocity[i], now.acceleration[i]
             dt = max(0.0, (stamp_ns - now.stamp_ns) * 1e-9)
-            move(one, dt, p, R, velocity, acceleration, covariance, now.agility)
+            move(one, dt, p, R, velocity, acceleration, ahead, now.agility)
+            fade(sense_models, dt, ahead)
+            so3.copy(ahead, found.covariance)
             for i in range(POSE):
-                covariance[i, i] += _calibration(sense_models, shares[n]) * UNITS[i] ** 2
+                found.covariance[i, i] += _calibration(sense_models, shares[n]) * UNITS[i] ** 2
+            consider(sense_models, of_senses, ahead, found.covariance)
             if stamp_ns > now.accepted_ns:  # a guess; what is measured is believed
                 within_reach(one, p, R)
-            found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, covariance, one.limits)
+            found.state = state_of((stamp_ns - now.accepted_ns) * 1e-9, found.covariance, one.limits)
             if found.state == TRACKING and (
                 is_contested(one, State(now, of_senses, P[n, slot]), stamp_ns)
                 or _is_denied(one, of_senses, denied_ns[n], stamp_ns)
@@ -306,6 +343,5 @@ def estimate_all(
                 found.pose[i, j] = R[i, j]
             found.pose[i, 3], found.pose[3, i] = p[i], 0.0
         found.pose[3, 3] = 1.0
-        so3.copy(covariance, found.covariance)
         for i in range(POSE):
             found.velocity[i] = velocity[i]

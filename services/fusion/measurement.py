@@ -21,6 +21,7 @@ from penumbra.shared.native import inner
 def reduce(model, source, stamp_ns, T, information, step, m):  # type: ignore[no-untyped-def]
     """Writes a pose (4, 4) with its information (6, 6) as the MEASUREMENT m; step (6,): from there to where its likelihood
     peaks."""
+    of = model.senses[source]
     m.stamp_ns, m.source = stamp_ns, source
     for i in range(3):
         m.p[i] = T[i, 3]
@@ -34,10 +35,13 @@ def reduce(model, source, stamp_ns, T, information, step, m):  # type: ignore[no
     k = 0
     for e in range(POSE):
         if scaled[e, e] > max(model.one.unobserved**-2, 1e-9 * scaled[POSE - 1, POSE - 1]):
+            variance = 1.0 / scaled[e, e]
+            share = of.typical + (1.0 - of.typical) * variance / (variance + of.sure**2)
             for i in range(POSE):
                 m.directions[k, i] = vectors[i, e]
                 m.basis[k, i] = vectors[i, e] / UNITS[i]
-            m.sigma[k] = math.sqrt(1.0 / scaled[e, e])
+            m.sigma[k] = math.sqrt(share * variance)
+            m.rest[k] = (1.0 - share) * variance
             m.ahead[k] = so3.dot(m.basis[k], step)
             k += 1
     m.rank, m.has_axis, m.slides = k, 0, 0

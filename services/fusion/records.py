@@ -47,7 +47,7 @@ MODEL = np.dtype(
 
 SENSE_MODEL = np.dtype(
     [
-        *((name, "f8") for name in ("lasting", "time_constant", "floor")),  # as in `senses.Errors`
+        *((name, "f8") for name in ("lasting", "time_constant", "floor", "typical", "sure")),  # as in `senses.Errors`
         ("threshold", "f8", (GATES, POSE + 1)),  # maximum squared Mahalanobis distances of its `gate`, by rank
     ]
 )
@@ -63,6 +63,7 @@ MEASUREMENT = np.dtype(
         ("directions", "f8", (POSE, POSE)),  # unit vectors (k, 6), in UNITS
         ("basis", "f8", (POSE, POSE)),  # (k, 6): `basis @ error` has independent entries ...
         ("sigma", "f8", POSE),  # ... with these standard deviations (k,)
+        ("rest", "f8", POSE),  # the stated variances less these typical ones (k,): of lasting errors that are not estimated
         ("ahead", "f8", POSE),  # `basis @` the pose error from p, R to the peak of its likelihood (k,)
         ("has_axis", "i8"),  # whether the rotation about `axis` is not observed (a limb's, if its roll is not seen)
         ("axis", "f8", 3),
@@ -98,6 +99,7 @@ SENSE_STATE = np.dtype(
         ("rank", "i8"),  # and the directions that it observed, with their standard deviations, as in a MEASUREMENT
         ("directions", "f8", (POSE, POSE)),
         ("sigma", "f8", POSE),
+        ("rest", "f8", POSE),
         ("learned_ns", "i8"),  # stamp of the last measurement to which agility and doubt were adapted
         ("accepted_ns", "i8"),  # stamp of the last accepted measurement
         ("refused", "i8"),  # number of measurements refused since

@@ -170,7 +170,7 @@ def sense_models(senses: Sequence[Sense]) -> NDArray[np.void]:
     """The SENSE_MODEL of every sense (n,). Raises ValueError for a gate that is not in `chi_square.QUANTILES`."""
     out = np.zeros(len(senses), SENSE_MODEL)
     for record, sense in zip(out, senses, strict=True):
-        for name in ("lasting", "time_constant", "floor"):
+        for name in ("lasting", "time_constant", "floor", "typical", "sure"):
             record[name] = getattr(sense.errors, name)
         record["threshold"] = [[quantile(share, max(rank, 1)) for rank in range(POSE + 1)] for share in sense.errors.gate]
     return out

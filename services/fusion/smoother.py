@@ -219,6 +219,13 @@ class Segment:
             smooth(out, i, later, j, F[j], Q[j], self.smoothed, k)
         return out
 
+    def covariance(self, states: States, i: int) -> Array:
+        """The covariance (6, 6) of the pose of state i."""
+        P = states.P[i]
+        covariance: Array = P[:POSE, :POSE].copy()
+        history.consider(self._filter.senses, states.senses[i], P, covariance)
+        return covariance
+
     def agreement(self, measurements: NDArray[np.void], states: States, is_used: bool) -> Array:
         """Squared Mahalanobis distances (m,) of measurements from the smoothed states at their stamps. is_used: whether the
         states contain them; each is then compared with the states without it."""
@@ -263,15 +270,12 @@ class Trajectory:
             for part in (mine[i : i + BLOCK] for i in range(0, len(mine), BLOCK)):
                 states = segment.at(part)
                 for i, stamp_ns in enumerate(part.tolist()):
-                    yield self._estimate(segment.stamps_ns, stamp_ns, states.now[i], states.P[i])
-
-    def _estimate(self, measured_ns: Indices, stamp_ns: int, now: np.void, P: Array) -> Estimate:
-        after = int(np.searchsorted(measured_ns, stamp_ns))
-        age_s = 1e-9 * float(np.abs(measured_ns[max(0, after - 1) : after + 1] - stamp_ns).min())
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = now["R"], now["p"]
-        covariance = P[:POSE, :POSE].copy()
-        return Estimate(T, now["velocity"].copy(), covariance, self._limits.state(age_s, covariance), {})
+                    now, covariance = states.now[i], segment.covariance(states, i)
+                    after = int(np.searchsorted(segment.stamps_ns, stamp_ns))
+                    age_s = 1e-9 * float(np.abs(segment.stamps_ns[max(0, after - 1) : after + 1] - stamp_ns).min())
+                    T = np.eye(4)
+                    T[:3, :3], T[:3, 3] = now["R"], now["p"]
+                    yield Estimate(T, now["velocity"].copy(), covariance, self._limits.state(age_s, covariance), {})
 
 
 class Smoother:

@@ -48,7 +48,10 @@ class Errors:
         """An error (6,) for a measurement of information (6, 6)."""
         self._bias = self._keep * self._bias + np.sqrt(1 - self._keep**2) * self._rng.normal(size=6)
         w, V = np.linalg.eigh(seen * np.outer(UNITS, UNITS))
-        root = (V * np.where(w > 1e-6, np.abs(w), np.inf) ** -0.5) @ V.T
+        of = self._errors
+        variances = np.where(w > 1e-6, 1.0 / np.abs(w), 0.0)
+        share = of.typical + (1.0 - of.typical) * variances / (variances + of.sure**2)
+        root = (V * np.sqrt(share * variances)) @ V.T
         white = self._rng.normal(size=6)
         lasting = self._errors.lasting
         return UNITS * (root @ (np.sqrt(lasting) * self._bias + np.sqrt(1 - lasting) * white))

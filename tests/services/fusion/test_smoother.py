@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from penumbra.services.fusion import history
 from penumbra.services.fusion.estimate import Estimate
 from penumbra.services.fusion.observer import ErrorStateObserver
 from penumbra.services.fusion.records import MOTION, POSE, UNITS
 from penumbra.services.fusion.settings import FusionSettings, Subject
 from penumbra.services.fusion.smoother import Filter, NothingMeasuredError, Smoother, Trajectory
-from penumbra.shared.contract.senses import SENSES, Sense
+from penumbra.shared.contract.senses import SENSES, Errors, Sense
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array, perturb, pose_error
 from penumbra.sim.world.motion import Reach
@@ -50,6 +51,13 @@ def resting(begin: float, end: float, T: Array = HOME, seed: int = 0) -> list[tu
 # ---- the smoother's equations
 
 
+def split(of: Errors, sigma: float) -> tuple[float, float]:
+    """The variance [m^2] by which a measurement with a standard deviation sigma [m] is weighed, and the rest of its variance."""
+    variance, sure = sigma**2, (UNITS[0] * of.sure) ** 2
+    share = of.typical + (1.0 - of.typical) * variance / (variance + sure)
+    return share * variance, (1.0 - share) * variance
+
+
 def batch(times: Array, measured: dict[int, float], sigma: float, sense: Sense) -> tuple[Array, Array]:
     """Position, velocity, acceleration and bias (k, 4) of one axis at all times, and their covariances (k, 4, 4): the solution of
     the whole linear problem at once. measured: position [m] by the index of its time, with a standard deviation sigma [m]."""
@@ -59,12 +67,13 @@ def batch(times: Array, measured: dict[int, float], sigma: float, sense: Sense) 
     first = 10.0 * SPREAD[0], spread, spread / LINEAR.motion_time[0], 1.0  # as `filter.start` begins where a measurement decides
     information[:4, :4] += np.diag(np.square(first) ** -1.0)
     pull[0] += measured[0] / first[0] ** 2
-    lasting = UNITS[0] * np.sqrt(of.lasting * (sigma / UNITS[0]) ** 2 + of.floor**2)
+    typical, _ = split(of, sigma)
+    lasting = np.sqrt(of.lasting * typical + (UNITS[0] * of.floor) ** 2)
     h = np.array([1.0, 0.0, 0.0, lasting])
     for k, z in measured.items():
         here = slice(4 * k, 4 * k + 4)
-        information[here, here] += np.outer(h, h) / ((1.0 - of.lasting) * sigma**2)
-        pull[here] += h * z / ((1.0 - of.lasting) * sigma**2)
+        information[here, here] += np.outer(h, h) / ((1.0 - of.lasting) * typical)
+        pull[here] += h * z / ((1.0 - of.lasting) * typical)
     for k, dt in enumerate(np.diff(times)):
         F, Q = np.eye(4), np.eye(4)
         F[:3, :3], Q[:3, :3] = motion(float(dt), LINEAR)
@@ -91,7 +100,12 @@ def test_of_a_linear_problem_it_finds_the_batch_least_squares_solution_also_betw
     assert of.dismissed == of.reinstated == 0
     np.testing.assert_allclose([each.T[2, 3] - HOME[2, 3] for each in found], expected[:, 0], atol=1e-9)
     np.testing.assert_allclose([each.velocity[2] for each in found], expected[:, 1], atol=1e-8)
-    np.testing.assert_allclose([each.covariance[2, 2] for each in found], covariances[:, 0, 0], rtol=1e-6)
+    errors = SENSES[0].errors
+    typical, rest = split(errors, sigma)
+    larger = rest / (errors.lasting * typical + (UNITS[0] * errors.floor) ** 2)
+    of_bias = covariances[:, 0, 3] ** 2 / covariances[:, 3, 3]  # the part of the position's variance that is the bias's
+    expected_variances = covariances[:, 0, 0] + larger * of_bias
+    np.testing.assert_allclose([each.covariance[2, 2] for each in found], expected_variances, rtol=1e-6)
     states = trajectory._segments[0].smoothed
     kept = sorted(measured)
     rows = np.array([2, POSE + 2, 2 * POSE + 2, MOTION + 2])
@@ -112,7 +126,9 @@ def test_the_motion_between_two_states_is_the_observers_own() -> None:
     for dt in (0.0, 0.005, 0.3, 2.0):
         later, F, Q = filter.moved(states, np.array([ns(0.45 + dt)]))
         expected = observer.estimate(ns(0.45 + dt))
-        np.testing.assert_allclose(later.P[0, :6, :6] + CALIBRATION, expected.covariance, rtol=1e-9, atol=1e-15)
+        published = later.P[0, :6, :6] + CALIBRATION
+        history.consider(filter.senses, later.senses[0], later.P[0], published)
+        np.testing.assert_allclose(published, expected.covariance, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(later.now["p"][0], expected.T[:3, 3], atol=1e-12)
         np.testing.assert_allclose(later.now["R"][0], expected.T[:3, :3], atol=1e-12)
         np.testing.assert_allclose(F[0] @ states.P[0] @ F[0].T + Q[0], later.P[0], atol=1e-15)
