@@ -19,6 +19,8 @@ from penumbra.shared.contract.processes import PROCESSES
 from penumbra.shared.runtime import logs
 
 if TYPE_CHECKING:
+    import torch
+
     from penumbra.shared.runtime.metrics import Reports
 
 Options = SimpleNamespace
@@ -556,6 +558,39 @@ def training(name: str, minutes: float) -> tuple[Option, ...]:
             help="continue from the checkpoint if there is one, else from the compact one if there is",
         ),
     )
+
+
+def on_device(drawn: str) -> tuple[Option, ...]:
+    """The flags of a training on any device, with other processes that draw what is learned from (`drawn`)."""
+    return (
+        Option(
+            "--device", type=_device, default="cpu", metavar="NAME", help="that the network is on, as torch names it: cuda, say"
+        ),
+        Option(
+            "--workers",
+            type=natural,
+            default=0,
+            metavar="N",
+            help="other processes that draw what is learned from; their time is not counted",
+        ),
+        Option(
+            "--times",
+            type=positive,
+            default=1,
+            metavar="N",
+            help=f"N times as many {drawn} a step, where a device has room for them",
+        ),
+    )
+
+
+def _device(text: str) -> torch.device:
+    import torch  # here, because only trainings have it
+
+    try:
+        return torch.empty(0, device=text).device
+    except (RuntimeError, AssertionError) as error:
+        there = ", ".join(["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))])
+        raise ValueError(f"expected a device that torch has here ({there}), got {text!r}: {error}") from None
 
 
 def _one_of(other: str) -> Callable[[click.Context, click.Parameter, Any], Any]:

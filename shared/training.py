@@ -17,6 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ class Trainer(ABC, Generic[N, D]):
 
     SETTINGS: the dataclass of the network's settings. step, minutes (of processor time): progress over all runs. steps: total
     number of steps, None where minutes end the training. warm_from: step at which the optimiser was empty. started_from: entry in
-    the card of the weights that the training started from, None where it started from none.
+    the card of the weights that the training started from, None where it started from none. device, workers: `place`.
     """
 
     SETTINGS: ClassVar[type]
@@ -51,6 +52,15 @@ class Trainer(ABC, Generic[N, D]):
         self.step, self.minutes, self.warm_from = 0, 0.0, 0
         self.steps: int | None = None
         self.started_from: dict[str, Any] | None = None
+        self.device, self.workers = torch.device("cpu"), 0
+
+    def place(self, device: torch.device, workers: int) -> None:
+        """Move the network to a device and set the number of processes that draw the next steps' data; with 0 each step draws its
+        own."""
+        for net in (self.net, self.average):
+            net.to(device)
+        self.optimizer.load_state_dict(self.optimizer.state_dict())  # moves its state to the device of the weights
+        self.device, self.workers = device, workers
 
     @abstractmethod
     def train_step(self, data: D, progress: float) -> dict[str, float]:
@@ -108,6 +118,11 @@ class Trainer(ABC, Generic[N, D]):
             trainer.optimizer.load_state_dict(content["optimizer"])
             trainer.warm_from = content["warm_from"]
         return trainer
+
+
+def alone_on_a_core(_: int) -> None:
+    """For the beginning of a process that draws: as many threads as cores, in as many processes, only wait for each other."""
+    cv2.setNumThreads(0)
 
 
 def one_cycle(progress: float, rise: float) -> float:

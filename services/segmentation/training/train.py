@@ -29,7 +29,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
@@ -144,17 +143,8 @@ class Trainer(training.Trainer[PredNet, Data]):
         if of_encoder:
             groups.append({"params": of_encoder, "share": schedule.encoder_share})
         super().__init__(settings, schedule, seed, net, torch.optim.Adam(groups, betas=(0.9, 0.98)))
-        self.device, self.workers = torch.device("cpu"), 0
         self._progress = 0.0
         self._batches: tuple[Data, Iterator[Any]] | None = None
-
-    def place(self, device: torch.device, workers: int) -> None:
-        """Move the network to a device and set the number of processes that draw the next steps' data; with 0 each step draws its
-        own."""
-        for net in (self.net, self.average):
-            net.to(device)
-        self.optimizer.load_state_dict(self.optimizer.state_dict())  # moves its state to the device of the weights
-        self.device, self.workers = device, workers
 
     def train_step(self, data: Data, progress: float) -> dict[str, float]:
         """One step of gradient descent; returns the parts of the loss."""
@@ -194,7 +184,7 @@ class Trainer(training.Trainer[PredNet, Data]):
                 batch_size=None,
                 sampler=following(),
                 num_workers=self.workers,
-                worker_init_fn=_alone_on_a_core,
+                worker_init_fn=training.alone_on_a_core,
             )
         )
 
@@ -272,10 +262,6 @@ class Trainer(training.Trainer[PredNet, Data]):
         return trainer
 
 
-def _alone_on_a_core(_: int) -> None:
-    cv2.setNumThreads(0)  # as many threads as cores, in as many processes, only wait for each other
-
-
 def mean(net: PredNet, others: Sequence[PredNet]) -> PredNet:
     """The network whose weights are the mean of those of all. Raises ValueError if their forms differ."""
     for other in others:
@@ -316,14 +302,6 @@ def _named(card: Mapping[str, Any]) -> dict[str, Any]:
     """The entry with which a card names another card's weights."""
     named = {key: card[key] for key in ("seed", "date") if key in card}
     return named | {key: card["settings"][key] for key in ("steps", "minutes") if key in card["settings"]}
-
-
-def _device(text: str) -> torch.device:
-    try:
-        return torch.empty(0, device=text).device
-    except (RuntimeError, AssertionError) as error:
-        there = ", ".join(["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))])
-        raise ValueError(f"expected a device that torch has here ({there}), got {text!r}: {error}") from None
 
 
 @flags.command(
@@ -401,23 +379,7 @@ def _device(text: str) -> torch.device:
     flags.Option(
         "--held-out", type=flags.positive, default=60, help="simulated sequences for calibration, and as many for the score"
     ),
-    flags.Option(
-        "--device", type=_device, default="cpu", metavar="NAME", help="that the network is on, as torch names it: cuda, say"
-    ),
-    flags.Option(
-        "--workers",
-        type=flags.natural,
-        default=0,
-        metavar="N",
-        help="other processes that draw what is learned from; their time is not counted",
-    ),
-    flags.Option(
-        "--times",
-        type=flags.positive,
-        default=1,
-        metavar="N",
-        help="N times as many sequences a step, where a device has room for them",
-    ),
+    *flags.on_device("sequences"),
     example="penumbra segmentation train --data recordings --start --minutes 60",
 )
 def main(options: flags.Options) -> int:
