@@ -40,14 +40,15 @@ ARM_M = 0.085
 @dataclass(frozen=True)
 class Variety:
     """The variety of the sequences. frames: per sequence; size [px] of the window; scale: bounds of the focal length relative to
-    the cell's camera; speed [m/s] and turn [rad/s]: maximum of the target's; jitter [m]: maximum offset of the window's middle
-    from the target's along each axis; away: bounds of the camera's distance relative to the cell's camera's, its focal length
-    growing with it; real: share of sequences with the looks, hands, sizes and cameras of `sim.picture.looks`, `sim.picture.limb`
-    and ARM_PX."""
+    the cell's camera; finer: a factor of these; speed [m/s] and turn [rad/s]: maximum of the target's; jitter [m]: maximum offset
+    of the window's middle from the target's along each axis; away: bounds of the camera's distance relative to the cell's
+    camera's, its focal length growing with it; real: share of sequences with the looks, hands, sizes and cameras of
+    `sim.picture.looks`, `sim.picture.limb` and ARM_PX."""
 
     frames: int = 8
     size: int = 192
     scale: tuple[float, float] = (0.4, 1.5)
+    finer: float = 1.0
     speed: float = 0.5
     turn: float = 1.2
     jitter: float = 0.06
@@ -232,7 +233,7 @@ def _camera(camera: cells.Camera, target: Array, variety: Variety, rng: np.rando
     low, high = variety.scale
     choice = rng.random()  # around 1: the crop at native resolution; around 0.5: the whole frame at scale 2
     scale = rng.uniform(0.85, 1.15) if choice < 0.7 else rng.uniform(0.45, 0.6) if choice < 0.9 else rng.uniform(low, high)
-    scale = float(np.clip(scale, low, high))
+    scale = variety.finer * float(np.clip(scale, low, high))
     width, height = (max(round(scale * n), variety.size) for n in (camera.width, camera.height))
     factor = 1.0
     if variety.away != (1.0, 1.0):
