@@ -23,6 +23,10 @@ from penumbra.shared.perception.lookout import Window
 from penumbra.shared.perception.vision import State, VisionEstimate
 
 WEIGHTS = Path(__file__).parent / "weights" / "posecnn.npz"
+WIDTHS = (1.1, 0.85)
+"""Sides of the patches that are looked at, in those of the window. The network's lengths lean towards those that are usual in a
+patch, the more the less of the target is seen; the mean of two patches leans less. The first one's classes, votes and rotation
+are used."""
 SMALLEST = 24
 """Pixels of the target, counted at the network's stride, below which there is nothing to vote."""
 AGREEING = 0.6
@@ -89,7 +93,7 @@ class PoseCNN:
         """Compiles what `update` needs, so that the first frame does not wait for it."""
         image = np.zeros((self._camera.height, self._camera.width, 3), np.uint8)
         with torch.inference_mode():
-            self._look(patch.cut(image, self._intrinsics, np.array([patch.SIDE / 2.0] * 2), float(patch.SIDE)))
+            self._look(self._squares(image, np.array([patch.SIDE / 2.0] * 2), float(patch.SIDE)))
         voting.vote(np.array([[4.0, 4.0], [8.0, 4.0]]), np.array([[1.0, 0.0], [-1.0, 0.0]]), patch.SIDE // STRIDE)
         ahead = rigid.apply(rigid.from_rpy((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)), self._mesh.vertices)
         raster.silhouette(ahead, self._mesh.faces, (50.0, 50.0, 32.0, 32.0), (0, 0, 64, 64))
@@ -110,15 +114,19 @@ class PoseCNN:
             looks += [(middle + side / 4.0 * np.array([x, y]), TILE * side) for y in (-1, 1) for x in (-1, 1)]
         with torch.inference_mode():
             for at, width in looks:
-                square = patch.cut(image, self._intrinsics, at, width)
-                labels, found = self._look(square)
-                estimate = self._judge(square, labels, found, T_prior)
-                if T_prior is None and (region := self._region(labels, square)) is not None:
-                    nearer = patch.cut(image, self._intrinsics, *region)
-                    estimate = self._judge(nearer, *self._look(nearer), T_prior)
+                squares = self._squares(image, at, width)
+                labels, found = self._look(squares)
+                estimate = self._judge(squares[0], labels, found, T_prior)
+                if T_prior is None and (region := self._region(labels, squares[0])) is not None:
+                    nearer = self._squares(image, *region)
+                    estimate = self._judge(nearer[0], *self._look(nearer), T_prior)
                 if estimate.state == "tracking":
                     break
         return estimate
+
+    def _squares(self, image: NDArray[np.uint8], middle: Array, side: float) -> list[patch.Patch]:
+        """The patches of an image around a point (2,) [px], for a window `side` image columns wide."""
+        return [patch.cut(image, self._intrinsics, middle, width * side) for width in WIDTHS]
 
     def _region(self, labels: NDArray[np.int64], square: patch.Patch) -> tuple[Array, float] | None:
         """Middle (2,) and side [image px] of a square around the pixels of the target, where they take up too little of a patch:
@@ -139,31 +147,41 @@ class PoseCNN:
         camera = self._camera
         return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
-    def _look(self, square: patch.Patch) -> tuple[NDArray[np.int64], Found | None]:
-        """The class of every position (side / STRIDE, …) of a patch, and the target in it, None where too little of it shows."""
-        picture = torch.from_numpy(square.pixels).movedim(-1, 0)[None].float() / 255.0
+    def _look(self, squares: list[patch.Patch]) -> tuple[NDArray[np.int64], Found | None]:
+        """The class of every position (side / STRIDE, …) of the first of the patches, and the target, None where too little of it
+        shows there."""
+        pictures = torch.from_numpy(np.stack([square.pixels for square in squares])).movedim(-1, 1).float() / 255.0
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half):
-            out = self._net(picture, self._shape)
-        labels = out.logits[0].argmax(0).numpy()
-        seen = np.isin(labels, self._target.label_values)
-        rows, columns = np.nonzero(seen)
+            out = self._net(pictures, self._shape.expand(len(squares), -1))
+        classes = out.logits.argmax(1).numpy()
+        seen = np.isin(classes, self._target.label_values)
+        square, labels = squares[0], classes[0]
+        rows, columns = np.nonzero(seen[0])
         if len(rows) < SMALLEST:
             return labels, None
         directions = out.direction[0].numpy()[:, rows, columns].T.astype(np.float64)
         directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
         vote = voting.vote(np.column_stack([columns, rows]).astype(np.float64), directions, len(labels))
-        lengths = out.length[0].numpy()[rows, columns][vote.agrees]
-        if not len(lengths):
+        if not vote.agrees.any():
             return labels, None
-        length_px = REFERENCE_PX * float(np.exp(lengths.mean()))
+        counts = torch.from_numpy(seen.copy())
+        counts[0, rows[~vote.agrees], columns[~vote.agrees]] = False
+        depth = self._depth(squares, network.mean_length(out.length, out.weight, counts).numpy(), counts.sum((1, 2)).numpy())
         centre = vote.centre * STRIDE + (STRIDE - 1) / 2.0
-        depth = square.focal * self._length / length_px
+        length_px = square.focal * self._length / depth
         T = np.eye(4)
         T[:3, 3] = depth * np.array([*(centre - square.centre) / square.focal, 1.0])
         pooled = torch.from_numpy(centre[None].astype(np.float32)), torch.tensor([length_px])
-        quaternion = self._net.rotations(out.features, *pooled)[0].numpy()
+        quaternion = self._net.rotations(out.features[:1], *pooled)[0].numpy()
         T[:3, :3] = patch.facing(T[:3, 3]) @ rigid.transform((0.0, 0.0, 0.0), quaternion)[:3, :3]
-        return labels, self._found(T, vote, labels, seen, square)
+        return labels, self._found(T, vote, labels, seen[0], square)
+
+    def _depth(self, squares: list[patch.Patch], lengths: NDArray[np.float32], pixels: NDArray[np.int64]) -> float:
+        """The depth [m] at which the target has its apparent lengths (n,), logarithms over REFERENCE_PX, in patches in which so
+        many pixels (n,) show it; the first counts in any case."""
+        focal = np.array([square.focal for square in squares])
+        depths = np.log(focal * self._length / REFERENCE_PX) - lengths
+        return float(np.exp(depths[(pixels >= SMALLEST) | (np.arange(len(pixels)) == 0)].mean()))
 
     def _found(
         self, T: Array, vote: voting.Vote, labels: NDArray[np.int64], seen: NDArray[np.bool_], square: patch.Patch

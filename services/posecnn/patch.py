@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from penumbra.shared.geometry.rigid import Array
 
-SIDE = 128
+SIDE = 256
 """Pixels a side."""
 COARSEST = 0.6
 """A picture is halved before it would be sampled more coarsely than this, so that nothing is skipped."""
@@ -26,19 +26,21 @@ class Patch:
     centre: Array
 
 
-def square(intrinsics: Array, middle: Array, side: float, angle: float = 0.0) -> tuple[Array, float, Array]:
-    """(M (2, 3), focal, principal point (2,)) of a patch: M maps pixels of an image with `intrinsics` (fx, fy, cx, cy) to those
-    of the patch around `middle` (2,), `side` image columns wide, turned by `angle` [rad] clockwise.
+def square(intrinsics: Array, middle: Array, side: float | Array, angle: float | Array = 0.0) -> tuple[Array, Array, Array]:
+    """(M (..., 2, 3), focal (...), principal point (..., 2)) of patches: M maps pixels of an image with `intrinsics` (..., 4)
+    (fx, fy, cx, cy) to those of the patch around `middle` (..., 2), `side` (...) image columns wide, turned by `angle` (...)
+    [rad] clockwise.
 
     Rows are scaled so that both focal lengths become one. A picture that is turned and scaled about its principal point is that
     of a camera turned about its axis with another lens: poses need no other correction.
     """
-    fx, fy, cx, cy = intrinsics
-    zoom = SIDE / side
-    c, s = np.cos(angle), np.sin(angle)
-    linear = np.array([[c, -s], [s, c]]) @ np.diag([zoom, zoom * fx / fy])
-    offset = (SIDE - 1) / 2.0 - linear @ middle
-    return np.column_stack([linear, offset]), float(zoom * fx), linear @ [cx, cy] + offset
+    fx, fy, cx, cy = np.moveaxis(np.asarray(intrinsics, float), -1, 0)
+    zoom = SIDE / np.asarray(side)
+    c, s = zoom * np.cos(angle), zoom * np.sin(angle)
+    linear = np.stack([np.stack([c, -s * fx / fy], -1), np.stack([s, c * fx / fy], -1)], -2)
+    offset = (SIDE - 1) / 2.0 - np.einsum("...ij,...j->...i", linear, middle)
+    principal = np.einsum("...ij,...j->...i", linear, np.stack([cx, cy], -1)) + offset
+    return np.concatenate([linear, offset[..., None]], -1), zoom * fx, principal
 
 
 def warp(image: NDArray[np.uint8], M: Array) -> NDArray[np.uint8]:
@@ -61,12 +63,13 @@ def warp(image: NDArray[np.uint8], M: Array) -> NDArray[np.uint8]:
 def cut(image: NDArray[np.uint8], intrinsics: Array, middle: Array, side: float) -> Patch:
     """The upright patch of an image (h, w, 3) uint8 RGB around a point (2,) [px], `side` image columns wide."""
     M, focal, centre = square(intrinsics, middle, side)
-    return Patch(warp(image, M), focal, centre)
+    return Patch(warp(image, M), float(focal), centre)
 
 
 def facing(point: Array) -> Array:
-    """R_camera_ray (3, 3): the camera turned by the shortest way until a point (3,) in its frame lies straight ahead. The
-    rotation of an object relative to it is allocentric: that in which it looks the same wherever in the image it is."""
-    x, y, z = point / np.linalg.norm(point)
+    """R_camera_ray (..., 3, 3): the camera turned by the shortest way until a point (..., 3) in its frame lies straight ahead.
+    The rotation of an object relative to it is allocentric: that in which it looks the same wherever in the image it is."""
+    x, y, z = np.moveaxis(point / np.linalg.norm(point, axis=-1, keepdims=True), -1, 0)
     a = 1.0 / (1.0 + z)
-    return np.array([[1.0 - a * x * x, -a * x * y, x], [-a * x * y, 1.0 - a * y * y, y], [-x, -y, z]])
+    rows = ([1.0 - a * x * x, -a * x * y, x], [-a * x * y, 1.0 - a * y * y, y], [-x, -y, z])
+    return np.stack([np.stack(row, -1) for row in rows], -2)

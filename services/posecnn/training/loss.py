@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from penumbra.services.posecnn.network import Dense
+from penumbra.services.posecnn.network import Dense, mean_length
 from penumbra.shared.contract.labels import TARGET_LABELS
 
 
@@ -42,17 +42,17 @@ def dense(out: Dense, labels: Tensor, centre: Tensor, length: Tensor) -> dict[st
 
     labels: cross entropy; target: 1 - Dice of the target's classes as one, a picture with few of its pixels weighing as much as
     another; direction and length: smooth L1 on the target's visible pixels, every picture weighing the same; distance: that of
-    the mean of their lengths, which the estimator takes.
+    the mean of their lengths by their weights, which the estimator takes.
     """
-    h, w = labels.shape[1:]
-    target = torch.isin(labels, torch.tensor(TARGET_LABELS))
+    (h, w), device = labels.shape[1:], labels.device
+    target = torch.isin(labels, torch.tensor(TARGET_LABELS, device=device))
     shown = target.sum((1, 2)) > 0
     share = target / target.sum((1, 2), keepdim=True).clamp_min(1) / shown.sum().clamp_min(1)
-    rows, columns = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    rows, columns = torch.meshgrid(torch.arange(h, device=device), torch.arange(w, device=device), indexing="ij")
     direction = F.normalize(centre[:, :, None, None] - torch.stack([columns, rows])[None], dim=1)
     missed = F.smooth_l1_loss(out.direction, direction, reduction="none", beta=0.1).sum(1)
     probability = out.logits.softmax(1)[:, list(TARGET_LABELS)].sum(1)
-    mean = (target * out.length).sum((1, 2)) / target.sum((1, 2)).clamp_min(1)
+    mean = mean_length(out.length, out.weight, target)
     both, total = (probability * target).sum((1, 2)), probability.sum((1, 2)) + target.sum((1, 2))
     return {
         "labels": F.cross_entropy(out.logits, labels),
@@ -61,5 +61,5 @@ def dense(out: Dense, labels: Tensor, centre: Tensor, length: Tensor) -> dict[st
         "length": (
             share * F.smooth_l1_loss(out.length, length[:, None, None].expand_as(out.length), reduction="none", beta=0.02)
         ).sum(),
-        "distance": (shown * F.smooth_l1_loss(mean, length, reduction="none", beta=0.01)).sum() / shown.sum().clamp_min(1),
+        "distance": (shown * F.smooth_l1_loss(mean, length, reduction="none", beta=0.005)).sum() / shown.sum().clamp_min(1),
     }

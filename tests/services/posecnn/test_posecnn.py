@@ -1,6 +1,6 @@
 """PoseCNN: votes, losses, patches, training, weights, and the service on a recording."""
 
-import functools
+import dataclasses
 import json
 
 import cv2
@@ -14,7 +14,8 @@ from penumbra.services.command import cli
 from penumbra.services.launcher import launch, up
 from penumbra.services.posecnn import estimator, network, patch, voting
 from penumbra.services.posecnn.estimator import PoseCNN
-from penumbra.services.posecnn.training import evaluate, loss, train
+from penumbra.services.posecnn.training import evaluate, loss, patches, pictures, train
+from penumbra.services.posecnn.training.schedule import Schedule
 from penumbra.services.posecnn.uncertainty import KINDS, Signs, Uncertainty, errors, fitted
 from penumbra.services.replay.chain import Replay
 from penumbra.shared import training
@@ -28,6 +29,7 @@ from penumbra.shared.perception.lookout import Window, whole_frame
 from penumbra.sim.sets import sequences, shots
 from penumbra.sim.world.world import record
 
+CPU = torch.device("cpu")
 TABLE = cells.load("table")
 SMALL = network.PoseCnnSettings(channels=(8, 8, 16, 16), pooled=4, hidden=16)
 
@@ -122,7 +124,17 @@ def test_a_patch_has_the_intrinsics_that_it_says():
     pixel = k[:2] * point[:2] / point[2] + k[2:]
     x, y, z = rigid.from_rpy((0, 0, 0), (0, 0, angle))[:3, :3] @ point
     assert M[:, :2] @ pixel + M[:, 2] == pytest.approx(focal * np.array([x, y]) / z + centre)
-    assert M[:, :2] @ [350.0, 230.0] + M[:, 2] == pytest.approx([63.5, 63.5])
+    assert M[:, :2] @ [350.0, 230.0] + M[:, 2] == pytest.approx([(patch.SIDE - 1) / 2.0] * 2)
+
+
+def test_patches_and_rays_of_many_are_those_of_each():
+    k, middle, side = np.array([[500.0, 400.0, 310.0, 250.0], [90.0, 90.0, 5.0, 6.0]]), np.eye(2) * 100.0, np.array([180.0, 40.0])
+    angle = np.array([0.3, -1.0])
+    together, each = patch.square(k, middle, side, angle), [patch.square(k[i], middle[i], side[i], angle[i]) for i in range(2)]
+    for found, expected in zip(together, zip(*each, strict=True), strict=True):
+        assert np.allclose(found, expected)
+    points = np.array([[0.5, -0.3, 1.2], [-0.1, 0.2, 3.0]])
+    assert np.allclose(patch.facing(points), [patch.facing(point) for point in points])
 
 
 @pytest.mark.parametrize("side", [60.0, 128.0, 500.0])
@@ -150,11 +162,51 @@ def test_errors_of_a_length_that_cancel_cost_its_pixels_but_not_the_distance():
     labels[0, 1, :2] = int(Label.FOREARM)
     length = torch.zeros(1, 4, 4)
     length[0, 1, 0], length[0, 1, 1] = 0.3, -0.1
-    out = network.Dense(torch.zeros(1, len(Label), 4, 4), torch.zeros(1, 2, 4, 4), length, torch.zeros(1))
+    out = network.Dense(torch.zeros(1, len(Label), 4, 4), torch.zeros(1, 2, 4, 4), length, torch.zeros(1, 4, 4), torch.zeros(1))
     costs = {true: loss.dense(out, labels, torch.zeros(1, 2), torch.tensor([true])) for true in (0.1, -0.1)}
     assert costs[0.1]["distance"] == pytest.approx(0.0, abs=1e-6)
     assert costs[-0.1]["distance"] == pytest.approx(0.2, abs=0.01)
     assert costs[0.1]["length"] == pytest.approx(0.2, abs=0.02)
+
+
+def test_lengths_count_by_their_weights_where_they_count_at_all():
+    length, weight = torch.tensor([[[1.0, 3.0, 9.0]], [[1.0, 3.0, 9.0]]]), torch.log(torch.tensor([[[3.0, 1.0, 7.0]]] * 2))
+    counts = torch.tensor([[[True, True, False]], [[False, False, False]]])
+    assert network.mean_length(length, weight, counts).tolist() == pytest.approx([1.5, 0.0])
+
+
+class Said(network.Network):
+    """A network that sees the target everywhere, its centre in the middle and the same length in every patch."""
+
+    def forward(self, images, shapes):
+        n, side = len(images), patch.SIDE // network.STRIDE
+        logits = torch.zeros(n, len(Label), side, side)
+        logits[:, Label.FOREARM] = 1.0
+        steps = torch.arange(side, dtype=torch.float32) - (side - 1) / 2.0
+        direction = -torch.stack(torch.meshgrid(steps, steps, indexing="xy")).expand(n, -1, -1, -1)
+        said = torch.full((n, side, side), 0.2)
+        return network.Dense(logits, direction, said, torch.zeros_like(said), torch.zeros(n, 1, side // 4, side // 4))
+
+    def rotations(self, features, centre, length):
+        return torch.tensor([[0.0, 0.0, 0.0, 1.0]])
+
+
+def test_the_depth_is_the_mean_of_what_both_patches_say():
+    posecnn = PoseCNN(TABLE, net=Said(SMALL), uncertainty=evaluate.UNCALIBRATED)
+    image = np.zeros((480, 640, 3), np.uint8)
+    squares = posecnn._squares(image, np.array([320.0, 240.0]), 200.0)
+    assert [square.focal for square in squares] == pytest.approx(
+        [patch.SIDE / (width * 200.0) * TABLE.cameras["front"].fx for width in estimator.WIDTHS]
+    )
+
+    def depth(squares):
+        _, found = posecnn._look(squares)
+        assert found is not None
+        return found.T[2, 3]
+
+    depths = [depth([square]) for square in squares]
+    assert depths[0] / depths[1] == pytest.approx(estimator.WIDTHS[1] / estimator.WIDTHS[0])
+    assert depth(squares) == pytest.approx(np.sqrt(depths[0] * depths[1]))
 
 
 def test_a_camera_further_away_shows_the_target_as_large():
@@ -166,6 +218,14 @@ def test_a_camera_further_away_shows_the_target_as_large():
     assert further == pytest.approx(5.0 * nearer)
     assert [far.fx, far.fy] == pytest.approx([5.0 * near.fx, 5.0 * near.fy])
     assert (far.width, far.height) == (near.width, near.height)
+
+
+def test_a_finer_picture_shows_the_target_larger():
+    (plain, _), (fine, _) = (
+        sequences.scene(np.random.default_rng(6), sequences.Variety(frames=1, finer=finer)) for finer in (1.0, 1.5)
+    )
+    assert fine.fx == pytest.approx(1.5 * plain.fx)
+    assert fine.position == pytest.approx(plain.position)
 
 
 def test_sequences_say_where_their_target_is():
@@ -185,35 +245,61 @@ def test_sequences_say_where_their_target_is():
     assert min(overlaps) > 0.9
 
 
+FEW = Schedule(batch=4, peak_rate=4e-3, reuse=2, kept=16, first=12)
+
+
+class Still(pictures.RenderedPictures):
+    """Pictures to which no step adds any."""
+
+    def ensure(self, step):
+        return super().ensure(0)
+
+
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    data = train.RenderedPictures(tmp_path_factory.mktemp("posecnn"), 1, 32, chunk=16)
-    yield data
-    data.close()
+def data():
+    data = Still(1, each=1, kept=32, first=32, device=CPU)
+    data.ensure(0)
+    return data
 
 
-def trained(data, steps, checkpoint, resume_at=None):
-    schedule = train.Schedule(batch=4, peak_rate=4e-3)
-    trainer = train.Trainer(SMALL, schedule, seed=1)
+def test_the_last_pictures_are_kept_and_every_step_brings_new_ones():
+    data = pictures.RenderedPictures(1, each=2, kept=6, first=2, device=CPU)
+    assert data.ensure(0) == 4
+    assert data.ensure(5) == 6
+    pixels, _ = pictures.Rendered(1)[range(8, 14)]
+    assert torch.equal(data.pixels, pixels[[4, 5, 0, 1, 2, 3]])  # 12 and 13 took the place of 6 and 7
+    again = pictures.RenderedPictures(1, each=2, kept=6, first=2, device=CPU)
+    assert again.ensure(5) == 6
+    assert torch.equal(again.pixels, data.pixels)
+    assert np.array_equal(again.truth(np.arange(6)).length, data.truth(np.arange(6)).length)
+
+
+def trained(steps, checkpoint, resume_at=None, workers=0):
+    trainer = train.Trainer(SMALL, FEW, seed=1)
     if resume_at is not None:
+        first = FEW.pictures(1, CPU, 0)
         while trainer.step < resume_at:
-            trainer.train_step(data, trainer.step / steps)
+            trainer.train_step(first, trainer.step / steps)
         trainer.save(checkpoint)
-        trainer = train.Trainer.restore(checkpoint, schedule)
-    return trainer, training.run(trainer, data, steps, 0.0, checkpoint)
+        trainer = train.Trainer.restore(checkpoint, FEW)
+    data = FEW.pictures(1, CPU, workers)
+    training.run(trainer, data, steps, 0.0, checkpoint)
+    data.close()
+    return trainer
 
 
 @pytest.mark.slow
-def test_training_that_was_interrupted_ends_with_the_same_weights(data, tmp_path):
-    straight, _ = trained(data, 4, tmp_path / "a")
-    resumed, _ = trained(data, 4, tmp_path / "b", resume_at=2)
+@pytest.mark.parametrize("workers", [0, 2])
+def test_training_that_was_interrupted_ends_with_the_same_weights_whoever_draws(tmp_path, workers):
+    straight = trained(4, tmp_path / "a")
+    resumed = trained(4, tmp_path / "b", 2, workers)
     for a, b in zip(straight.average.parameters(), resumed.average.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
 @pytest.mark.slow
 def test_training_lowers_the_loss(data):
-    trainer = train.Trainer(SMALL, train.Schedule(batch=8, peak_rate=4e-3), seed=1)
+    trainer = train.Trainer(SMALL, Schedule(batch=8, peak_rate=4e-3), seed=1)
     parts = [trainer.train_step(data, 0.1) for _ in range(100)]
     before, after = ({name: np.mean([part[name] for part in some]) for name in parts[0]} for some in (parts[:6], parts[-12:]))
     assert after["total"] < 0.72 * before["total"]
@@ -222,10 +308,9 @@ def test_training_lowers_the_loss(data):
 
 
 def test_a_batch_contains_the_target_s_place_in_every_patch(data):
-    data.ensure(32)
     rng = np.random.default_rng(3)
-    chosen = [data[i] for i in range(32) if data[i][1].hidden < 0.3]
-    batch = train.draw_batch(chosen, train.Schedule(), rng)
+    chosen = np.flatnonzero(data.truth(np.arange(32)).hidden < 0.3)
+    batch = patches.draw_batch(data.pixels, chosen, data.truth(chosen), Schedule(), rng)
     assert batch.images.shape == (len(chosen), 3, patch.SIDE, patch.SIDE)
     for labels, centre, length in zip(batch.labels, batch.centre, batch.length, strict=True):
         rows, columns = np.nonzero(np.isin(labels, TARGET_LABELS))
@@ -238,17 +323,16 @@ def test_a_batch_contains_the_target_s_place_in_every_patch(data):
 @pytest.mark.parametrize("spoilt", [{}, {"cropped": 1.0}, {"coarse": 1.0}, {"soft": 1.0}])
 def test_a_spoilt_picture_shows_the_target_where_its_batch_says(spoilt):
     plain: dict[str, float] = {"cropped": 0.0, "coarse": 0.0, "soft": 0.0, "noise": 0.0, "jitter": 0.0}
-    schedule = train.Schedule(**{**plain, **spoilt, "off": 0.0, "wide": 0.0})
+    schedule = Schedule(**{**plain, **spoilt, "off": 0.0, "wide": 0.0})
     vertices = anatomy.forearm_mesh(cells.Body()).vertices
-    truth = train.Truth(
-        rigid.from_rpy((0.02, -0.03, 1.5), (0.0, 0.0, 0.6)), np.array([500.0, 500.0, 130.0, 120.0]), 0.0, vertices
-    )
-    pixels = np.zeros((256, 256, 4), np.uint8)
-    x, y = truth.intrinsics[:2] * truth.T[:2, 3] / truth.T[2, 3] + truth.intrinsics[2:]
-    rows, columns = np.indices((256, 256))
-    blob = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2.0 * 5.0**2))
+    T, intrinsics = rigid.from_rpy((0.02, -0.03, 1.5), (0.0, 0.0, 0.6)), np.array([750.0, 750.0, 195.0, 180.0])
+    pixels = np.zeros((1, 384, 384, 4), np.uint8)
+    x, y = intrinsics[:2] * T[:2, 3] / T[2, 3] + intrinsics[2:]
+    rows, columns = np.indices((384, 384))
+    blob = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2.0 * 7.0**2))
     pixels[..., :3] = np.round(255.0 * blob)[..., None]
-    batch = train.draw_batch([(pixels, truth)] * 8, schedule, np.random.default_rng(5))
+    truth = pictures.Truth.of(np.repeat(pictures.row(T, intrinsics, 0.0, vertices)[None], 8, 0))
+    batch = patches.draw_batch(torch.from_numpy(pixels), np.zeros(8, np.int64), truth, schedule, np.random.default_rng(5))
     bright = batch.images.mean(1)
     places = torch.from_numpy(np.indices((patch.SIDE, patch.SIDE), np.float32))
     for picture, centre in zip(bright, batch.centre, strict=True):
@@ -259,12 +343,12 @@ def test_a_spoilt_picture_shows_the_target_where_its_batch_says(spoilt):
 def test_a_training_starts_from_weights_and_its_checkpoint_names_them(tmp_path):
     first = network.Network(SMALL)
     network.save(tmp_path / "w.npz", first, {"seed": 3, "date": "2026-01-02"})
-    trainer = train.Trainer.begin(tmp_path / "w.npz", train.Schedule(), seed=1)
+    trainer = train.Trainer.begin(tmp_path / "w.npz", Schedule(), seed=1)
     for net in (trainer.net, trainer.average):
         for ours, theirs in zip(net.parameters(), first.parameters(), strict=True):
             assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-4)
     trainer.save(tmp_path / "checkpoint")
-    assert train.Trainer.restore(tmp_path / "checkpoint", train.Schedule()).started_from == {"seed": 3, "date": "2026-01-02"}
+    assert train.Trainer.restore(tmp_path / "checkpoint", Schedule()).started_from == {"seed": 3, "date": "2026-01-02"}
 
 
 def test_the_calibration_finds_the_deviations_that_errors_were_drawn_with():
@@ -303,10 +387,10 @@ def test_the_covariance_lies_along_the_ray_and_the_limb():
 
 def test_the_committed_weights_fit_their_card():
     net, card = network.load(estimator.WEIGHTS)
-    assert card["parameters"] == sum(p.numel() for p in net.parameters()) <= 1_600_000
+    assert card["parameters"] == sum(p.numel() for p in net.parameters()) <= 4_200_000
     assert set(card["calibration"]["coefficients"]) == set(KINDS)
     assert card["calibration"]["seed"] != card["held_out"]["seed"]
-    assert card["settings"]["schedule"] == json.loads(json.dumps(train.asdict(train.Schedule())))
+    assert card["settings"]["schedule"] == json.loads(json.dumps(dataclasses.asdict(Schedule(peak_rate=2e-3).times(32))))
     assert card["differs"] == list(train.DIFFERS)
     assert [row["hidden"] for row in card["held_out"]["bands"]] == [list(band) for band in evaluate.BANDS]
 
@@ -404,11 +488,10 @@ def test_up_starts_one_way_to_see(vision, there):
 
 @pytest.mark.slow
 def test_the_command_s_train_writes_weights_that_the_service_reads(tmp_path, monkeypatch):
-    few = functools.partial(train.RenderedPictures, most=16, chunk=16)
-    monkeypatch.setattr(train, "RenderedPictures", lambda folder, seed, most: few(folder, seed))
+    monkeypatch.setattr(train, "Schedule", lambda: FEW)
     monkeypatch.setattr(train, "PoseCnnSettings", lambda: SMALL)
     out = tmp_path / "weights" / "mine.npz"
-    places = ["--cache", str(tmp_path / "data"), "--checkpoint", str(tmp_path / "checkpoint"), "--out", str(out)]
+    places = ["--checkpoint", str(tmp_path / "checkpoint"), "--out", str(out)]
     assert cli.main(["posecnn", "train", "--steps", "2", "--held-out", "2", *places]) == 0
     net, _ = estimator.load(out)
     assert net.settings == SMALL
