@@ -92,6 +92,36 @@ def test_errors_are_as_large_as_the_covariance_says_while_how_a_wrong_sense_chan
     assert low < total < high
 
 
+# ---- a sense whose covariance allows for rare errors
+
+
+def seen_by(errors: senses.Errors, pose: Callable[[float], Array], seconds: float) -> ErrorStateObserver:
+    """One that saw a limb at `pose(t)` at 20 Hz, stated to 3 cm and 0.1 rad, without any other sense."""
+    vision = dataclasses.replace(senses.SENSES[0], errors=errors)
+    observer = ErrorStateObserver(HOME, SPREAD, senses=(vision,))
+    stated = np.diag(1.0 / np.square(np.repeat([0.03, 0.1], 3)))
+    for t in np.arange(0.0, seconds, 0.05):
+        observer.measure("vision", ns(t), pose(t), stated)
+    return observer
+
+
+def test_a_limb_is_followed_by_typical_errors_and_the_rare_ones_are_in_the_covariance() -> None:
+    def setting_out(t: float) -> Array:
+        return perturb(HOME, [0.3 * max(0.0, t - 1.0), 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def lag(errors: senses.Errors) -> float:
+        return float(pose_error(setting_out(1.25), seen_by(errors, setting_out, 1.3).estimate(ns(1.25)).T)[0])
+
+    def variance(errors: senses.Errors) -> float:
+        return float(seen_by(errors, lambda _: HOME, 3.0).estimate(ns(2.95)).covariance[0, 0])
+
+    stated, typical = senses.Errors(0.5, 0.7), senses.Errors(0.5, 0.7, typical=0.2, sure=10.0)
+    assert 0.0 < lag(typical) < 0.6 * lag(stated)
+    assert 0.8 * 0.03**2 < variance(typical) < 0.03**2  # all but a tenth of the stated variance may last
+    unsure = dataclasses.replace(typical, sure=1e-3)  # all of the variance is typical where a direction is hardly known
+    assert lag(unsure) == pytest.approx(lag(stated), rel=1e-3)
+
+
 # ---- senses whose errors last: fused must not be worse than the better one
 
 CAMERA = rigid.look_at([0.35, -1.15, 0.90], [0.05, 0.0, 0.15])[:3, 3]
