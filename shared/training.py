@@ -159,7 +159,7 @@ def begun(options: SimpleNamespace) -> Path | None:
 
 
 def complete(trainer: Trainer[Any, D], data: D, options: SimpleNamespace) -> bool:
-    """Trains as specified by the flags of `services.flags.training`, on one thread, and closes the data. False where Ctrl-C or
+    """Trains as specified by the flags of `services.training_flags`, on one thread, and closes the data. False where Ctrl-C or
     SIGTERM ended it; then the checkpoint is written, and the output says how to continue."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     torch.set_num_threads(1)

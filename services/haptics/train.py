@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from penumbra.services import flags
+from penumbra.services import flags, training_flags
 from penumbra.services.haptics.estimator import Estimator
 from penumbra.services.haptics.paper_network import PoseNetwork, Regression, Relative, features, fingerprint
 from penumbra.shared import training
@@ -402,7 +402,7 @@ def export(trainer: Trainer, pool: Pool, out: Path, held_out: int) -> dict[str, 
 @flags.command(
     "haptics train",
     "Trains the skin's pose network for a cell, and writes weights and card.",
-    *flags.training("haptics", 15.0),
+    *training_flags.of_every("haptics", 15.0),
     flags.CELL,
     flags.Option("--target", show_default="the cell's first", help="the target's name"),
     flags.Option("--out", type=Path, show_default="the file that the service loads", help="weights file"),

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from penumbra.services import flags
+from penumbra.services import flags, training_flags
 from penumbra.services.posecnn import network
 from penumbra.services.posecnn.estimator import WEIGHTS
 from penumbra.services.posecnn.network import REFERENCE_PX, STRIDE, Network, PoseCnnSettings
@@ -153,14 +153,14 @@ def export(trainer: Trainer, out: Path, each: int) -> dict[str, Any]:
 @flags.command(
     "posecnn train",
     "Trains PoseCNN on simulated pictures, and writes weights and card.",
-    *flags.training("posecnn", 75.0),
+    *training_flags.of_every("posecnn", 75.0),
     flags.Option("--start", type=Path, metavar="FILE", help="start from these weights instead of random ones"),
     flags.Option("--rate", type=float, default=Schedule.peak_rate, help="peak learning rate"),
     flags.Option(
         "--out", type=Path, default=WEIGHTS, show_default="the committed ones", help="the weights, their card beside them"
     ),
     flags.Option("--held-out", type=flags.positive, default=500, help="pictures for the calibration, and as many for the score"),
-    *flags.on_device("patches"),
+    *training_flags.on_device("patches"),
     example="penumbra posecnn train --minutes 75 --out posecnn.npz",
 )
 def main(options: flags.Options) -> int:

@@ -33,7 +33,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from penumbra.services import flags
+from penumbra.services import flags, training_flags
 from penumbra.services.segmentation import inference, prednet
 from penumbra.services.segmentation.model import PRIORS, kernels_of
 from penumbra.services.segmentation.prednet import PredNet, Settings, State
@@ -308,7 +308,7 @@ def _named(card: Mapping[str, Any]) -> dict[str, Any]:
     "segmentation train",
     "Trains the segmentation network on simulated sequences, on your own frames and masks, or both.\n\n"
     + (recordings.__doc__ or ""),
-    *flags.training("segmentation", 60.0),
+    *training_flags.of_every("segmentation", 60.0),
     flags.Option("--size", type=int, takes="many", metavar="N ...", show_default="16 16 32 64", help="channels of each layer"),
     flags.Option("--delay/--no-delay", default=False, help="axonal delays between the layers"),
     flags.Option("--recurrence", choices=tuple(prednet.CELLS), default="hgru", help="what updates the layers' representations"),
@@ -379,7 +379,7 @@ def _named(card: Mapping[str, Any]) -> dict[str, Any]:
     flags.Option(
         "--held-out", type=flags.positive, default=60, help="simulated sequences for calibration, and as many for the score"
     ),
-    *flags.on_device("sequences"),
+    *training_flags.on_device("sequences"),
     example="penumbra segmentation train --data recordings --start --minutes 60",
 )
 def main(options: flags.Options) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ from penumbra.shared.native import Kernel
 from penumbra.tests.support.fusion_data import HOME, SKIN, SPREAD, STEP, VISION, ns, still, without_roll
 
 OBSERVERS = [ErrorStateObserver, PaperObserver]
+AS_STATED = tuple(replace(sense, errors=replace(sense.errors, typical=1.0)) for sense in SENSES)
+"""The senses with errors as large as they state."""
 
 
 # ---- what arrives late, twice, wrong, or not at all
@@ -138,8 +141,8 @@ def test_a_sense_that_is_wrong_beside_another_ends_tracking_only_until_the_other
 
 def test_a_sense_that_was_wrong_is_used_again_when_it_agrees_and_not_when_it_is_nearly_plausible() -> None:
     def accepted(refusals: int) -> bool:
-        """Whether the skin, 4 cm off, is accepted after 20 measurements that were 10 cm off."""
-        observer = ErrorStateObserver(HOME, SPREAD, FusionSettings(refusals=refusals))
+        """Whether the skin, 5 cm off, is accepted after 20 measurements that were 10 cm off."""
+        observer = ErrorStateObserver(HOME, SPREAD, FusionSettings(refusals=refusals), AS_STATED)
         still(observer, HOME, 0.0, 1.0)
         for k in range(20):
             t = 1.0 + 0.01 * k
@@ -147,7 +150,7 @@ def test_a_sense_that_was_wrong_is_used_again_when_it_agrees_and_not_when_it_is_
                 still(observer, HOME, t, t + 0.01)
             observer.measure("haptic", ns(t), perturb(HOME, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]), 2.0 * VISION)
         still(observer, HOME, 1.2, 1.21)
-        return observer.measure("haptic", ns(1.205), perturb(HOME, [0.04, 0.0, 0.0, 0.0, 0.0, 0.0]), 2.0 * VISION)
+        return observer.measure("haptic", ns(1.205), perturb(HOME, [0.05, 0.0, 0.0, 0.0, 0.0, 0.0]), 2.0 * VISION)
 
     assert accepted(refusals=100) and not accepted(refusals=5)
 
