@@ -4,9 +4,12 @@ Every step renders some new simulated pictures (`pictures`) and learns from patc
 pictures, patches and colours from a generator seeded by (seed, n), and the schedule is a function of the progress, so that a run
 of --steps interrupted and resumed ends with the same weights as one that was not.
 
-On a GPU other processes render, one per core, and a step uses more patches at once:
+On a GPU other processes render, one per core, and a step uses more patches at once. The committed weights are of two such
+trainings, the second one with `reuse` 32:
 
-  OMP_NUM_THREADS=1 penumbra posecnn train --device cuda --workers 15 --times 32 --rate 2e-3 --steps 8500
+  export OMP_NUM_THREADS=1
+  penumbra posecnn train --device cuda --workers 15 --times 32 --rate 2e-3 --steps 8500 --out first.npz
+  penumbra posecnn train --device cuda --workers 15 --times 32 --rate 1.5e-3 --steps 14000 --seed 1 --start first.npz
 """
 
 from __future__ import annotations
@@ -50,7 +53,7 @@ DIFFERS = (
     "loss of the rotation: SLoss on the forearm and PLoss on the hand, distances not squared",
     "the centre is refined by least squares over the rays that agree",
     "covariance: learned from held-out pictures; the original has none; no refinement by depth images",
-    "data: single frames simulated as PredNet's sequences are, 166 326 of them, finer and by cameras up to 6 times as far away, "
+    "data: single frames simulated as PredNet's sequences are, 386 486 of them, finer and by cameras up to 6 times as far away, "
     "in place of YCB-Video and its synthetic images",
 )
 
