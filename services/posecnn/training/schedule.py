@@ -31,7 +31,7 @@ class Schedule:
     peak_rate: float = 1e-3
     decay: float = 1e-2
     batch: int = 16
-    reuse: int = 26
+    reuse: int = 32
     kept: int = 2048
     first: int = 128
     weights: tuple[tuple[str, float], ...] = (

@@ -391,7 +391,7 @@ def test_the_committed_weights_fit_their_card():
     assert card["parameters"] == sum(p.numel() for p in net.parameters()) <= 4_200_000
     assert set(card["calibration"]["coefficients"]) == set(KINDS)
     assert card["calibration"]["seed"] != card["held_out"]["seed"]
-    schedule = Schedule(peak_rate=1.5e-3, reuse=32).times(32)
+    schedule = Schedule(peak_rate=1.5e-3).times(32)
     assert card["settings"]["schedule"] == json.loads(json.dumps(dataclasses.asdict(schedule)))
     assert card["differs"] == list(train.DIFFERS)
     assert [row["hidden"] for row in card["held_out"]["bands"]] == [list(band) for band in evaluate.BANDS]
