@@ -120,7 +120,7 @@ def test_a_recorder_beside_a_running_cell_takes_the_only_one(own, tmp_path):
                 wait_for(lambda: running.ask(session, "mine", "record"), PATIENCE_S, "the recorder of the cell")
         finally:
             recorder.terminate()
-            words = recorder.communicate(timeout=PATIENCE_S)[1]  # a process whose last words find no reader may end with 120
+            words = recorder.communicate(timeout=PATIENCE_S)[1]
     assert recorder.returncode == 0, words
     again = subprocess.run(penumbra_command("record", "--connect", where), capture_output=True, timeout=PATIENCE_S)
     assert again.returncode == 2, "its file is not known here any more"
