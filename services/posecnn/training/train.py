@@ -5,7 +5,7 @@ pictures, patches and colours from a generator seeded by (seed, n), and the sche
 of --steps interrupted and resumed ends with the same weights as one that was not.
 
 On a GPU other processes render, one per core, and a step uses more patches at once. The committed weights are of two such
-trainings:
+trainings, the first with `reuse` 26; the card says what differed in the second:
 
   export OMP_NUM_THREADS=1
   penumbra posecnn train --device cuda --workers 15 --times 32 --rate 2e-3 --steps 8500 --out first.npz
