@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra.services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL
+from penumbra.services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, UNKNOWNS
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.skin.layout import Skin
 
@@ -58,6 +58,8 @@ MOVED = 0.03
 """Distance [m] that a limb must move before a block seen by a camera adds information: the field model's error then differs."""
 AGAIN_S = 30.0
 """Time [s] after which such a block is used even if the limb has not moved. Chosen."""
+CURVED = 0.5
+"""Error of the linearisation by the shoulder's place: this share of the deviation that its uncertainty makes. Chosen."""
 BIAS = np.repeat([0.01, 0.05], 3)
 """Standard deviations [m, rad] of the lasting error of a camera's pose. Chosen: that of a camera's mounting beside the robot."""
 BIAS_S = 100.0
@@ -66,11 +68,12 @@ BIAS_S = 100.0
 
 @dataclass(frozen=True)
 class Seen:
-    """A camera's prediction of a window, linear about the window's solution. signal (n,) [V]: at the solution; slopes (n, 8):
-    derivatives by pose and size; toward (8,): step from the solution to the camera's pose and the usual size; covariance (6, 6):
-    of the camera's pose; position (3,) [m]: of the solution."""
+    """A camera's prediction of a window, linear about the window's solution. signal (n,) [V]: at the solution; error (n,): of the
+    field model there, as a share; slopes (n, 11): derivatives by pose and body; toward (11,): step from the solution to the
+    camera's pose and the usual body; covariance (6, 6): of the camera's pose; position (3,) [m]: of the solution."""
 
     signal: Array
+    error: Array
     slopes: Array
     toward: Array
     covariance: Array
@@ -78,19 +81,19 @@ class Seen:
 
 
 class Drift:
-    """Kalman filter of gains and offsets. error (n,), links_error: standard deviations of the field model's signals and of the
-    links' signals, as shares; size_spread (2,): standard deviations of log sizes between people.
+    """Kalman filter of gains and offsets. links_error: standard deviation of the links' signals, as a share; body_spread (5,):
+    standard deviations of the body (`person.Person`) between people.
 
     sigma: standard deviations (n,) of the gains about their common mean, and of the offsets [V]. A common change of the gains
     looks like another girth, whose spread between people is several times as large.
 
-    The state is the changes of gains (n,) and offsets (n,) [V], and the bias (8,) of camera and size.
+    The state is the changes of gains (n,) and offsets (n,) [V], and the bias (11,) of camera and body.
     """
 
-    def __init__(self, skin: Skin, error: Array, links_error: float, size_spread: Array):
+    def __init__(self, skin: Skin, links_error: float, body_spread: Array):
         n = self._n = len(skin)
-        self._noise, self._error, self._links_error = skin.noise, error, links_error
-        spread = np.concatenate([np.full(n, GAIN_SPREAD), np.full(n, OFFSET_SPREAD), BIAS, size_spread])
+        self._noise, self._links_error = skin.noise, links_error
+        spread = np.concatenate([np.full(n, GAIN_SPREAD), np.full(n, OFFSET_SPREAD), BIAS, body_spread])
         self._old = np.diag(spread**2)  # of an old calibration and an unknown person
         self._old[:n, :n] += GAIN_SHARED**2
         self._times = np.concatenate([np.full(2 * n, WALK_S), np.full(len(spread) - 2 * n, BIAS_S)])
@@ -115,6 +118,11 @@ class Drift:
     def offset(self) -> Array:
         """Change of each offset (n,) [V]."""
         return self._mean[self._n : 2 * self._n]
+
+    @property
+    def shoulder(self) -> tuple[Array, Array]:
+        """Offset (3,) [m] of the person's shoulder from where the posture has it, and its covariance (3, 3)."""
+        return self._mean[-3:], self._covariance[-3:, -3:]
 
     def _deviations(self) -> tuple[Array, Array]:
         """The value of `sigma` for the current covariance."""
@@ -199,8 +207,10 @@ class Drift:
         """Covariance (n, n), the measurement Jacobian (n, m) and the innovation (n,) of a block."""
         n = self._n
         H = np.concatenate([np.diag(block.signal + block.links), np.eye(n), block.slopes], axis=1)
-        share = MODEL * (self._error + NEAR_ERROR * block.signal / NEAR_SIGNAL)
+        share = MODEL * (block.error + NEAR_ERROR * block.signal / NEAR_SIGNAL)
         alone = self._noise / np.maximum(block.samples, 1) + (share * block.signal) ** 2 + (self._links_error * block.links) ** 2
+        shoulder = block.slopes[:, 8:]
+        alone += CURVED**2 * np.einsum("ni,ij,nj->n", shoulder, self._covariance[-3:, -3:], shoulder)
         pose = block.slopes[:, :6] @ block.covariance @ block.slopes[:, :6].T
         return H @ self._covariance @ H.T + pose + np.diag(alone), H, block.innovation - block.slopes @ self._mean[2 * n :]
 
@@ -217,12 +227,12 @@ class Drift:
 
 class _Block:
     """Means over windows, weighted by their samples (n,): unexplained signals, the signals of limb and links by the field model
-    (n,) [V], slopes (n, 8), the camera's covariance (6, 6) and the limb's position (3,)."""
+    (n,) [V], the model's error (n,), slopes (n, 11), the camera's covariance (6, 6) and the limb's position (3,)."""
 
     def __init__(self, n: int, is_seen: bool = False):
         self.is_seen, self.seconds, self.samples = is_seen, 0.0, np.zeros(n)
         self._windows = 0
-        self._sums = np.zeros((n, 3)), np.zeros((n, 8)), np.zeros((6, 6)), np.zeros(3)
+        self._sums = np.zeros((n, 4)), np.zeros((n, UNKNOWNS)), np.zeros((6, 6)), np.zeros(3)
 
     def add(self, signal: Array, links: Array, samples: NDArray[np.integer], elapsed_s: float, seen: Seen | None) -> None:
         """Adds a window."""
@@ -230,14 +240,14 @@ class _Block:
         self.samples += samples
         self._windows += 1
         columns, slopes, covariance, position = self._sums
-        predicted = np.zeros_like(signal) if seen is None else seen.signal
+        predicted, error = (np.zeros_like(signal), np.zeros_like(signal)) if seen is None else (seen.signal, seen.error)
         unexplained = signal - predicted
         if seen is not None:
             unexplained = unexplained - seen.slopes @ seen.toward
             slopes += samples[:, None] * seen.slopes
             covariance += seen.covariance
             position += seen.position
-        columns += samples[:, None] * np.stack([unexplained, predicted, links], axis=1)
+        columns += samples[:, None] * np.stack([unexplained, predicted, links, error], axis=1)
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -255,6 +265,10 @@ class _Block:
     @property
     def links(self) -> Array:
         return self._mean(0)[:, 2]
+
+    @property
+    def error(self) -> Array:
+        return self._mean(0)[:, 3]
 
     @property
     def slopes(self) -> Array:

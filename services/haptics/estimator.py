@@ -30,13 +30,14 @@ from penumbra.services.haptics.contact import Contact
 from penumbra.services.haptics.drift import Drift, Seen
 from penumbra.services.haptics.identity import Identity
 from penumbra.services.haptics.paper_network import PoseNetwork, Relative, features
+from penumbra.services.haptics.person import PERSON_S, SIZE_GAP, SIZE_LASTING, Person
 from penumbra.services.haptics.settings import HapticSettings
-from penumbra.services.haptics.size import PERSON_S, SIZE_GAP, SIZE_LASTING, Size
 from penumbra.services.haptics.solve import SCALES, Prior, Reading, Solution, Solver, peak
 from penumbra.services.haptics.starts import Limb, Starts
 from penumbra.services.haptics.surface_points import Shapes, SurfacePoint, SurfacePoints
 from penumbra.services.haptics.track import Home, Place, Track
 from penumbra.services.haptics.trust import PadTrust, SmoothedMisfit
+from penumbra.shared.body.posture import Posture
 from penumbra.shared.contract.messages import ContactState, HapticState
 from penumbra.shared.geometry.rigid import Array, pose_error
 from penumbra.shared.geometry.surface import Surface
@@ -86,8 +87,8 @@ class HapticEstimate:
 class Estimator:
     """Haptic pose estimator of one target. home (4, 4), spread (6,): the expected pose; network: None if none was trained (the
     solve then starts from home); method: `solve`, or `paper` for the network alone; measured: whether the cell file states this
-    person's limb size; shapes: None if they were not measured for these pads (then no surface points). Raises ValueError for
-    `paper` without a network."""
+    person's limb size; shapes: None if they were not measured for these pads (then no surface points); posture: where the rest of
+    the person is, None for a limb without one. Raises ValueError for `paper` without a network."""
 
     def __init__(
         self,
@@ -101,6 +102,7 @@ class Estimator:
         measured: bool = False,
         settings: HapticSettings | None = None,
         shapes: Shapes | None = None,
+        posture: Posture | None = None,
     ):
         if method not in ("solve", "paper"):
             raise ValueError(f"method: expected solve or paper, got {method!r}")
@@ -108,10 +110,10 @@ class Estimator:
             raise ValueError("method paper needs the network's weights: run `penumbra haptics train` for this cell, or use solve")
         self.skin, self.surface, self.network, self.method = skin, surface, network, method
         self.settings = settings or HapticSettings()
-        self.size = Size(measured)
-        self.drift = Drift(skin, response.error, self.settings.links_error, self.size.usual[1])
+        self.person = Person(measured, posture.spread if posture else 1.0)
+        self.drift = Drift(skin, self.settings.links_error, self.person.usual[1])
         self.identity = Identity(skin, response.error, self.settings)
-        self._response, self._solver = response, Solver(skin, response)
+        self._response, self._solver = response, Solver(skin, response, posture)
         self._home = Home(home, spread, self.settings)
         self._limb, self._pads = Limb(skin, surface), PadTrust(skin, self.settings)
         self._track = Track(self._home, self.settings)
@@ -125,7 +127,7 @@ class Estimator:
         self._stamp_ns, self._away_s = 0, 0.0
         self._is_tracking, self._untracked = False, -1  # number of windows since the track was lost
         self._track_misfit = SmoothedMisfit(self.settings)
-        for part in (self._track, self._starts, self._pads, self.size, self.drift, self.identity, self._contact):
+        for part in (self._track, self._starts, self._pads, self.person, self.drift, self.identity, self._contact):
             part.forget()
 
     def nothing(self, why: str) -> HapticEstimate:
@@ -188,7 +190,7 @@ class Estimator:
             self.reset()
             elapsed_s = 0.0
         self._stamp_ns = stamp_ns
-        self.size.predict(elapsed_s)
+        self.person.predict(elapsed_s, self.drift.shoulder)
         self._track.decay(elapsed_s)
         return elapsed_s
 
@@ -216,7 +218,7 @@ class Estimator:
         self._track.place = Place(self.network.posterior(x), self._home.place.covariance)
         relative = Relative.of(self.skin, self.surface, reading.T_world_pads, np.isfinite(reading.variance), self.pose)
         T, information = self.network.likelihood(x, relative)
-        gap = self._limb.gap(reading, T, self.size.mean)
+        gap = self._limb.gap(reading, T, self.person.size)
         state: HapticState = "in_range" if self._is_felt(information, gap) else "out_of_range"
         return self._estimate(T, information, np.zeros(6), gap, state, np.zeros(len(self.skin)))
 
@@ -226,7 +228,7 @@ class Estimator:
         solution = self._solution(reading, expected is not None)
         if self.identity.odds < 0.0 and before.place.is_apart(self._track.place, self.settings):
             self.identity.doubt()
-        gap = self._limb.gap(reading, solution.T, solution.size)
+        gap = self._limb.gap(reading, solution.T, solution.body[:2])
         self._judge(solution)
         self._learn_size(reading, solution, gap)
         information, gradient = self._pose_likelihood(reading, solution)
@@ -238,7 +240,7 @@ class Estimator:
             self._track = before  # fits to noise would lead it away, and their covariances would call it sure
         state = self._identified(reading, solution, gap, expected, elapsed_s) if is_felt else self._absent(elapsed_s)
         self._pads.update(solution.residuals, np.isfinite(reading.variance))
-        seen = None if expected is None or state == "object" else self._seen(solution, expected)
+        seen = None if expected is None or state == "object" else self._seen(reading, solution, expected)
         step = pose_error(T, solution.T)
         return self._estimate(T, self.settings.trusted * information, step, gap, state, solution.residuals), seen
 
@@ -246,7 +248,7 @@ class Estimator:
         """Forget the size of a limb that has been away: the next one may be another person's."""
         self._away_s = 0.0 if in_range else self._away_s + elapsed_s
         if self._away_s > PERSON_S:
-            self.size.forget()
+            self.person.forget()
 
     # ---- where the limb is
 
@@ -280,19 +282,20 @@ class Estimator:
     def _look_elsewhere(self, reading: Reading, solution: Solution) -> None:
         """Solve from another start than the tracked solution; a different place becomes its rival."""
         home = self._prior(self._home.place)
-        other = self._solve(reading, home, self._starts.elsewhere(reading, self.pose, self.size.mean))
+        other = self._solve(reading, home, self._starts.elsewhere(reading, self.pose, self.person.size))
         rival = self._place(reading, other, home)
         if not self._track.place.stands_for(rival, self.settings):
             # judge the track with the same freedom: from its pose, but with home's spread
-            same = self._solver.solve(reading, home, solution.T, solution.size, 0, 2)
-            self._track.contest(rival, self.settings.beside_odds + self._track.limited(other.cost - same.cost))
+            same = self._solver.solve(reading, home, solution.T, solution.body, 0, 2)
+            odds = self.settings.beside_odds + self._track.against(rival) + self._track.limited(other.cost - same.cost)
+            self._track.contest(rival, odds)
 
     def _from_scratch(self, reading: Reading) -> Solution:
         """The best solution from the track and all starts, of which the most probable ones are solved; the second best at another
         place becomes the rival."""
         home, track = self._prior(self._home.place), self._track
-        starts = [self.pose, *(self._starts.at(which, reading, self.size.mean) for which in range(len(self._starts)))]
-        cost = [self._solver.solve(reading, home, start, self.size.mean, coarse=0, fine=0).cost for start in starts]
+        starts = [self.pose, *(self._starts.at(which, reading, self.person.size) for which in range(len(self._starts)))]
+        cost = [self._solver.solve(reading, home, start, self.person.mean, coarse=0, fine=0).cost for start in starts]
         likely = [starts[which] for which in np.argsort(cost)[: self.settings.scratch_solves]]
         best, *others = sorted((self._solve(reading, home, start) for start in likely), key=lambda solution: solution.cost)
         track.place, track.rival = self._place(reading, best, home), None
@@ -303,15 +306,15 @@ class Estimator:
         return best
 
     def _solve(self, reading: Reading, prior: Prior, start: Array, coarse: int = 12) -> Solution:
-        return self._solver.solve(reading, prior, start, self.size.mean, coarse=coarse)
+        return self._solver.solve(reading, prior, start, self.person.mean, coarse=coarse)
 
     def _prior(self, place: Place) -> Prior:
-        return Prior(place.T, place.information, self.size.mean, self.size.information)
+        return Prior(place.T, place.information, self.person.mean, self.person.information)
 
     def _place(self, reading: Reading, solution: Solution, prior: Prior) -> Place:
         """The limb's place by a window's solution from a prior."""
         information, gradient = self._solver.likelihood(reading, solution)
-        information = self.size.marginalised(information, gradient, solution.size)[0] + prior.information
+        information = self.person.marginalised(information, gradient, solution.body)[0] + prior.information
         return Place(solution.T, np.asarray(np.linalg.inv(information), np.float64))
 
     def _network_pose(self, reading: Reading) -> Array:
@@ -334,7 +337,7 @@ class Estimator:
         """Learn the size where it can be separated from the pose: close to the pads, without a rival."""
         if gap < SIZE_GAP and self._is_tracking and self._track.rival is None:
             likelihood = self._solver.likelihood(reading, solution, SIZE_LASTING)
-            self.size.learn(solution.size, *likelihood, self._home.place.information)
+            self.person.learn(solution.body, *likelihood, self._home.place.information)
 
     def _identified(
         self, reading: Reading, solution: Solution, gap: float, expected: Place | None, elapsed_s: float
@@ -342,32 +345,34 @@ class Estimator:
         """The state after a window and its best limb solution; elapsed_s: time since the last window."""
         free = self._solver.free(reading, solution, self._prior(self._home.place))
         self.identity.take(reading, solution, free, gap, elapsed_s)
-        if self.size.strangeness > self.settings.strange_size:
+        if self.person.strangeness > self.settings.strange_size:
             self.identity.refuse()
         is_there = expected is not None and not self._track.place.is_apart(expected, self.settings)
         if is_there and solution.misfit < self.settings.track_misfit:
             self.identity.see()
         verdict = self.identity.verdict
         if verdict == "object":
-            self.size.forget()  # it was not a limb's size
+            self.person.forget()  # it was not a limb's size
         return "in_range" if verdict == "limb" else verdict
 
     def _absent(self, elapsed_s: float) -> HapticState:
         self.identity.miss(elapsed_s)
         return "out_of_range"
 
-    def _seen(self, solution: Solution, expected: Place) -> Seen | None:
+    def _seen(self, reading: Reading, solution: Solution, expected: Place) -> Seen | None:
         """The camera's prediction for a limb at the expected place; None if the voltages say that it is elsewhere."""
         if self._track.place.is_apart(expected, self.settings):
             return None
-        toward = np.concatenate([pose_error(expected.T, solution.T), self.size.usual[0] - solution.size])
+        toward = np.concatenate([pose_error(expected.T, solution.T), self.person.usual[0] - solution.body])
         slopes = solution.signal[:, None] * solution.point.rows
-        return Seen(solution.signal, slopes, toward, expected.covariance, solution.T[:3, 3])
+        gains = np.square(reading.error) - np.square(self._response.error)
+        error = np.sqrt(np.square(solution.point.error) - gains)
+        return Seen(solution.signal, error, slopes, toward, expected.covariance, solution.T[:3, 3])
 
     def _pose_likelihood(self, reading: Reading, solution: Solution) -> tuple[Array, Array]:
         """Information (6, 6) and gradient (6,) of the pose from the voltages alone, with the size marginalised."""
         likelihood = self._solver.likelihood(reading, solution, self.settings.error_lasts)
-        return self.size.marginalised(*likelihood, solution.size, self.settings.size_lasts)
+        return self.person.marginalised(*likelihood, solution.body, self.settings.size_lasts)
 
     def _peak(self, solution: Solution, information: Array, gradient: Array) -> tuple[Array, Array]:
         """T_world_target (4, 4) where a likelihood at the solution peaks, and its information (6, 6) there. Voltages with a large

@@ -16,6 +16,7 @@ from penumbra.services.haptics.estimator import FOREIGN, Estimator, HapticEstima
 from penumbra.services.haptics.pad_poses import PadPoses
 from penumbra.services.haptics.surface_points import Shapes
 from penumbra.shared.body.anatomy import target_mesh
+from penumbra.shared.body.posture import Posture
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell.description import Cell
 from penumbra.shared.contract.messages import FusedPose, HapticPose, Joints, SurfacePoint, Voltages
@@ -136,6 +137,7 @@ def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str
         options.method,
         cell.targets[target].size is not None,
         shapes=shapes,
+        posture=Posture.usual(cell, cell.targets[target]),
     )
     made.warm_up(sum(len(robot.joints) for robot in cell.robots.values()))
     return made

@@ -1,12 +1,13 @@
-"""Solves limb pose and size by least squares on the voltages of all electrodes, with the field model's derivatives.
+"""Solves limb pose and body by least squares on the voltages of all electrodes, with the field model's derivatives.
 
-The unknowns are a pose error (6,) and the limb's size (2,): the logs of its length and girth. Residuals in volts keep the noise
+The unknowns are a pose error (6,) and the body (5,): the logs of the limb's length and girth, and the offset of the shoulder from
+where the posture has it [m], on which the part of the signals by upper arm and torso depends. Residuals in volts keep the noise
 white and Gaussian even where an electrode feels nothing. Consistency and convergence rest on these measures:
 
 - the first steps compare the signals' logs where they exceed the noise (an inverse hyperbolic sine does that): a signal's log is
   smooth in the pose over centimetres, the signal itself is not;
 - a step that worsens the fit is shortened;
-- the field model's error counts as noise, a share of the signal;
+- the field model's error counts as noise, a share of the signal, and so does that of upper arm and torso;
 - an electrode that feels something else, or is faulty, loses weight as its residual grows.
 
 The prior only holds the directions that the skin does not observe. The result is the likelihood: J^T R^-1 J, and its peak.
@@ -20,22 +21,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from penumbra.shared.body.posture import Posture
 from penumbra.shared.geometry import so3
 from penumbra.shared.geometry.rigid import Array, perturb, pose_error
 from penumbra.shared.native import inner, kernel
+from penumbra.shared.skin import bearer
 from penumbra.shared.skin.layout import Skin
 from penumbra.shared.skin.response import ARRAYS, Response, derivatives, values
 
+BODY = 5
+UNKNOWNS = 6 + BODY
 NEAR_ERROR = 0.06
 """Growth of the response's error near touch: this share of the signal per NEAR_SIGNAL is added to the error."""
 NEAR_SIGNAL = 1.0
 """Signal [V] at a gap of half a centimetre."""
+BEARER_ERROR = 0.13
+"""Error of the part of upper arm and torso, as a share of its logarithm. Measured: the networks' cards have medians of 0.4, 0.7,
+1.5 and 2 % where leaving it out costs 1, 4, 10 and 15 %."""
 COARSE_ERROR = 0.3
 """Error share in the first steps: it makes near and far electrodes weigh alike."""
 OUTLIER = 3.0
 """Residual, in standard deviations, above which an electrode's weight falls as its square."""
-FARTHEST_STEP = (0.06, 0.5, 0.25)
-"""Maximum step: position [m], rotation [rad], log size."""
+FARTHEST_STEP = (0.06, 0.5, 0.25, 0.1)
+"""Maximum step: position [m], rotation [rad], log size, shoulder [m]."""
+NUDGE = (1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4)
+"""Steps of the derivatives of what upper arm and torso add: position [m], rotation [rad], log size, shoulder [m]."""
+FAINT = 0.1
+"""Signal, in standard deviations of the noise, below which these derivatives are left out: they change nothing there."""
 SAME_SLOPE = 0.3
 """Change of the log signals below which a step keeps the derivatives of the previous one."""
 CONVERGED = 0.05
@@ -61,18 +73,18 @@ unknown."""
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of a solve: T_world_target (4, 4) with its information (6, 6) about `geometry.perturb`, and the size (2,) with its
-    information (2, 2)."""
+    """Prior of a solve: T_world_target (4, 4) with its information (6, 6) about `geometry.perturb`, and the body (5,) with its
+    information (5, 5)."""
 
     T: Array
     information: Array
-    size: Array
-    size_information: Array
+    body: Array
+    body_information: Array
 
     def cost(self, solution: Solution) -> float:
         """The prior's part of a solution's cost; the rest is the voltages' part."""
-        toward, toward_size = pose_error(self.T, solution.T), self.size - solution.size
-        return 0.5 * float(toward @ self.information @ toward) + 0.5 * float(toward_size @ self.size_information @ toward_size)
+        toward, toward_body = pose_error(self.T, solution.T), self.body - solution.body
+        return 0.5 * float(toward @ self.information @ toward) + 0.5 * float(toward_body @ self.body_information @ toward_body)
 
 
 @dataclass(frozen=True)
@@ -93,23 +105,24 @@ class Reading:
 
 @dataclass(frozen=True)
 class Point:
-    """Linearisation point: T_world_target (4, 4), size (2,), the log signals (n,) [V] there and their derivatives (n, 8) by pose
-    and size."""
+    """Linearisation point: T_world_target (4, 4), body (5,), the log signals (n,) [V] there and their derivatives (n, 11) by pose
+    and body, and the error (n,) of field model and gain, as a share of the signal."""
 
     T: Array
-    size: Array
+    body: Array
     logs: Array
     rows: Array
+    error: Array
 
 
 @dataclass(frozen=True)
 class Solution:
-    """The most probable T_world_target (4, 4) and size (2,). cost: the robust negative log posterior, up to a constant; misfit:
+    """The most probable T_world_target (4, 4) and body (5,). cost: the robust negative log posterior, up to a constant; misfit:
     mean squared residual of the electrodes that feel something [variances]; residuals (n,): in standard deviations, zero for
     electrodes left out; signal (n,) [V]: predicted; point: the linearisation for `Solver.likelihood`."""
 
     T: Array
-    size: Array
+    body: Array
     cost: float
     misfit: float
     residuals: Array
@@ -118,46 +131,52 @@ class Solution:
 
 
 class Solver:
-    """Solver for the pads of one cell. skin, response: of the same cell."""
+    """Solver for the pads of one cell. skin, response: of the same cell. posture: where the rest of the person is; None for a
+    limb without one."""
 
-    def __init__(self, skin: Skin, response: Response):
+    def __init__(self, skin: Skin, response: Response, posture: Posture | None = None):
         self.response = response
+        self._bearer: tuple[Array, ...] = (np.empty(0), *bearer.nobody(response.electrodes))
+        if posture is not None and response.bearers is not None:
+            self._bearer = posture.numbers, *response.bearers.arrays
         self._pad_of = skin.pad_of
         self._scale = np.log(skin.gain * skin.sensitivity)
 
-    def solve(self, window: Reading, prior: Prior, T: Array, size: Array, coarse: int = 12, fine: int = 8) -> Solution:
-        """The most probable pose and size near a start T (4, 4), size (2,). coarse, fine: maximum numbers of steps on logs and on
-        volts."""
+    def solve(self, window: Reading, prior: Prior, T: Array, body: Array, coarse: int = 12, fine: int = 8) -> Solution:
+        """The most probable pose and body near a start T (4, 4), body (5,). coarse, fine: maximum numbers of steps on logs and on
+        volts; without any, the solution has no derivatives."""
         n = len(self._scale)
-        at = Point(np.array(T, order="C"), np.array(size), np.empty(n), np.empty((n, 8)))
+        at = Point(np.array(T, order="C"), np.array(body), np.empty(n), np.zeros((n, UNKNOWNS)), np.empty(n))
         z = np.empty(n)
-        believed = np.ascontiguousarray(prior.T), np.ascontiguousarray(prior.information), prior.size, prior.size_information
+        believed = np.ascontiguousarray(prior.T), np.ascontiguousarray(prior.information), prior.body, prior.body_information
         pads = self.response.size, self._scale, self._pad_of, window.T_world_pads
-        found = at.T, at.size, at.logs, at.rows, z
-        cost = _descend(*self.response.arrays, *pads, *self._given(window), *believed, coarse, fine, *found)
+        found = at.T, at.body, at.logs, at.rows, at.error, z
+        cost = _descend(*self.response.arrays, *self._bearer, *pads, *_given(window), *believed, coarse, fine, *found)
         predicted = np.exp(at.logs)
-        return Solution(at.T, at.size, cost, _misfit(window, predicted, z), z, predicted, at)
+        return Solution(at.T, at.body, cost, _misfit(window, predicted, z), z, predicted, at)
 
     def likelihood(self, window: Reading, solution: Solution, lasting: float = 1.0) -> tuple[Array, Array]:
-        """Information (8, 8) and gradient (8,) of the voltages alone at a solution, by pose and size. lasting: factor on the
+        """Information (11, 11) and gradient (11,) of the voltages alone at a solution, by pose and body. lasting: factor on the
         variance of errors that last longer than a window."""
-        H, g = np.zeros((8, 8)), np.zeros(8)
+        H, g = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
         at, z = solution.point, np.zeros(len(self._scale))
-        _normal_equations(*self._given(window), at.logs, at.rows, False, lasting, H, g, z)
+        signal, variance, distrust, doubt, _ = _given(window)
+        _normal_equations(signal, variance, distrust, doubt, at.error, at.logs, at.rows, False, lasting, H, g, z)
         return H, g
 
     def free(self, window: Reading, solution: Solution, prior: Prior) -> Array:
         """The share (n,) of an electrode's error that stays in its residual after a solve with this prior, with noise averaged
-        out: one less its leverage. Close to zero where few electrodes feel anything and pose and size fit them."""
+        out: one less its leverage. Close to zero where few electrodes feel anything and pose and body fit them."""
         J = solution.signal[:, None] * solution.point.rows
-        weight = 1.0 / (window.variance / AVERAGED + (window.error * solution.signal) ** 2)
+        weight = 1.0 / (window.variance / AVERAGED + (solution.point.error * solution.signal) ** 2)
         A = J.T @ (weight[:, None] * J)
         A[:6, :6] += prior.information
-        A[6:, 6:] += prior.size_information
+        A[6:, 6:] += prior.body_information
         return np.minimum(np.maximum(1.0 - weight * np.einsum("ni,in->n", J, np.linalg.solve(A, J.T)), 0.0), 1.0)
 
-    def _given(self, window: Reading) -> tuple[Array, Array, Array, Array, Array]:
-        return window.signal, window.variance, window.distrust, window.doubt, window.error
+
+def _given(window: Reading) -> tuple[Array, Array, Array, Array, Array]:
+    return window.signal, window.variance, window.distrust, window.doubt, window.error
 
 
 def _misfit(window: Reading, predicted: Array, z: Array) -> float:
@@ -171,84 +190,87 @@ def _misfit(window: Reading, predicted: Array, z: Array) -> float:
 
 
 @kernel(
-    f"""{ARRAYS}, f8[2], f8[n], i8[n], f8[p, 4, 4], f8[n], f8[n], f8[n], f8[n], f8[n],
-    f8[4, 4], f8[6, 6], f8[2], f8[2, 2], i8, i8, out f8[4, 4], out f8[2], out f8[n], out f8[n, 8], out f8[n] -> f8"""
+    f"""{ARRAYS}, f8[r], {bearer.ARRAYS}, f8[2], f8[n], i8[n], f8[p, 4, 4], f8[n], f8[n], f8[n], f8[n], f8[n],
+    f8[4, 4], f8[6, 6], f8[{BODY}], f8[{BODY}, {BODY}], i8, i8,
+    out f8[4, 4], out f8[{BODY}], out f8[n], out f8[n, {UNKNOWNS}], out f8[n], out f8[n] -> f8"""
 )
 def _descend(  # type: ignore[no-untyped-def]
-    index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip, own_size, scale, pad_of, T_world_pads,
-    signal, variance, distrust, doubt, error, T_prior, information, size_prior, size_information, coarse, fine,
-    T, size, logs, rows, z,
+    index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip,
+    posture, pieces, b_mean, b_scale, v0, c0, v1, c1, v2, c2,
+    own_size, scale, pad_of, T_world_pads, signal, variance, distrust, doubt, error,
+    T_prior, information, body_prior, body_information, coarse, fine, T, body, logs, rows, error_there, z,
 ):  # fmt: skip
-    """The steps of `Solver.solve`, from the pose T and size that are given to those that are found, with the logs, derivatives
-    and residuals there; returns the cost."""
+    """The steps of `Solver.solve`, from the pose T and body that are given to those that are found, with the logs, derivatives,
+    errors and residuals there; returns the cost."""
     network = (index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip)
-    pads, given = (own_size, scale, pad_of, T_world_pads), (signal, variance, distrust, doubt, error)
-    prior = (T_prior, information, size_prior, size_information)
+    bearers = (posture, (pieces, b_mean, b_scale, v0, c0, v1, c1, v2, c2))
+    pads, given = (own_size, scale, pad_of, T_world_pads), (signal, variance, distrust, doubt, error_there)
+    prior = (T_prior, information, body_prior, body_information)
     n = len(scale)
-    T_there, size_there, logs_there, rows_there = np.empty((4, 4)), np.empty(2), np.empty(n), np.empty((n, 8))
-    H, g, H_there, g_there, step = np.empty((8, 8)), np.empty(8), np.empty((8, 8)), np.empty(8), np.empty(8)
-    _predict(network, pads, T, size, True, logs, rows)
+    T_next, body_next, logs_next, rows_next = np.empty((4, 4)), np.empty(BODY), np.empty(n), np.empty((n, UNKNOWNS))
+    H, g, H_next, g_next = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    step, added = np.empty(UNKNOWNS), np.empty(n)
+    _predict(network, bearers, pads, variance, T, body, coarse + fine > 0, logs, rows, added)
+    for e in range(n):
+        error_there[e] = math.sqrt(error[e] * error[e] + (BEARER_ERROR * added[e]) ** 2)
     for stage in range(2):
         is_coarse = stage == 0
-        cost = _posterior(given, prior, T, size, logs, rows, is_coarse, H, g, z)
+        cost = _posterior(given, prior, T, body, logs, rows, is_coarse, H, g, z)
         for _ in range(coarse if is_coarse else fine):
             _step(H, g, step)
             gain = 0.0
-            for i in range(8):
+            for i in range(UNKNOWNS):
                 gain += step[i] * g[i]
-                for j in range(8):
+                for j in range(UNKNOWNS):
                     gain -= 0.5 * step[i] * H[i, j] * step[j]
             if gain < CONVERGED:
                 if not is_coarse:  # to first order
                     for e in range(n):
-                        for i in range(8):
+                        for i in range(UNKNOWNS):
                             logs[e] += rows[e, i] * step[i]
-                    _move(T, size, step, T_there, size_there)
-                    T[:], size[:] = T_there, size_there
+                    _move(T, body, step, T_next, body_next)
+                    T[:], body[:] = T_next, body_next
                 break
             improves = False
             for _ in range(4):
                 largest = 0.0
                 for e in range(n):
                     change = 0.0
-                    for i in range(8):
+                    for i in range(UNKNOWNS):
                         change += rows[e, i] * step[i]
                     largest = max(largest, abs(change))
                 has_rows = is_coarse or largest >= SAME_SLOPE
-                _move(T, size, step, T_there, size_there)
+                _move(T, body, step, T_next, body_next)
                 if not has_rows:
-                    rows_there[:] = rows
-                _predict(network, pads, T_there, size_there, has_rows, logs_there, rows_there)
-                cost_there = _posterior(given, prior, T_there, size_there, logs_there, rows_there, is_coarse, H_there, g_there, z)
-                improves = cost_there <= cost
+                    rows_next[:] = rows
+                _predict(network, bearers, pads, variance, T_next, body_next, has_rows, logs_next, rows_next, added)
+                cost_next = _posterior(given, prior, T_next, body_next, logs_next, rows_next, is_coarse, H_next, g_next, z)
+                improves = cost_next <= cost
                 if improves:
                     break
-                for i in range(8):
+                for i in range(UNKNOWNS):
                     step[i] *= 0.4
             if not improves:
                 break
-            T[:], size[:], logs[:], rows[:] = T_there, size_there, logs_there, rows_there
-            H[:], g[:], cost = H_there, g_there, cost_there
-    return _posterior(given, prior, T, size, logs, rows, False, H, g, z)
+            T[:], body[:], logs[:], rows[:] = T_next, body_next, logs_next, rows_next
+            H[:], g[:], cost = H_next, g_next, cost_next
+    return _posterior(given, prior, T, body, logs, rows, False, H, g, z)
 
 
 @inner
-def _predict(network, pads, T, size, has_rows, logs, rows):  # type: ignore[no-untyped-def]
-    """The logs (n,) of the signals at a pose (4, 4) and size (2,), and with has_rows their derivatives (n, 8) along the world's
-    axes, which cost four times as much."""
+def _predict(network, bearers, pads, variance, T, body, has_rows, logs, rows, added):  # type: ignore[no-untyped-def]
+    """The logs (n,) of the signals at a pose (4, 4) and body (5,), and the part of upper arm and torso in them, added (n,); with
+    has_rows also their derivatives (n, 11) along the world's axes, which cost several times as much."""
     index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip = network
     own_size, scale, pad_of, T_world_pads = pads
     T_pads_target = np.zeros((len(T_world_pads), 4, 4))
     for k in range(len(T_world_pads)):
-        for i in range(3):
-            for j in range(3):
-                T_pads_target[k, i, 3] += T_world_pads[k, j, i] * (T[j, 3] - T_world_pads[k, j, 3])
-                for m in range(3):
-                    T_pads_target[k, i, j] += T_world_pads[k, m, i] * T[m, j]
-    whole = own_size + size
+        _seen_from(T_world_pads[k], T, T_pads_target[k])
+    whole = own_size + body[:2]
     if has_rows:
-        by_pads = np.empty_like(rows)
+        by_pads = np.empty((len(logs), 8))
         derivatives(index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip, T_pads_target, whole, logs, by_pads)
+        rows[:, 8:] = 0.0
         for e in range(len(logs)):
             k = pad_of[e]
             for i in range(3):
@@ -259,67 +281,145 @@ def _predict(network, pads, T, size, has_rows, logs, rows):  # type: ignore[no-u
             rows[e, 6], rows[e, 7] = by_pads[e, 6], by_pads[e, 7]
     else:
         values(index, points, ends, mean, scaling, w0, b0, w1, b1, w2, b2, skip, T_pads_target, whole, logs)
+    added[:] = 0.0
+    if len(bearers[0]) > 0:
+        _add_bearer(index, bearers, scale, T_world_pads, variance, T, body, has_rows, logs, rows, added)
     for e in range(len(logs)):
         logs[e] += scale[e]
 
 
 @inner
-def _move(T, size, step, T_there, size_there):  # type: ignore[no-untyped-def]
-    """Writes the pose (4, 4) and size (2,) a step (8,) away, as `geometry.perturb` moves a pose."""
+def _add_bearer(index, bearers, scale, T_world_pads, variance, T, body, has_rows, logs, rows, added):  # type: ignore[no-untyped-def]
+    """Adds what upper arm and torso add to the logs (n,) of the limb's own changes, and with has_rows to their derivatives."""
+    posture, networks = bearers
+    size = len(logs) // len(index)
+    units = networks[4].shape[1]
+    x, first, second = np.empty(networks[1].shape[1]), np.empty(units), np.empty(units)
+    step, there, other = np.zeros(UNKNOWNS), np.empty(size), np.empty(size)
+    parts, nudged, before = np.empty((3, 4, 4)), np.empty((UNKNOWNS, 3, 4, 4)), np.zeros((3, 4, 4))
+    T_there, body_there = np.empty((4, 4)), np.empty(BODY)
+    _behind(posture, T, body, parts)
+    if has_rows:
+        for k in range(UNKNOWNS):
+            step[k] = NUDGE[k]
+            _move(T, body, step, T_there, body_there)
+            _behind(posture, T_there, body_there, nudged[k])
+            step[k] = 0.0
+    for p in range(len(index)):
+        own, out = logs[p * size : (p + 1) * size], added[p * size : (p + 1) * size]
+        for part in range(3):
+            _seen_from(T_world_pads[p], parts[part], before[part])
+        bearer.factors(networks, index[p], before, own, x, first, second, out)
+        is_felt = False
+        for e in range(size):
+            predicted = math.exp(own[e] + out[e] + scale[p * size + e])
+            is_felt |= predicted * predicted > FAINT * FAINT * variance[p * size + e]
+        if has_rows and is_felt:
+            for k in range(UNKNOWNS):
+                for part in range(3):
+                    _seen_from(T_world_pads[p], nudged[k, part], before[part])
+                for e in range(size):
+                    there[e] = own[e] + rows[p * size + e, k] * NUDGE[k]
+                bearer.factors(networks, index[p], before, there, x, first, second, other)
+                for e in range(size):
+                    rows[p * size + e, k] += (other[e] - out[e]) / NUDGE[k]
+        for e in range(size):
+            own[e] += out[e]
+
+
+@inner
+def _behind(posture, T, body, parts):  # type: ignore[no-untyped-def]
+    """Writes T_world_part (3, 4, 4) of limb, upper arm and torso: see `shared.body.posture`."""
+    parts[:] = 0.0
+    parts[0] = T
+    away = 0.0
+    for i in range(3):
+        parts[1, i, 0] = T[i, 3] - T[i, 0] * posture[12] - posture[i] - body[2 + i]  # from the shoulder to the elbow
+        away += parts[1, i, 0] ** 2
+    for i in range(3):
+        parts[1, i, 0] /= math.sqrt(away)
+        parts[1, i, 3] = T[i, 3] - T[i, 0] * posture[12] - posture[13] * parts[1, i, 0]
+        parts[2, i, 3] = parts[1, i, 3]
+        for j in range(3):
+            parts[2, i, j] = posture[3 + 3 * i + j]
+    x0, x1, x2 = parts[1, 0, 0], parts[1, 1, 0], parts[1, 2, 0]
+    level = math.sqrt(x0 * x0 + x1 * x1)
+    y0, y1 = -x1 / level, x0 / level
+    parts[1, 0, 1], parts[1, 1, 1] = y0, y1
+    parts[1, 0, 2], parts[1, 1, 2], parts[1, 2, 2] = -x2 * y1, x2 * y0, x0 * y1 - x1 * y0
+
+
+@inner
+def _seen_from(T_world_pad, T_world, out):  # type: ignore[no-untyped-def]
+    """Writes a pose (4, 4) in the world as seen from a pad; its last row is not written."""
+    for i in range(3):
+        for j in range(4):
+            out[i, j] = 0.0
+            for m in range(3):
+                out[i, j] += T_world_pad[m, i] * (T_world[m, j] - (T_world_pad[m, 3] if j == 3 else 0.0))
+
+
+@inner
+def _move(T, body, step, T_next, body_next):  # type: ignore[no-untyped-def]
+    """Writes the pose (4, 4) and body (5,) a step (11,) away, as `geometry.perturb` moves a pose."""
     turn = np.empty((3, 3))
     so3.exp(step[3:6], turn)
-    T_there[:] = T
-    so3.turn(turn, T_there, 0)
+    T_next[:] = T
+    so3.turn(turn, T_next, 0)
     for i in range(3):
-        T_there[i, 3] = T[i, 3] + step[i]
-    size_there[0], size_there[1] = size[0] + step[6], size[1] + step[7]
+        T_next[i, 3] = T[i, 3] + step[i]
+    for i in range(BODY):
+        body_next[i] = body[i] + step[6 + i]
 
 
 @inner
 def _step(H, g, step):  # type: ignore[no-untyped-def]
-    """Writes the step (8,) with H step = g, for a symmetric positive definite H (Cholesky without square roots), no longer than
+    """Writes the step (11,) with H step = g, for a symmetric positive definite H (Cholesky without square roots), no longer than
     FARTHEST_STEP."""
-    L, d = np.empty((8, 8)), np.empty(8)
-    for j in range(8):
+    L, d = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    for j in range(UNKNOWNS):
         d[j] = H[j, j]
         for k in range(j):
             d[j] -= L[j, k] * L[j, k] * d[k]
-        for i in range(j + 1, 8):
+        for i in range(j + 1, UNKNOWNS):
             L[i, j] = H[i, j]
             for k in range(j):
                 L[i, j] -= L[i, k] * L[j, k] * d[k]
             L[i, j] /= d[j]
-    for i in range(8):
+    for i in range(UNKNOWNS):
         step[i] = g[i]
         for k in range(i):
             step[i] -= L[i, k] * step[k]
-    for i in range(8):
+    for i in range(UNKNOWNS):
         step[i] /= d[i]
-    for i in range(7, -1, -1):
-        for k in range(i + 1, 8):
+    for i in range(UNKNOWNS - 1, -1, -1):
+        for k in range(i + 1, UNKNOWNS):
             step[i] -= L[k, i] * step[k]
     position = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
     rotation = math.sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
     size = max(abs(step[6]), abs(step[7]))
+    shoulder = math.sqrt(step[8] * step[8] + step[9] * step[9] + step[10] * step[10])
     share = max(1.0, position / FARTHEST_STEP[0], rotation / FARTHEST_STEP[1], size / FARTHEST_STEP[2])
-    for i in range(8):
+    share = max(share, shoulder / FARTHEST_STEP[3])
+    for i in range(UNKNOWNS):
         step[i] /= share
 
 
 @inner
-def _posterior(given, prior, T, size, logs, rows, is_coarse, H, g, z):  # type: ignore[no-untyped-def]
-    """Writes the information (8, 8) and gradient (8,) of voltages and prior, and the residuals (n,); returns the cost."""
+def _posterior(given, prior, T, body, logs, rows, is_coarse, H, g, z):  # type: ignore[no-untyped-def]
+    """Writes the information (11, 11) and gradient (11,) of voltages and prior, and the residuals (n,); returns the cost."""
     signal, variance, distrust, doubt, error = given
-    T_prior, information, size_prior, size_information = prior
+    T_prior, information, body_prior, body_information = prior
     H[:], g[:] = 0.0, 0.0
     cost = _normal_equations(signal, variance, distrust, doubt, error, logs, rows, is_coarse, 1.0, H, g, z)
-    turn, toward = np.empty((3, 3)), np.empty(8)
+    turn, toward = np.empty((3, 3)), np.empty(UNKNOWNS)
     so3.product_transposed(T_prior[:3, :3], T[:3, :3], turn)
     so3.log(turn, toward[3:6])
     for i in range(3):
         toward[i] = T_prior[i, 3] - T[i, 3]
-    toward[6], toward[7] = size_prior[0] - size[0], size_prior[1] - size[1]
-    for first, part in ((0, information), (6, size_information)):
+    for i in range(BODY):
+        toward[6 + i] = body_prior[i] - body[i]
+    for first, part in ((0, information), (6, body_information)):
         for i in range(len(part)):
             for j in range(len(part)):
                 H[first + i, first + j] += part[i, j]
@@ -328,9 +428,12 @@ def _posterior(given, prior, T, size, logs, rows, is_coarse, H, g, z):  # type: 
     return cost
 
 
-@kernel("f8[n], f8[n], f8[n], f8[n], f8[n], f8[n], f8[n, 8], b1, f8, out f8[8, 8], out f8[8], out f8[n] -> f8")
+@kernel(
+    f"""f8[n], f8[n], f8[n], f8[n], f8[n], f8[n], f8[n, {UNKNOWNS}], b1, f8,
+    out f8[{UNKNOWNS}, {UNKNOWNS}], out f8[{UNKNOWNS}], out f8[n] -> f8"""
+)
 def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coarse, lasting, H, g, z):  # type: ignore[no-untyped-def]
-    """Adds the information (8, 8) and gradient (8,) about the target's pose error in the world and its size, writes residuals
+    """Adds the information (11, 11) and gradient (11,) about the target's pose error in the world and its body, writes residuals
     (n,) and returns the robust cost."""
     cost = 0.0
     for e in range(len(signal)):
@@ -362,9 +465,9 @@ def _normal_equations(signal, variance, distrust, doubt, error, logs, rows, coar
         else:
             cost += 0.5 * square
         weight = trust * slope / total
-        for i in range(8):
+        for i in range(UNKNOWNS):
             g[i] += weight * residual * rows[e, i]
-            for j in range(8):
+            for j in range(UNKNOWNS):
                 H[i, j] += weight * slope * rows[e, i] * rows[e, j]
     return cost
 

@@ -18,6 +18,7 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
+from penumbra.shared.body.posture import Posture
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import report, topics
@@ -68,6 +69,7 @@ class Examination:
         self.pads = {name: Pad(Watch(self.skin, k)) for k, name in enumerate(self.skin.pads)}
         self.notes: list[str] = []
         self._target = next(iter(cell.targets))
+        self._posture = Posture.usual(cell, cell.targets[self._target])
         self._robots = robot_models(cell)
         self._poses: deque[FusedPose] = deque(maxlen=200)
         self._joints: dict[str, deque[Joints]] = {name: deque(maxlen=100) for name in cell.robots}
@@ -113,10 +115,14 @@ class Examination:
             return
         links = {robot: self._robots[robot].link_transforms(known.position) for robot, known in joints.items() if known}
         T_world_pads = self.skin.T_world_pads(link_names(links))
-        T_pads_target = np.stack([inverse(T) for T in T_world_pads]) @ transform(pose.position, pose.orientation)
+        T_world_target = transform(pose.position, pose.orientation)
         own = self.skin.of(self.skin.pads.index(name))
         angles = np.concatenate([np.empty(0), *(known.position for known in joints.values() if known)])
-        change = self._response.change(T_pads_target) + self._response.rest(angles)
+        change = self._response.change(np.stack([inverse(T) for T in T_world_pads]) @ T_world_target)
+        if self._posture is not None:
+            parts = [T_world_target, *self._posture.poses(T_world_target)]
+            change *= np.exp(self._response.person(T_world_pads, parts, np.log(change)))
+        change += self._response.rest(angles)
         predicted = self.skin.signal(self.skin.amplitude(change))[own]
         measured = self.skin.polarity[own] * (volts.mean(axis=0) - self.skin.a3[own])
         gap = np.sqrt(max(self.skin.peak[own].max() / max(predicted.max(), 1e-6) - 1.0, 1.0) / self.skin.a2[own].max())

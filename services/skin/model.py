@@ -11,9 +11,10 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull
 
 from penumbra.services import flags
+from penumbra.services.skin import bearer
 from penumbra.shared.body.anatomy import Mesh, target_mesh
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
@@ -61,6 +63,8 @@ PIECES = (40, 18)
 HIDDEN, HIDDEN_BACKED = 128, 32
 STEPS, STEPS_BACKED, BATCH = 250_000, 10_000, 512
 """Units of the hidden layers and training steps, of a bare pad and of the effect of a link behind it; samples per step."""
+PERSONS, PERSONS_BACKED, PERSON_STEPS = 8_000, 3_000, 20_000
+"""Numbers of fields solved for the rest of the person, and training steps for it."""
 NEAR_GAP = 0.05
 """Gap [m] below which the networks have larger errors."""
 FAINTEST = 1e-5
@@ -358,37 +362,72 @@ def main(options: flags.Options) -> int:
     target = cell.one("targets", options.target)
     mesh = target_mesh(cell.targets[target].model_copy(update={"size": None}), cell)  # the networks take the size as input
     points = pieces(mesh)
+    is_whole = cell.targets[target].mesh == "body:forearm"
     with Progress() as progress:
         for mounting in mountings(cell, target):
             known = networks(cell)
-            if mounting.fingerprint in known and not options.again:
+            network = None if options.again else known.get(mounting.fingerprint)
+            if network is not None and (network.bearer is not None or not is_whole):
                 progress.console.print(f"{mounting.name}: has a network already, kept (--again fits it anew)")
                 continue
-            began = time.monotonic()
-            start = known.get(mounting.bare) if mounting.backing is not None else None
-            poses = options.poses or (POSES if start is None else POSES_BACKED)
-            steps = options.steps or (STEPS if start is None else STEPS_BACKED)
-            data = solve(mounting, mesh, poses, options.seed, progress)
-            network = fit(points, data, options.seed, steps, start, progress)
-            unseen = solve(mounting, mesh, max(poses // 12, 50), HELD_OUT_SEED, progress)
-            held_out = score(network, unseen)
-            rest, rest_error = fit_rest(cell, mounting, options.seed) if mounting.backing is not None else (None, None)
-            network = replace(network, rest=rest, error=error(network, unseen))
             path = cell.folder / FOLDER / f"{mounting.name}.npz"
+            card: dict[str, Any] = json.loads(path.with_suffix(".json").read_text()) if path.is_file() else {}
+            card["made_by"] = f"penumbra skin model --cell {options.cell} --target {target} --seed {options.seed}"
+            if network is None:
+                network, fitted = _fitted(cell, mounting, mesh, points, known, options, progress)
+                card |= fitted
+            if is_whole:
+                network, card["rest_of_person"] = _with_person(cell, mounting, mesh, network, options, progress)
             save(path, network, mounting.fingerprint)
-            card = {
-                "made_by": f"penumbra skin model --cell {options.cell} --target {target} --seed {options.seed}",
-                "date": date.today().isoformat(),
-                "fingerprint": mounting.fingerprint,
-                "poses": poses,
-                "steps": steps,
-                "minutes": round((time.monotonic() - began) / 60.0, 1),
-                "held_out_seed": HELD_OUT_SEED,
-                "held_out": held_out,
-                **({"other_links_p95_percent": round(100.0 * rest_error, 2)} if rest_error is not None else {}),
-            }
             path.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n")
             progress.console.print(f"{mounting.name}: {path}")
-            for band, row in held_out.items():
-                progress.console.print(f"  {band:>9}: median {row['median_percent']} %, 95 % below {row['p95_percent']} %")
+            for what in ("held_out", "rest_of_person"):
+                for band, row in card.get(what, {}).items():
+                    words = f"median {row['median_percent']} %, 95 % below {row['p95_percent']} %"
+                    progress.console.print(f"  {what.replace('_', ' ')} {band:>9}: {words}")
     return 0
+
+
+def _fitted(
+    cell: cells.Cell,
+    mounting: Mounting,
+    mesh: Mesh,
+    points: Array,
+    known: Mapping[str, Network],
+    options: flags.Options,
+    progress: Progress,
+) -> tuple[Network, dict[str, Any]]:
+    """A mounting's network and what its card says of it."""
+    began = time.monotonic()
+    start = known.get(mounting.bare) if mounting.backing is not None else None
+    poses = options.poses or (POSES if start is None else POSES_BACKED)
+    steps = options.steps or (STEPS if start is None else STEPS_BACKED)
+    data = solve(mounting, mesh, poses, options.seed, progress)
+    network = fit(points, data, options.seed, steps, start, progress)
+    unseen = solve(mounting, mesh, max(poses // 12, 50), HELD_OUT_SEED, progress)
+    rest, rest_error = fit_rest(cell, mounting, options.seed) if mounting.backing is not None else (None, None)
+    card = {
+        "date": date.today().isoformat(),
+        "fingerprint": mounting.fingerprint,
+        "poses": poses,
+        "steps": steps,
+        "minutes": round((time.monotonic() - began) / 60.0, 1),
+        "held_out_seed": HELD_OUT_SEED,
+        "held_out": score(network, unseen),
+        **({"other_links_p95_percent": round(100.0 * rest_error, 2)} if rest_error is not None else {}),
+    }
+    return replace(network, rest=rest, error=error(network, unseen)), card
+
+
+def _with_person(
+    cell: cells.Cell, mounting: Mounting, mesh: Mesh, network: Network, options: flags.Options, progress: Progress
+) -> tuple[Network, dict[str, Any]]:
+    """The network with the rest of the person beside it, and the score of that."""
+    poses = options.poses or (PERSONS if mounting.backing is None else PERSONS_BACKED)
+    field = PadField(mounting.kind, mounting.backing)
+    data, unseen = (
+        bearer.solve(field, Poses(mesh, mounting.backing, seed), mesh, cell.body, count, progress)
+        for seed, count in ((options.seed, poses), (HELD_OUT_SEED, max(poses // 8, 50)))
+    )
+    found = bearer.fit(data, bearer.pieces(cell.body), options.seed, options.steps or PERSON_STEPS)
+    return replace(network, bearer=found), bearer.score(found, unseen)

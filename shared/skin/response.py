@@ -15,7 +15,7 @@ import functools
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from penumbra.shared.body import urdf
 from penumbra.shared.cell import description as cells
-from penumbra.shared.geometry.rigid import Array
+from penumbra.shared.geometry.rigid import Array, inverse
 from penumbra.shared.native import inner, kernel
+from penumbra.shared.skin.bearer import Bearer, Bearers
 
 FOLDER = "skin"
 """Folder beside a cell file with its fitted networks."""
@@ -84,7 +85,8 @@ def _pairs(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 class Network:
     """Response of one mounting. points (7, k): pieces of the limb's skin, in its own frame: centre [m], normal, area [m^2]; mean
     and scale (FEATURES,) of the input; three weight matrices (rows are outputs) with biases; a linear skip (e, FEATURES); rest:
-    contribution of the robot, where the pad sits on one; error: standard deviation of the relative error on held-out poses."""
+    contribution of the robot, where the pad sits on one; error: standard deviation of the relative error on held-out poses;
+    bearer: contribution of the rest of the person, if the limb is the parametric forearm."""
 
     points: NDArray[np.float32]
     mean: Array
@@ -94,6 +96,7 @@ class Network:
     skip: Array
     rest: Rest | None = None
     error: float = 0.0
+    bearer: Bearer | None = None
 
     @property
     def ends(self) -> Array:
@@ -106,6 +109,8 @@ class Network:
         out |= {f"weight{i}": w for i, w in enumerate(self.weights)} | {f"bias{i}": b for i, b in enumerate(self.biases)}
         if self.rest is not None:
             out |= {"rest": self.rest.coefficients, "rest_middle": self.rest.middle, "rest_half": self.rest.half}
+        if self.bearer is not None:
+            out |= self.bearer.stored()
         return {**out, "skip": self.skip}
 
     @staticmethod
@@ -117,7 +122,8 @@ class Network:
         )
         mean, scale, skip = (np.ascontiguousarray(data[name], dtype=float) for name in ("mean", "scale", "skip"))
         rest = Rest(*(data[name].astype(float) for name in ("rest", "rest_middle", "rest_half"))) if "rest" in data else None
-        return Network(points, mean, scale, weights, biases, skip, rest, float(data["error"]))  # type: ignore[arg-type]
+        bearer = Bearer.of(data) if "bearer_mean" in data else None
+        return Network(points, mean, scale, weights, biases, skip, rest, float(data["error"]), bearer)  # type: ignore[arg-type]
 
 
 class Response:
@@ -151,6 +157,8 @@ class Response:
         self._rest = Rest(*(np.stack([getattr(rest, name) for rest in rests.values()]) for name in REST)) if rests else None
         self.error = np.repeat([known[each].error for each in prints], self.electrodes)
         self.index = np.array([different.index(each) for each in prints])
+        bearers = [each.bearer for each in own if each.bearer is not None]
+        self.bearers = Bearers(bearers, self.index) if len(bearers) == len(own) else None
         points, ends = np.stack([_whole(each.points) for each in own]), np.stack([each.ends for each in own])
         mean, scale = np.stack([each.mean for each in own]), np.stack([each.scale for each in own])
         first, second, third = (_stack([each.weights[i] for each in own]) for i in range(3))
@@ -164,6 +172,15 @@ class Response:
         out = np.empty(len(self.index) * self.electrodes)
         values(*self.arrays, np.ascontiguousarray(T_pads_target), self.size + size, out)
         return np.exp(out)
+
+    def person(self, T_world_pads: Array, T_world_parts: Sequence[Array], own: Array) -> Array:
+        """Logarithms (n,) of the factors by which the rest of the person changes the limb's own changes; own (n,): the logarithms
+        of these [fF]. T_world_pads (p, 4, 4); T_world_parts (4, 4) of limb, upper arm and torso. Zero where it was not fitted,
+        as for a limb that is not the parametric forearm."""
+        if self.bearers is None:
+            return np.zeros(len(own))
+        T_pads_world = np.stack([inverse(T) for T in T_world_pads])
+        return self.bearers.logs(T_pads_world[:, None] @ np.stack(T_world_parts), own)
 
     def rest(self, joints: ArrayLike) -> Array:
         """Changes (n,) [fF] due to the robot's other links, also without a limb, at all joint angles (j,) of the cell."""

@@ -15,6 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.body.posture import frame
 from penumbra.shared.body.robot import RobotModel, robot_models
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import Label
@@ -24,7 +25,7 @@ from penumbra.sim.picture import appearance, limb, looks
 from penumbra.sim.picture.appearance import Appearance
 from penumbra.sim.picture.occluder import Panel, box
 from penumbra.sim.picture.renderer import Body, Renderer, Shape
-from penumbra.sim.world.person import Person, frame
+from penumbra.sim.world.person import Person
 
 CELLS = ("table", "arm")
 PERIOD_S = 0.05

@@ -1,11 +1,13 @@
 """Readings of the pads: how a limb changes the capacitance of their electrodes, and the resulting amplitudes.
 
 The changes come from the networks that stand for the boundary-element field (`shared.skin.response`): eight pads at 1 kHz take a
-few per cent of a core. The changes by the robot's other links are added, as if the limb did not shade them. The person's upper
-arm and torso and other pads are not modelled.
+few per cent of a core, with the factors by which the person's upper arm and torso change them. The changes by the robot's other
+links are added, as if the limb did not shade them. Other pads are not modelled.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,16 +25,16 @@ class SkinModel:
         self.skin = Skin(cell)
         self._response = Response(cell, target)
 
-    def change(self, T_world_pads: Array, T_world_target: Array, joints: ArrayLike = ()) -> Array:
-        """Changes of capacitance (n,) [fF] by the target and by the robots at all their joint angles (j,), for pads (p, 4, 4)."""
-        return self.limb(T_world_pads, T_world_target) + self.rest(joints)
-
-    def limb(self, T_world_pads: Array, T_world_target: Array) -> Array:
-        """The target's part of the changes (n,) [fF]."""
-        return self._response.change(np.stack([inverse(T) for T in T_world_pads]) @ T_world_target)
+    def person(self, T_world_pads: Array, T_world_parts: Sequence[Array]) -> Array:
+        """Changes of capacitance (n,) [fF] by the target's person, for pads (p, 4, 4). T_world_parts (4, 4): the target, and the
+        upper arm and torso if it has them."""
+        change = self._response.change(np.stack([inverse(T) for T in T_world_pads]) @ T_world_parts[0])
+        if len(T_world_parts) == 1:
+            return change
+        return change * np.exp(self._response.person(T_world_pads, T_world_parts, np.log(change)))
 
     def rest(self, joints: ArrayLike) -> Array:
-        """The robots' part of the changes (n,) [fF]."""
+        """Changes (n,) [fF] by the robots at all their joint angles (j,)."""
         return self._response.rest(joints)
 
     def volts(self, change: ArrayLike, rng: np.random.Generator) -> Array:

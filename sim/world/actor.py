@@ -78,8 +78,10 @@ class Actor:
         self._limb.plan(until_s)
 
     def change(self, placed: Placed, T_world_pads: Array) -> Array:
-        """Changes of capacitance (m,) [fF] by the target at the electrodes of `near`, for poses of all pads (p, 4, 4)."""
-        return np.zeros(0) if self._skin is None else self._skin.limb(T_world_pads[self.near.pads], placed.T_world_target)
+        """Changes of capacitance (m,) [fF] by the person at the electrodes of `near`, for poses of all pads (p, 4, 4)."""
+        if self._skin is None:
+            return np.zeros(0)
+        return self._skin.person(T_world_pads[self.near.pads], self.person.poses(placed.T_world_target))
 
     def gaps(self, placed: Placed, points: Array) -> Array:
         """Distances [m] (n,) from points (n, 3) in the world to the target's skin; 0 inside."""

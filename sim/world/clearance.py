@@ -7,13 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from penumbra.shared.body.anatomy import Mesh
+from penumbra.shared.body.posture import frame
 from penumbra.shared.body.robot import RobotModel
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
 from penumbra.sim.world.motion import JointMotion
-from penumbra.sim.world.person import Person, frame
+from penumbra.sim.world.person import Person
 
 ROBOT_CLEARANCE = 0.022
 """Minimum distance [m] to the robot at the instants that are checked; between them it shrinks by less than 7 mm."""

@@ -7,7 +7,7 @@ the broad prior that the first look at a limb has, once with a tracking prior.
 
 Then limbs that rest for ten seconds (what is published, and what the default observer makes of it, against their covariances),
 limbs that move through all gaps, and things that are no limb. `--only-surface`: points of surfaces without a shape, and contact.
-`--only-drift`: limbs before electrodes whose gains and offsets have drifted.
+`--only-drift`: limbs before electrodes whose gains and offsets have drifted. `--only-persons`: limbs with upper arm and torso.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from penumbra.services.haptics.service import WEIGHTS, shapes_of
 from penumbra.services.haptics.surface_points import SurfacePoints
 from penumbra.services.skin.model import links, mountings
 from penumbra.shared.body.anatomy import SIZE_SPREAD, target_mesh
+from penumbra.shared.body.posture import Posture
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
@@ -45,7 +46,7 @@ from penumbra.shared.skin import bound
 from penumbra.shared.skin.layout import Skin, link_names
 from penumbra.shared.skin.response import Response, fingerprint
 from penumbra.sim.skin import field
-from penumbra.tests.bench.lib import drift, results, surfaces, things
+from penumbra.tests.bench.lib import drift, persons, results, surfaces, things
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
 ARRAYS = {"bare": "table", "hull": "arm"}
@@ -126,9 +127,10 @@ class Rig:
         order = np.argsort(away.round(6), kind="stable")
         self.chosen = {count: np.sort(order[:count]) for count in PADS}
 
-    def estimator(self, home: Array, spread: Array, method: str = "solve") -> Estimator:
+    def estimator(self, home: Array, spread: Array, method: str = "solve", posture: Posture | None = None) -> Estimator:
         """A new estimator that expects the target at home (4, 4), with standard deviations spread (6,) along the world's axes."""
-        return Estimator(self.skin, self.response, self.surface, home, spread, self.weights, method, shapes=self.shapes)
+        given = self.skin, self.response, self.surface, home, spread, self.weights, method
+        return Estimator(*given, shapes=self.shapes, posture=posture)
 
     def samples(self, count: int) -> np.ndarray:
         """Numbers of samples (n,) of the electrodes in a window when `count` pads are used."""
@@ -446,6 +448,8 @@ def tables(result: Result) -> list[Part]:
         return surfaces.tables(result)
     if "drift" in result:
         return [drift.table(result)]
+    if "persons" in result:
+        return [persons.table(result["persons"])]
     if "arrays" not in result:
         return [things.table(result)]
     shown, lines = result["arrays"], list[Part]()
@@ -560,6 +564,7 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     flags.Option("--only-objects", is_flag=True, help="only things that pass"),
     flags.Option("--only-surface", is_flag=True, help="only points of surfaces, and contact"),
     flags.Option("--only-drift", is_flag=True, help="only limbs before electrodes that have drifted"),
+    flags.Option("--only-persons", is_flag=True, help="only limbs with upper arm and torso"),
     flags.Option("--quick", is_flag=True, help="a few of everything: whether it runs, no numbers to believe"),
     example="penumbra bench haptics --quick --json haptics.json",
 )
@@ -576,6 +581,9 @@ def main(options: flags.Options, report: results.Report) -> None:
             limbs = 1 if options.quick else drift.LIMBS
             rows = [row for name in arrays for row in drift.measure(Rig(name), options.seed, limbs, progress)]
         result = {"seed": options.seed, "drift": rows}
+    elif options.only_persons:
+        each = [persons.measure(Rig(name), options.seed, plan.poses, plan.draws, TRACKING) for name in arrays]
+        result = {"seed": options.seed, "persons": [row for rows in each for row in rows]}
     elif options.only_objects:
         result = {"seed": options.seed, "objects": measure_objects(options.seed, plan.passes, arrays)}
     else:

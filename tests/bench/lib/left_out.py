@@ -1,8 +1,8 @@
-"""What the runtime field model leaves out: the rest of the person, and the boards beside a pad.
+"""What surrounds a pad and the forearm before it changes of the signals, and how much of that the runtime field model leaves out.
 
-The networks stand for a pad alone before the hand and forearm of a person. Here boundary elements have more in one system, so
-that everything shades everything: upper arm and torso, one conductor with the forearm, and the three boards that surround one of
-the table's, with their rings held at zero (boards that are driven one after the other) or driven with its own.
+Here boundary elements have more in one system, so that everything shades everything: upper arm and torso, one conductor with the
+forearm, and the three boards that surround one of the table's, with their rings held at zero (boards that are driven one after
+the other) or driven with its own. The runtime model contains upper arm and torso (`shared.skin.bearer`), but no other boards.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.geometry.surface import Surface
 from penumbra.shared.skin.layout import Skin
+from penumbra.shared.skin.response import Response
 from penumbra.sim.skin.field import Body, PadField, Panels, limb, shell
 from penumbra.sim.world.person import Person
 from penumbra.tests.bench.lib.results import Result
@@ -30,15 +31,17 @@ PAD, BESIDE = "p1", ("p2", "p5", "p6")
 SHIFT, TURN = (0.06, 0.03), (0.3, 0.12, 0.26)
 """Bounds of the forearm's displacement along and across from the pads' middle [m], and of its roll, pitch and yaw [rad]."""
 PERSON = ("upper arm", "upper arm and torso")
+LEFT = "what the networks leave of upper arm and torso"
 BOARDS = ("three boards beside, not driven", "three boards beside, driven together")
 
 
 def measure(cell: cells.Cell, seed: int, progress: Progress) -> list[dict[str, Any]]:
-    """Rows by omitted part and gap: relative changes of the signals by its presence."""
+    """Rows by part and gap: relative changes of the signals by its presence."""
     target = next(iter(cell.targets))
     assert cell.sim is not None, f"cell {cell.name}: expected a `sim` section"
     person, skin = Person(cell, cell.sim, cell.targets[target]), Skin(cell)
     forearm, *others = person.meshes
+    response = Response(cell, target)
     bodies = [limb(forearm).panels.corners, *(shell(mesh.vertices).corners for mesh in others)]
     surface, alone = Surface(forearm.vertices, forearm.faces), Body(Panels(bodies[0]))
     pads = dict(zip(skin.pads, skin.T_world_pads(), strict=True))
@@ -57,6 +60,9 @@ def measure(cell: cells.Cell, seed: int, progress: Progress) -> list[dict[str, A
                 body = Body(Panels(np.concatenate(parts[:count])))
                 found = [bare.change(body, rigid.inverse(pad) @ T) / usual[own] - 1.0 for own, pad in pads.items()]
                 shares.setdefault((name, gap), []).extend(found)
+            own = np.log(np.concatenate(list(usual.values())))
+            known = np.exp(response.person(np.stack(list(pads.values())), person.poses(T), own))
+            shares.setdefault((LEFT, gap), []).append((1.0 + np.concatenate(found)) / known - 1.0)
             for name, field in zip(BOARDS, boards, strict=True):
                 found = [field.change(alone, rigid.inverse(pads[PAD]) @ T) / usual[PAD] - 1.0]
                 shares.setdefault((name, gap), []).extend(found)
@@ -78,13 +84,13 @@ def _row(name: str, gap: float, share: Array) -> dict[str, Any]:
 
 
 def table(result: Result) -> Table:
-    """Medians and ranges of the changes by omitted parts, by gap."""
+    """Medians and ranges of the changes by part and gap."""
     out = Table(
-        *("left out", *(f"{100 * gap:g} cm" for gap in GAPS)),
-        title="What the runtime field model leaves out, share of the signal: median (5 % to 95 %)",
+        *("part", *(f"{100 * gap:g} cm" for gap in GAPS)),
+        title="What surrounds the pads and the forearm, share of the signal: median (5 % to 95 %)",
         caption=f"The forearm at {POSES} random poses a gap; of the person at all pads, of the boards at {PAD}.",
     )
-    for name in (*PERSON, *BOARDS):
+    for name in (*PERSON, LEFT, *BOARDS):
         rows = [row for row in result["left_out"] if row["left_out"] == name]
         out.add_row(name, *(f"{row['median']:+.1%} ({row['p5']:+.1%} to {row['p95']:+.1%})" for row in rows))
     return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,21 @@ from penumbra.services.haptics import train
 from penumbra.services.haptics.estimator import FOREIGN, Estimator, HapticEstimate
 from penumbra.services.haptics.paper_nearest import nearest_points
 from penumbra.services.haptics.paper_network import Relative
-from penumbra.services.haptics.size import Size
-from penumbra.services.haptics.solve import NEAR_ERROR, NEAR_SIGNAL, Prior, Reading, Solver, marginal, peak
+from penumbra.services.haptics.person import Person
+from penumbra.services.haptics.solve import (
+    BEARER_ERROR,
+    BODY,
+    NEAR_ERROR,
+    NEAR_SIGNAL,
+    UNKNOWNS,
+    Prior,
+    Reading,
+    Solver,
+    marginal,
+    peak,
+)
 from penumbra.shared.body.anatomy import SIZE, SIZE_SPREAD, target_mesh
+from penumbra.shared.body.posture import Posture
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
@@ -30,6 +43,10 @@ MS = 1_000_000
 WEIGHTS = Path(train.__file__).parent / "weights"
 SIZES = np.array([0.03, -0.2])
 """A woman's arm, near the 5th percentile: the estimator does not know it."""
+UNKNOWN = np.array([*SIZE, 0.0, 0.0, 0.0])
+"""The body of a person of whom nothing is known."""
+BESIDE = np.array([0.06, -0.1, 0.08])
+"""How far the shoulder is from where the estimator takes it to be [m]."""
 ANYWHERE = np.repeat([0.12, 0.4], 3)
 THREE_SIGMA = 20.06
 """Squared Mahalanobis distance of six directions that is as improbable as three standard deviations of one."""
@@ -64,10 +81,17 @@ def gaps(skin: Skin, surface: Surface, T: np.ndarray) -> np.ndarray:
     return surface.nearest((electrodes - T[:3, 3]) @ T[:3, :3])[0]
 
 
-def signal(skin: Skin, response: Response, T: np.ndarray, size: np.ndarray = SIZES) -> np.ndarray:
-    """Noise-free signals (n,) [V] of a limb."""
-    T_pads_target = np.stack([rigid.inverse(pad) for pad in skin.T_world_pads()]) @ T
-    return skin.gain * skin.sensitivity * response.change(T_pads_target, size)
+def signal(skin: Skin, response: Response, T: np.ndarray, size: np.ndarray = SIZES, posture: Posture | None = None) -> np.ndarray:
+    """Noise-free signals (n,) [V] of a limb, and of the person behind it."""
+    change = response.change(np.stack([rigid.inverse(pad) for pad in skin.T_world_pads()]) @ T, size)
+    if posture is not None:
+        change *= np.exp(response.person(skin.T_world_pads(), [T, *posture.poses(T)], np.log(change)))
+    return skin.gain * skin.sensitivity * change
+
+
+def moved(posture: Posture, offset: np.ndarray) -> Posture:
+    """The posture with its shoulder elsewhere."""
+    return replace(posture, shoulder=posture.shoulder + offset)
 
 
 def feel(skin: Skin, signals: np.ndarray, rng: np.random.Generator, samples: int = 10) -> np.ndarray:
@@ -128,22 +152,35 @@ def test_a_dead_pad_has_only_the_expectation(skin: Skin) -> None:
 # ---- solve
 
 
-def test_the_information_is_that_of_the_voltages_derivatives(skin: Skin, response: Response, pads: np.ndarray) -> None:
+@pytest.mark.parametrize("is_whole", [False, True])
+def test_the_information_is_that_of_the_voltages_derivatives(
+    table: cells.Cell, skin: Skin, response: Response, pads: np.ndarray, is_whole: bool
+) -> None:
     # a millimetre: large beside the rounding of a single-precision network, small beside the distance over which signals change
     T, step = rigid.from_rpy((0.01, -0.02, 0.14), (0.1, -0.1, 0.2)), 1e-3
-    solver = Solver(skin, response)
-    prior = Prior(T, 1e-9 * np.eye(6), SIZES, 1e-9 * np.eye(2))
-    window = Reading(signal(skin, response, T), skin.noise / 10, pads, np.ones(len(skin)), np.zeros(len(skin)), response.error)
-    information, gradient = solver.likelihood(window, solver.solve(window, prior, T, SIZES, 0, 0))
-    moved = [
-        [signal(skin, response, rigid.perturb(T, s * step * e[:6]), SIZES + s * step * e[6:]) for s in (1, -1)] for e in np.eye(8)
-    ]
-    J = np.stack([(up - down) / (2 * step) for up, down in moved], axis=1)
-    share = response.error + NEAR_ERROR * window.signal / NEAR_SIGNAL
+    posture = Posture.usual(table, table.targets["forearm"]) if is_whole else None
+    solver = Solver(skin, response, posture)
+    body = np.array([*SIZES, *BESIDE])
+    prior = Prior(T, 1e-9 * np.eye(6), body, 1e-9 * np.eye(BODY))
+
+    def felt(step: np.ndarray) -> np.ndarray:
+        person = None if posture is None else moved(posture, BESIDE + step[8:])
+        return signal(skin, response, rigid.perturb(T, step[:6]), SIZES + step[6:8], person)
+
+    measured = felt(np.zeros(UNKNOWNS))
+    window = Reading(measured, skin.noise / 10, pads, np.ones(len(skin)), np.zeros(len(skin)), response.error)
+    information, gradient = solver.likelihood(window, solver.solve(window, prior, T, body, 0, 1))
+    J = np.stack([(felt(step * e) - felt(-step * e)) / (2.0 * step) for e in np.eye(UNKNOWNS)], axis=1)
+    alone = np.log(measured / signal(skin, response, T))
+    error = np.hypot(response.error, BEARER_ERROR * alone)
+    share = error + NEAR_ERROR * window.signal / NEAR_SIGNAL
     expected = J.T @ (J / (skin.noise / 10 + (share * window.signal) ** 2)[:, None])
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.005)
+    scale = np.sqrt(np.maximum(np.diag(expected), 1e-9 * expected.max()))
+    np.testing.assert_allclose(
+        information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.01 if is_whole else 0.005
+    )
     assert (np.abs(gradient) < 1e-6 * scale).all()
+    assert is_whole == (np.diag(information)[8:] > 0.0).all()
 
 
 @pytest.mark.parametrize("gap", [0.01, 0.05, 0.12])
@@ -153,10 +190,10 @@ def test_the_solve_finds_pose_and_size_from_centimetres_away(
     T = rigid.from_rpy((0.02, 0.01, 0.04 + gap), (0.0, 0.05, 0.2))
     solver = Solver(skin, response)
     away = rigid.perturb(T, np.array([0.02, -0.02, 0.03, 0.1, 0.1, -0.1]))
-    prior = Prior(away, np.diag(np.repeat([0.02, 0.1], 3) ** -2.0), SIZE, np.diag(SIZE_SPREAD**-2))
+    prior = Prior(away, np.diag(np.repeat([0.02, 0.1], 3) ** -2.0), UNKNOWN, np.diag([*SIZE_SPREAD**-2.0, 1.0, 1.0, 1.0]))
     window = Reading(signal(skin, response, T), skin.noise / 1000, pads, np.ones(len(skin)), np.zeros(len(skin)), response.error)
-    found = solver.solve(window, prior, away, SIZE)
-    at_truth = solver.solve(window, prior, T, SIZES)
+    found = solver.solve(window, prior, away, UNKNOWN)
+    at_truth = solver.solve(window, prior, T, np.array([*SIZES, 0.0, 0.0, 0.0]))
     assert found.cost == pytest.approx(at_truth.cost, abs=0.2)
     assert np.abs(rigid.pose_error(T, found.T)[1:3]).max() < 0.001 + 0.1 * gap
 
@@ -183,17 +220,30 @@ def test_the_peak_of_a_quadratic_is_found_only_along_known_directions() -> None:
 
 
 def test_the_size_is_learnt_and_forgotten() -> None:
-    size = Size()
-    information = np.zeros((8, 8))
+    person, shoulder = Person(False, 0.1), (np.zeros(3), 0.01 * np.eye(3))
+    information, gradient = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
     information[7, 7] = 1e3
-    gradient = np.zeros(8)
     gradient[7] = 1e3 * 0.2  # the girth is larger by 0.2
-    size.learn(SIZE, information, gradient, np.eye(6))
-    assert size.mean[1] == pytest.approx(SIZE[1] + 0.2 * 1e3 / (1e3 + SIZE_SPREAD[1] ** -2), rel=1e-6)
-    assert size.mean[0] == SIZE[0] and size.strangeness > 1.5
-    size.predict(200.0)
-    np.testing.assert_allclose(size.mean, SIZE, atol=1e-3)
-    np.testing.assert_allclose(np.linalg.inv(size.information), np.diag(SIZE_SPREAD**2), rtol=1e-3)
+    person.learn(UNKNOWN, information, gradient, np.eye(6))
+    assert person.size[1] == pytest.approx(SIZE[1] + 0.2 * 1e3 / (1e3 + SIZE_SPREAD[1] ** -2), rel=1e-6)
+    assert person.size[0] == SIZE[0] and person.strangeness > 1.5
+    person.predict(200.0, shoulder)
+    np.testing.assert_allclose(person.size, SIZE, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.inv(person.information)[:2, :2], np.diag(SIZE_SPREAD**2), rtol=1e-3)
+
+
+def test_the_uncertainty_of_the_shoulder_is_in_that_of_the_pose() -> None:
+    rng = np.random.default_rng(4)
+    J = rng.standard_normal((30, UNKNOWNS))
+    information, gradient = J.T @ J, np.zeros(UNKNOWNS)
+    person, prior = Person(False, 0.1), np.diag([*SIZE_SPREAD**-2.0, *np.full(3, 0.01**-2)])
+    person.predict(1e9, (np.array([0.02, 0.0, 0.0]), 0.01**2 * np.eye(3)))
+    left, pull = person.marginalised(information, gradient, UNKNOWN)
+    whole = information.copy()
+    whole[6:, 6:] += prior
+    np.testing.assert_allclose(np.linalg.inv(left), np.linalg.inv(whole)[:6, :6], rtol=1e-6)
+    toward = np.linalg.solve(whole, np.concatenate([np.zeros(8), [0.02 / 0.01**2, 0.0, 0.0]]))
+    np.testing.assert_allclose(np.linalg.solve(left, pull), toward[:6], atol=1e-9)
 
 
 # ---- the estimator
@@ -249,7 +299,7 @@ def test_the_size_is_learnt_close_in_and_makes_the_height_sure_farther_away(
     near, far = rigid.transform([0, 0, 0.07]), rigid.transform([0, 0, 0.14])
     fresh, knowing = (estimator(skin, response, forearm, near) for _ in range(2))
     windows(knowing, skin, signal(skin, response, near), 50, seed=0)
-    assert knowing.size.mean[1] == pytest.approx(SIZES[1], abs=0.05)
+    assert knowing.person.size[1] == pytest.approx(SIZES[1], abs=0.05)
     up = np.array([0, 0, 1.0, 0, 0, 0])
 
     def sure(which: Estimator, begin: int) -> float:
@@ -293,10 +343,13 @@ def test_windows_in_which_nothing_is_felt_only_make_the_place_less_certain(
 
 def test_a_limb_that_comes_back_elsewhere_is_found_at_once(skin: Skin, response: Response, forearm: Surface) -> None:
     here, there = rigid.transform([0.05, -0.05, 0.10]), rigid.from_rpy((-0.05, 0.05, 0.12), (0, 0, 0.3))
-    which = estimator(skin, response, forearm, rigid.transform([0, 0, 0.2]))
-    windows(which, skin, signal(skin, response, here), 20, seed=4)
-    windows(which, skin, signal(skin, response, there), 4, seed=5, begin=20)
-    assert np.abs(rigid.pose_error(there, which.pose)[1:3]).max() < 0.015
+    errors = []
+    for seed in range(9):
+        which = estimator(skin, response, forearm, rigid.transform([0, 0, 0.2]))
+        windows(which, skin, signal(skin, response, here), 20, seed)
+        windows(which, skin, signal(skin, response, there), 4, seed + 100, begin=20)
+        errors.append(np.abs(rigid.pose_error(there, which.pose)[1:3]).max())
+    assert np.median(errors) < 0.015
 
 
 @pytest.mark.slow

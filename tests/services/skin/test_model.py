@@ -1,5 +1,6 @@
 """`penumbra skin model`: networks for pads, limbs and mountings that are new."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -33,6 +34,9 @@ def test_a_cell_with_another_limb_is_fitted_once_and_then_usable(tmp_path, few_l
     found = response.change(np.tile(T, (8, 1, 1)))
     np.testing.assert_allclose(found[:5], pad.change(limb(forearm_mesh(cell.body)), T), rtol=0.5)  # from 150 poses
     assert 0.0 < response.error[0] < 0.5
+    card = json.loads((tmp_path / FOLDER / "five-forearm.json").read_text())
+    with_person = sum(band["poses"] for band in card["rest_of_person"].values())
+    assert with_person > 10 and networks(cell)[card["fingerprint"]].bearer is not None
     capsys.readouterr()
     assert model.main(["--cell", str(path)]) == 0  # nothing is left to do
     assert "kept" in capsys.readouterr().out
