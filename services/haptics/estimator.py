@@ -273,10 +273,12 @@ class Estimator:
 
     def _compared(self, reading: Reading, solution: Solution, prior: Prior, rival: Place) -> Solution:
         """The solution at the track, found from this prior, or at the rival if that has become more probable. Only the voltages
-        count as evidence: the odds already contain the priors."""
+        count as evidence: the odds already contain the priors. The field model's error is nearly the same in several windows, so
+        each of them counts for its share only."""
         rival_prior = self._prior(rival)
         other = self._solve(reading, rival_prior, rival.T, coarse=0)
         evidence = other.cost - rival_prior.cost(other) - (solution.cost - prior.cost(solution))
+        evidence /= self.settings.error_lasts
         return other if self._track.weigh(self._place(reading, other, rival_prior), evidence) else solution
 
     def _look_elsewhere(self, reading: Reading, solution: Solution) -> None:
@@ -287,8 +289,7 @@ class Estimator:
         if not self._track.place.stands_for(rival, self.settings):
             # judge the track with the same freedom: from its pose, but with home's spread
             same = self._solver.solve(reading, home, solution.T, solution.body, 0, 2)
-            odds = self.settings.beside_odds + self._track.against(rival) + self._track.limited(other.cost - same.cost)
-            self._track.contest(rival, odds)
+            self._track.contest(rival, self.settings.beside_odds + self._track.limited(other.cost - same.cost))
 
     def _from_scratch(self, reading: Reading) -> Solution:
         """The best solution from the track and all starts, of which the most probable ones are solved; the second best at another

@@ -125,11 +125,15 @@ def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str
         shapes = shapes_of(cell, target, options.weights)
     except (FileNotFoundError, ValueError) as error:
         node.log.warning("no points of surfaces, and nothing touches", target=target, why=str(error))
+    response, posture = Response(cell, target), Posture.usual(cell, cell.targets[target])
+    if posture is not None and response.bearers is None:
+        why = "the field model has none: run `penumbra skin model` for this cell, which adds them"
+        node.log.warning("upper arm and torso are taken for a nearer limb", target=target, why=why)
     mesh = target_mesh(cell.targets[target], cell)
     spread = cell.targets[target].home_spread
     made = Estimator(
         Skin(cell),
-        Response(cell, target),
+        response,
         Surface(mesh.vertices, mesh.faces),
         cell.targets[target].home.transform,
         np.repeat([spread.position, spread.rotation], 3),
@@ -137,7 +141,7 @@ def estimator(node: ServiceNode, options: flags.Options, cell: Cell, target: str
         options.method,
         cell.targets[target].size is not None,
         shapes=shapes,
-        posture=Posture.usual(cell, cell.targets[target]),
+        posture=posture,
     )
     made.warm_up(sum(len(robot.joints) for robot in cell.robots.values()))
     return made

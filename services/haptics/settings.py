@@ -103,14 +103,8 @@ class HapticSettings:
     fifty to one a limb that has jumped is found too late."""
     odds_step: float = 2.0
     """Maximum change of the log odds by one window, so that a burst of noise does not decide. Chosen."""
-    odds_decided: float = 12.0
-    """Log odds above which the rival is dropped. Chosen with replays of `arm`: where two places explain the voltages equally
-    well, as along an arm whose upper arm goes on behind the elbow, noise alone reaches a thousand to one (7). Below zero the two
-    change places."""
-    told_odds: float = 4.0
-    """Maximum log odds that the fused pose adds against a rival that it contradicts, when that is found. Chosen likewise."""
-    rival_share: float = 0.1
-    """Minimum probability of the rival in the published covariance, as long as there is one. Chosen likewise."""
+    odds_decided: float = 7.0
+    """Log odds above which the rival is dropped: a thousand to one. Chosen. Below zero the two change places."""
     slides: tuple[float, ...] = (0.0, -0.08, 0.08, -0.16, 0.16, -0.24, 0.24)
     """Displacements along the limb [m] of the starts from scratch, from home. Chosen to cover a forearm: its thick and thin parts
     feel alike."""

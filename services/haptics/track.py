@@ -35,11 +35,6 @@ class Place:
         """The standard deviation [m] of the position along its worst direction."""
         return math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
-    def squared_distance(self, other: Place) -> float:
-        """Squared Mahalanobis distance between the positions of two places, by both covariances."""
-        offset = self.T[:3, 3] - other.T[:3, 3]
-        return float(offset @ np.linalg.solve((self.covariance + other.covariance)[:3, :3], offset))
-
     def is_apart(self, other: Place, settings: HapticSettings) -> bool:
         """Whether the distance between two places exceeds their covariances."""
         offset = self.T[:3, 3] - other.T[:3, 3]
@@ -90,7 +85,7 @@ class Home:
 
 class Track:
     """The tracked place, its rival (None if only one place is possible) and odds: the log odds of the place to the rival, never
-    negative; told: where the fused pose has the limb in this window, None without one."""
+    negative."""
 
     def __init__(self, home: Home, settings: HapticSettings):
         self._home, self._settings = home, settings
@@ -101,21 +96,20 @@ class Track:
         """Restart at home."""
         self.place, self.odds = self._home.place, 0.0
         self.rival: Place | None = None
-        self.told: Place | None = None
 
     def decay(self, elapsed_s: float) -> None:
-        """Decay both places over elapsed_s seconds in which nothing is felt, and forget what the fused pose told."""
-        self.told = None
+        """Decay both places over elapsed_s seconds in which nothing is felt."""
         self.place = self._home.decayed(self.place, elapsed_s)
         self.rival = None if self.rival is None else self._home.decayed(self.rival, elapsed_s)
 
     def expect(self, T: Array, covariance: Array) -> bool:
         """Move the track to a fused pose (4, 4) with covariance (6, 6) if that is known well (`expected_sigma`), or better than
         the track; the track then has no rival. Returns whether it is known well."""
-        is_sure = Place(T, covariance).sigma < self._settings.expected_sigma
-        self.told = Place(T, self._settings.expected_inflation**2 * covariance + self._floor)
-        if is_sure or self.told.sigma < self.place.sigma:
-            self.place, self.rival = self.told, None
+        settings = self._settings
+        is_sure = Place(T, covariance).sigma < settings.expected_sigma
+        expected = Place(T, settings.expected_inflation**2 * covariance + self._floor)
+        if is_sure or expected.sigma < self.place.sigma:
+            self.place, self.rival = expected, None
         return is_sure
 
     def contest(self, rival: Place, odds: float) -> None:
@@ -133,27 +127,17 @@ class Track:
         self.contest(rival, self.odds)
         return is_overtaken
 
-    def against(self, rival: Place) -> float:
-        """Log odds of the track to a rival by the fused pose of this window: none in favour of the rival, and no more than
-        `told_odds`, as the fused pose may follow the skin."""
-        if self.told is None:
-            return 0.0
-        ours, theirs = (place.squared_distance(self.told) for place in (self.place, rival))
-        return min(max(0.5 * (theirs - ours), 0.0), self._settings.told_odds)
-
     def limited(self, evidence: float) -> float:
         """The evidence of one window, limited to the maximum change by one window."""
         return min(max(evidence, -self._settings.odds_step), self._settings.odds_step)
 
     def mixed(self, information: Array, gradient: Array) -> tuple[Array, Array]:
         """Widen a likelihood at the track, as information (6, 6) and gradient (6,), to the mixture of the track and its rival.
-        The scatter between the two lasts until one of them is dropped, and counts the rival as probable to `rival_share` at
-        least: of places that explain the voltages equally well, noise prefers one."""
+        The scatter between the two lasts until one of them is dropped."""
         if self.rival is None:
             return information, gradient
         offset, share = pose_error(self.rival.T, self.place.T), 1.0 / (1.0 + np.exp(self.odds))
-        doubt = max(share, self._settings.rival_share)
-        mean, scatter = share * offset, doubt * (1.0 - doubt) * np.outer(offset, offset)
+        mean, scatter = share * offset, share * (1.0 - share) * np.outer(offset, offset)
         if scatter.any():
             keep = np.linalg.inv(np.eye(6) + self._settings.doubt_lasts * information @ scatter)
             gradient = keep @ (gradient + information @ mean)

@@ -177,7 +177,8 @@ class Target(Model):
     shoulder: Vector3 | None = Field(
         default=None,
         description="where the person's shoulder is in the world, if it stays there, as that of somebody seated [m]: a limb that "
-        "nothing measures stays within the arm's reach of it; for the mesh body:forearm",
+        "nothing measures stays within the arm's reach of it, and the skin expects upper arm and torso there; for the mesh "
+        "body:forearm",
     )
 
     @model_validator(mode="after")

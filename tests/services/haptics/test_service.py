@@ -19,7 +19,7 @@ from penumbra.shared.geometry import rigid
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 from penumbra.shared.skin.layout import Skin
-from penumbra.shared.skin.response import Response
+from penumbra.shared.skin.response import Response, networks
 from penumbra.sim.world.world import TICK_NS, Sensors, World
 from penumbra.tests.support.live import free_port, wait_for
 
@@ -288,3 +288,16 @@ def test_a_turned_pad_stands_out_by_its_misfit_in_the_health(table: cells.Cell, 
     told = node.report().report
     assert max(told, key=told.__getitem__) == "misfit/p1" and told["misfit/p1"] > 6.0
     assert np.abs(rigid.pose_error(T, which.pose)[:3]).max() < 0.01
+
+
+@pytest.mark.parametrize("is_fitted", [True, False])
+def test_a_field_model_without_the_rest_of_the_person_is_reported(
+    table: cells.Cell, monkeypatch: pytest.MonkeyPatch, is_fitted: bool
+) -> None:
+    without = {own: replace(network, bearer=None) for own, network in networks(table).items()}
+    if not is_fitted:
+        monkeypatch.setattr(service, "Response", lambda cell, target: Response(cell, target, without))
+    told: list[str] = []
+    node = SimpleNamespace(log=SimpleNamespace(warning=lambda what, **values: told.append(values["why"])))
+    service.estimator(node, SimpleNamespace(**OPTIONS), table, "forearm")
+    assert is_fitted == (not told) and all("penumbra skin model" in why for why in told)
