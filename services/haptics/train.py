@@ -26,6 +26,7 @@ from penumbra.services.haptics.estimator import Estimator
 from penumbra.services.haptics.paper_network import PoseNetwork, Regression, Relative, features, fingerprint
 from penumbra.shared import training
 from penumbra.shared.body.anatomy import SIZE, SIZE_SPREAD, target_mesh
+from penumbra.shared.body.posture import Posture
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry.rigid import Array, from_rpy, pose_error
@@ -67,7 +68,7 @@ BANDS = (0.0, 0.04, 0.075, 0.125, 0.175)
 
 class Scenes:
     """Random scenes of a cell. home (4, 4), spread (6,): the training's Gaussian; expected: home and spread of the target in the
-    cell. Raises CellError if the cell has no `sim` section."""
+    cell; posture: where the rest of the person usually is. Raises CellError if the cell has no `sim` section."""
 
     def __init__(self, cell: cells.Cell, target: str):
         if cell.sim is None:
@@ -82,6 +83,7 @@ class Scenes:
         self.expected = cell.targets[target].home.transform, np.repeat([spread.position, spread.rotation], 3)
         mesh = target_mesh(cell.targets[target], cell)
         self.surface, self.response = Surface(mesh.vertices, mesh.faces), Response(cell, target)
+        self.posture = Posture.usual(cell, cell.targets[target])
         self.models = robot_models(cell)
 
     def draw(self, rng: np.random.Generator, count: int, motion: bool = False) -> dict[str, Any]:
@@ -136,12 +138,22 @@ class Scenes:
         _gaps(electrodes, normals_out, T, np.exp(size), *self.surface.arrays, gap, ahead)
         T_pads_target = np.linalg.inv(pads) @ T[:, None]
         change = np.stack([self.response.change(each, own) for each, own in zip(T_pads_target, size, strict=True)])
+        change *= np.exp(self._person(rng, pads, T, np.log(change)))
         signal = skin.gain * skin.sensitivity * change * (1.0 + self.response.error * rng.standard_normal(change.shape))
         amplitude = skin.a3 + skin.polarity * signal + np.sqrt(skin.noise / SAMPLES) * rng.standard_normal(change.shape)
         alive = rng.uniform(size=(count, len(skin.pads))) >= DEAD
         free = (gap > CLOSEST) & ahead
         scene = {"T": T, "size": size, "joints": joints, "pads": pads, "gap": gap, "amplitude": amplitude, "alive": alive}
         return {name: value[free] for name, value in scene.items()}
+
+    def _person(self, rng: np.random.Generator, pads: Array, T: Array, own: Array) -> Array:
+        """What people behind the limbs (count, 4, 4) add to the logs (count, n) of their changes, with shoulders as the estimator
+        expects them."""
+        if self.posture is None:
+            return np.zeros_like(own)
+        shoulder = self.posture.shoulder + self.posture.spread * rng.standard_normal((len(T), 3))
+        parts = [T, *replace(self.posture, shoulder=shoulder).poses(T)]
+        return np.stack([self.response.person(pads[k], [part[k] for part in parts], own[k]) for k in range(len(T))])
 
 
 @kernel("""f8[s, n, 3], f8[s, n, 3], f8[s, 4, 4], f8[s, 2], f8[m, 3, 3], f8[3, m], f8[m], f8[m, 7, 3], out f8[s], out b1[s]""")
@@ -252,7 +264,8 @@ def evaluate(scenes: Scenes, network: PoseNetwork, seed: int, count: int = 4000)
     samples = np.full(len(scenes.skin), SAMPLES)
     scene = scenes.draw(np.random.default_rng(seed), count, motion=True)
     for method in ("paper", "solve"):
-        estimator = Estimator(scenes.skin, scenes.response, scenes.surface, home, spread, network, method)
+        given = scenes.skin, scenes.response, scenes.surface, home, spread, network, method
+        estimator = Estimator(*given, posture=scenes.posture)
         rows = []
         for i in range(count):
             estimator.reset()
