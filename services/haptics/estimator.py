@@ -1,17 +1,17 @@
 """Estimates one limb pose per window of voltages, from all pads together.
 
 Each window is estimated from its own samples, and its likelihood is published. Earlier windows only set where the solve starts
-and its prior, and the slowly changing states (`size.py`, `drift.py`). The steps of a window:
+and its prior, and the slowly changing states (`person.py`, `drift.py`). The steps of a window:
 
 1. predict: the track decays to its home (`track.py`), or moves to a fused pose that is known well, or better than the track
-2. solve from there (`solve.py`), with the learned size of the limb as a prior; where nothing is felt, the track stays
+2. solve from there (`solve.py`), with the learned size and shoulder as a prior; where nothing is felt, the track stays
 3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from the likeliest of `starts.py`
 4. far from the pads, thick and thin parts of a limb feel alike: another possible place, from scratch or found beside the
    track, is kept as its rival and solved as well, until the windows have decided between the two
-5. learn the trust in each pad (`trust.py`), the limb's size close to the pads, and the drift of the electrodes while nothing is
-   near or a camera sees the limb
+5. learn the trust in each pad (`trust.py`), the limb's size close to the pads, and while nothing is near or a camera sees the
+   limb the drift of the electrodes and where the shoulder is
 6. add up the evidence on whether the object that is felt is a limb (`identity.py`)
-7. publish the likelihood: size and roll marginalised, the errors of model and drift counted as nearly the same in several
+7. publish the likelihood: body and roll marginalised, the errors of model and drift counted as nearly the same in several
    windows; if there is a rival, the likelihood of the mixture of the two
 8. independently of the pose: the nearest surface point before each pad (`surface_points.py`), and contact (`contact.py`)
 
@@ -371,7 +371,7 @@ class Estimator:
         return Seen(solution.signal, error, slopes, toward, expected.covariance, solution.T[:3, 3])
 
     def _pose_likelihood(self, reading: Reading, solution: Solution) -> tuple[Array, Array]:
-        """Information (6, 6) and gradient (6,) of the pose from the voltages alone, with the size marginalised."""
+        """Information (6, 6) and gradient (6,) of the pose from the voltages alone, with the body marginalised."""
         likelihood = self._solver.likelihood(reading, solution, self.settings.error_lasts)
         return self.person.marginalised(*likelihood, solution.body, self.settings.size_lasts)
 

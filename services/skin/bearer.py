@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from rich.progress import Progress
 
+from penumbra.services.skin import fitting
 from penumbra.shared.body.anatomy import Mesh, torso_mesh, upper_arm_mesh
 from penumbra.shared.body.posture import frame
 from penumbra.shared.cell import description as cells
@@ -138,43 +139,23 @@ def pieces(body: cells.Body) -> Array:
 
 
 def fit(data: Solved, points: Array, seed: int, steps: int) -> Bearer:
-    """Train a network of the ratio's logarithm, robust against the few poses that it cannot fit."""
+    """Train a network of the ratio's logarithm."""
     torch.manual_seed(seed)
     rng = np.random.default_rng([seed, 46])
     own = inputs(points, data.T, data.own)
     mean, scale = own.mean(axis=0), own.std(axis=0) + 1e-9
-    x, y = (torch.from_numpy(each.astype(np.float32)) for each in ((own - mean) / scale, data.ratio))
-    layers = [torch.nn.Linear(x.shape[1], HIDDEN), torch.nn.Linear(HIDDEN, HIDDEN), torch.nn.Linear(HIDDEN, y.shape[1])]
+    layers = [
+        torch.nn.Linear(own.shape[1], HIDDEN),
+        torch.nn.Linear(HIDDEN, HIDDEN),
+        torch.nn.Linear(HIDDEN, data.ratio.shape[1]),
+    ]
     model = torch.nn.Sequential(layers[0], torch.nn.Tanh(), layers[1], torch.nn.Tanh(), layers[2])
-    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3, weight_decay=0.05)
-    for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = 4e-3 * min(1.0, (step + 1) / 300) * (0.5 * (1.0 + np.cos(np.pi * step / steps)) + 5e-4)
-        rows = torch.from_numpy(rng.integers(0, len(x), BATCH))
-        error = model(x[rows]) - y[rows]
-        loss = (torch.sqrt(error * error + 0.02**2) - 0.02).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    with torch.no_grad():
-        weights = tuple(layer.weight.numpy().astype(float) for layer in layers)
-        biases = tuple(layer.bias.numpy().astype(float) for layer in layers)
-    return Bearer(points, mean, scale, weights, biases)
+    fitting.learn(model, (own - mean) / scale, data.ratio, rng, steps, BATCH, rate=4e-3, decay=0.05)
+    return Bearer(points, mean, scale, *fitting.parameters(layers))
 
 
 def score(bearer: Bearer, data: Solved) -> dict[str, dict[str, float]]:
     """Median and 95th percentile of the error of the whole person's signals [%], and of what leaving the rest of the person out
     would be, per band of the gap [cm]."""
-    found, out = 100.0 * np.abs(np.expm1(bearer.logs(data.T, data.own) - data.ratio)), {}
-    without = 100.0 * np.abs(np.expm1(-data.ratio))
-    for low, high in itertools.pairwise(BANDS):
-        own = (data.gap >= low) & (data.gap < high)
-        if own.any():
-            out[f"{100 * low:g}-{100 * high:g} cm"] = {
-                "poses": int(own.sum()),
-                "median_percent": round(float(np.median(found[own])), 3),
-                "p95_percent": round(float(np.percentile(found[own], 95)), 3),
-                "left_out_median_percent": round(float(np.median(without[own])), 3),
-                "left_out_p95_percent": round(float(np.percentile(without[own], 95)), 3),
-            }
-    return out
+    found = 100.0 * np.abs(np.expm1(bearer.logs(data.T, data.own) - data.ratio))
+    return fitting.score(data.gap, BANDS, {"": found, "left_out_": 100.0 * np.abs(np.expm1(-data.ratio))})

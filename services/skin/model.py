@@ -3,12 +3,11 @@
 For every mounting in a cell (a pad type, and for a backed pad its robot link) the field is solved for limbs of random size at
 random poses, from contact to where nothing is felt, and a network learns the logarithms. Mountings that already have a network
 are left alone. The network of a bare pad is trained from scratch; for a pad before a link only the difference from the bare one
-is trained, which needs fewer poses.
+is trained, which needs fewer poses. Beside each, a network for the rest of the person (`bearer.py`), if it has none.
 """
 
 from __future__ import annotations
 
-import itertools
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull
 
 from penumbra.services import flags
-from penumbra.services.skin import bearer
+from penumbra.services.skin import bearer, fitting
 from penumbra.shared.body.anatomy import Mesh, target_mesh
 from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
@@ -267,8 +266,8 @@ class _Fit(torch.nn.Module):
 def fit(
     points: Array, data: Solved, seed: int, steps: int, start: Network | None = None, progress: Progress | None = None
 ) -> Network:
-    """Train a network of the changes' logarithms, robust against the few poses that it cannot fit. With a start, only the
-    difference from it is trained, by a small network beside it."""
+    """Train a network of the changes' logarithms. With a start, only the difference from it is trained, by a small network
+    beside it."""
     torch.manual_seed(seed)
     rng = np.random.default_rng([seed, 43])
     usable = (data.change > FAINTEST).all(axis=1)
@@ -277,30 +276,12 @@ def fit(
     if start is not None:
         wanted -= np.log(predict(start, data))
     mean, scale = (start.mean, start.scale) if start else (inputs.mean(axis=0), inputs.std(axis=0) + 1e-9)
-    x = torch.from_numpy(((inputs - mean) / scale).astype(np.float32))
-    y = torch.from_numpy(wanted.astype(np.float32))
-    model = _Fit(y.shape[1], HIDDEN if start is None else HIDDEN_BACKED)
+    model = _Fit(wanted.shape[1], HIDDEN if start is None else HIDDEN_BACKED)
     with torch.no_grad():
-        model.last.bias.copy_(y.mean(dim=0))
-    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3, weight_decay=0.0 if start is None else 0.1)
-    task = progress.add_task("network", total=steps) if progress else None
-    for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = 2e-3 * min(1.0, (step + 1) / 300) * (0.5 * (1.0 + np.cos(np.pi * step / steps)) + 5e-4)
-        rows = torch.from_numpy(rng.integers(0, len(x), BATCH))
-        error = model(x[rows]) - y[rows]
-        loss = (torch.sqrt(error * error + 0.02**2) - 0.02).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        if progress and task is not None and step % 100 == 0:
-            progress.update(task, completed=step, description=f"network, error {error.abs().median().item():.4f}")
-    if progress and task is not None:
-        progress.remove_task(task)
-    with torch.no_grad():
-        weights = tuple(layer.weight.numpy().astype(float) for layer in model.layers)
-        biases = tuple(layer.bias.numpy().astype(float) for layer in model.layers)
-        network = Network(points, mean, scale, weights, biases, model.skip.weight.numpy().astype(float))  # type: ignore[arg-type]
+        model.last.bias.copy_(torch.from_numpy(wanted.astype(np.float32)).mean(dim=0))
+    fitting.learn(model, (inputs - mean) / scale, wanted, rng, steps, BATCH, 2e-3, 0.0 if start is None else 0.1, progress)
+    weights, biases = fitting.parameters(model.layers)
+    network = Network(points, mean, scale, weights, biases, model.skip.weight.detach().numpy().astype(float))  # type: ignore[arg-type]
     return network if start is None else beside(start, network)
 
 
@@ -330,17 +311,7 @@ def error(network: Network, data: Solved) -> float:
 
 def score(network: Network, data: Solved) -> dict[str, dict[str, float]]:
     """Median and 95th percentile of the relative error of all electrodes [%] per band of the gap [cm]."""
-    error = 100.0 * np.abs(predict(network, data) / data.change - 1.0)
-    out = {}
-    for low, high in itertools.pairwise(BANDS):
-        own = error[(data.gap >= low) & (data.gap < high)]
-        if len(own):
-            out[f"{100 * low:g}-{100 * high:g} cm"] = {
-                "poses": len(own),
-                "median_percent": round(float(np.median(own)), 3),
-                "p95_percent": round(float(np.percentile(own, 95)), 3),
-            }
-    return out
+    return fitting.score(data.gap, BANDS, {"": 100.0 * np.abs(predict(network, data) / data.change - 1.0)})
 
 
 @flags.command(
