@@ -136,9 +136,8 @@ class Scenes:
         gap, ahead = np.empty(count), np.empty(count, np.bool_)
         electrodes, normals_out = np.ascontiguousarray(electrodes), np.ascontiguousarray(frames[..., :3, 2])
         _gaps(electrodes, normals_out, T, np.exp(size), *self.surface.arrays, gap, ahead)
-        T_pads_target = np.linalg.inv(pads) @ T[:, None]
-        change = np.stack([self.response.change(each, own) for each, own in zip(T_pads_target, size, strict=True)])
-        change *= np.exp(self._person(rng, pads, T, np.log(change)))
+        parts = np.stack([T, *self._rest_of_person(rng, T)], axis=1)
+        change = np.stack([self.response.person(*scene) for scene in zip(pads, parts, size, strict=True)])
         signal = skin.gain * skin.sensitivity * change * (1.0 + self.response.error * rng.standard_normal(change.shape))
         amplitude = skin.a3 + skin.polarity * signal + np.sqrt(skin.noise / SAMPLES) * rng.standard_normal(change.shape)
         alive = rng.uniform(size=(count, len(skin.pads))) >= DEAD
@@ -146,14 +145,12 @@ class Scenes:
         scene = {"T": T, "size": size, "joints": joints, "pads": pads, "gap": gap, "amplitude": amplitude, "alive": alive}
         return {name: value[free] for name, value in scene.items()}
 
-    def _person(self, rng: np.random.Generator, pads: Array, T: Array, own: Array) -> Array:
-        """What people behind the limbs (count, 4, 4) add to the logs (count, n) of their changes, with shoulders as the estimator
-        expects them."""
+    def _rest_of_person(self, rng: np.random.Generator, T: Array) -> list[Array]:
+        """Poses (count, 4, 4) of upper arm and torso behind limbs (count, 4, 4), with shoulders as the estimator expects them."""
         if self.posture is None:
-            return np.zeros_like(own)
+            return []
         shoulder = self.posture.shoulder + self.posture.spread * rng.standard_normal((len(T), 3))
-        parts = [T, *replace(self.posture, shoulder=shoulder).poses(T)]
-        return np.stack([self.response.person(pads[k], [part[k] for part in parts], own[k]) for k in range(len(T))])
+        return replace(self.posture, shoulder=shoulder).poses(T)
 
 
 @kernel("""f8[s, n, 3], f8[s, n, 3], f8[s, 4, 4], f8[s, 2], f8[m, 3, 3], f8[3, m], f8[m], f8[m, 7, 3], out f8[s], out b1[s]""")

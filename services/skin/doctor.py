@@ -23,7 +23,7 @@ from penumbra.shared.body.robot import robot_models
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import report, topics
 from penumbra.shared.contract.messages import FusedPose, Joints, Voltages
-from penumbra.shared.geometry.rigid import Array, inverse, transform
+from penumbra.shared.geometry.rigid import Array, transform
 from penumbra.shared.runtime import bus
 from penumbra.shared.runtime.node import Node
 from penumbra.shared.skin.faults import MENDS, MISFIT, Fault, Look, Watch, likely
@@ -118,11 +118,8 @@ class Examination:
         T_world_target = transform(pose.position, pose.orientation)
         own = self.skin.of(self.skin.pads.index(name))
         angles = np.concatenate([np.empty(0), *(known.position for known in joints.values() if known)])
-        change = self._response.change(np.stack([inverse(T) for T in T_world_pads]) @ T_world_target)
-        if self._posture is not None:
-            parts = [T_world_target, *self._posture.poses(T_world_target)]
-            change *= np.exp(self._response.person(T_world_pads, parts, np.log(change)))
-        change += self._response.rest(angles)
+        parts = [T_world_target, *(self._posture.poses(T_world_target) if self._posture else [])]
+        change = self._response.person(T_world_pads, parts) + self._response.rest(angles)
         predicted = self.skin.signal(self.skin.amplitude(change))[own]
         measured = self.skin.polarity[own] * (volts.mean(axis=0) - self.skin.a3[own])
         gap = np.sqrt(max(self.skin.peak[own].max() / max(predicted.max(), 1e-6) - 1.0, 1.0) / self.skin.a2[own].max())

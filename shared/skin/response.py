@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from penumbra.shared.body import urdf
 from penumbra.shared.cell import description as cells
-from penumbra.shared.geometry.rigid import Array, inverse
+from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
 from penumbra.shared.skin.bearer import Bearer, Bearers
 
@@ -173,14 +173,14 @@ class Response:
         values(*self.arrays, np.ascontiguousarray(T_pads_target), self.size + size, out)
         return np.exp(out)
 
-    def person(self, T_world_pads: Array, T_world_parts: Sequence[Array], own: Array) -> Array:
-        """Logarithms (n,) of the factors by which the rest of the person changes the limb's own changes; own (n,): the logarithms
-        of these [fF]. T_world_pads (p, 4, 4); T_world_parts (4, 4) of limb, upper arm and torso. Zero where it was not fitted,
-        as for a limb that is not the parametric forearm."""
-        if self.bearers is None:
-            return np.zeros(len(own))
-        T_pads_world = np.stack([inverse(T) for T in T_world_pads])
-        return self.bearers.logs(T_pads_world[:, None] @ np.stack(T_world_parts), own)
+    def person(self, T_world_pads: Array, T_world_parts: Sequence[Array] | Array, size: ArrayLike = (0.0, 0.0)) -> Array:
+        """Changes (n,) [fF] by a limb with its person. T_world_pads (p, 4, 4); T_world_parts (4, 4): the limb, and upper arm and
+        torso if it has them, which count where they were fitted; size: as for `change`."""
+        T_pads_parts: Array = np.linalg.inv(T_world_pads)[:, None] @ np.stack(tuple(T_world_parts))
+        change = self.change(T_pads_parts[:, 0], size)
+        if self.bearers is None or len(T_world_parts) == 1:
+            return change
+        return np.asarray(change * np.exp(self.bearers.logs(T_pads_parts, np.log(change))))
 
     def rest(self, joints: ArrayLike) -> Array:
         """Changes (n,) [fF] due to the robot's other links, also without a limb, at all joint angles (j,) of the cell."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from penumbra.shared.cell import description as cells
-from penumbra.shared.geometry.rigid import Array, inverse
+from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.skin.layout import Skin
 from penumbra.shared.skin.response import Response
 
@@ -28,10 +28,7 @@ class SkinModel:
     def person(self, T_world_pads: Array, T_world_parts: Sequence[Array]) -> Array:
         """Changes of capacitance (n,) [fF] by the target's person, for pads (p, 4, 4). T_world_parts (4, 4): the target, and the
         upper arm and torso if it has them."""
-        change = self._response.change(np.stack([inverse(T) for T in T_world_pads]) @ T_world_parts[0])
-        if len(T_world_parts) == 1:
-            return change
-        return change * np.exp(self._response.person(T_world_pads, T_world_parts, np.log(change)))
+        return self._response.person(T_world_pads, T_world_parts)
 
     def rest(self, joints: ArrayLike) -> Array:
         """Changes (n,) [fF] by the robots at all their joint angles (j,)."""

@@ -26,8 +26,10 @@ from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.labels import Label
 from penumbra.shared.geometry import rigid
 from penumbra.shared.geometry.surface import Surface
-from penumbra.shared.skin.response import Response, networks
+from penumbra.shared.skin.response import networks
 from penumbra.sim.skin.field import Body, PadField, limb, shell
+from penumbra.sim.skin.pads import SkinModel
+from penumbra.sim.world.person import Person
 from penumbra.tests.bench.lib import left_out, results
 from penumbra.tests.bench.lib.results import Part, Result, marked
 
@@ -144,7 +146,7 @@ def bodies(cell: cells.Cell, pad: PadField) -> dict[str, dict[int, list[float]]]
 def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
     """The networks of a cell beside the boundary elements: relative errors by gap, and time."""
     target, aim = next(iter(cell.targets.items()))
-    mesh, known, response = target_mesh(aim, cell), networks(cell), Response(cell, target)
+    mesh, known = target_mesh(aim, cell), networks(cell)
     errors: dict[float, list[Array]] = {gap: [] for gap in GAPS_CM}
     mountings = model.mountings(cell, target)
     limbs: dict[Any, Any] = {}
@@ -155,13 +157,15 @@ def live(cell: cells.Cell, seed: int, poses: int) -> dict[str, Any]:
         for k, gap in enumerate(GAPS_CM):
             errors[gap].append(relative[k :: len(GAPS_CM)].ravel())
     pooled = {gap: np.concatenate(parts) for gap, parts in errors.items()}
-    T = np.tile(rigid.from_rpy((0.0, 0.0, 0.12), (0.1, 0.2, 0.3)), (len(cell.pads), 1, 1))
-    response.change(T)
+    assert cell.sim is not None, f"cell {cell.name}: expected a `sim` section"
+    skin, person = SkinModel(cell, target), Person(cell, cell.sim, aim)
+    T, pads = rigid.from_rpy((0.0, 0.0, 0.12), (0.1, 0.2, 0.3)), np.tile(np.eye(4), (len(cell.pads), 1, 1))
+    skin.person(pads, person.poses(T))
     blocks = []
     for _ in range(9):
         began = time.process_time()
         for _ in range(300):
-            response.change(T)
+            skin.person(pads, person.poses(T))
         blocks.append((time.process_time() - began) / 300)
     return {
         "pads": len(cell.pads),

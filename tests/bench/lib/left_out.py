@@ -60,8 +60,8 @@ def measure(cell: cells.Cell, seed: int, progress: Progress) -> list[dict[str, A
                 body = Body(Panels(np.concatenate(parts[:count])))
                 found = [bare.change(body, rigid.inverse(pad) @ T) / usual[own] - 1.0 for own, pad in pads.items()]
                 shares.setdefault((name, gap), []).extend(found)
-            own = np.log(np.concatenate(list(usual.values())))
-            known = np.exp(response.person(np.stack(list(pads.values())), person.poses(T), own))
+            parts, placed = person.poses(T), np.stack(list(pads.values()))
+            known = response.person(placed, parts) / response.person(placed, parts[:1])
             shares.setdefault((LEFT, gap), []).append((1.0 + np.concatenate(found)) / known - 1.0)
             for name, field in zip(BOARDS, boards, strict=True):
                 found = [field.change(alone, rigid.inverse(pads[PAD]) @ T) / usual[PAD] - 1.0]

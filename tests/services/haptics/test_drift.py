@@ -57,10 +57,8 @@ class Bench:
 
     def limb(self, T: Array, size: Array = SIZE) -> Array:
         """Signals (n,) [V] of a limb and its person."""
-        change = self.response.change(np.stack([rigid.inverse(pad) for pad in self.pads]) @ T, size)
-        if self.person is not None:
-            change *= np.exp(self.response.person(self.pads, [T, *self.person.poses(T)], np.log(change)))
-        return self.skin.gain * self.skin.sensitivity * change
+        parts = [T, *(self.person.poses(T) if self.person else [])]
+        return self.skin.gain * self.skin.sensitivity * self.response.person(self.pads, parts, size)
 
     def window(self, signal: Array, seen: Array | None = None) -> None:
         """A window, with the pose that a camera has just seen."""

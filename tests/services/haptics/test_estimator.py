@@ -83,10 +83,8 @@ def gaps(skin: Skin, surface: Surface, T: np.ndarray) -> np.ndarray:
 
 def signal(skin: Skin, response: Response, T: np.ndarray, size: np.ndarray = SIZES, posture: Posture | None = None) -> np.ndarray:
     """Noise-free signals (n,) [V] of a limb, and of the person behind it."""
-    change = response.change(np.stack([rigid.inverse(pad) for pad in skin.T_world_pads()]) @ T, size)
-    if posture is not None:
-        change *= np.exp(response.person(skin.T_world_pads(), [T, *posture.poses(T)], np.log(change)))
-    return skin.gain * skin.sensitivity * change
+    parts = [T, *(posture.poses(T) if posture else [])]
+    return skin.gain * skin.sensitivity * response.person(skin.T_world_pads(), parts, size)
 
 
 def moved(posture: Posture, offset: np.ndarray) -> Posture:
