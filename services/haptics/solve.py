@@ -106,7 +106,7 @@ class Reading:
 @dataclass(frozen=True)
 class Point:
     """Linearisation point: T_world_target (4, 4), body (5,), the log signals (n,) [V] there and their derivatives (n, 11) by pose
-    and body, and the error (n,) of field model and gain, as a share of the signal."""
+    and body, and the error (n,) of field model and gain where the solve began, as a share of the signal."""
 
     T: Array
     body: Array
