@@ -44,8 +44,9 @@ OUTLIER = 3.0
 """Residual, in standard deviations, above which an electrode's weight falls as its square."""
 FARTHEST_STEP = (0.06, 0.5, 0.25, 0.1)
 """Maximum step: position [m], rotation [rad], log size, shoulder [m]."""
-NUDGE = (1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4)
-"""Steps of the derivatives of what upper arm and torso add: position [m], rotation [rad], log size, shoulder [m]."""
+NUDGE = (1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 0.0, 0.0, 1e-4, 1e-4, 1e-4)
+"""Steps of the derivatives of where upper arm and torso are: position [m], rotation [rad], shoulder [m]. The limb's size moves
+neither."""
 FAINT = 0.1
 """Signal, in standard deviations of the noise, below which these derivatives are left out: they change nothing there."""
 SAME_SLOPE = 0.3
@@ -292,37 +293,45 @@ def _predict(network, bearers, pads, variance, T, body, has_rows, logs, rows, ad
 def _add_bearer(index, bearers, scale, T_world_pads, variance, T, body, has_rows, logs, rows, added):  # type: ignore[no-untyped-def]
     """Adds what upper arm and torso add to the logs (n,) of the limb's own changes, and with has_rows to their derivatives."""
     posture, networks = bearers
-    size = len(logs) // len(index)
-    units = networks[4].shape[1]
-    x, first, second = np.empty(networks[1].shape[1]), np.empty(units), np.empty(units)
-    step, there, other = np.zeros(UNKNOWNS), np.empty(size), np.empty(size)
-    parts, nudged, before = np.empty((3, 4, 4)), np.empty((UNKNOWNS, 3, 4, 4)), np.zeros((3, 4, 4))
-    T_there, body_there = np.empty((4, 4)), np.empty(BODY)
+    size, units = len(logs) // len(index), networks[5].shape[1]
+    x, sums = np.empty(networks[1].shape[1]), np.empty((2, 4))
+    change, slopes = np.empty(len(x)), np.empty((size, len(x)))
+    first, second = np.empty(units, np.float32), np.empty(units, np.float32)
+    parts, moved, before = np.empty((3, 4, 4)), np.empty((UNKNOWNS, 3, 4, 4)), np.zeros((3, 4, 4))
+    step, T_there, body_there = np.zeros(UNKNOWNS), np.empty((4, 4)), np.empty(BODY)
     _behind(posture, T, body, parts)
     if has_rows:
         for k in range(UNKNOWNS):
             step[k] = NUDGE[k]
             _move(T, body, step, T_there, body_there)
-            _behind(posture, T_there, body_there, nudged[k])
+            _behind(posture, T_there, body_there, moved[k])
             step[k] = 0.0
     for p in range(len(index)):
         own, out = logs[p * size : (p + 1) * size], added[p * size : (p + 1) * size]
         for part in range(3):
             _seen_from(T_world_pads[p], parts[part], before[part])
-        bearer.factors(networks, index[p], before, own, x, first, second, out)
+        bearer.described(networks[0], before, own, sums, x)
+        bearer.factors(networks, index[p], x, first, second, out)
         is_felt = False
         for e in range(size):
             predicted = math.exp(own[e] + out[e] + scale[p * size + e])
             is_felt |= predicted * predicted > FAINT * FAINT * variance[p * size + e]
         if has_rows and is_felt:
+            by = rows[p * size : (p + 1) * size]
+            bearer.slopes(networks, index[p], first, second, slopes)
             for k in range(UNKNOWNS):
-                for part in range(3):
-                    _seen_from(T_world_pads[p], nudged[k, part], before[part])
+                change[:] = 0.0
+                if NUDGE[k] > 0.0:
+                    for part in range(3):
+                        _seen_from(T_world_pads[p], moved[k, part], before[part])
+                    bearer.described(networks[0], before, own, sums, change)
+                    for i in range(size, len(x)):
+                        change[i] = (change[i] - x[i]) / NUDGE[k]
                 for e in range(size):
-                    there[e] = own[e] + rows[p * size + e, k] * NUDGE[k]
-                bearer.factors(networks, index[p], before, there, x, first, second, other)
-                for e in range(size):
-                    rows[p * size + e, k] += (other[e] - out[e]) / NUDGE[k]
+                    change[e] = by[e, k]
+                for i in range(len(x)):
+                    for e in range(size):
+                        by[e, k] += slopes[e, i] * change[i]
         for e in range(size):
             own[e] += out[e]
 

@@ -27,6 +27,7 @@ from penumbra.shared.body import urdf
 from penumbra.shared.cell import description as cells
 from penumbra.shared.geometry.rigid import Array
 from penumbra.shared.native import inner, kernel
+from penumbra.shared.skin import layers
 from penumbra.shared.skin.bearer import Bearer, Bearers
 
 FOLDER = "skin"
@@ -476,57 +477,10 @@ def _features(points, ends, R, t, size, out):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _tanh(x):  # type: ignore[no-untyped-def]
-    """tanh in single precision to a few units in the last place, of numbers and without a call, so that it runs on vectors: the
-    rational approximation that Eigen uses (`generic_fast_tanh_float`)."""
-    x = min(max(x, np.float32(-7.905311)), np.float32(7.905311))
-    square = x * x
-    top = np.float32(-2.7607684e-16) * square + np.float32(2.0001879e-13)
-    top = top * square + np.float32(-8.604672e-11)
-    top = top * square + np.float32(5.1222973e-08)
-    top = top * square + np.float32(1.4857224e-05)
-    top = top * square + np.float32(6.3726195e-04)
-    top = top * square + np.float32(4.8935246e-03)
-    bottom = np.float32(1.1982584e-06) * square + np.float32(1.1853471e-04)
-    bottom = bottom * square + np.float32(2.2684346e-03)
-    bottom = bottom * square + np.float32(4.8935253e-03)
-    return x * top / bottom
-
-
-@inner
-def _layer(weights, bias, x, is_bent, out):  # type: ignore[no-untyped-def]
-    """A layer's output (n,), bias + x weights, through tanh where is_bent, for an input (m,) and weights (m, n), four rows of
-    them at a time. All in single precision, as the weights were learnt."""
-    for j in range(len(out)):
-        out[j] = bias[j]
-    m = len(x)
-    for i in range(0, m - m % 4, 4):
-        x0, x1, x2, x3 = x[i], x[i + 1], x[i + 2], x[i + 3]
-        w0, w1, w2, w3 = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
-        for j in range(len(out)):
-            out[j] += x0 * w0[j] + x1 * w1[j] + x2 * w2[j] + x3 * w3[j]
-    for i in range(m - m % 4, m):
-        for j in range(len(out)):
-            out[j] += x[i] * weights[i, j]
-    if is_bent:
-        for j in range(len(out)):
-            out[j] = _tanh(out[j])
-
-
-@inner(fastmath=True)
-def _dot(a, b):  # type: ignore[no-untyped-def]
-    """The scalar product of two vectors (n,)."""
-    total = np.float32(0.0)
-    for i in range(len(a)):
-        total += a[i] * b[i]
-    return total
-
-
-@inner
 def _outputs(last, bias, skip, second, x, out):  # type: ignore[no-untyped-def]
     """The network's output (e,): last (e, n) on its second layer (n,), skip (e, FEATURES) on its input."""
     for i in range(len(out)):
-        out[i] = _dot(last[i], second) + bias[i] + _dot(skip[i], x)
+        out[i] = layers.dot(last[i], second) + bias[i] + layers.dot(skip[i], x)
 
 
 ARRAYS = """i8[p], f4[m, 7, k], f8[m, 2], f8[m, 36], f8[m, 36],
@@ -546,8 +500,8 @@ def values(index, points, ends, mean, scale, w0, b0, w1, b1, w2, b2, skip, T, si
         _described(points[m], ends[m], T[p, :3, :3], T[p, :3, 3], size, False, sums, exact, nothing)
         for i in range(FEATURES):
             x[i] = (exact[i] - mean[m, i]) / scale[m, i]
-        _layer(w0[m], b0[m], x, True, first)
-        _layer(w1[m], b1[m], first, True, second)
+        layers.bent(w0[m], b0[m], x, first)
+        layers.bent(w1[m], b1[m], first, second)
         _outputs(w2[m], b2[m], skip[m], second, x, out[p * e : (p + 1) * e])
 
 
@@ -557,26 +511,20 @@ def derivatives(index, points, ends, mean, scale, w0, b0, w1, b1, w2, b2, skip, 
     e = skip.shape[1]
     exact, x, by = np.empty(FEATURES), np.empty(FEATURES, np.float32), np.empty((FEATURES, SLOPES))
     first, second = np.empty(w0.shape[2], np.float32), np.empty(w1.shape[2], np.float32)
-    shallow, deep = np.empty((e, w0.shape[2]), np.float32), np.empty((e, w1.shape[2]), np.float32)  # slopes by the layers' sums
+    shallow, deep = np.empty((e, w0.shape[2]), np.float32), np.empty((e, w1.shape[2]), np.float32)
     sums = np.empty((1 + SLOPES, SUMS))
     for p in range(len(index)):
         m = index[p]
         _described(points[m], ends[m], T[p, :3, :3], T[p, :3, 3], size, True, sums, exact, by)
         for i in range(FEATURES):
             x[i] = (exact[i] - mean[m, i]) / scale[m, i]
-        _layer(w0[m], b0[m], x, True, first)
-        _layer(w1[m], b1[m], first, True, second)
+        layers.bent(w0[m], b0[m], x, first)
+        layers.bent(w1[m], b1[m], first, second)
         _outputs(w2[m], b2[m], skip[m], second, x, out[p * e : (p + 1) * e])
-        one = np.float32(1.0)
-        for electrode in range(e):
-            for j in range(deep.shape[1]):
-                deep[electrode, j] = w2[m, electrode, j] * (one - second[j] * second[j])  # the slope of tanh
-        for j in range(shallow.shape[1]):  # a row of weights is read once for all electrodes
-            for electrode in range(e):
-                shallow[electrode, j] = _dot(w1[m, j], deep[electrode]) * (one - first[j] * first[j])
+        layers.slopes(w1[m], w2[m], first, second, deep, shallow)
         jacobian[p * e : (p + 1) * e] = 0.0
         for i in range(FEATURES):
             for electrode in range(e):
-                slope = (_dot(w0[m, i], shallow[electrode]) + skip[m, electrode, i]) / scale[m, i]
+                slope = (layers.dot(w0[m, i], shallow[electrode]) + skip[m, electrode, i]) / scale[m, i]
                 for k in range(SLOPES):
                     jacobian[p * e + electrode, k] += slope * by[i, k]
