@@ -11,7 +11,8 @@ the sense's bias, a first-order Gauss-Markov process that the filter estimates, 
 measurement's own standard deviation, which changes with distance and occlusion: a measurement of covariance L L' reads
 pose + sqrt(lasting) L bias + white noise. Where a stated covariance allows for rare large errors, L L' is the `typical` share of
 it: a filter that weighs by more takes a limb's motion for a change of the bias, and lags behind. What the bias may be larger by
-is considered and not estimated: `history.consider` adds it to the covariance that is published.
+is considered and not estimated: `history.consider` adds it to the covariance that is published. A measurement that leaves
+directions open is linearised where it was measured; used far from there, it has an error which lasts, too (`measurement.error`).
 
 A measurement that the gate refuses and another sense contradicts is wrong, but its changes may be right. From then on its sense
 reads pose + offset + bias + white noise. The offset is unknown at first, and constant except for a slow random walk. While the
@@ -407,10 +408,11 @@ def linearised(model, state, m, z, H):  # type: ignore[no-untyped-def]
     """
     of, sense = model.senses[m.source], state.senses[m.source]
     derivative = np.empty((POSE, POSE))
-    error(state.now.p, state.now.R, m, z, derivative)
+    bend = error(state.now.p, state.now.R, m, z, derivative)
     for i in range(m.rank):
-        # the floor, which no covariance contains, is an error of calibration: all of it lasts
-        lasting = math.sqrt(sense.doubt * (of.lasting * m.sigma[i] ** 2 + of.floor**2))
+        # what no covariance contains, the errors of calibration (the floor) and of linearisation (the bend), lasts
+        unstated = of.floor**2 + bend**2 * so3.dot(m.directions[i, :3], m.directions[i, :3])
+        lasting = math.sqrt(sense.doubt * (of.lasting * m.sigma[i] ** 2 + unstated))
         z[i] = -z[i]
         for j in range(POSE):
             H[i, j] = derivative[i, j]

@@ -85,9 +85,13 @@ def error(p, R, m, value, derivative):  # type: ignore[no-untyped-def]
     What is not observed belongs to the limb and turns with it: the roll about its axis, the way along it. Were the directions
     those at the measured pose, their noise would let information leak into what nobody observes; so they are turned to the
     pose in question. A roll that is made up, however large, says nothing (swing-twist decomposition).
+
+    Returns the bend, the error of linearisation in UNITS: the displacement from the measured pose times the rotation from there,
+    as far as the measurement sees it. Along what it observes, both are taken within three of its standard deviations, where they
+    are if the pose in question is right.
     """
     turn, rotation, jacobian, slide = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    back = np.empty(3)
+    back, away = np.empty(3), np.empty(POSE)
     so3.product_transposed(R, m.R, turn)
     if m.has_axis:
         so3.turned(turn, m.axis, back)
@@ -112,3 +116,13 @@ def error(p, R, m, value, derivative):  # type: ignore[no-untyped-def]
                     derivative[k, i] += m.basis[k, j] * slide[j, i]
                 derivative[k, 3 + i] += m.basis[k, 3 + j] * jacobian[j, i]
             value[k] += derivative[k, i] * (p[i] - m.p[i]) + m.basis[k, 3 + i] * rotation[i]
+    for i in range(3):
+        away[i], away[3 + i] = (p[i] - m.p[i]) / UNITS[i], rotation[i] / UNITS[3 + i]
+    for k in range(m.rank):
+        excess = value[k] - min(max(value[k], -3.0 * m.sigma[k]), 3.0 * m.sigma[k])
+        for i in range(POSE):
+            away[i] -= excess * m.directions[k, i]
+    turned = 0.0
+    for k in range(m.rank):
+        turned += so3.dot(m.directions[k, 3:], away[3:]) ** 2
+    return math.sqrt(turned * so3.dot(away[:3], away[:3]))

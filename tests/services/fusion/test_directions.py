@@ -47,6 +47,19 @@ def test_a_roll_that_is_made_up_does_not_disturb_the_axis(make: type) -> None:
     assert roll_variance > 0.5 * SPREAD[1] ** 2  # nobody saw it
 
 
+@pytest.mark.parametrize(("lateral", "turn", "least", "most"), [(0.02, 0.0, 0.01, 0.02), (0.1, 0.6, 0.0, 0.02)])
+def test_what_is_seen_far_along_the_limb_says_little_about_it_the_more_it_is_turned_there(
+    lateral: float, turn: float, least: float, most: float
+) -> None:
+    observer = ErrorStateObserver(HOME, SPREAD)
+    still(observer, HOME, 0.0, 0.5, np.diag(np.square([25.0, 33.0, 33.0, 2.5, 5.0, 5.0])))
+    elsewhere = perturb(HOME, [-0.23, lateral, 0.0, 0.0, 0.0, turn])
+    across, up = np.array([0.0, 33.0, 0.0, 0.0, 0.0, -2.8]), np.array([0.0, 0.0, 11.0, 0.0, 0.9, 0.0])
+    for k in range(10):
+        observer.measure("haptic", ns(0.5 + 0.02 * k), elsewhere, np.outer(across, across) + np.outer(up, up))
+    assert least < np.linalg.norm(pose_error(HOME, observer.estimate(ns(0.68)).T)[:3]) < most
+
+
 def test_a_turn_that_a_pose_leaves_open_is_bound_to_the_rest_no_farther_than_it_is_straight() -> None:
     slope = np.array([0.02, -0.1, 0.05, 1.0, 0.0, 0.0])  # of the others by the roll
     near = np.diag(np.square([0.002, 0.004, 0.003, 0.05, 0.01, 0.02]))
