@@ -48,19 +48,23 @@ Score = tuple[float, float]
 """Position error [m] and NEES."""
 
 
-def trajectories(subject: Subject, measurements: Sequence[Measurement], stamps_ns: Sequence[int]) -> list[dict[str, Estimate]]:
-    """The estimates as of each stamp (ascending), from the measurements up to it (`stamp`) and from all (`smoothed`)."""
+def trajectories(
+    subject: Subject, measurements: Sequence[Measurement], stamps_ns: Sequence[int]
+) -> dict[int, dict[str, Estimate]]:
+    """The estimates by stamp (ascending), from the measurements up to it (`stamp`) and from all (`smoothed`). Stamps before the
+    first measurement that the smoother uses or after the last one are left out."""
     observer, smoother = ErrorStateObserver(subject.home, subject.spread), Smoother(subject)
     in_order = sorted(measurements, key=lambda each: (each[1], list(observer.log.counts).index(each[0])))
     for each in measurements:
         smoother.measure(*each)
-    found, taken = [], 0
-    for stamp_ns, smoothed in zip(stamps_ns, smoother.trajectory().estimates(np.array(stamps_ns)), strict=True):
+    found, taken, trajectory = {}, 0, smoother.trajectory()
+    within = [stamp_ns for stamp_ns in stamps_ns if trajectory.begin_ns <= stamp_ns <= trajectory.end_ns]
+    for stamp_ns, smoothed in zip(within, trajectory.estimates(np.array(within)), strict=True):
         while taken < len(in_order) and in_order[taken][1] <= stamp_ns:
             source, at_ns, T, information, step = in_order[taken]
             observer.measure(source, at_ns, T, information, step=step)
             taken += 1
-        found.append({"stamp": observer.estimate(stamp_ns), "smoothed": smoothed})
+        found[stamp_ns] = {"stamp": observer.estimate(stamp_ns), "smoothed": smoothed}
     return found
 
 
@@ -98,11 +102,12 @@ def of_senses(seed: int, count: int, seconds: float, console: Console) -> dict[s
             run = runs.wronged(run, seed, index) if situation.wrong else run
             observer = ErrorStateObserver(scores.HOME, scores.SPREAD)
             player = scores.Player(run, [scores.taking(observer)])
-            times = [t for t in scores.instants(run) if t < max(m.stamp for m in run.messages)]
             told = [(m.source, runs.ns(m.stamp), m.T, m.information, None) for m in run.messages]
             subject = Subject(scores.HOME, scores.SPREAD)
-            for t, poses in zip(times, trajectories(subject, told, [runs.ns(t) for t in times]), strict=True):
+            at = trajectories(subject, told, [runs.ns(t) for t in scores.instants(run)])
+            for t in (t for t in scores.instants(run) if runs.ns(t) in at):
                 player.until(t)
+                poses = at[runs.ns(t)]
                 poses["published"] = observer.estimate(runs.ns(t))
                 rolls = situation.rolls(t)
                 rows.append({key: score(run.at(t), each.T, each.covariance, rolls) for key, each in poses.items()})
@@ -154,17 +159,17 @@ def of_cell(cell: cells.Cell, seed: int, seconds: float, skip: float) -> dict[st
         for item in heard
         if (sense := BY_TOPIC.get(item.topic)) is not None and item.message.state == sense.usable
     ]
-    stamps_ns = [each[1] for each in told]
     begins_ns = heard[0].time_ns + round(skip * 1e9)
     fused = [item.message for item in heard if item.topic is topics.FUSED][::EVERY]
-    fused = [each for each in fused if max(begins_ns, min(stamps_ns)) <= each.stamp_ns <= max(stamps_ns)]
+    fused = [each for each in fused if each.stamp_ns >= begins_ns]
     reach = max(cell.pad_types[pad.type].range for pad in cell.pads.values())
     situations: dict[str, list[tuple[dict[str, Score], str]]] = {}
     poses = trajectories(Subject.of(target, cell.body), told, [each.stamp_ns for each in fused])
-    for each, found in zip(fused, poses, strict=True):
+    for each in fused:
         T, near = truths.at(each.stamp_ns)
-        if VISIBLE < near.hidden <= OCCLUDED:
+        if each.stamp_ns not in poses or VISIBLE < near.hidden <= OCCLUDED:
             continue
+        found = poses[each.stamp_ns]
         row = {key: score(T, one.T, one.covariance) for key, one in found.items()}
         row["published"] = score(T, rigid.transform(each.position, each.orientation), each.covariance)
         where = f"{'hidden' if near.hidden > OCCLUDED else 'visible'}, {'in' if near.gap <= reach else 'out of'} range"

@@ -20,13 +20,15 @@ from penumbra.tests.support.fusion_data import HOME, SPREAD, VISION, ns
 def test_the_pose_as_of_the_stamp_knows_nothing_of_later_measurements_and_the_smoothed_one_does() -> None:
     moved = rigid.perturb(HOME, [0.03, 0.0, 0.0, 0.0, 0.0, 0.0])
     told = [("vision", ns(0.05 * k), HOME if k < 20 else moved, VISION, None) for k in range(40)]
-    stamps_ns = [ns(t) for t in (0.5, 0.95)]
+    stamps_ns = [ns(t) for t in (0.5, 0.95, 2.0)]  # the last one is after all measurements
     found = smooth.trajectories(Subject(HOME, SPREAD), list(reversed(told)), stamps_ns)
     observer = ErrorStateObserver(HOME, SPREAD)
     for source, stamp_ns, T, information, _ in told[:20]:
         observer.measure(source, stamp_ns, T, information)
-    np.testing.assert_array_equal(found[1]["stamp"].T, observer.estimate(stamps_ns[1]).T)
-    assert abs(found[1]["stamp"].T[0, 3] - HOME[0, 3]) < 1e-6 < abs(found[1]["smoothed"].T[0, 3] - HOME[0, 3])
+    assert list(found) == stamps_ns[:2]
+    poses = found[stamps_ns[1]]
+    np.testing.assert_array_equal(poses["stamp"].T, observer.estimate(stamps_ns[1]).T)
+    assert abs(poses["stamp"].T[0, 3] - HOME[0, 3]) < 1e-6 < abs(poses["smoothed"].T[0, 3] - HOME[0, 3])
 
 
 def test_between_two_truths_the_limb_is_where_its_velocity_takes_it() -> None:
