@@ -191,7 +191,7 @@ def test_a_fast_hand_is_as_fast_as_hands_are_and_no_faster() -> None:
 
 
 def test_late_and_shuffled_measurements_end_in_the_same_poses() -> None:
-    found = scores.late(3, 0, 3.0)
+    found = scores.late(3, 0, 6.0)
     assert list(found) == ["0", "50", "200", "shuffled"]
     assert all(each.difference < 1e-9 for each in found.values())
     np.testing.assert_allclose(found["50"].now.mean(), found["0"].now.mean(), rtol=0.5)
