@@ -194,7 +194,7 @@ def test_late_and_shuffled_measurements_end_in_the_same_poses() -> None:
     found = scores.late(3, 0, 6.0)
     assert list(found) == ["0", "50", "200", "shuffled"]
     assert all(each.difference < 1e-9 for each in found.values())
-    np.testing.assert_allclose(found["50"].now.mean(), found["0"].now.mean(), rtol=0.5)
+    np.testing.assert_allclose(found["50"].now.mean(), found["0"].now.mean(), rtol=0.4)
     assert found["200"].now.mean() > found["0"].now.mean()
 
 
