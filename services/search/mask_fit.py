@@ -137,6 +137,16 @@ def overlap_of(model: Model, T: Array, evidence: Evidence, hand: float) -> tuple
     return both, free, (both - less * both_hand) / max(either, 1.0)
 
 
+def hand_differs(model: Model, T: Array, evidence: Evidence) -> int:
+    """Number of pixels beyond the wrist, of a limb at T_camera_target, that only its silhouette or only the mask's target covers;
+    zero where the limb points at the camera."""
+    state = evidence.state
+    beyond = model.beyond_wrist(T, evidence.intrinsics, state.shape)
+    shown, seen = model.silhouette(T, evidence.intrinsics, (0, 0, *state.shape[::-1]))[beyond], state[beyond]
+    both, free = compare(seen[None], shown[None])
+    return int(np.count_nonzero(seen == TARGET)) - both + free
+
+
 @dataclass(frozen=True)
 class Pass:
     """The contour at one pose, which is `moved` (7,) from the prior: pose error and dilation."""

@@ -19,9 +19,10 @@ bent, only the forearms are compared.
 One rival is compared per picture: all eight at once would delay the first pictures of a limb that was just found, and it would
 have moved by then. The mirror image comes first, also when another rival has won, as it is the farthest away: a limb found again
 with the wrong tilt is 10 cm off. Once all were compared, every second comparison is of a rival that the pictures clearly prefer
-to the pose, if there is one, so that a right one wins within a few pictures. If all are refuted, pictures are skipped: a
-comparison costs as much as the pose itself. A limb that is not quite the mesh has its mirror image as a rival in each picture
-(`against_mirror`).
+to the pose, if there is one, so that a right one wins within a few pictures. If all are refuted, pictures are skipped, as a
+comparison costs as much as the pose itself, and every second comparison is of one of the nearest turns: a pose whose hand comes
+out from behind something may drift away from the right roll, and leave it a turn of 30 degrees behind. A limb that is not quite
+the mesh has its mirror image as a rival in each picture (`against_mirror`).
 """
 
 from __future__ import annotations
@@ -46,6 +47,8 @@ TURNS = tuple(math.radians(degrees) for degrees in (180.0, 30.0, -30.0, 60.0, -6
 the pose. Measured: a fit that starts 60 degrees from a pose that is off by 35 ends elsewhere."""
 RIVALS, MIRROR = len(TURNS) + 1, 0
 """Number of rivals: the turns, and the mirror image, which is the first."""
+NEAREST = (2, 3)
+"""The rivals that are turned by 30 degrees."""
 PASSES = 8
 """Maximum number of steps of a rival's fit."""
 REFUTED = 9.0
@@ -64,11 +67,15 @@ hand is bent or the limb is not quite the mesh. An observer treats the pictures'
 prefer the wrong turn would convince it. With ten for bent hands, 8 % of the fused poses were outside the 99.7 % bound of place
 and axis, instead of 5 % (30 streams of 2 s, seeds 76 to 78)."""
 REST_NS = 140_000_000
-"""Time [ns] between two comparisons while all rivals are refuted: each is compared every 1.1 s, or in every eighth picture if
-pictures are rarer."""
+"""Time [ns] between two comparisons while all rivals are refuted: the nearest turns are compared at least every 0.6 s and the
+others every 2.2 s, or in every fourth and sixteenth picture if pictures are rarer."""
 KEPT, MOST = 0.7, 6.0
 """Share of the evidence about a rival that is kept until it is compared again, and maximum evidence of one picture against it:
 two pictures are needed to refute it, and several with a slight preference decide together. Chosen."""
+HAND_PX, MOST_BY_HAND = 7.0, 9.0
+"""Number of pixels of a hand in which mask and silhouette differ that counts as much as a cost of one: so many are wrong where
+the mask's boundary is off by a standard deviation over its correlation length (`Noise`); and the most that they count in a
+picture, as a mask's errors last."""
 APART_RAD = 0.2
 """Angle [rad] below which two poses count as one."""
 JUMPED_RAD = 0.4
@@ -84,7 +91,7 @@ class Rivals:
 
     def forget(self) -> None:
         """Start over, as with another limb."""
-        self._is_repeat_due = False
+        self._is_repeat_due, self._nearest = False, 0
         self._begin()
 
     def _begin(self, won: int | None = None) -> None:
@@ -96,10 +103,13 @@ class Rivals:
         self._before: Array | None = None
         self._compared_ns = 0
 
-    def contested(self, best: Fit, stamp_ns: int, shown: Shown, surprise: Callable[[Fit], float]) -> Fit:
+    def contested(
+        self, best: Fit, stamp_ns: int, shown: Shown, surprise: Callable[[Fit], float], differs: Callable[[Fit], int]
+    ) -> Fit:
         """`best`, or a rival if the picture of this stamp and the prediction prefer it, with the uncertainty that its rivals add.
 
-        shown: fits to the image, without a prediction; surprise(fit): squared Mahalanobis distance of a pose from the prediction.
+        shown: fits to the image, without a prediction; surprise(fit): squared Mahalanobis distance of a pose from the prediction;
+        differs(fit): number of pixels in which its hand and the mask differ.
         """
 
         def unlikelier(other: Fit) -> float:
@@ -107,7 +117,7 @@ class Rivals:
 
         if self._before is not None and _angle(self._before, best.T) > JUMPED_RAD:
             other = _fitted(self._before, best, shown)
-            excess = _excess(other, best, shown) + unlikelier(other)
+            excess = _excess(other, best, shown, differs) + unlikelier(other)
             if other.sharp and excess < (PREFERRED if None in self._evidence else 0.0):
                 best = other
             else:
@@ -115,7 +125,7 @@ class Rivals:
         if self._is_due(stamp_ns):
             which = self._chosen()
             other = _fitted(_start(best, which), best, shown)
-            evidence = KEPT * (self._evidence[which] or 0.0) + min(_excess(other, best, shown), MOST)
+            evidence = KEPT * (self._evidence[which] or 0.0) + min(_excess(other, best, shown, differs), MOST)
             excess = evidence + unlikelier(other)
             if which != MIRROR and other.sharp and _is_same(other, best):
                 self._evidence[which], self._doubts[which] = 0.0, None
@@ -137,21 +147,28 @@ class Rivals:
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Whether to compare a rival in the picture of this stamp."""
-        are_refuted = None not in self._evidence and not any(doubt is not None for doubt in self._doubts)
-        if are_refuted and 0 <= stamp_ns - self._compared_ns < REST_NS:
+        if self._are_refuted and 0 <= stamp_ns - self._compared_ns < REST_NS:
             return False
         self._compared_ns = stamp_ns
         return True
 
     def _chosen(self) -> int:
-        """The rival to compare: the next one in turn, but every second time the one that the pictures prefer most to the pose, if
-        they do so clearly and all were compared."""
+        """The rival to compare: the next one in turn, but every second time, once all were compared, the one that the pictures
+        prefer most to the pose, if they do so clearly, or one of the nearest turns, if all are refuted."""
         self._is_repeat_due = not self._is_repeat_due
         compared = [evidence for evidence in self._evidence if evidence is not None]
-        if self._is_repeat_due and len(compared) == RIVALS and min(compared) < -MOST:
-            return compared.index(min(compared))
+        if self._is_repeat_due and len(compared) == RIVALS:
+            if min(compared) < -MOST:
+                return compared.index(min(compared))
+            if self._are_refuted:
+                self._nearest = (self._nearest + 1) % len(NEAREST)
+                return NEAREST[self._nearest]
         which, self._next = self._next, (self._next + 1) % RIVALS
         return which
+
+    @property
+    def _are_refuted(self) -> bool:
+        return None not in self._evidence and not any(doubt is not None for doubt in self._doubts)
 
     def _doubt(self, best: Fit, T: Array, covariance: Array, excess: float) -> Array:
         """The covariance that a rival adds (`_added`), along the limb's axes."""
@@ -208,16 +225,22 @@ def _fitted(T: Array, best: Fit, shown: Shown) -> Fit:
     return straightest(straight, shown(T, PASSES, MOST_BENT))
 
 
-def _excess(other: Fit, best: Fit, shown: Shown) -> float:
+def _excess(other: Fit, best: Fit, shown: Shown, differs: Callable[[Fit], int]) -> float:
     """By how much a rival's cost exceeds that of the best pose; infinite if the two are the same pose, or the image does not
-    confirm the rival. Costs are scaled to the longer of the two contours: a hand seen edge on has less contour than one that
-    shows its fingers, and must not gain by that."""
+    confirm the rival.
+
+    Costs are scaled to the longer of the two contours: a hand seen edge on has less contour than one that shows its fingers, and
+    must not gain by that. A thumb in the picture that a turn does not show costs its contour nothing: the mask tells, if both
+    hands are believed."""
     if not other.sharp or _is_same(other, best):
         return math.inf
     here = best if best.hand == other.hand else shown(best.T_searched, 1, other.hand)
     longer = max(other.points, here.points)
     excess = longer * (other.cost / other.points - here.cost / here.points)
-    return excess / max(1.0, min(other.rms, here.rms) / TYPICAL) ** 2
+    excess /= max(1.0, min(other.rms, here.rms) / TYPICAL) ** 2
+    if best.hand == other.hand == 1.0 and math.acos(min(float(other.T[:3, 0] @ best.T[:3, 0]), 1.0)) < JUMPED_RAD:
+        excess += min(max((differs(other) - differs(best)) / HAND_PX, -MOST_BY_HAND), MOST_BY_HAND)
+    return excess
 
 
 def _is_same(other: Fit, best: Fit) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from penumbra.services.search import contour, detect, evidence, paper_search
 from penumbra.services.search.evidence import TARGET, Evidence
 from penumbra.services.search.image_fit import ImageSettings, fit_image, straightest
-from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, with_prior
+from penumbra.services.search.mask_fit import CONVERGED, GOOD, MISFIT, ROUGH, Fit, Limits, Noise, fit, hand_differs, with_prior
 from penumbra.services.search.rivals import PASSES, Rivals, against_mirror
 from penumbra.services.search.settings import SearchSettings
 from penumbra.services.search.shape_fit import fit_shape
@@ -203,7 +203,10 @@ class Search:
                 return found
             return near(self._fit(seen, T, T, self._beside, ROUGH))
 
-        return self._rivals.contested(best, stamp_ns, shown, _surprise(T_prior, prior))
+        def differs(found: Fit) -> int:
+            return hand_differs(self._model, found.T_searched, seen)
+
+        return self._rivals.contested(best, stamp_ns, shown, _surprise(T_prior, prior), differs)
 
     def _behind_unknown(
         self, seen: Evidence, labels: NDArray[np.uint8], T_start: Array, prior: Array, image: NDArray[np.uint8]

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from penumbra.services.search import contour, tracker
+from penumbra.services.search import contour, evidence, tracker
 from penumbra.services.search.contour import MEASURED, POINT
 from penumbra.services.search.image_fit import UNKNOWNS, ImageSettings, fit_image, offsets, unfitted
-from penumbra.services.search.mask_fit import Limits, marginal
+from penumbra.services.search.mask_fit import Limits, hand_differs, marginal
 from penumbra.services.search.rivals import PASSES, RIVALS
 from penumbra.services.search.tracker import Search, Searched
 from penumbra.shared.contract.labels import TARGET_LABELS, Label
@@ -162,6 +162,19 @@ def test_a_limb_with_its_hand_in_sight_does_not_stay_turned_over(visible, degree
         rolls = [abs(np.degrees(off(shot, estimate)[3:] @ estimate.T[:3, 0])) for estimate in estimates]
         right.append(np.median(rolls) < 10.0)
     assert np.mean(right) > 0.8
+
+
+def test_a_hand_differs_from_the_mask_at_another_turn_and_less_where_it_is_hidden(visible):
+    def differs(shot: Shot, seen: Mask, degrees: float) -> int:
+        k = Intrinsics.of_window(shot.camera, seen.x0, seen.y0, seen.scale)
+        known = evidence.gather(evidence.classify(seen.labels, TARGET_LABELS), seen.labels, k, seen.x0, seen.y0, seen.scale)
+        T_camera_world = rigid.inverse(shot.camera.T_world_camera)
+        return hand_differs(contour.Model(shot.mesh), T_camera_world @ turned(shot, degrees), known)
+
+    for shot in visible:
+        shown, behind = mask(shot, shot.T_world_target), with_hand_covered(shot)[0]
+        assert differs(shot, shown, 0.0) == differs(shot, behind, 0.0) == 0
+        assert differs(shot, shown, 90.0) > max(200, 2 * differs(shot, behind, 90.0))
 
 
 def test_a_turn_that_takes_the_pose_s_place_is_doubted_until_the_others_are_compared_with_it(visible):

@@ -30,6 +30,11 @@ def fitted(T: np.ndarray, cost: float, hand: float = 1.0, rms: float = 0.1) -> F
     return Fit(T, 1e-4 * np.eye(6), T, 50.0, rms, 0.0, cost, 1.0, 0, 0, 1.0, hand=hand, sharp=rms < SHARP)
 
 
+def same(fit: Fit) -> int:
+    """Of pictures whose masks tell nothing."""
+    return 0
+
+
 def roll(fit: Fit) -> float:
     """The turn [rad] from HERE."""
     return float(rigid.pose_error(fit.T, HERE)[3:] @ HERE[:3, 0])
@@ -48,7 +53,9 @@ def costs(preferred: float, by: float) -> Callable[[np.ndarray, int, float], Fit
 def taken(by: float, pictures: int) -> list[float]:
     """The turns said of so many pictures in which the fit ends at HERE and another turn costs less."""
     rivals, shown = Rivals(Limits()), costs(TURNS[3], by)
-    return [roll(rivals.contested(shown(HERE, 1, 1.0), PICTURE_NS * i, shown, lambda fit: 0.0)) for i in range(1, pictures + 1)]
+    return [
+        roll(rivals.contested(shown(HERE, 1, 1.0), PICTURE_NS * i, shown, lambda fit: 0.0, same)) for i in range(1, pictures + 1)
+    ]
 
 
 @pytest.mark.parametrize(("by", "comparisons"), [(25.0, 1), (12.0, 2), (8.0, 4)])
@@ -64,7 +71,9 @@ def test_noise_that_prefers_now_the_one_and_now_the_other_changes_nothing():
     rivals = Rivals(Limits())
     for i in range(1, 30 * RIVALS):
         best = fitted(HERE, 100.0 + rng.normal(scale=3.0))
-        estimate = rivals.contested(best, PICTURE_NS * i, lambda T, *_: fitted(T, 100.0 + rng.normal(scale=3.0)), lambda fit: 0.0)
+        estimate = rivals.contested(
+            best, PICTURE_NS * i, lambda T, *_: fitted(T, 100.0 + rng.normal(scale=3.0)), lambda fit: 0.0, same
+        )
         assert abs(roll(estimate)) < 0.1
 
 
@@ -74,13 +83,52 @@ def test_a_rival_that_took_the_place_keeps_it_where_fits_begin_from_the_turn_bef
     assert (said[first:] > 0.1).all()
 
 
+@pytest.mark.parametrize(
+    ("cost", "hand", "wins"),
+    [(88.0, 1.0, (True, False, True)), (100.0, 1.0, (False, False, True)), (88.0, 4.0, (True, True, True))],
+)
+def test_a_turn_that_leaves_a_thumb_in_the_mask_unexplained_loses_unless_hands_are_not_believed(cost, hand, wins):
+    def is_rival(fit: Fit) -> bool:
+        return abs(roll(fit) - TURNS[3]) < 0.1
+
+    def shown(T: np.ndarray, passes: int, hand: float) -> Fit:
+        found = fitted(T, 100.0, hand)
+        return replace(found, cost=cost) if is_rival(found) else found
+
+    for differs, is_taken in zip((50, 150, 0), wins, strict=True):
+        rivals, turns = Rivals(Limits()), []
+        for i in range(1, 4 * RIVALS):
+            found = rivals.contested(
+                shown(HERE, 1, hand), PICTURE_NS * i, shown, lambda fit: 0.0, lambda fit, px=differs: px if is_rival(fit) else 50
+            )
+            turns.append(roll(found))
+        assert (max(turns) > 0.9) == is_taken
+
+
+def test_while_all_are_refuted_every_second_comparison_is_of_a_nearest_turn():
+    starts: list[float] = []
+
+    def shown(T: np.ndarray, passes: int, hand: float) -> Fit:
+        starts.append(apart(T, TILTED))
+        return fitted(T, 150.0)
+
+    rivals = Rivals(Limits())
+    for i in range(1, 20 * RIVALS):
+        rivals.contested(fitted(TILTED, 100.0), PICTURE_NS * i, shown, lambda fit: 0.0, same)
+    near = np.isclose(starts, np.radians(30.0), atol=0.01)
+    assert near[: 2 * RIVALS].sum() == 4, "each of the eight twice: two pictures are needed to refute it"
+    assert near[2 * RIVALS :].mean() == pytest.approx(0.5 + 0.5 * 2 / RIVALS, abs=0.05)
+
+
 def test_what_was_said_of_a_rival_before_it_was_one_with_the_pose_is_forgotten():
     rivals, stamps = Rivals(Limits()), itertools.count(PICTURE_NS, PICTURE_NS)
     for _ in range(10 * RIVALS):
-        rivals.contested(fitted(HERE, 100.0), next(stamps), lambda *_: fitted(HERE, 100.0), lambda fit: 0.0)
+        rivals.contested(fitted(HERE, 100.0), next(stamps), lambda *_: fitted(HERE, 100.0), lambda fit: 0.0, same)
     shown = costs(TURNS[3], 25.0)  # they part, and the first comparison tells which is right
     every = -(-REST_NS // PICTURE_NS)
-    said = [roll(rivals.contested(fitted(HERE, 100.0), next(stamps), shown, lambda fit: 0.0)) for _ in range(RIVALS * every)]
+    said = [
+        roll(rivals.contested(fitted(HERE, 100.0), next(stamps), shown, lambda fit: 0.0, same)) for _ in range(RIVALS * every)
+    ]
     assert max(np.abs(said)) == pytest.approx(TURNS[3], abs=0.01)
 
 
@@ -96,7 +144,7 @@ def test_a_limb_found_with_the_wrong_tilt_has_the_right_one_at_once():
     def shown(T: np.ndarray, passes: int, hand: float) -> Fit:
         return fitted(T, 80.0 if apart(T, MIRROR) < 0.1 else 100.0)
 
-    found = Rivals(Limits()).contested(shown(TILTED, 1, 1.0), PICTURE_NS, shown, lambda fit: 0.0)
+    found = Rivals(Limits()).contested(shown(TILTED, 1, 1.0), PICTURE_NS, shown, lambda fit: 0.0, same)
     assert apart(TILTED, MIRROR) > 0.5 and apart(found.T, MIRROR) < 0.1
 
 
@@ -110,7 +158,7 @@ def test_the_mirror_image_of_a_turn_that_wins_is_compared_next():
 
     for i in range(1, 4):  # the mirror image costs as much, the first turn less, then the turn's mirror image is looked at
         best = fitted(TILTED, 160.0) if i < 3 else fitted(starts[-1], 100.0)
-        rivals.contested(best, PICTURE_NS * i, shown, lambda fit: 0.0)
+        rivals.contested(best, PICTURE_NS * i, shown, lambda fit: 0.0, same)
     assert apart(starts[0], mirrored) < 0.01
     assert apart(starts[1], TILTED) > 1.0
     assert apart(starts[2], detect.mirrored(starts[1])[0]) < 0.01
@@ -124,7 +172,7 @@ def test_where_the_hand_is_bent_the_forearm_tells_the_tilt_unless_a_straight_han
             return fitted(T, 150.0 if is_mirror else 100.0, rms=straight_px)
         return fitted(T, 70.0 if is_mirror else 100.0, hand)
 
-    found = Rivals(Limits()).contested(fitted(TILTED, 100.0, 4.0), PICTURE_NS, shown, lambda fit: 0.0)
+    found = Rivals(Limits()).contested(fitted(TILTED, 100.0, 4.0), PICTURE_NS, shown, lambda fit: 0.0, same)
     assert (apart(found.T, MIRROR) < 0.1) == is_taken
 
 
