@@ -6,8 +6,8 @@ and its prior, and the slowly changing states (`person.py`, `drift.py`). The ste
 1. predict: the track decays to its home (`track.py`), or moves to a fused pose that is known well, or better than the track
 2. solve from there (`solve.py`), with the learned size and shoulder as a prior; where nothing is felt, the track stays
 3. if that does not explain the voltages, or nothing is tracked, solve from scratch: from the likeliest of `starts.py`
-4. far from the pads, thick and thin parts of a limb feel alike: another possible place, from scratch or found beside the
-   track, is kept as its rival and solved as well, until the windows have decided between the two
+4. far from the pads, thick and thin parts of a limb feel alike: another possible place, from scratch, found beside the track or
+   at the fused pose, is kept as its rival and solved as well, until the windows have decided between the two
 5. learn the trust in each pad (`trust.py`), the limb's size close to the pads, and while nothing is near or a camera sees the
    limb the drift of the electrodes and where the shoulder is
 6. add up the evidence on whether the object that is felt is a limb (`identity.py`)
@@ -20,6 +20,7 @@ Voltages that no limb explains (a metal part, a block) are reported as an object
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -265,10 +266,16 @@ class Estimator:
             self._untracked = 0
             return self._from_scratch(reading)
         self._track.place = self._place(reading, solution, prior)
+        may_be_elsewhere, fused = self._is_tracking and not is_expected, self._track.fused
+        if may_be_elsewhere and fused is not None and not self._track.includes(fused):
+            self._contest(reading, solution, fused.T, 0, lambda evidence: evidence / self.settings.error_lasts)
         if self._track.rival is not None:
             return self._compared(reading, solution, prior, self._track.rival)
-        if self._is_tracking and not is_expected and (self._starts.is_due() or self.identity.odds < 0.0):
-            self._look_elsewhere(reading, solution)
+        if may_be_elsewhere and (self._starts.is_due() or self.identity.odds < 0.0):
+            elsewhere = self._starts.elsewhere(reading, self.pose, self.person.size)
+            self._contest(
+                reading, solution, elsewhere, 12, lambda evidence: self.settings.beside_odds + self._track.limited(evidence)
+            )
         return solution
 
     def _compared(self, reading: Reading, solution: Solution, prior: Prior, rival: Place) -> Solution:
@@ -281,23 +288,28 @@ class Estimator:
         evidence /= self.settings.error_lasts
         return other if self._track.weigh(self._place(reading, other, rival_prior), evidence) else solution
 
-    def _look_elsewhere(self, reading: Reading, solution: Solution) -> None:
-        """Solve from another start than the tracked solution; a different place becomes its rival."""
+    def _contest(self, reading: Reading, solution: Solution, start: Array, coarse: int, odds: Callable[[float], float]) -> None:
+        """Solve from another start (4, 4) than the tracked solution; a different place becomes its rival, if it is more probable
+        than the rival before. odds: of the track, by the evidence of the window for it."""
         home = self._prior(self._home.place)
-        other = self._solve(reading, home, self._starts.elsewhere(reading, self.pose, self.person.size))
+        other = self._solve(reading, home, start, coarse)
         rival = self._place(reading, other, home)
-        if not self._track.place.stands_for(rival, self.settings):
+        if not self._track.includes(rival):
             # judge the track with the same freedom: from its pose, but with home's spread
             same = self._solver.solve(reading, home, solution.T, solution.body, 0, 2)
-            self._track.contest(rival, self.settings.beside_odds + self._track.limited(other.cost - same.cost))
+            odds_to_rival = odds(other.cost - same.cost)
+            if self._track.rival is None or odds_to_rival < self._track.odds:
+                self._track.contest(rival, odds_to_rival)
 
     def _from_scratch(self, reading: Reading) -> Solution:
-        """The best solution from the track and all starts, of which the most probable ones are solved; the second best at another
-        place becomes the rival."""
+        """The best solution from the fused pose, the track and all starts, of which the most probable ones are solved; the second
+        best at another place becomes the rival."""
         home, track = self._prior(self._home.place), self._track
         starts = [self.pose, *(self._starts.at(which, reading, self.person.size) for which in range(len(self._starts)))]
         cost = [self._solver.solve(reading, home, start, self.person.mean, coarse=0, fine=0).cost for start in starts]
         likely = [starts[which] for which in np.argsort(cost)[: self.settings.scratch_solves]]
+        if track.fused is not None:
+            likely.append(track.fused.T)
         best, *others = sorted((self._solve(reading, home, start) for start in likely), key=lambda solution: solution.cost)
         track.place, track.rival = self._place(reading, best, home), None
         self._track_misfit.value = best.misfit

@@ -85,7 +85,7 @@ class Home:
 
 class Track:
     """The tracked place, its rival (None if only one place is possible) and odds: the log odds of the place to the rival, never
-    negative."""
+    negative; fused: where the fused pose has the limb in this window, None if it is unknown."""
 
     def __init__(self, home: Home, settings: HapticSettings):
         self._home, self._settings = home, settings
@@ -96,21 +96,29 @@ class Track:
         """Restart at home."""
         self.place, self.odds = self._home.place, 0.0
         self.rival: Place | None = None
+        self.fused: Place | None = None
 
     def decay(self, elapsed_s: float) -> None:
-        """Decay both places over elapsed_s seconds in which nothing is felt."""
+        """Decay both places over elapsed_s seconds in which nothing is felt, and forget the fused pose."""
+        self.fused = None
         self.place = self._home.decayed(self.place, elapsed_s)
         self.rival = None if self.rival is None else self._home.decayed(self.rival, elapsed_s)
 
     def expect(self, T: Array, covariance: Array) -> bool:
-        """Move the track to a fused pose (4, 4) with covariance (6, 6) if that is known well (`expected_sigma`), or better than
-        the track; the track then has no rival. Returns whether it is known well."""
+        """Take a fused pose (4, 4) with covariance (6, 6), and move the track there if it is known well (`expected_sigma`), or
+        better than the track; the track then has no rival. Returns whether it is known well."""
         settings = self._settings
-        is_sure = Place(T, covariance).sigma < settings.expected_sigma
+        self.fused = Place(T, covariance)
+        is_sure = self.fused.sigma < settings.expected_sigma
         expected = Place(T, settings.expected_inflation**2 * covariance + self._floor)
         if is_sure or expected.sigma < self.place.sigma:
             self.place, self.rival = expected, None
         return is_sure
+
+    def includes(self, place: Place) -> bool:
+        """Whether the tracked place or its rival stands for another one."""
+        known = (self.place,) if self.rival is None else (self.place, self.rival)
+        return any(one.stands_for(place, self._settings) for one in known)
 
     def contest(self, rival: Place, odds: float) -> None:
         """Keep a rival with these log odds of the track to it, if it is a distinct place and still possible."""

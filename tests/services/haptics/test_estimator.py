@@ -347,6 +347,18 @@ def test_a_limb_that_comes_back_elsewhere_is_found_at_once(skin: Skin, response:
     assert np.abs(rigid.pose_error(there, which.pose)[1:3]).max() < 0.015
 
 
+def test_a_fused_pose_that_the_voltages_refute_changes_no_window(skin: Skin, response: Response, forearm: Surface) -> None:
+    here, elsewhere = rigid.transform([0.0, 0.0, 0.07]), rigid.transform([0.12, 0.0, 0.07])
+    told, untold = (estimator(skin, response, forearm, here, np.repeat([0.15, 0.4], 3)) for _ in range(2))
+    rng, used = np.random.default_rng(7), np.full(len(skin), 10)
+    for i in range(40):
+        felt = feel(skin, signal(skin, response, here), rng)
+        expected = (elsewhere, np.diag(np.repeat([0.06, 0.4], 3) ** 2)) if i > 20 else None
+        one = told.update(10 * MS * (i + 1), felt, used, skin.T_world_pads(), expected=expected)
+        other = untold.update(10 * MS * (i + 1), felt, used, skin.T_world_pads())
+        np.testing.assert_array_equal(one.information, other.information)
+
+
 @pytest.mark.slow
 def test_of_two_places_that_feel_alike_far_away_neither_is_called_certain(
     skin: Skin, response: Response, forearm: Surface, pads: np.ndarray

@@ -105,6 +105,16 @@ def test_a_fused_pose_that_is_known_better_than_the_track_moves_it_without_being
     np.testing.assert_array_equal(track.place.T, T, "this one is known worse")
 
 
+def test_a_fused_pose_elsewhere_is_not_included_until_it_is_the_track_s_rival_and_counts_for_its_window_alone():
+    track = followed()
+    track.expect(rigid.transform([0.15, 0.0, 0.1]), np.diag(np.repeat([0.06, 0.1], 3) ** 2))
+    assert track.fused is not None and not track.includes(track.fused)
+    track.contest(place(0.15), 0.0)
+    assert track.includes(track.fused) and track.includes(place(0.01)) and not track.includes(place(0.4))
+    track.decay(0.02)
+    assert track.fused is None and track.rival is not None
+
+
 # ---- what is forgotten
 
 
