@@ -95,14 +95,16 @@ def test_a_turn_that_leaves_a_thumb_in_the_mask_unexplained_loses_unless_hands_a
         found = fitted(T, 100.0, hand)
         return replace(found, cost=cost) if is_rival(found) else found
 
-    for differs, is_taken in zip((50, 150, 0), wins, strict=True):
+    def is_taken(px: int) -> bool:
+        def differs(fit: Fit) -> int:
+            return px if is_rival(fit) else 50
+
         rivals, turns = Rivals(Limits()), []
         for i in range(1, 4 * RIVALS):
-            found = rivals.contested(
-                shown(HERE, 1, hand), PICTURE_NS * i, shown, lambda fit: 0.0, lambda fit, px=differs: px if is_rival(fit) else 50
-            )
-            turns.append(roll(found))
-        assert (max(turns) > 0.9) == is_taken
+            turns.append(roll(rivals.contested(shown(HERE, 1, hand), PICTURE_NS * i, shown, lambda fit: 0.0, differs)))
+        return max(turns) > 0.9
+
+    assert (is_taken(50), is_taken(150), is_taken(0)) == wins
 
 
 def test_while_all_are_refuted_every_second_comparison_is_of_a_nearest_turn():
