@@ -238,7 +238,7 @@ def _excess(other: Fit, best: Fit, shown: Shown, differs: Callable[[Fit], int]) 
     longer = max(other.points, here.points)
     excess = longer * (other.cost / other.points - here.cost / here.points)
     excess /= max(1.0, min(other.rms, here.rms) / TYPICAL) ** 2
-    if best.hand == other.hand == 1.0 and math.acos(min(float(other.T[:3, 0] @ best.T[:3, 0]), 1.0)) < JUMPED_RAD:
+    if best.hand == other.hand == 1.0 and other.T[:3, 0] @ best.T[:3, 0] > math.cos(JUMPED_RAD):
         excess += min(max((differs(other) - differs(best)) / HAND_PX, -MOST_BY_HAND), MOST_BY_HAND)
     return excess
 
