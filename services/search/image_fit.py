@@ -43,8 +43,8 @@ inside and outside. Nearer, the sides are mixed, and farther inside a limb is li
 side in the shade was found up to 0.9 px too far inside, since its last pixels look more like the background than like the rest of
 the limb. Chosen on seven replays and 1120 single pictures."""
 DEEP, DEEP_SPREAD, DEEP_FROM = 2.5, 1.0, 2
-"""The same for the change of the colours inside, and its minimum distance [px]: nearer, what changes is mostly the edge's blur,
-and edges with contrast were found 0.05 px farther outside."""
+"""The same for the pixels inside that tell whether their colours change, and the minimum distance of these: nearer, what changes
+is mostly the edge's blur, and edges with contrast were found 0.05 px farther outside."""
 EXTENDS = 2
 """Distance [px] outside the contour up to which colours inside go on changing: it may lie too far inside."""
 UNCHANGED = 0.1
