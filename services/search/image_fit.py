@@ -2,8 +2,7 @@
 
 One pass, from a pose near the right one (contracting curve density: Hanek, Beetz 2004, doi:10.1023/B:VISI.0000036836.66311.97):
   1. project the mesh's contour (`contour.Model.matched`) and read the picture's colours on a short line across it at each point;
-  2. learn the colours on both sides: mean and covariance just beyond the edge's blur, pooled along the contour, and how those
-     inside change towards a shaded edge;
+  2. learn the colours on both sides: mean and covariance just beyond the edge's blur, pooled along the contour;
   3. for every offset of the edge on the line, compare the colours with those of a blurred step between the two sides, and add
      the mask's term; this is the likelihood of the contour's offset, approximated by a Gaussian;
   4. solve for the pose error as `fit` does.
@@ -42,25 +41,16 @@ NEAR, SPREADS = 1.5, (1.0, 1.5)
 inside and outside. Nearer, the sides are mixed, and farther inside a limb is lit differently. With equal weights the edge of a
 side in the shade was found up to 0.9 px too far inside, since its last pixels look more like the background than like the rest of
 the limb. Chosen on seven replays and 1120 single pictures."""
-DEEP, DEEP_SPREAD, DEEP_FROM = 2.5, 1.0, 2
-"""The same for the pixels inside that tell whether their colours change, and the minimum distance of these: nearer, what changes
-is mostly the edge's blur, and edges with contrast were found 0.05 px farther outside."""
-EXTENDS = 2
-"""Distance [px] outside the contour up to which colours inside go on changing: it may lie too far inside."""
-UNCHANGED = 0.1
-"""Variance [px^2] that is added to that of the distances before a change is learned: few pixels tell none."""
 
 
 @dataclass(frozen=True)
 class ImageSettings:
     """Noise of a picture's colours. `passes`: maximum number; `spacing` of contour points [px]; `pooling`: standard deviation of
     the pooling along the contour [px]; `floor`: minimum standard deviation of a colour [of 255]; `clipped`: maximum squared
-    Mahalanobis distance of a pixel; `shading`: share of the difference between both sides by which colours inside approach those
-    outside per pixel, from which on most of their change counts; `temperature`: number of a line's pixels that count as one;
-    `mask`: standard deviation of the mask's boundary on a line [px]; `huber`: Huber's threshold [px]; `edge`: minimum standard
-    deviation of an offset [px]; `correlation`: length of contour over which offsets share their error [px]; `dilation`: standard
-    deviation of the whole contour's [px]; `wave`: standard deviation of errors that change slowly along each side of the limb, as
-    its shading does [px].
+    Mahalanobis distance of a pixel; `temperature`: number of a line's pixels that count as one; `mask`: standard deviation of the
+    mask's boundary on a line [px]; `huber`: Huber's threshold [px]; `edge`: minimum standard deviation of an offset [px];
+    `correlation`: length of contour over which offsets share their error [px]; `dilation`: standard deviation of the whole
+    contour's [px]; `wave`: standard deviation of errors that change slowly along each side of the limb, as its shading does [px].
     With one side hidden, they look like another distance. If both sides of an edge are so alike that its offset is more uncertain
     than `wave`, they are as large as that, and what exceeds `edge` is an error of the whole side of the limb. If offsets are
     larger than TYPICAL, all these errors grow."""
@@ -70,7 +60,6 @@ class ImageSettings:
     pooling: float = 4.0
     floor: float = 2.0
     clipped: float = 25.0
-    shading: float = 0.12
     temperature: float = 2.0
     mask: float = 2.5
     huber: float = 0.5
@@ -259,7 +248,7 @@ class _Picture:
         evidence, settings, k = self.evidence, self.settings, self.evidence.intrinsics
         found = self.model.matched(T, evidence, settings.spacing, LINE, self.hand)
         points = found.points
-        noise = (settings.pooling, settings.floor, settings.clipped, settings.shading, settings.temperature, settings.mask)
+        noise = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
         r, sigma, kind = offsets(points, self.image, evidence.guarded, found.r, found.kind, *noise)
         weight = points["length"] / (settings.correlation * (sigma**2 + settings.edge**2))
 
@@ -352,7 +341,6 @@ def offsets(
     pooling: float,
     floor: float,
     clipped: float,
-    shading: float,
     temperature: float,
     mask_sigma: float,
 ) -> tuple[Array, Array, NDArray[np.uint8]]:
@@ -360,42 +348,30 @@ def offsets(
     (DROPPED, MEASURED). The arguments after `mask_kind` are those of `ImageSettings`."""
     n = len(points)
     r, sigma, kind = np.zeros(n), np.ones(n), np.zeros(n, np.uint8)
-    noise = (pooling, floor, clipped, shading, temperature, mask_sigma)
+    noise = (pooling, floor, clipped, temperature, mask_sigma)
     _offsets(points, image, guarded, by_mask, mask_kind, *noise, r, sigma, kind)
     return r, sigma, kind
 
 
-@kernel("POINT[n], u1[h, w, 3], u1[h, w], f8[n], u1[n], f8, f8, f8, f8, f8, f8, out f8[n], out f8[n], out u1[n]", POINT=POINT)
-def _offsets(
-    points, image, guarded, by_mask, mask_kind, pooling, floor, clipped, shading, temperature, mask_sigma, r, sigma, kind
-):
+@kernel("POINT[n], u1[h, w, 3], u1[h, w], f8[n], u1[n], f8, f8, f8, f8, f8, out f8[n], out f8[n], out u1[n]", POINT=POINT)
+def _offsets(points, image, guarded, by_mask, mask_kind, pooling, floor, clipped, temperature, mask_sigma, r, sigma, kind):
     n = len(points)
     colours = np.empty((n, _SAMPLES, 3), np.float32)
     first, last = np.empty(n, np.int64), np.empty(n, np.int64)  # of the samples that nothing covers
-    counts, deep = np.empty(_SAMPLES), np.zeros(_SAMPLES)
+    counts = np.empty(_SAMPLES)
     for s in range(_SAMPLES):
         t = s - LINE
         counts[s] = math.exp(-0.5 * ((abs(t) - NEAR) / SPREADS[0 if t < 0 else 1]) ** 2)
-        if t <= -DEEP_FROM:
-            deep[s] = math.exp(-0.5 * ((t + DEEP) / DEEP_SPREAD) ** 2)
     own = np.zeros((n, 2, 10))  # of the samples inside and outside: number, sums, sums of products
-    own_change = np.zeros((n, 14))  # of those inside, by `_count_change`
     for i in range(n):
         first[i], last[i] = _read(points[i], image, guarded, colours[i])
         for s in range(first[i], last[i] + 1):
             t = s - LINE
             if abs(t) >= NEAREST:
                 _count(own[i, 0 if t < 0 else 1], colours[i, s], counts[s])
-                if t < 0:
-                    _count_change(own_change[i], colours[i, s], float(t), counts[s], deep[s])
-    side, change = np.empty((2, 10)), np.empty(14)
-    slope, within = np.empty(3), np.empty((_SAMPLES, 3))  # of the colours inside: change per pixel, and what it makes of samples
+    side = np.empty((2, 10))
     mean, spread = np.empty((2, 3)), np.empty((2, 6))
     mixture = np.empty((2 * _MIXED + 1, 10))  # mean, precision and log determinant of each
-    shares = np.empty(2 * _MIXED + 1)  # of the inside in each
-    for m in range(2 * _MIXED + 1):
-        shares[m] = 0.5 - 0.5 * math.tanh(0.5 * (m - _MIXED) / BLUR)
-    shares[0], shares[2 * _MIXED] = 1.0, 0.0
     pure = np.empty((2, _SAMPLES))
     score = np.empty(_GRID)
     reach2 = (2.5 * pooling) ** 2
@@ -403,7 +379,6 @@ def _offsets(
         if first[i] > LINE - NEAREST or last[i] < LINE + NEAREST:
             continue
         side[:] = 0.0
-        change[:] = 0.0
         here = points[i]
         for j in range(n):
             other = points[j]
@@ -414,20 +389,18 @@ def _offsets(
                 for a in range(2):
                     for b in range(10):
                         side[a, b] += w * own[j, a, b]
-                for b in range(14):
-                    change[b] += w * own_change[j, b]
         if side[0, 0] < 2.0 or side[1, 0] < 2.0:
             continue
         for a in range(2):
             _moments(side[a], floor, mean[a], spread[a])
-        _shade(change, side[0, 0], shading, mean, spread[0], slope)
         for m in range(2 * _MIXED + 1):
-            _blend(shares[m], mean[0], mean[1], mixture[m])
-            _mix(shares[m], spread, mixture[m])
+            share = 0.5 - 0.5 * math.tanh(0.5 * (m - _MIXED) / BLUR)
+            if m == 0:
+                share = 1.0
+            elif m == 2 * _MIXED:
+                share = 0.0
+            _mix(share, mean, spread, mixture[m])
         for s in range(first[i], last[i] + 1):
-            for c in range(3):
-                within[s, c] = max(mean[0, c] + slope[c] * min(s - LINE, EXTENDS), 1.0)
-                mixture[0, c] = within[s, c]
             pure[0, s] = _misfit(colours[i, s], mixture[0], clipped)
             pure[1, s] = _misfit(colours[i, s], mixture[2 * _MIXED], clipped)
         best = -1e30
@@ -441,7 +414,6 @@ def _offsets(
                 elif m >= 2 * _MIXED:
                     total += pure[1, s]
                 else:
-                    _blend(shares[m], within[s], mean[1], mixture[m])
                     total += _misfit(colours[i, s], mixture[m], clipped)
             score[o] = -0.5 * total / temperature
             if mask_kind[i] == MEASURED:
@@ -517,64 +489,13 @@ def _moments(sums, floor, mean, spread):
 
 
 @inner
-def _count_change(sums, colour, t, weight, deep):
-    """Adds a colour at t [px] outside the contour to the sums (14,) from which `_shade` learns. weight: as of `_count`; deep: its
-    weight for the change."""
-    sums[0] += weight * t
-    sums[1] += weight * t * t
-    sums[5] += deep
-    sums[6] += deep * t
-    sums[7] += deep * t * t
-    for c in range(3):
-        sums[2 + c] += weight * t * colour[c]
-        sums[8 + c] += deep * colour[c]
-        sums[11 + c] += deep * t * colour[c]
-
-
-@inner
-def _shade(sums, n, shading, mean, spread, slope):
-    """Replaces the inside's mean of mean (2, 3) by that at the contour, and its covariance (6,) by that about colours that change
-    by slope (3,) per pixel outwards. sums, n: of `_count_change` and of the weights.
-
-    The change counts where much of it leads to the colours outside: the last pixels of a limb's shaded side may look like what
-    is behind it."""
-    depth = sums[0] / n
-    square = sums[1] / n - depth * depth
-    deep = max(sums[5], 1e-6)
-    deeper = sums[6] / deep
-    lever = max(sums[7] / deep - deeper * deeper, 0.0) + UNCHANGED
-    towards, apart = 0.0, 1.0
-    for c in range(3):
-        sums[2 + c] = sums[2 + c] / n - depth * mean[0, c]
-        slope[c] = sums[2 + c] / (square + UNCHANGED)
-        step = mean[1, c] - mean[0, c]
-        towards += step * (sums[11 + c] - deeper * sums[8 + c]) / (deep * lever)
-        apart += step * step
-    ratio = max(towards / apart, 0.0) / shading
-    for c in range(3):
-        slope[c] *= ratio**4 / (ratio**4 + 1.0)
-        mean[0, c] -= depth * slope[c]
-    k = 0
-    for c in range(3):
-        for d in range(c, 3):
-            spread[k] += slope[c] * slope[d] * square - slope[c] * sums[2 + d] - slope[d] * sums[2 + c]
-            k += 1
-
-
-@inner
-def _blend(share, inside, outside, out):
-    """Colour (3,) of a pixel that shows `share` of the inside.
+def _mix(share, mean, spread, out):
+    """Mean (3,), precision (6,) and log determinant of the covariance of the colours where a pixel shows `share` of the inside.
 
     Light mixes, and not a display's values: without this an edge seems to lie in the darker side, by up to a quarter of a pixel.
     """
     for c in range(3):
-        out[c] = math.sqrt(share * inside[c] ** 2 + (1.0 - share) * outside[c] ** 2)
-
-
-@inner
-def _mix(share, spread, out):
-    """Precision (6,) and log determinant, into out[3:], of the covariance of the colours where a pixel shows `share` of the
-    inside."""
+        out[c] = math.sqrt(share * mean[0, c] ** 2 + (1.0 - share) * mean[1, c] ** 2)
     mixed = share * spread[0] + (1.0 - share) * spread[1]
     a, b, c, d, e, f = mixed[0], mixed[1], mixed[2], mixed[3], mixed[4], mixed[5]
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d

@@ -232,20 +232,17 @@ def test_a_bent_hand_leaves_the_roll_open_and_nothing_else():
     np.testing.assert_allclose(bent - straight, limits.rotation**2 * np.outer(axis, axis), atol=1e-12)
 
 
-def test_what_the_prediction_knows_stays_known_where_the_hand_is_hidden(visible):
-    """In one scene the poses differ, and with them what the picture measures: eight scenes tell what the prediction adds."""
-    sigmas = []
-    for seed, shot in zip(SEEDS, visible, strict=True):
-        behind, image = with_hand_covered(shot)
-        T = start(shot, seed)
-        for prior in (PRIOR, with_open_roll(T)):
-            estimate = looked_at(shot, behind, image, T, prior)[-1]
-            assert estimate.state == "tracking"
-            place = np.sqrt(np.trace(estimate.covariance[:3, :3]))
-            sigmas.append((place, np.sqrt(estimate.T[:3, 0] @ estimate.covariance[3:, 3:] @ estimate.T[:3, 0])))
-            assert prior is not PRIOR or error_cm(shot, estimate) < 3.0 * 100.0 * place
-    place, roll = np.mean(sigmas[::2], axis=0) / np.mean(sigmas[1::2], axis=0)
-    assert place < 0.8 and roll < 0.5
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_the_prediction_knows_stays_known_where_the_hand_is_hidden(visible, seed):
+    shot = visible[seed]
+    behind, image = with_hand_covered(shot)
+    T = start(shot, seed)
+    known, not_known = (looked_at(shot, behind, image, T, prior)[-1] for prior in (PRIOR, with_open_roll(T)))
+    place, open_place = (np.sqrt(np.trace(each.covariance[:3, :3])) for each in (known, not_known))
+    roll, open_roll = (np.sqrt(each.T[:3, 0] @ each.covariance[3:, 3:] @ each.T[:3, 0]) for each in (known, not_known))
+    assert known.state == not_known.state == "tracking"
+    assert place < open_place and roll < 0.9 * open_roll
+    assert error_cm(shot, known) < 3.0 * 100.0 * place
 
 
 def test_the_edge_of_a_side_in_the_shade_is_found_where_it_is():
@@ -258,32 +255,10 @@ def test_the_edge_of_a_side_in_the_shade_is_found_where_it_is():
     points["pixel"] = np.column_stack([np.arange(10.0, 70.0, 3.0), np.full(20, 29.5)])
     points["normal"], points["length"] = (0.0, 1.0), 3.0
     nothing, settings = np.zeros((60, 80), np.uint8), ImageSettings()
-    noise = (settings.pooling, settings.floor, settings.clipped, settings.shading, settings.temperature, settings.mask)
+    noise = (settings.pooling, settings.floor, settings.clipped, settings.temperature, settings.mask)
     r, _, kind = offsets(points, np.rint(values).astype(np.uint8), nothing, np.zeros(20), nothing[0, :20].copy(), *noise)
     assert (kind == MEASURED).all()
     assert abs(np.mean(r)) < 0.1
-
-
-def test_the_edge_of_a_side_that_darkens_to_its_background_is_found_from_inside_as_well():
-    # a limb above row 30 that darkens ever faster, to what is behind it but for a little blue, as on a replay's shaded side
-    depth = np.arange(29.5, -31.0, -1.0)[:60, None]
-    limb = np.array([190.0, 150.0, 133.0]) - np.exp(-np.clip(depth, 0.0, None) / 3.0) * [95.0, 80.0, 62.0]
-    light = np.repeat(np.where(depth > 0.0, limb, [91.0, 67.0, 84.0])[:, None] ** 2, 80, axis=1)
-    values = np.sqrt(cv2.GaussianBlur(light, (0, 0), 0.7)) + np.random.default_rng(2).normal(0.0, 1.5, light.shape)
-    nothing, settings = np.zeros((60, 80), np.uint8), ImageSettings()
-
-    def off(shading: float) -> float:
-        noise = (settings.pooling, settings.floor, settings.clipped, shading, settings.temperature, settings.mask)
-        points = np.zeros(20, POINT)
-        points["pixel"] = np.column_stack([np.arange(10.0, 70.0, 3.0), np.full(20, 29.5 - 1.5)])
-        points["normal"], points["length"] = (0.0, 1.0), 3.0
-        for _ in range(20):
-            r, _, _ = offsets(points, np.rint(values).astype(np.uint8), nothing, np.zeros(20), nothing[0, :20].copy(), *noise)
-            points["pixel"][:, 1] += np.mean(r)
-        return float(points["pixel"][0, 1]) - 29.5
-
-    assert abs(off(settings.shading)) < 0.5
-    assert off(1e6) < -1.0, "without a change of colours the last pixels of the limb are taken for what is behind it"
 
 
 @pytest.mark.parametrize("points", [8.0, 16.0, 64.0])
