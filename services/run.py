@@ -26,7 +26,7 @@ def serve(process: Process, options: flags.Options, argv: Sequence[str]) -> int:
     sys.setswitchinterval(SWITCH_S)
     from penumbra.shared import native
     from penumbra.shared.cell import description
-    from penumbra.shared.runtime import bus, logs
+    from penumbra.shared.runtime import bus, logs, scheduling
     from penumbra.shared.runtime.node import Node
 
     module = importlib.import_module(process.module)
@@ -36,6 +36,8 @@ def serve(process: Process, options: flags.Options, argv: Sequence[str]) -> int:
     with flags.metrics(options.metrics_port, lambda: [node.report()]):
         native.prepare(partial(node.progress, "compiling"))
         module.start(node, options)
+        if process.goes_first:  # only now: what it prepares takes seconds
+            scheduling.go_first()
         node.run()
     return leave()
 

@@ -21,7 +21,7 @@ from penumbra.services import flags
 from penumbra.services.command import check, look
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract.processes import PROCESSES
-from penumbra.shared.runtime import bus, running
+from penumbra.shared.runtime import bus, running, scheduling
 
 ROOT = Path(__file__).parents[2]
 SHM_BYTES = 128 << 20
@@ -79,6 +79,7 @@ def findings(cell: str, connection: bus.Connection) -> Iterator[Finding]:
     yield _python()
     yield from _packages()
     yield _cores()
+    yield _priority()
     yield _shared_memory()
     yield from _cell(cell)
     yield from _weights()
@@ -145,6 +146,13 @@ def _cores() -> Finding:
     if usable < 2:
         return Finding("warn", f"{usable} core", "the whole chain needs two for its rates")
     return Finding("ok", f"{usable} cores")
+
+
+def _priority() -> Finding:
+    names = ", ".join(process.name for process in PROCESSES if process.goes_first)
+    if scheduling.may_go_first():
+        return Finding("ok", f"real-time priority for {names}")
+    return Finding("ok", f"no real-time priority for {names}: the skin's poses are later (docs/operation.md, Real time)")
 
 
 def _shared_memory(folder: Path = Path("/dev/shm")) -> Finding:

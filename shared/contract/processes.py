@@ -73,8 +73,9 @@ class Process:
     `penumbra up` starts; `restart`: whether it is restarted after a crash; `flags`: passed on by `penumbra up`; `starter`: flag
     of `penumbra up` that starts one, where it is not started by default; `beside`: whether a second instance may run and share
     the streams with the first; `joins`: whether it joins a cell that runs already, and without --cell takes the only one at the
-    router; `is_required`: whether the cell is disconnected without it; `tools`: commands of the service;
-    `trained_by`: tool that trains its weights; `answers`: names of the queryables that it answers beside its health
+    router; `is_required`: whether the cell is disconnected without it; `goes_first`: whether its work is short and must not wait
+    for that of other processes, so that it is scheduled in real time where the system permits it; `tools`: commands of the
+    service; `trained_by`: tool that trains its weights; `answers`: names of the queryables that it answers beside its health
     (`shared.contract.topics.QUERYABLES`); `metrics`: metrics from its report; `in_compose`: whether `docker compose` runs it;
     `imports_sim`: whether its image contains the simulated world.
     """
@@ -91,6 +92,7 @@ class Process:
     beside: bool = True
     joins: bool = False
     is_required: bool = False
+    goes_first: bool = False
     tools: tuple[Tool, ...] = ()
     trained_by: str | None = None
     answers: tuple[str, ...] = ()
@@ -115,6 +117,7 @@ PROCESSES = (
         extra="router",
         beside=False,
         is_required=True,
+        goes_first=True,
     ),
     Process(
         "emulator",
@@ -250,6 +253,7 @@ PROCESSES = (
         "voltages to the skin's pose",
         extra="haptics",
         needs="pads",
+        goes_first=True,
         tools=(
             Tool("train", "train the network", "penumbra.services.haptics.train:main", extra="haptics,train"),
             Tool("shapes", "what unknown shapes do to pads", "penumbra.services.haptics.shapes:main", extra="haptics,train"),
@@ -271,6 +275,7 @@ PROCESSES = (
         "both poses to the one pose",
         extra="fusion",
         replicas=2,  # the pose must not pause when one of them dies
+        goes_first=True,
         flags=(Flag("observer", "of the fusion", choices=("default", "paper")),),
         answers=("current_pose", "description"),
         metrics=(

@@ -19,6 +19,8 @@ from rich.table import Table
 from penumbra.services import flags
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, topics
+from penumbra.shared.contract.processes import PROCESSES
+from penumbra.shared.runtime import scheduling
 from penumbra.tests.bench.lib import accuracy, results
 from penumbra.tests.bench.lib.accuracy import SENSES, percentiles
 from penumbra.tests.bench.lib.results import Part, Result, marked
@@ -91,6 +93,7 @@ def tables(result: Result) -> list[Part]:
     for key, name, goal in AGES:
         p50, p95 = result[key]["p50"], result[key]["p95"]
         table.add_row(name, "-" if p95 is None else marked(f"{p50:.1f} / {p95:.1f}", p95 <= goal), f"p95 <= {goal:g}")
+    table.add_row("skin, fusion and router in real time", "yes" if result["in_real_time"] else "no", "")
     for name, share in result["cpu"].items():
         table.add_row(f"CPU of {name}", f"{share:.2f} cores", "")
     own = sum(share for name, share in result["cpu"].items() if name != "emulator")
@@ -114,6 +117,8 @@ def main(options: flags.Options, report: results.Report) -> None:
     with penumbra_up(options.cell, options.seed, *options.up) as running:
         wait_for(running.is_tracking, 120, "a tracked pose", 0.5)
         processes = running.processes()
+        first = [processes[process.name] for process in PROCESSES if process.goes_first and process.name in processes]
+        in_real_time = all(scheduling.goes_first(process.pid) for process in first)
         recording = Recording(running.session, cell.name, target)
         cpu_before, started = cpu_times(processes), time.monotonic()
         time.sleep(options.seconds)
@@ -129,6 +134,7 @@ def main(options: flags.Options, report: results.Report) -> None:
         "fused_hz": round(len(estimates["fused"]) / elapsed, 2),
         "age_ms": percentiles(fused_ages_s(estimates["vision"], estimates["fused"]), 1e3),
         "haptic_age_ms": percentiles(haptic_age, 1e-6),
+        "in_real_time": in_real_time,
         "cpu": {name: round((cpu_after[name] - cpu_before[name]) / elapsed, 3) for name in cpu_after},
     })  # fmt: skip
 
