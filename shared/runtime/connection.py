@@ -27,6 +27,9 @@ nothing behind: readers keep the pool of a publisher that died for as long as th
 ATTEMPT_MS = 500
 """Maximum time [ms] of one attempt to reach the router, inside Zenoh, where no signal is handled."""
 
+RETRY = {"period_init_ms": 10, "period_max_ms": 200, "period_increase_factor": 1.5}
+"""Pauses between the attempts: a router that died listens again after some 40 ms, and the pose is missing until then."""
+
 
 class BusError(RuntimeError):
     """The bus cannot be used as requested. The text says what to do."""
@@ -118,7 +121,7 @@ def configuration(connection: Connection) -> zenoh.Config:
         # one attempt is short, because Ctrl-C has no effect inside it; `open_session` repeats it, and later Zenoh itself does
         "connect/timeout_ms": ATTEMPT_MS,
         "connect/exit_on_failure": False,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 200, "period_increase_factor": 1},
+        "connect/retry": RETRY,
         # processes connect to the router only: no peer is found by chance
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,

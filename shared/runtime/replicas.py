@@ -19,10 +19,11 @@ import zenoh
 from penumbra.shared.runtime.beats import BEAT_S, Beats
 from penumbra.shared.runtime.traffic import Traffic
 
-CLOCK_S = 1.0
-"""Period [s] over which messages are counted to detect a process's clock that differs from all others."""
 CLOCK_MESSAGES = 10
-"""Minimum number of messages refused for their stamps in it. Chosen, not measured."""
+"""Number of messages in a row refused for their stamps from which a process's clock differs from all others. Chosen, not
+measured."""
+CLOCK_SILENT_S = 1.0
+"""Time [s] without such messages after which nothing is known of the clock any more."""
 PACE_SHARE = 0.5
 """Weight of the newest check in the smoothed lateness of a process: three late checks in a row suffice."""
 PACE_LOST = 0.5
@@ -190,19 +191,21 @@ class Clock:
     there is none."""
 
     def __init__(self) -> None:
-        self._since_s = -math.inf
-        self._good = self._odd = 0
+        self._good = self._odd = self._odd_before = 0
+        self._odd_s = -math.inf
         self.fault = ""
 
     def judge(self, traffic: Iterable[Traffic], now_s: float) -> str:
         """The current fault. traffic: counters of everything that is read; now_s: monotonic time."""
-        if now_s - self._since_s >= CLOCK_S:
-            traffic = list(traffic)
-            good = sum(each.count for each in traffic)
-            odd = sum(each.bad.get("past", 0) + each.bad.get("future", 0) for each in traffic)
-            is_off = odd - self._odd >= CLOCK_MESSAGES and good == self._good
-            self.fault = "all received messages have stamps of another time: check the clock of this host" if is_off else ""
-            self._since_s, self._good, self._odd = now_s, good, odd
+        traffic = list(traffic)
+        good = sum(each.count for each in traffic)
+        odd = sum(each.bad.get("past", 0) + each.bad.get("future", 0) for each in traffic)
+        if odd != self._odd:
+            self._odd, self._odd_s = odd, now_s
+        if good != self._good or now_s - self._odd_s > CLOCK_SILENT_S:
+            self._good, self._odd_before, self.fault = good, odd, ""
+        elif odd - self._odd_before >= CLOCK_MESSAGES:
+            self.fault = "all received messages have stamps of another time: check the clock of this host"
         return self.fault
 
 

@@ -5,20 +5,28 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections.abc import Iterable
 from pathlib import Path
 
 PRIORITY = 1
 """Priority in real time, the lowest: it is before all processes that have none."""
 ITSELF = 0
 """The number of the calling thread, for the kernel."""
+TASKS = Path("/proc/self/task")
+"""The threads of this process."""
 
 
-def go_first() -> bool:
+def go_first(with_caller: bool = True) -> bool:
     """Schedules all threads of this process, and those that they start, before the processes of this machine that have no
     real-time priority (SCHED_RR, `man 7 sched`). Returns whether the system permits it; if not, nothing changes. It needs Linux,
-    and a limit RLIMIT_RTPRIO of at least `PRIORITY` or the capability CAP_SYS_NICE."""
-    return _schedule([ITSELF]) and _schedule(int(task.name) for task in Path("/proc/self/task").iterdir())
+    and a limit RLIMIT_RTPRIO of at least `PRIORITY` or the capability CAP_SYS_NICE. with_caller: the calling thread as well."""
+    if not may_go_first():
+        return False
+    left_out = None if with_caller else threading.get_native_id()
+    for thread in (int(task.name) for task in TASKS.iterdir()):
+        if thread != left_out:
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                _schedule(thread)
+    return True
 
 
 def may_go_first() -> bool:
@@ -27,7 +35,9 @@ def may_go_first() -> bool:
 
     def ask() -> None:
         nonlocal permitted
-        permitted = _schedule([ITSELF])
+        with contextlib.suppress(AttributeError, PermissionError):  # not Linux, or no right
+            _schedule(ITSELF)
+            permitted = True
 
     thread = threading.Thread(target=ask)
     thread.start()
@@ -40,13 +50,5 @@ def goes_first(pid: int) -> bool:
     return hasattr(os, "sched_getscheduler") and os.sched_getscheduler(pid) == os.SCHED_RR
 
 
-def _schedule(threads: Iterable[int]) -> bool:
-    if not hasattr(os, "sched_setscheduler"):
-        return False
-    for thread in threads:
-        try:
-            with contextlib.suppress(ProcessLookupError):  # it has just ended
-                os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY))
-        except PermissionError:
-            return False
-    return True
+def _schedule(thread: int) -> None:
+    os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY))

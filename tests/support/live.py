@@ -18,6 +18,7 @@ import zenoh
 
 from penumbra.shared.cell import description as cells
 from penumbra.shared.contract import messages, processes, topics
+from penumbra.shared.runtime.connection import RETRY
 
 PATIENCE_S = 60.0
 """Minimum deadline [s] of a test: a step that is short on a quiet machine takes a while on a busy one, and a deadline that is not
@@ -73,11 +74,12 @@ def free_port() -> int:
 
 
 def connect(port: int = 7447) -> zenoh.Session:
-    """A client session at a router on loopback, as any user of the bus would open it."""
+    """A client session at a router on loopback, as any user of the bus would open it, but one that finds a router that is back as
+    soon as the services do: with Zenoh's default it tries again after a second."""
     return zenoh.open(
         zenoh.Config.from_json5(
-            f'{{mode: "client", connect: {{endpoints: ["tcp/127.0.0.1:{port}"], timeout_ms: -1, exit_on_failure: false}}, '
-            "scouting: {multicast: {enabled: false}}}"
+            f'{{mode: "client", connect: {{endpoints: ["tcp/127.0.0.1:{port}"], timeout_ms: -1, exit_on_failure: false, '
+            f"retry: {json.dumps(RETRY)}}}, scouting: {{multicast: {{enabled: false}}}}}}"
         )
     )
 

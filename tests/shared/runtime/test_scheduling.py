@@ -56,6 +56,13 @@ def test_all_threads_go_first_those_that_were_there_before_and_those_that_come()
     assert policies.split() == [str(os.SCHED_RR)] * 4
 
 
+@permitted
+def test_the_caller_may_stay_behind_with_what_it_starts():
+    said, policies = asked(ASKS.replace("go_first()", "go_first(with_caller=False)"))
+    assert said == "True"
+    assert [int(policy) for policy in policies.split()] == [os.SCHED_OTHER, os.SCHED_RR, os.SCHED_RR, os.SCHED_OTHER]
+
+
 def test_asking_changes_nothing():
     scheduling.may_go_first()
     assert not scheduling.goes_first(os.getpid())
