@@ -15,17 +15,15 @@ TASKS = Path("/proc/self/task")
 """The threads of this process."""
 
 
-def go_first(with_caller: bool = True) -> bool:
-    """Schedules all threads of this process, and those that they start, before the processes of this machine that have no
-    real-time priority (SCHED_RR, `man 7 sched`). Returns whether the system permits it; if not, nothing changes. It needs Linux,
-    and a limit RLIMIT_RTPRIO of at least `PRIORITY` or the capability CAP_SYS_NICE. with_caller: the calling thread as well."""
+def go_first(with_children: bool = True) -> bool:
+    """Schedules all threads of this process before the processes of this machine that have no real-time priority (SCHED_RR, `man
+    7 sched`). Returns whether the system permits it; if not, nothing changes. It needs Linux, and a limit RLIMIT_RTPRIO of at
+    least `PRIORITY` or the capability CAP_SYS_NICE. with_children: also the threads and processes that it starts from then on."""
     if not may_go_first():
         return False
-    left_out = None if with_caller else threading.get_native_id()
-    for thread in (int(task.name) for task in TASKS.iterdir()):
-        if thread != left_out:
-            with contextlib.suppress(ProcessLookupError):  # it has just ended
-                _schedule(thread)
+    for task in TASKS.iterdir():
+        with contextlib.suppress(ProcessLookupError):  # it has just ended
+            _schedule(int(task.name), os.SCHED_RR if with_children else os.SCHED_RR | os.SCHED_RESET_ON_FORK)
     return True
 
 
@@ -36,7 +34,7 @@ def may_go_first() -> bool:
     def ask() -> None:
         nonlocal permitted
         with contextlib.suppress(AttributeError, PermissionError):  # not Linux, or no right
-            _schedule(ITSELF)
+            _schedule(ITSELF, os.SCHED_RR)
             permitted = True
 
     thread = threading.Thread(target=ask)
@@ -50,5 +48,5 @@ def goes_first(pid: int) -> bool:
     return hasattr(os, "sched_getscheduler") and os.sched_getscheduler(pid) == os.SCHED_RR
 
 
-def _schedule(thread: int) -> None:
-    os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY))
+def _schedule(thread: int, policy: int) -> None:
+    os.sched_setscheduler(thread, policy, os.sched_param(PRIORITY))

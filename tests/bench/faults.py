@@ -287,7 +287,7 @@ def run(options: flags.Options, done: Callable[[Row], None]) -> None:
             names = (chain.cell.one("targets", None), next(iter(chain.cell.pads)))
             wait_for(chain.is_settled, READY_S, "a chain that tracks the arm", 0.3)
             chain.outside = stack.enter_context(observed.Outside(chain.running.session, options.cell, *names))
-            scheduling.go_first(with_caller=False)  # or gaps contain this process's own waiting
+            scheduling.go_first(with_children=False)  # or gaps contain this process's own waiting
             for name, service in track(rows, f"{setup}, {number} of each", console=Console(stderr=True)):
                 done(measure(chain, name, service))
 

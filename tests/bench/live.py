@@ -120,7 +120,7 @@ def main(options: flags.Options, report: results.Report) -> None:
         first = [processes[process.name] for process in PROCESSES if process.goes_first and process.name in processes]
         in_real_time = all(scheduling.goes_first(process.pid) for process in first)
         recording = Recording(running.session, cell.name, target)
-        scheduling.go_first(with_caller=False)  # or ages contain this process's own waiting
+        scheduling.go_first(with_children=False)  # or ages contain this process's own waiting
         cpu_before, started = cpu_times(processes), time.monotonic()
         time.sleep(options.seconds)
         elapsed, cpu_after = time.monotonic() - started, cpu_times(processes)

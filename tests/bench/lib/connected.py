@@ -273,7 +273,7 @@ def _chain(cell: str, seed: int) -> Iterator[Beside]:
         loaded = cells.load(cell)
         target = loaded.one("targets", None)
         outside = stack.enter_context(observed.Outside(running.session, running.cell, target, next(iter(loaded.pads))))
-        scheduling.go_first(with_caller=False)  # or gaps contain this process's own waiting
+        scheduling.go_first(with_children=False)  # or gaps contain this process's own waiting
         yield Beside(running, target, outside, router, page, folder, disk)
 
 
