@@ -152,7 +152,8 @@ def _priority() -> Finding:
     names = ", ".join(process.name for process in PROCESSES if process.goes_first)
     if scheduling.may_go_first():
         return Finding("ok", f"real-time priority for {names}")
-    return Finding("ok", f"no real-time priority for {names}: the skin's poses are later (docs/operation.md, Real time)")
+    later = f"no real-time priority for {names}: the skin's poses are later"
+    return Finding("ok", later, "optional: docs/operation.md, Real time, tells how to permit it")
 
 
 def _shared_memory(folder: Path = Path("/dev/shm")) -> Finding:

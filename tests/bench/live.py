@@ -93,7 +93,8 @@ def tables(result: Result) -> list[Part]:
     for key, name, goal in AGES:
         p50, p95 = result[key]["p50"], result[key]["p95"]
         table.add_row(name, "-" if p95 is None else marked(f"{p50:.1f} / {p95:.1f}", p95 <= goal), f"p95 <= {goal:g}")
-    table.add_row("skin, fusion and router in real time", "yes" if result["in_real_time"] else "no", "")
+    names = ", ".join(process.name for process in PROCESSES if process.goes_first)
+    table.add_row(f"{names} in real time", "yes" if result["in_real_time"] else "no", "")
     for name, share in result["cpu"].items():
         table.add_row(f"CPU of {name}", f"{share:.2f} cores", "")
     own = sum(share for name, share in result["cpu"].items() if name != "emulator")
