@@ -19,7 +19,8 @@ reads pose + offset + bias + white noise. The offset is unknown at first, and co
 sense is on trial, its measurements update the offset and not the pose; later ones also update the motion of the limb, as far as
 their noise allows. The speed of the offset's walk is learned: a sense whose offset runs away says nothing about the limb. The
 offset is dropped when a measurement passes the gate without it, because the sense is right again, and when the sense or another
-one is surprising: then the sense is not used until it is right again.
+one is surprising: then the sense is not used until it is right again, which also means near what the others measured last: a
+covariance that has grown since lets anything pass the gate.
 
 Three factors adapt to the innovations, by whether each innovation resembles the one before of the same sense:
 - If those of a wrong sense, relative to its offset, resemble each other, the offset runs away: its walk grows.
@@ -126,6 +127,10 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
     while True:
         linearised(model, state, m, z, H)
         innovated(model, state, m, z, H, PHt, S_inverse, innovation)
+        for j in range(POSE):
+            sense.residual[j] = 0.0
+            for k in range(m.rank):
+                sense.residual[j] += z[k] * m.directions[k, j]
         if fresh:
             break
         distance = so3.dot(innovation, innovation)
@@ -134,6 +139,8 @@ def step(model, state, m, PHt):  # type: ignore[no-untyped-def]
         contradicted = _is_contradicted(one, state, m, z)
         gate = 0 if not contradicted else 1 if sense.refused < one.refusals else 2
         passes = distance <= model.senses[m.source].threshold[gate, m.rank]
+        if passes and sense.unsteady and _disagrees(one, state, m):  # only the covariance has grown meanwhile
+            passes, contradicted = False, True
         if now.wrong != NOBODY and now.wrong != m.source and distance > model.senses[m.source].threshold[1, m.rank]:
             _refute(state)
             continue
@@ -241,6 +248,31 @@ def _is_contradicted(one, state, m, z):  # type: ignore[no-untyped-def]
                 apart += (along / other.sigma[k]) ** 2
             if apart > TOLD_APART:
                 return True
+    return False
+
+
+@inner
+def _disagrees(one, state, m):  # type: ignore[no-untyped-def]
+    """Whether a recent measurement of another sense is told apart from this one, by the covariances of the two. If the other one
+    was refused, the limb may have moved in between as the state does not."""
+    sense = state.senses[m.source]
+    for s in range(len(state.senses)):
+        other = state.senses[s]
+        age = (m.stamp_ns - other.measured_ns) * 1e-9
+        if s == m.source or age >= one.agreement_time:
+            continue
+        apart = 0.0
+        for k in range(other.rank):
+            along, variance = 0.0, other.sigma[k] ** 2
+            for j in range(POSE):
+                along += (sense.residual[j] - other.residual[j]) * other.directions[k, j]
+                if other.refused:
+                    variance += (age * one.velocity_spread[j // 3] / UNITS[j] * other.directions[k, j]) ** 2
+            for i in range(m.rank):
+                variance += (m.sigma[i] * so3.dot(m.directions[i], other.directions[k])) ** 2
+            apart += along**2 / variance
+        if apart > TOLD_APART:
+            return True
     return False
 
 
@@ -536,6 +568,9 @@ def update(state, m, z, PHt, S_inverse, first):  # type: ignore[no-untyped-def]
                 P[i, j] -= K[k] * PHt[j, k]
         if i < first:
             correction = 0.0
+        if i < POSE:
+            for s in range(len(state.senses)):
+                state.senses[s].residual[i] -= correction / UNITS[i]
         if i < 3:
             now.p[i] += correction
         elif i < POSE:

@@ -100,6 +100,7 @@ SENSE_STATE = np.dtype(
         ("directions", "f8", (POSE, POSE)),
         ("sigma", "f8", POSE),
         ("rest", "f8", POSE),
+        ("residual", "f8", POSE),  # how far it is from the state along them, in UNITS
         ("learned_ns", "i8"),  # stamp of the last measurement to which agility and doubt were adapted
         ("accepted_ns", "i8"),  # stamp of the last accepted measurement
         ("refused", "i8"),  # number of measurements refused since

@@ -155,12 +155,13 @@ def test_a_sense_that_was_wrong_is_used_again_when_it_agrees_and_not_when_it_is_
     assert accepted(refusals=100) and not accepted(refusals=5)
 
 
-def beside_a_wrong_skin(off: Callable[[float], float]) -> ErrorStateObserver:
-    """One that sees a limb until 1.95 s, at 0.1 m/s from 1.2 s on, beside a skin that is off along y by `off` [m] from 1 s on."""
+def beside_a_wrong_skin(off: Callable[[float], float], speed: float = 0.1) -> ErrorStateObserver:
+    """One that sees a limb until 1.95 s, at a speed [m/s] from 1.2 s on, beside a skin that is off along y by `off` [m] from 1 s
+    on."""
     observer = ErrorStateObserver(HOME, SPREAD)
     for k in range(196):
         t = 0.01 * k
-        moved = 0.1 * max(0.0, t - 1.2)
+        moved = speed * max(0.0, t - 1.2)
         if k % 5 == 0:
             observer.measure("vision", ns(t), perturb(HOME, [0.0, moved, 0.0, 0.0, 0.0, 0.0]), VISION)
         observer.measure(
@@ -194,6 +195,12 @@ def test_a_sense_that_is_off_by_an_offset_is_refused_and_still_makes_the_pose_su
 def test_a_wrong_sense_whose_offset_does_not_stay_is_hardly_followed(off: Callable[[float], float], within: float) -> None:
     # the limb has gone 7.5 cm, and the offset has changed by as much, by 28 cm, and by 10 cm
     assert beside_a_wrong_skin(off).estimate(ns(1.95)).T[1, 3] == pytest.approx(0.075, abs=within)
+
+
+def test_a_wrong_sense_is_not_used_again_where_a_limb_sets_out_and_the_covariance_grows() -> None:
+    observer = beside_a_wrong_skin(lambda t: -0.1, speed=0.8)  # the skin feels the limb where it was when it set out
+    assert observer.log.counts["haptic"].gated == 96
+    assert observer.estimate(ns(1.95)).T[1, 3] == pytest.approx(0.6, abs=0.01)
 
 
 def test_tracking_promises_its_bound_at_three_standard_deviations() -> None:
