@@ -107,15 +107,26 @@ def hypotheses(model: Model, evidence: Evidence, T_home: Array) -> list[Array]:
 def mirrored(T: Array) -> list[Array]:
     """Poses (4 x 4 each) with nearly the same silhouette as T_camera_target: the axis tilted the other way out of the image
     plane, or another roll. A fit that stopped at one of them is restarted from the others."""
-    sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
-    x = T[:3, 0]
-    reflected = x - 2.0 * (x @ sight) * sight
-    starts = []
-    for R, roll in ((_shortest_rotation(x, reflected), 0.0), (np.eye(3), 0.6), (np.eye(3), -0.6)):
-        start = T.copy()
-        start[:3, :3] = rigid.rotation(roll * x) @ R @ T[:3, :3]
-        starts.append(start)
-    return starts
+    return [tilted(T, -2.0 * tilt(T)), rolled(T, 0.6), rolled(T, -0.6)]
+
+
+def tilt(T: Array) -> float:
+    """The angle [rad] from the image plane to the axis of T_camera_target (4 x 4), positive away from the camera."""
+    return float(np.arcsin(np.clip(T[:3, 0] @ T[:3, 3] / np.linalg.norm(T[:3, 3]), -1.0, 1.0)))
+
+
+def tilted(T: Array, angle: float) -> Array:
+    """T_camera_target (4 x 4) with its axis turned away from the camera by an angle [rad]."""
+    out = T.copy()
+    out[:3, :3] = rigid.rotation(angle * _perpendicular(T[:3, 0], T[:3, 3])) @ T[:3, :3]
+    return out
+
+
+def rolled(T: Array, angle: float) -> Array:
+    """T_camera_target (4 x 4) turned about its axis by an angle [rad]."""
+    out = T.copy()
+    out[:3, :3] = rigid.rotation(angle * T[:3, 0]) @ T[:3, :3]
+    return out
 
 
 def _directions(evidence: Evidence, rows: NDArray[np.intp], columns: NDArray[np.intp], axis: Array) -> list[Array]:
@@ -130,11 +141,12 @@ def _directions(evidence: Evidence, rows: NDArray[np.intp], columns: NDArray[np.
 
 def _shortest_rotation(a: Array, b: Array) -> Array:
     """The rotation matrix of the shortest arc from unit vector a (3,) to b (3,); about any perpendicular if they are opposite."""
+    return rigid.rotation(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b) * _perpendicular(a, b))
+
+
+def _perpendicular(a: Array, b: Array) -> Array:
+    """The unit vector (3,) along a x b; any that is perpendicular to a, if they are parallel."""
     axis = np.cross(a, b)
     if np.linalg.norm(axis) < 1e-9:
-        if a @ b > 0.0:
-            return np.eye(3)
         axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
-        return rigid.rotation(np.pi * axis / np.linalg.norm(axis))
-    angle = np.arctan2(np.linalg.norm(axis), a @ b)
-    return rigid.rotation(angle * axis / np.linalg.norm(axis))
+    return np.asarray(axis / np.linalg.norm(axis), np.float64)

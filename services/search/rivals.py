@@ -1,22 +1,24 @@
 """Rivals of a tracked limb's pose, which explain the picture as well: another roll if the hand is hidden, another tilt if the
 limb lies in the image plane.
 
-A forearm is nearly round. Without its hand, a limb that is turned over has almost the same contour, and every fit keeps the roll
-that it started from, right or wrong. So rivals are fitted to the picture: turns about the limb's axis, and the mirror image of
-its tilt. One that the image does not confirm there is fitted to the mask first: a turned limb of which only a piece shows lies
-elsewhere. The evidence of the pictures about a rival is summed. A rival that the pictures and the prediction prefer replaces the
-pose, and all rivals are compared anew. Until that is done, it keeps its place in the next pictures, in which a fit from the
-prediction, which has the turn before, would end at the previous pose again. A rival that is not refuted makes the pose as
-uncertain as the two are apart, until it is compared again; so does one that was not compared yet. The prediction counts because
-it knows the pictures before: a limb does not turn over because something hides its hand. A turn whose fit ends at the pose is no
-other pose for now, and the evidence about it starts over: where a hand turns past the view in which both its turns look the same,
-the two poses meet and part again, and what was said before does not tell which of them is right. The mirror image meets the pose
-whenever the limb lies across the line of sight, and is held to what was said before.
+A forearm is nearly round. Without its hand, a limb that is turned over has almost the same contour, and every fit keeps the
+roll that it started from, right or wrong. So rivals are fitted to the picture: turns about the limb's axis, the mirror image of
+its tilt, and another tilt: nearly across the line of sight, two tilts to the same side may have much the same contour (about 5
+and 27 degrees), each with a minimum of its own. A rival that the image does not confirm where it begins is fitted to the mask
+first: a turned limb of which only a piece shows lies elsewhere. The evidence of the pictures about a rival is summed. A rival
+that the pictures and the prediction prefer replaces the pose, and all rivals are compared anew. Until that is done, it keeps
+its place in the next pictures, in which a fit from the prediction, which has the pose before, would end there again. A rival
+that is not refuted makes the pose as uncertain as the two are apart, until it is compared again; so does one that was not
+compared yet. The prediction counts because it knows the pictures before: a limb does not turn over because something hides its
+hand. A turn whose fit ends at the pose is no other pose for now, and the evidence about it starts over: where a hand turns past
+the view in which both its turns look the same, the two poses meet and part again, and what was said before does not tell which
+of them is right. The mirror image meets the pose whenever the limb lies across the line of sight, and is held to what was said
+before.
 
 With a bent hand, a wrong rival may look right, as the mesh's stiff hand then points to where the bent one is. So if the hand is
 bent, only the forearms are compared.
 
-One rival is compared per picture: all eight at once would delay the first pictures of a limb that was just found, and it would
+One rival is compared per picture: all nine at once would delay the first pictures of a limb that was just found, and it would
 have moved by then. The mirror image comes first, also when another rival has won, as it is the farthest away: a limb found again
 with the wrong tilt is 10 cm off. Once all were compared, every second comparison is of a rival that the pictures clearly prefer
 to the pose, if there is one, so that a right one wins within a few pictures. If all are refuted, pictures are skipped, as a
@@ -45,8 +47,13 @@ uncertain as the forearm's (`mask_fit.Fit.hand`)."""
 TURNS = tuple(math.radians(degrees) for degrees in (180.0, 30.0, -30.0, 60.0, -60.0, 120.0, -120.0))
 """Turns of the rivals about the limb's axis [rad], spaced by the reach of `PASSES` steps of a fit, and by half of that next to
 the pose. Measured: a fit that starts 60 degrees from a pose that is off by 35 ends elsewhere."""
-RIVALS, MIRROR = len(TURNS) + 1, 0
-"""Number of rivals: the turns, and the mirror image, which is the first."""
+TILT_RAD = math.radians(22.0)
+"""Distance [rad] of another tilt, and minimum one of the mirror image, which is the pose itself if a limb lies in the image
+plane. Fits to pictures of visible limbs that began so far from the right tilt ended 14 to 24 degrees from it, if elsewhere."""
+MIRROR, TILT = 0, len(TURNS) + 1
+RIVALS = TILT + 1
+"""Number of rivals: the mirror image, which is the first, the turns, and the other tilt, away from the image plane if the limb
+lies nearly in it, and towards it if not."""
 NEAREST = (2, 3)
 """The rivals that are turned by 30 degrees."""
 PASSES = 8
@@ -78,8 +85,8 @@ the mask's boundary is off by a standard deviation over its correlation length (
 picture, as a mask's errors last."""
 APART_RAD = 0.2
 """Angle [rad] below which two poses count as one."""
-JUMPED_RAD = 0.4
-"""Angle [rad] from the pose in the picture before above which a pose has jumped; the pose before is then its rival."""
+ASKEW_RAD = 0.4
+"""Angle [rad] between two axes above which it is another tilt, and not another roll."""
 
 
 class Rivals:
@@ -91,7 +98,7 @@ class Rivals:
 
     def forget(self) -> None:
         """Start over, as with another limb."""
-        self._is_repeat_due, self._nearest = False, 0
+        self._nearest = 0
         self._begin()
 
     def _begin(self, won: int | None = None) -> None:
@@ -101,7 +108,7 @@ class Rivals:
         self._evidence: list[float | None] = [None] * RIVALS
         self._doubts: list[Array | None] = [None] * RIVALS
         self._before: Array | None = None
-        self._compared_ns = 0
+        self._compared_ns, self._is_repeat_due = 0, False
 
     def contested(
         self, best: Fit, stamp_ns: int, shown: Shown, surprise: Callable[[Fit], float], differs: Callable[[Fit], int]
@@ -115,12 +122,12 @@ class Rivals:
         def unlikelier(other: Fit) -> float:
             return min(surprise(other), SURPRISING) - min(surprise(best), SURPRISING)
 
-        if self._before is not None and _angle(self._before, best.T) > JUMPED_RAD:
+        if self._before is not None and _angle(self._before, best.T) > APART_RAD:  # it jumped: the pose before is its rival
             other = _fitted(self._before, best, shown)
             excess = _excess(other, best, shown, differs) + unlikelier(other)
             if other.sharp and excess < (PREFERRED if None in self._evidence else 0.0):
                 best = other
-            else:
+            elif not _is_same(other, best):
                 self._begin()
         if self._is_due(stamp_ns):
             which = self._chosen()
@@ -155,12 +162,12 @@ class Rivals:
     def _chosen(self) -> int:
         """The rival to compare: the next one in turn, but every second time, once all were compared, the one that the pictures
         prefer most to the pose, if they do so clearly, or one of the nearest turns, if all are refuted."""
-        self._is_repeat_due = not self._is_repeat_due
         compared = [evidence for evidence in self._evidence if evidence is not None]
-        if self._is_repeat_due and len(compared) == RIVALS:
-            if min(compared) < -MOST:
+        if len(compared) == RIVALS:
+            self._is_repeat_due = not self._is_repeat_due
+            if self._is_repeat_due and min(compared) < -MOST:
                 return compared.index(min(compared))
-            if self._are_refuted:
+            if self._is_repeat_due and self._are_refuted:
                 self._nearest = (self._nearest + 1) % len(NEAREST)
                 return NEAREST[self._nearest]
         which, self._next = self._next, (self._next + 1) % RIVALS
@@ -186,7 +193,7 @@ def against_mirror(
     `Fit.overlap` of a rival.
     """
     T = detect.mirrored(best.T_searched)[0]
-    if _angle(T, best.T_searched) < JUMPED_RAD:
+    if _angle(T, best.T_searched) < ASKEW_RAD:
         return best
     other = near(T)
     if other.overlap < overlap or _is_same(other, best):
@@ -209,11 +216,14 @@ def _added(best: Fit, T: Array, covariance: Array, excess: float, limits: Limits
 
 def _start(best: Fit, which: int) -> Array:
     """The pose from which a rival is fitted."""
-    T = best.T_searched.copy()
+    T = best.T_searched
+    tilt = detect.tilt(T)
+    is_across = abs(tilt) < 0.5 * TILT_RAD
     if which == MIRROR:
-        return detect.mirrored(T)[0]
-    T[:3, :3] = rigid.rotation(TURNS[which - 1] * T[:3, 0]) @ T[:3, :3]
-    return T
+        return detect.tilted(T, -math.copysign(TILT_RAD if is_across else 2.0 * abs(tilt), tilt))
+    if which == TILT:
+        return detect.tilted(T, math.copysign(TILT_RAD, tilt if is_across else -tilt))
+    return detect.rolled(T, TURNS[which - 1])
 
 
 def _fitted(T: Array, best: Fit, shown: Shown) -> Fit:
@@ -238,7 +248,7 @@ def _excess(other: Fit, best: Fit, shown: Shown, differs: Callable[[Fit], int]) 
     longer = max(other.points, here.points)
     excess = longer * (other.cost / other.points - here.cost / here.points)
     excess /= max(1.0, min(other.rms, here.rms) / TYPICAL) ** 2
-    if best.hand == other.hand == 1.0 and other.T[:3, 0] @ best.T[:3, 0] > math.cos(JUMPED_RAD):
+    if best.hand == other.hand == 1.0 and other.T[:3, 0] @ best.T[:3, 0] > math.cos(ASKEW_RAD):
         excess += min(max((differs(other) - differs(best)) / HAND_PX, -MOST_BY_HAND), MOST_BY_HAND)
     return excess
 

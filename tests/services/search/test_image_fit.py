@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from penumbra.services.search import contour, evidence, tracker
+from penumbra.services.search import contour, detect, evidence, tracker
 from penumbra.services.search.contour import MEASURED, POINT
 from penumbra.services.search.image_fit import UNKNOWNS, ImageSettings, fit_image, offsets, unfitted
 from penumbra.services.search.mask_fit import Limits, hand_differs, marginal
@@ -195,6 +195,19 @@ def test_a_turn_that_takes_the_pose_s_place_is_doubted_until_the_others_are_comp
     assert len(changes) >= len(visible) // 2
     first, last = np.array(changes).T
     assert first.min() > 1.0 and np.median(last) < 0.5 * np.median(first)
+
+
+def test_a_limb_that_was_found_tilted_too_little_does_not_stay_so():
+    shot = shots.shot(7200, 14, hidden=0.0, domain="easy")
+    camera, search, errors = shot.camera.T_world_camera, Search(shot.cell), []
+    T = camera @ detect.tilted(rigid.inverse(camera) @ shot.T_world_target, np.radians(22.0))
+    T[:3, 3] += (shot.T_world_target[:3, :3] - T[:3, :3]) @ shot.mesh.vertices.mean(axis=0)
+    for _ in range(3 * RIVALS):
+        estimate = search.update(mask(shot, T, 0.4), T, 25.0 * PRIOR, shot.joints, shot.image)
+        T = estimate.T_searched
+        errors.append(error_cm(shot, estimate))
+    assert errors[0] > 2.0
+    assert np.median(errors[RIVALS:]) < 1.0
 
 
 def with_hand_covered(shot: Shot) -> tuple[Mask, np.ndarray]:

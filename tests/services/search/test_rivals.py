@@ -118,7 +118,7 @@ def test_while_all_are_refuted_every_second_comparison_is_of_a_nearest_turn():
     for i in range(1, 20 * RIVALS):
         rivals.contested(fitted(TILTED, 100.0), PICTURE_NS * i, shown, lambda fit: 0.0, same)
     near = np.isclose(starts, np.radians(30.0), atol=0.01)
-    assert near[: 2 * RIVALS].sum() == 4, "each of the eight twice: two pictures are needed to refute it"
+    assert near[: 2 * RIVALS].sum() == 4, "each of the nine twice: two pictures are needed to refute it"
     assert near[2 * RIVALS :].mean() == pytest.approx(0.5 + 0.5 * 2 / RIVALS, abs=0.05)
 
 
@@ -148,6 +148,20 @@ def test_a_limb_found_with_the_wrong_tilt_has_the_right_one_at_once():
 
     found = Rivals(Limits()).contested(shown(TILTED, 1, 1.0), PICTURE_NS, shown, lambda fit: 0.0, same)
     assert apart(TILTED, MIRROR) > 0.5 and apart(found.T, MIRROR) < 0.1
+
+
+@pytest.mark.parametrize(("degrees", "right"), [(5.0, 27.0), (-5.0, -27.0), (5.0, -17.0), (27.0, 5.0), (-27.0, -5.0)])
+def test_a_limb_whose_tilt_is_22_degrees_off_on_either_side_of_the_image_plane_is_set_right_and_stays_so(degrees, right):
+    there, here = (detect.tilted(HERE, np.radians(each)) for each in (right, degrees))
+
+    def shown(T: np.ndarray, passes: int, hand: float) -> Fit:
+        return fitted(T, 70.0 if apart(T, there) < 0.1 else 100.0)
+
+    rivals = Rivals(Limits())  # every fit from the prediction ends at the wrong tilt, as long as the rivals are compared
+    said = [rivals.contested(shown(here, 1, 1.0), PICTURE_NS * i, shown, lambda fit: 0.0, same) for i in range(1, 2 * RIVALS)]
+    is_right = np.array([apart(each.T, there) < 0.1 for each in said])
+    assert detect.tilt(there) == pytest.approx(np.radians(right))
+    assert is_right[RIVALS - 1 :].all()
 
 
 def test_the_mirror_image_of_a_turn_that_wins_is_compared_next():
