@@ -75,7 +75,7 @@ prefer the wrong turn would convince it. With ten for bent hands, 8 % of the fus
 and axis, instead of 5 % (30 streams of 2 s, seeds 76 to 78)."""
 REST_NS = 140_000_000
 """Time [ns] between two comparisons while all rivals are refuted: the nearest turns are compared at least every 0.6 s and the
-others every 2.2 s, or in every fourth and sixteenth picture if pictures are rarer."""
+others every 2.5 s, or in every fourth and eighteenth picture if pictures are rarer."""
 KEPT, MOST = 0.7, 6.0
 """Share of the evidence about a rival that is kept until it is compared again, and maximum evidence of one picture against it:
 two pictures are needed to refute it, and several with a slight preference decide together. Chosen."""
