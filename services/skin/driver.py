@@ -92,7 +92,8 @@ class Count:
 
 class Line:
     """One board on its port. measures: cycles per reply; noise: standard deviation of an amplitude over 100 cycles, in steps of
-    the converter. `electrode_hz` is the frequency last set, `resonance_hz` the result of `tune`."""
+    the converter. `electrode_hz` is the frequency last set, `resonance_hz` the result of `tune`, `asked_ns` the time of the last
+    request."""
 
     def __init__(self, port: Port, channels: Sequence[int], measures: int = 128, samples_per_cycle: int = 4, noise: float = 3.1):
         self.port, self.channels, self.count = port, list(channels), Count()
@@ -104,7 +105,7 @@ class Line:
         self.electrode_hz, self.resonance_hz = board.ELECTRODE_HZ, 0.0
         self._phase: Components | None = None
         self._slack: deque[int] = deque(maxlen=200)
-        self._asked_ns = self._answered_ns = port.now_ns()
+        self.asked_ns = self._answered_ns = port.now_ns()
         self._fault, self._is_cut, self._is_tuned = "", False, False
         self._attempt = 0  # an answer to an earlier attempt may arrive late
 
@@ -116,12 +117,12 @@ class Line:
         if stray:
             self.count.faults["overrun" if board.OVERRUN in stray else "garbled"] += 1
         self.port.write(self._request)
-        self._asked_ns = self.port.now_ns()
+        self.asked_ns = self.port.now_ns()
 
     def answer(self) -> tuple[int, Components] | None:
         """The middle of the integration on the port's clock [ns] and the Fourier components (6,) [steps] of the requested
         measurement; None after a fault, and then `recover` must be called first."""
-        data = self._read(self._size, self._asked_ns, self._least_s() + PATIENCE_S)
+        data = self._read(self._size, self.asked_ns, self._least_s() + PATIENCE_S)
         received_ns = self.port.now_ns()
         components, self._fault = self._judge(data)
         if self._fault:
@@ -179,10 +180,10 @@ class Line:
     def _middle_ns(self, received_ns: int) -> int:
         """The middle of the integration. Half of the minimum slack beyond line and cycles lies before it; any further slack of a
         reply was a delay in this machine or on the line."""
-        slack = received_ns - self._asked_ns - round(1e9 * board.reply_s(self.cycles, self.electrode_hz, self.samples_per_cycle))
+        slack = received_ns - self.asked_ns - round(1e9 * board.reply_s(self.cycles, self.electrode_hz, self.samples_per_cycle))
         self._slack.append(max(0, slack))
         before_s = board.COMMAND_BYTES * board.BYTE_S + 0.5 * self.cycles / self.electrode_hz
-        return self._asked_ns + round(1e9 * before_s) + min(self._slack) // 2
+        return self.asked_ns + round(1e9 * before_s) + min(self._slack) // 2
 
     def _has_slipped(self, components: Components) -> bool:
         """Whether all channels have turned relative to earlier replies: samples were lost, and the amplitude is wrong."""
@@ -325,11 +326,18 @@ def resonance(hz: Array, amplitude: Array, least: float) -> float:
 @dataclass(frozen=True)
 class Row:
     """A measurement of all electrodes. stamp_ns: the middle of the integration, on the ports' clock, averaged over the boards;
-    volts (e,) in the order of the pad type; skew_ns: spread of the boards' middles."""
+    volts (e,) in the order of the pad type; skew_ns: spread of the boards' middles; lag_ns: time from the request to the stamp,
+    of which the part on the line is assumed shorter once a reply was faster."""
 
     stamp_ns: int
     volts: Array
     skew_ns: int
+    lag_ns: int = 0
+
+    @property
+    def asked_ns(self) -> int:
+        """When the measurement was requested."""
+        return self.stamp_ns - self.lag_ns
 
 
 class PadReader:
@@ -361,11 +369,13 @@ class PadReader:
         stamps = [stamp_ns for stamp_ns, _ in whole]
         amplitudes = np.abs(np.array([components for _, components in whole]))
         volts = np.array([0.0 if at is None else amplitudes[at[0], at[1]].mean() for at in self._sources]) * self._lsb
-        return Row(sum(stamps) // len(stamps), volts, max(stamps) - min(stamps))
+        stamp_ns, asked_ns = sum(stamps) // len(stamps), sum(line.asked_ns for line in self.lines) // len(self.lines)
+        return Row(stamp_ns, volts, max(stamps) - min(stamps), stamp_ns - asked_ns)
 
 
 class Batches:
-    """Collects evenly spaced rows into batches. A late row ends the batch before it, so no stamp is invented."""
+    """Collects evenly spaced rows into batches. A late row ends the batch before it, so no stamp is invented. Rows are as far
+    apart as their requests: stamps come nearer to each other where the lag turns out to be less."""
 
     def __init__(self, length_ns: int = BATCH_NS):
         self._length_ns = length_ns
@@ -376,13 +386,13 @@ class Batches:
         """Batches that are complete now, each (stamp of the last row [ns], period [ns], volts (rows, e))."""
         out = []
         if self._rows:
-            elapsed_ns = row.stamp_ns - self._rows[-1].stamp_ns
+            elapsed_ns = row.asked_ns - self._rows[-1].asked_ns
             usual_ns = self._spacing_ns() or elapsed_ns
             if abs(elapsed_ns - usual_ns) > UNEVEN * usual_ns:
                 out += self.flush()
         self._rows.append(row)
         spacing_ns = self._spacing_ns()
-        if spacing_ns and row.stamp_ns - self._rows[0].stamp_ns + spacing_ns >= self._length_ns:
+        if spacing_ns and row.asked_ns - self._rows[0].asked_ns + spacing_ns >= self._length_ns:
             out += self.flush()
         return out
 
@@ -390,7 +400,7 @@ class Batches:
         """The collected rows as a batch; empty if there are none. A single row gets the period of the previous batch."""
         rows, self._rows = self._rows, []
         if len(rows) > 1:
-            self.period_ns = round((rows[-1].stamp_ns - rows[0].stamp_ns) / (len(rows) - 1))
+            self.period_ns = round((rows[-1].asked_ns - rows[0].asked_ns) / (len(rows) - 1))
         if not rows or not self.period_ns:
             return []
         return [(rows[-1].stamp_ns, self.period_ns, np.array([row.volts for row in rows]))]
@@ -399,4 +409,4 @@ class Batches:
         """Spacing [ns] of the collected rows; for a single one that of the previous batch."""
         if len(self._rows) < 2:
             return self.period_ns
-        return (self._rows[-1].stamp_ns - self._rows[0].stamp_ns) // (len(self._rows) - 1)
+        return (self._rows[-1].asked_ns - self._rows[0].asked_ns) // (len(self._rows) - 1)

@@ -215,6 +215,15 @@ def test_batches_are_evenly_spaced_rows_and_every_row_keeps_its_time():
     assert len(times) == len(stamps) and max(len(volts) for _, _, volts in out) == 5  # four, when the period is known
 
 
+def test_a_lag_that_turns_out_to_be_less_does_not_bring_rows_nearer_to_each_other():
+    period, lags = 4_400_000, (5_000_000, 5_000_000, 2_000_000, 2_000_000, 1_000_000)
+    batches, out = Batches(20_000_000), []
+    for k, lag in enumerate(lags):
+        out += batches.add(Row(k * period + lag, np.zeros(5), 0, lag))
+    ((stamp_ns, period_ns, volts),) = out
+    assert (stamp_ns, period_ns, len(volts)) == (4 * period + lags[-1], period, len(lags))
+
+
 def test_slow_rows_are_handed_on_at_once_when_their_period_is_known():
     batches = Batches(20_000_000)
     found = [len(batches.add(row)) for row in rows_at(0, 700_000_000, 1_400_000_000, 2_100_000_000)]
