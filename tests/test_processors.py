@@ -1,5 +1,4 @@
-"""What is promised holds on other processors than this one: the numerical tests again, with fewer instructions. Each library
-has a switch of its own for it."""
+"""What is promised holds on other processors than this one: the numerical tests again, with fewer instructions."""
 
 import os
 import platform
@@ -8,6 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from penumbra.tests.support.processors import PROCESSORS
 
 ROOT = Path(__file__).parents[1]
 TESTS = {
@@ -30,24 +31,6 @@ TESTS = {
 }
 """Newer processors load the kernels of x86-64-v3 too, so that row is for the libraries of others. OpenVINO is not in the
 other row: held to SSE4.1 on a processor with AVX-512, its version 2026.4 compiles no network ("bad combination")."""
-PROCESSORS = {
-    "x86-64-v2": {
-        "ATEN_CPU_CAPABILITY": "default",
-        "NPY_DISABLE_CPU_FEATURES": "AVX AVX2 FMA3 AVX512F AVX512_SKX AVX512_ICL AVX512_SPR X86_V3 X86_V4",
-        "ONEDNN_MAX_CPU_ISA": "SSE41",
-        "OPENBLAS_CORETYPE": "Nehalem",
-        "PYTEST_ADDOPTS": "-p penumbra.tests.support.without_avx",
-    },
-    "x86-64-v3": {
-        "ATEN_CPU_CAPABILITY": "avx2",
-        "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512_SKX AVX512_ICL AVX512_SPR X86_V4",
-        "ONEDNN_MAX_CPU_ISA": "AVX2",
-        "OPENBLAS_CORETYPE": "Haswell",
-    },
-}
-"""Switches of torch, numpy, oneDNN (in torch and OpenVINO), OpenBLAS (in numpy and scipy) and the kernels' library."""
-
-
 FORBIDDEN = {"x86-64-v2": "avx", "x86-64-v3": "avx512f"}
 """Instructions that a row does without: on a processor that has none, the tests of the default run were the row's."""
 

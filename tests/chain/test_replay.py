@@ -1,6 +1,6 @@
 """A recorded quarter of a minute through all services: a changed output is a mistake, or a new reference in the same commit
-(`python -m penumbra.tests.chain.test_replay`). It is played in a process of its own, in which all x86 processors with AVX2 round
-alike: what a mask shows changes the window of the next one, so that rounding becomes pixels, and later millimetres."""
+(`python -m penumbra.tests.chain.test_replay`). It is played in a process of its own, in which x86 processors round alike: what a
+mask shows changes the window of the next one, so that rounding becomes pixels, and later millimetres."""
 
 import json
 import os
@@ -20,12 +20,10 @@ from penumbra.shared.contract.labels import Label
 from penumbra.shared.contract.topics import FRAME
 from penumbra.shared.perception.lookout import whole_frame
 from penumbra.sim.world.world import record
+from penumbra.tests.support.processors import PROCESSORS
 
 REFERENCE = Path(__file__).parents[1] / "references" / "replay_table.json"
 SEED = 11
-ALIKE = {"ONEDNN_MAX_CPU_ISA": "AVX2", "OPENBLAS_CORETYPE": "Haswell"}
-"""Environment in which masks are computed in single precision (not all processors have bfloat16), and numpy's products by the
-same code."""
 
 
 def play() -> list[Heard]:
@@ -62,9 +60,9 @@ def write(path: Path) -> None:
 
 
 def written(path: Path) -> dict[str, list[Any]]:
-    """What another process writes."""
+    """What another process writes, with the instructions that all x86 processors since 2013 have."""
     command = [sys.executable, "-m", "penumbra.tests.chain.test_replay", str(path)]
-    subprocess.run(command, env={**os.environ, **ALIKE}, check=True)
+    subprocess.run(command, env={**os.environ, **PROCESSORS["x86-64-v3"]}, check=True)
     found: dict[str, list[Any]] = json.loads(path.read_text())
     return found
 
