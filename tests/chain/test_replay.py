@@ -60,7 +60,7 @@ def write(path: Path) -> None:
 
 
 def written(path: Path) -> dict[str, list[Any]]:
-    """What another process writes, with the instructions that all x86 processors since 2013 have."""
+    """What another process writes, with the instructions of x86-64-v3 on newer processors, too."""
     command = [sys.executable, "-m", "penumbra.tests.chain.test_replay", str(path)]
     subprocess.run(command, env={**os.environ, **PROCESSORS["x86-64-v3"]}, check=True)
     found: dict[str, list[Any]] = json.loads(path.read_text())
